@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from polysight.cli.main import main
 from polysight.polarimetry import fresnel, ratio_from_permittivity
-from polysight_papers.sensys2026 import permittivities, run as report, synchronisation
+from polysight_papers.sensys2026 import images, permittivities, run as report, synchronisation
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes, table2
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
@@ -125,6 +125,36 @@ def test_a_filter_is_fitted_to_tones_in_the_passband_alone(monkeypatch):
     assert if_hz.max() < 0.9 * chirp.sample_rate_hz
     assert if_hz.shape == amplitude.shape
     assert if_hz.size < 3 * example.shape[1]
+
+
+@pytest.fixture(scope="module")
+def small_scan():
+    """The scan of Fig. 12 and 15 on a small grid."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(images, "GRID", {"columns": 13, "rows": 13, "step_x_mm": 10.0, "step_y_mm": 6.0})
+        return synchronisation.sync_scan.__wrapped__(Run(quick=True))
+
+
+def test_range_profiles_show_the_plane_only_after_synchronisation(small_scan):
+    """The plane is 0.315 m behind the direct path; a cell of the range is 86 mm wide, a bin 16 mm."""
+    behind = small_scan.range_m > 0.15
+    before, after = small_scan.profiles
+    assert before.shape == after.shape == (13, small_scan.range_m.size)
+    peaks_m = small_scan.range_m[behind][after[:, behind].argmax(axis=1)]
+    assert np.abs(peaks_m - 0.315).max() < 0.05
+    assert not after.argmax(axis=1).any()
+    assert np.ptp(before.argmax(axis=1)) > 20
+
+
+def test_an_image_forms_only_after_synchronisation(small_scan):
+    before, after = (np.abs(image).max() / np.median(np.abs(image)) for image in small_scan.images)
+    assert after > 2 * before
+
+
+@pytest.mark.parametrize("key", ["fig12", "fig15"])
+def test_figures_of_synchronisation_are_made(key, small_scan, tmp_path, monkeypatch):
+    monkeypatch.setattr(synchronisation, "sync_scan", lambda _: small_scan)
+    assert report.write_item(tmp_path, report.MAKERS[key](Run(quick=True)))
 
 
 def test_location_independence_counts_pixels_of_its_materials_alone(monkeypatch):

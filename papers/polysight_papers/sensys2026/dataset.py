@@ -46,7 +46,7 @@ _CONTAINERS = {"glass", "plastic"}
 _ENOUGH = 0.5
 
 PIXELS = 16
-"""Pixels of a patch, at even intervals, as in our own libraries."""
+"""Largest number of pixels of a patch, at even intervals, as in our own libraries."""
 
 
 @dataclass(frozen=True)
@@ -339,7 +339,7 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
     Raises
     ------
     DataError
-        when nothing can be used, or no angle has scans enough to choose a model with.
+        when nothing can be used, or no angle has scans enough to judge a model on.
     """
     data = read_authors(folder, config)
     for notice in data.notices:

@@ -180,7 +180,7 @@ def h_accuracy(group: Group, errors: Errors, seeds: tuple[int, ...]) -> float:
 
 
 def count_draws(quick: bool) -> int:
-    """Return the number of draws on which errors are calibrated."""
+    """Return the number of draws on which errors are calibrated; chosen."""
     if quick:
         return 1
     return 3

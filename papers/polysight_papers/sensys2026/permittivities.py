@@ -38,8 +38,8 @@ CONTRAST = (1, 13, 16, 12, 18, 6, 3)
 CLUTTERED = ("Cardboard", "PET (1 mm)", "Acrylic (3 mm)")
 WATER = item.Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
 LINES = ("-", "--", "-.", ":")
-# Fig. 17: number of scans, plate centres within this distance of the middle and this far apart, and materials by their
-# numbers in Table 2.
+# Fig. 17: number of scans, as in the paper; plate centres within this distance of the middle and this far apart
+# (chosen); materials by their numbers in Table 2.
 PLACEMENTS = 8
 REACH_MM = 60.0
 APART_MM = 60.0

@@ -20,7 +20,16 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from polysight.capture import decode_row, row_words
 from polysight.imaging import ImageBuilder
 from polysight.report import INK, PALETTE, QUANTITIES, SyncReport
-from polysight.sync import STAGES, BoardSetup, HighPass, fit_high_pass, high_pass, synchronise_row
+from polysight.sync import (
+    FOLD,
+    STAGES,
+    BoardSetup,
+    HighPass,
+    fit_high_pass,
+    high_pass,
+    sample_frequencies_hz,
+    synchronise_row,
+)
 from polysight_papers.sensys2026.images import plate, simulate_scan
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, published_values, style_axes
 from polysight_shared.config import Chirp, load_instrument
@@ -39,6 +48,9 @@ USUAL_HZ = 870e3
 SKIRT_HZ = (60e3, 200e3)
 # Length of zero-padded spectra.
 _PADDED = 4096
+# Bins of a range profile over the unambiguous range of all samples, and the excess path that is shown; chosen.
+_RANGE_BINS = 1024
+_SHOWN_M = 2.5
 
 
 @dataclass(frozen=True)
@@ -52,7 +64,8 @@ class SyncScan:
     images
         |H image| before and after synchronisation, [ny, nx].
     profiles
-        |Range profile| of the middle row before and after, [position, range], and `range_m`, the excess path.
+        |Range profile| of the middle row before and after, [position, range], and `range_m`, the excess path. That
+        after is of decimated chirps, which show paths beyond 1 m too weak.
     extent_mm
         Left, right, bottom, top edge of the images from their centre.
     """
@@ -68,8 +81,8 @@ class SyncScan:
 def sync_scan(run: Run) -> SyncScan:
     """Simulate a scan of three metal plates with all disturbances, and synchronise it.
 
-    "Before" is one chirp of each position as the hardware trigger left it, mixed down by one frequency for the whole
-    scan, so that the object lies in the range gate at all; "after" is the pipeline's.
+    "Before" is the first chirp of each position as the hardware trigger left it, mixed down by one frequency for the
+    whole scan, so that the object lies in the range gate at all; "after" is the pipeline's.
     """
     plates = [plate("copper", None, 0.0, 0.0), plate("left", None, -60.0, 40.0), plate("right", None, 60.0, -40.0)]
     with simulate_scan("three metal plates", plates, run.config, seed=1200) as (source, _):
@@ -82,7 +95,8 @@ def sync_scan(run: Run) -> SyncScan:
         builder_before = ImageBuilder(rig)
         builder_after = ImageBuilder(rig)
         middle = source.plan.rows // 2
-        example = {}
+        before = np.zeros((0, 0), np.float32)
+        after = before
         carrier = None
         for row in source.rows():
             for name, setup in setups.items():
@@ -94,26 +108,38 @@ def sync_scan(run: Run) -> SyncScan:
                 if carrier is None:
                     carrier = float(np.median(synced.direct_hz)) / chirp.sample_rate_hz
                 mixed = raw[:, :: rig.burst.pulses] * np.exp(-2j * np.pi * carrier * np.arange(chirp.samples))
-                unsynchronised = replace(synced, samples=mixed.astype(np.complex64))
+                # All samples of the chirp, where synchronised rows are decimated, and no turn that was estimated.
+                unsynchronised = replace(
+                    synced, samples=mixed.astype(np.complex64), sweep_hz=sample_frequencies_hz(chirp), turn=None
+                )
                 builder_before.add_row(name, row, unsynchronised)
                 builder_after.add_row(name, row, synced)
                 if name == board and row == middle:
-                    example = {"before": unsynchronised.samples[0], "after": synced.samples[0]}
+                    a, b = chirp.linear_samples
+                    before = _compute_range_profile(mixed[0, :, a:b], 1)
+                    after = _compute_range_profile(synced.samples[0], FOLD)
         pairs = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
         grid = builder_after.grid
-    a, b = chirp.linear_samples
-    profiles = [np.abs(np.fft.fft(example[k][:, a:b] * np.hanning(b - a), 1024)).astype(np.float32) for k in example]
-    range_m = np.arange(1024) / 1024 * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
-    near = range_m < 2.5
+    range_m = np.arange(_RANGE_BINS) / _RANGE_BINS * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
+    bins = int((range_m < _SHOWN_M).sum())
     x = (grid.x_m[[0, -1]] - grid.x_m[[0, -1]].mean()) * 1e3
     y = (grid.y_m[[0, -1]] - grid.y_m[[0, -1]].mean()) * 1e3
     return SyncScan(
         reports,
         (pairs[0], pairs[1]),
-        (profiles[0][:, near], profiles[1][:, near]),
-        range_m[near],
+        (before[:, :bins], after[:, :bins]),
+        range_m[:bins],
         (float(x[0]), float(x[1]), float(y[0]), float(y[1])),
     )
+
+
+def _compute_range_profile(samples: npt.NDArray[np.complexfloating], step: int) -> npt.NDArray[np.float32]:
+    """Return |range profile| of samples [position, sample] under Hann's window, [position, range].
+
+    `step` is the distance of the samples, in samples of the chirp: the bins are the same for any.
+    """
+    spectrum = np.fft.fft(samples * np.hanning(samples.shape[1]), _RANGE_BINS // step)
+    return np.abs(spectrum).astype(np.float32)
 
 
 def fig12(run: Run) -> Item:

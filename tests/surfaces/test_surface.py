@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.refusals import refused
 
 from polysight.data import find_packaged
 from polysight.surfaces import (
@@ -22,6 +24,7 @@ from polysight.surfaces import (
 )
 from polysight.surfaces.result import point_cloud
 from polysight_shared.config import load_instrument
+from polysight_shared.error_codes import ErrorCode
 from polysight_worlds.media import Stack
 from polysight_worlds.shape_scenes import ShapeScene
 from polysight_worlds.shapes import cylinder, sphere
@@ -132,6 +135,19 @@ def test_files_hold_what_was_found(glass_ball, tmp_path):
     assert read.scan_id == surface.scan_id
     assert np.array_equal(read.points_m, surface.points_m)
     assert np.array_equal(read.permittivity, surface.permittivity, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    "content", [None, b"", b"not an archive", {"points_m": np.zeros((1, 3))}, {"segments": "[{}]"}]
+)
+def test_a_file_that_is_no_surface_is_refused_by_name(content: Any, tmp_path):
+    path = tmp_path / SURFACE
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.savez(path, **content)
+    with refused(ErrorCode.FILE_UNREADABLE, path):
+        read_surface(path)
 
 
 def test_the_point_cloud_is_a_ply_of_all_points(glass_ball):

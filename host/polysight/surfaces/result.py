@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -41,6 +42,8 @@ from polysight.surfaces.permittivity import (
 )
 from polysight.surfaces.points import tangents
 from polysight.surfaces.window import Echoes
+from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DataError
 from polysight_shared.files import write_atomically
 
 # Fields of a surface that are no arrays of points.
@@ -521,20 +524,29 @@ def write_surface(out: Path, surface: Surface) -> None:
 
 def read_surface(path: Path) -> Surface:
     """Read `surface.npz`. Raises DataError if it cannot be read."""
-    with open_npz(path) as f:
-        arrays: dict[str, Any] = dict(f)
-    segments = []
-    for row in json.loads(str(arrays.pop("segments"))):
-        eps = row["permittivity"]
-        covariance = row["covariance"]
-        row["permittivity"] = None if eps is None else complex(*eps)
-        row["covariance"] = None if covariance is None else tuple(map(tuple, covariance))
-        row["centre_m"] = tuple(row["centre_m"])
-        row["normal"] = tuple(row["normal"])
-        segments.append(Segment(**row))
-    scan_id = str(arrays.pop("scan_id"))
-    simulated = bool(arrays.pop("simulated"))
-    return Surface(scan_id=scan_id, simulated=simulated, segments=tuple(segments), **arrays)
+    try:
+        with open_npz(path) as f:
+            arrays: dict[str, Any] = dict(f)
+        segments = tuple(map(_read_segment, json.loads(str(arrays.pop("segments")))))
+        scan_id = str(arrays.pop("scan_id"))
+        simulated = bool(arrays.pop("simulated"))
+        return Surface(scan_id=scan_id, simulated=simulated, segments=segments, **arrays)
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
+        raise DataError(
+            f"{path}: the surface cannot be read: {type(e).__name__}: {e}",
+            "it is damaged, or of another version", "make it again: polysight surface", code=ErrorCode.FILE_UNREADABLE,
+        ) from None  # fmt: skip
+
+
+def _read_segment(row: dict[str, Any]) -> Segment:
+    """Return the segment that :func:`plain_segment` gave. Raises KeyError or TypeError for another row."""
+    eps = row["permittivity"]
+    covariance = row["covariance"]
+    row["permittivity"] = None if eps is None else complex(*eps)
+    row["covariance"] = None if covariance is None else tuple(map(tuple, covariance))
+    row["centre_m"] = tuple(row["centre_m"])
+    row["normal"] = tuple(row["normal"])
+    return Segment(**row)
 
 
 def point_cloud(surface: Surface) -> bytes:

@@ -145,7 +145,8 @@ def test_a_file_that_is_no_surface_is_refused_by_name(content: Any, tmp_path):
     if isinstance(content, bytes):
         path.write_bytes(content)
     elif content is not None:
-        np.savez(path, **content)
+        arrays: dict[str, Any] = content
+        np.savez(path, allow_pickle=False, **arrays)
     with refused(ErrorCode.FILE_UNREADABLE, path):
         read_surface(path)
 

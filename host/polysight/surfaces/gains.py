@@ -53,11 +53,11 @@ class Voltages:
     bend_inside, bend_across, twist
         Curvatures in and across the plane of incidence, and twist between both, [n].
     arrival, departure
-        Directions of arrival at V, and of departure at TX to H, their x and y, [n, 2].
+        Directions in which V sees the point, and in which TX sees it for H: x and y of unit vectors, [n, 2].
     band_rise
         ln of the amplitude in the upper half of the band over that in the lower half, of H and V [n, 2].
     at_m
-        Stage offsets, [n, 2].
+        Stage offsets of H's echoes, x and y, [n, 2].
     """
 
     b: Complex
@@ -150,9 +150,10 @@ def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOC
     return number.reshape(-1)
 
 
-# Degree of the gains' polynomials in the direction of arrival or departure, if the reference covers directions.
+# Degree of the gains' polynomials in the direction of arrival or departure, if the reference covers directions; chosen.
 DEGREE = 2
-# A reference whose directions span no more than this, in radians, is taken for a plate, which has one direction.
+# A reference whose directions span no more than this, in radians, is taken for a plate, which has one direction;
+# chosen.
 LEAST_SPAN_RAD = 0.1
 # Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
 # pattern cos^2 differ by 0.7.

@@ -30,12 +30,13 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # The curvature Q of a convex body's path is between 0 (plane) and 2.3 / m (point).
 START_BEND = 0.8
-# Steps of the fit, the share of the rest below which a step's gain ends it, and the damping at which it gives up.
+# Steps of the fit, the share of the rest below which a step's gain ends it, and the damping at which it gives up;
+# chosen.
 JOINT_ITERATIONS = 14
 JOINT_GAIN = 3e-3
 MOST_DAMPING = 10
 # How often the RX are added up anew at most (each turned by its phase for the paths found, `steering`), and the share
-# of the rest below which once more is worth it.
+# of the last energy that a round must leave at most for another one to be worth it; chosen.
 STEERINGS = 4
 STEERING_GAIN = 0.9
 # Two echoes that make each other's amplitude so much less certain have run into one another, or are two halves of a
@@ -126,13 +127,13 @@ class JointFit:
         echoes = self.amplitude.shape[1]
         energy = np.zeros(len(self.rest))
         energy[members] = find_energy(self.rest[members])
-        # Start and factors of the damping (0.2 after a step that helps, 8 after another) are chosen.
+        # Levenberg and Marquardt's damping. Its start and factors (0.2 after a step that helps, 8 after another) are
+        # chosen.
         damping = np.full(len(self.rest), 1e-3)
         running = members
         for _ in range(JOINT_ITERATIONS):
             normal, gradient = self._find_normal_equations(running)
             diagonal = np.einsum("wii->wi", normal)
-            # A step that leaves less is taken and the damping falls (0.2 times); otherwise it grows (8 times).
             damped = normal + (damping[running, None] * diagonal + 1e-12)[:, :, None] * np.eye(8 * echoes)
             step = np.linalg.solve(damped, gradient[..., None])[..., 0].reshape(-1, echoes, 8)
             path_step = np.clip(step[..., 2:], -STEP_LIMITS, STEP_LIMITS)
@@ -150,7 +151,6 @@ class JointFit:
             self.rest[accepted] = residual[better]
             has_converged = better & (gain < JOINT_GAIN * energy[running])
             energy[accepted] = new_energy[better]
-            # Levenberg and Marquardt's damping; the factors are chosen.
             damping[running] *= np.where(better, 0.2, 8)
             running = running[~has_converged & (damping[running] < MOST_DAMPING)]
             if not running.size:

@@ -51,7 +51,8 @@ MIN_SHARE = 0.05
 MIN_LEFT = 0.012
 # Echoes that a fit to some of the positions makes so much less certain have merged in a fit to all, too.
 THINNED_WIDENING = 5 * MERGED_WIDENING
-# An echo this far below the strongest of the scan is a side lobe or the echo of an edge.
+# An echo this far below the strongest of the scan, 32 dB in power, is taken for a side lobe or the echo of an edge;
+# chosen.
 MIN_POWER = 10 ** (-3.2)
 
 
@@ -81,7 +82,7 @@ class _Search:
         points = locate(path.ravel(), slope, zero, board.tx_m, board.middle_m)
         _, back, *_ = unit_legs(points, zero, board.tx_m, board.middle_m)
         lead = np.exp(1j * fit.middle * (back @ fit.lever.T))
-        # Places behind the stage or far away are no surfaces of the scene.
+        # Places behind the stage or far away (limits chosen) are no surfaces of the scene.
         lead[(points[:, 2] < 0.2) | (points[:, 2] > 1.5)] = 0
         self.lead = np.moveaxis(lead.reshape(*path.shape, -1), -1, 0).astype(np.complex64)
 

@@ -55,8 +55,8 @@ USUAL_RIPPLE = 0.02
 # Blocks that the scatter of the points is worth, if it were common to a block (chosen): the few blocks of a small
 # segment say little of their own scatter.
 EXPECTED_BLOCKS = 2.0
-# Error of the curvature, in proportion: those of 14 spheres and cylinders (50 to 190 mm, simulated) are 0.4 to 3 % too
-# large, 1.6 % in the root mean square (windows are not small to them).
+# Error of the curvature, in proportion; chosen: those of 14 spheres and cylinders (50 to 190 mm, simulated) are 0.4 to
+# 3 % too large, 1.6 % in the root mean square (windows are not small to them).
 CURVATURE_ERROR = 0.02
 # Second order of the reflection at a curved surface over the first, in K / (k cos^3 theta), K the curvature and k the
 # wave number: 1.9 by the exact series of spheres (100 and 200 mm, permittivity 2.8 to 8). Orders alternate in phase.
@@ -141,7 +141,7 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
 
 
 def clip_permittivity(eps: NDArray) -> Complex:
-    """Limit permittivities [any] to those of solids, so that iterations go on; 4 where they are not finite."""
+    """Limit permittivities [any] to `REAL_LIMITS` and `IMAGINARY_LIMITS`, so that iterations go on; 4 if not finite."""
     finite = np.where(np.isfinite(eps), eps, 4.0)
     return np.clip(np.real(finite), *REAL_LIMITS) + 1j * np.clip(np.imag(finite), *IMAGINARY_LIMITS)
 
@@ -376,7 +376,7 @@ def add_common_errors(
         add("model", (fit.answer @ change).real)
     for change in find_pattern_changes(fit.eps, v, wave_number):
         add("model", (fit.answer @ (find_misses(v, gains, coefficients + change) - miss)).real)
-    # Their phases are not known: both parts of each count.
+    # The phases of the reference's errors are not known: both parts of each count.
     sources["reference"] = (reference_changes @ reference_changes.conj().T).real
     return sources
 

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 # rest are for starts from which the first steps are cut to LONGEST_STEP_M.
 NEWTON_STEPS = 12
 LONGEST_STEP_M = 0.15
-# Newton's method starts this far in front of the antennas, and never comes closer than NEAREST_M: behind them a
-# mirror image of each point has nearly the same path and slope.
+# Newton's method starts this far in front of the antennas, and never comes closer than NEAREST_M (both chosen): behind
+# them a mirror image of each point has nearly the same path and slope.
 START_RANGE_M = 0.5
 NEAREST_M = 0.05
 # Keeps a singular matrix solvable. Entries are about 1, so that the added share lies far below the steps' precision.

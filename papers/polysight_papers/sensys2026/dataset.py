@@ -187,7 +187,10 @@ def _find_angle(folder: Path, scan: materials.LabelledScan, base: Instrument, no
 
 
 def _image_here(scan: materials.LabelledScan, images: Path, notices: list[str]) -> materials.LabelledScan | None:
-    """Return the scan's boxes with our own images, in the orientation of the authors' images."""
+    """Return the scan's boxes with our own images, in the orientation of the authors' images.
+
+    None, with a notice, if there are no images, or none that show the same.
+    """
     file = images / scan.scan / "image.npz"
     try:
         with open_npz(file) as z:

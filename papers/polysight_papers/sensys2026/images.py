@@ -113,8 +113,8 @@ PHASE_DEG = 30.0
 
 # Fig. 4.
 FRONT_ON_MM = 60.0
-"""Distance of each board's origin from the middle in the front-on rig. The antennas lie 7 to 15 mm from the middle:
-RX1 of H and V see it under 0.6 and 2.2 degrees of incidence."""
+"""Distance of each board's origin from the middle in x in the front-on rig. The antennas lie 7 to 16 mm from the middle
+in x: RX1 of H and V see it under 0.6 and 2.2 degrees of incidence."""
 FRONT_ON_GRID = {"columns": 81, "rows": 81, "step_x_mm": 4.5, "step_y_mm": 4.5}
 """Monostatic, a step d makes ghosts at wavelength * distance / 2 d: 216 mm for 4.5 mm, outside the plates."""
 ROWS = (3, 6, 15)

@@ -44,6 +44,7 @@ def test_all_checks_of_a_healthy_rig_pass(live, capsys):
     status = run_doctor(DoctorOptions(live.config, live.folder, move=True), as_json=True, system=QUICK)
     document = json.loads(capsys.readouterr().out)
     findings = {f["check"]: f for f in document["findings"]}
+    assert [f for f in document["findings"] if f["verdict"] == "error"] == []
     assert (status, document["ok"], document["simulated"]) == (0, True, True)
     assert {n for n, f in findings.items() if f["verdict"] not in ("ok", "warning")} == set()
     assert findings["trigger line"]["facts"]["edges"] == 8

@@ -63,6 +63,19 @@ def test_phase_is_cyclic_and_comes_round(images):
     assert np.abs(ends[0] - ends[-1]).max() < 0.02
 
 
+@pytest.mark.parametrize("picture", ["h_phase", "p_phase"])
+@pytest.mark.parametrize(
+    ("level_db", "opacity"), [(-30, 0.0), (-26, 0.0), (-24, 0.25), (-22, 0.5), (-18, 1.0), (-9, 1.0)]
+)
+def test_phases_fade_with_the_level_below_the_brightest_pixels(images, picture, level_db, opacity):
+    h = np.ones((NY, NX), np.complex64)
+    # The picture's first row
+    h[-1, 3] = 10 ** (level_db / 20)
+    drawn = pixels(draw(replace(images, h=h, v=np.ones_like(h)))[picture].png)
+    assert drawn[0, 3, 3] == pytest.approx(opacity, abs=0.01)
+    assert (np.delete(drawn[..., 3].ravel(), 3) == 1).all()
+
+
 def test_phase_of_p_is_the_difference(images):
     h = images.h * np.exp(1j).astype(np.complex64)
     v = images.v * np.exp(0.25j).astype(np.complex64)

@@ -9,7 +9,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 
 from polysight_shared import geometry
-from polysight_shared.config import Image, Instrument, MountStep, Section, load_instrument
+from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Section, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import no_such
 from polysight_shared.tables import decode, read_toml, to_builtins
@@ -112,6 +112,17 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
     raw = read_toml(RIG_FILE)
     raw[table][key] = value
     with refused(code, "my.toml", *named):
+        decode(raw, Instrument, "my.toml")
+
+
+@pytest.mark.parametrize("debounce_us", [2_000, 4_000])
+def test_a_trigger_outlasts_the_debounce_by_its_clocks_steps(debounce_us: int):
+    raw = read_toml(RIG_FILE)
+    raw["pi"]["trigger_debounce_us"] = debounce_us
+    raw["stage"]["trigger_width_us"] = debounce_us + DEBOUNCE_TICKS_US
+    assert decode(raw, Instrument, "my.toml").pi.trigger_debounce_us == debounce_us
+    raw["stage"]["trigger_width_us"] -= 1
+    with refused(ErrorCode.VALUE_INVALID, "trigger_width_us", "trigger_debounce_us"):
         decode(raw, Instrument, "my.toml")
 
 

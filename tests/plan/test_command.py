@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 
 import pytest
@@ -41,6 +42,23 @@ def test_text_and_json_have_the_same_plan(capsys):
     assert sum(numbers["time_s"].values()) == pytest.approx(2 * numbers["time_s"]["total"])
     assert "simulated" in words
     assert "simulated" in numbers["noise_source"]
+
+
+@pytest.mark.parametrize(
+    ("options", "unit", "unit_s"),
+    [
+        (["--columns", "30", "--rows", "3"], "s", 1),
+        (["--columns", "40", "--rows", "30"], "min", 60),
+        (["--columns", "200", "--rows", "400", "--step-y-mm", "1"], "h", 3600),
+    ],
+)
+def test_a_duration_is_said_in_seconds_minutes_or_hours(capsys, options, unit, unit_s):
+    assert main(["plan", *RIG, *options, "--json"]) == 0
+    total_s = json.loads(capsys.readouterr().out)["time_s"]["total"]
+    assert main(["plan", *RIG, *options]) == 0
+    said, unit_said = re.search(r"^time +([\d.]+) (\w+),", capsys.readouterr().out, re.MULTILINE).groups()
+    assert unit_said == unit
+    assert float(said) * unit_s == pytest.approx(total_s, rel=0.02)
 
 
 @pytest.mark.parametrize(("options", "aliases"), [(SMALL, False), (["--columns", "60", "--rows", "60"], True)])

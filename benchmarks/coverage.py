@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -388,11 +388,21 @@ def _print_reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]
     return out
 
 
-def _judge_without_result(job: tuple[int, str]) -> tuple[str, int, str, int, str]:
-    """Judge a scene (seed, kind) that must give no result.
+class WithoutResult(NamedTuple):
+    """One scene that must give no result."""
 
-    Return kind, seed, level of the verdict, number of patches with a name or permittivity, and first reason.
-    """
+    kind: str
+    seed: int
+    # Level of the verdict.
+    level: str
+    # Number of patches with a name or permittivity.
+    said: int
+    # The verdict's first reason.
+    reason: str
+
+
+def _judge_without_result(job: tuple[int, str]) -> WithoutResult:
+    """Judge a scene (seed, kind) that must give no result."""
     seed, kind = job
     _, _, findings, _ = judge_scan(seed, kind)
     rows = findings.analysis.rows()
@@ -400,7 +410,7 @@ def _judge_without_result(job: tuple[int, str]) -> tuple[str, int, str, int, str
     reason = ""
     if findings.verdict.reasons:
         reason = findings.verdict.reasons[0].what
-    return kind, seed, findings.verdict.level, said, reason
+    return WithoutResult(kind, seed, findings.verdict.level, said, reason)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -458,10 +468,10 @@ def run(args: argparse.Namespace) -> int:
     if differences:
         median_percent = 100 * float(np.median(differences))
         print(f"raw beside samples: errors of the same patches differ by {median_percent:.2f} % (median)")
-    said = [w for w in without if w[3] or w[2] != "none"]
+    said = [scene for scene in without if scene.said or scene.level != "none"]
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
-    for w in said:
-        print("   ", w)
+    for scene in said:
+        print("   ", tuple(scene))
     print(f"names of the library's materials, {args.named} scenes with every nuisance but other specimens")
     reliability = _print_reliability(named)
     if args.json is not None:
@@ -473,4 +483,4 @@ def run(args: argparse.Namespace) -> int:
             "without": without,
         }
         args.json.write_text(json.dumps(content, indent=1) + "\n")
-    return int(any(w[3] for w in said))
+    return int(any(scene.said for scene in said))

@@ -49,7 +49,10 @@ SIDE_MM = 46.0
 GLASS = (5.5, 0.05)
 CONDUCTOR = (1.0, 1e9)
 """Permittivity of metal behind a sheet: of a good conductor, reflects -1 to one part in 1e4."""
-KINDS = ("sheet in air", "sheet on metal", "liquid behind a wall")
+IN_AIR = "sheet in air"
+ON_METAL = "sheet on metal"
+LIQUID = "liquid behind a wall"
+KINDS = (IN_AIR, ON_METAL, LIQUID)
 # Relative error up to which a result counts as right; chosen.
 ENOUGH = 0.05
 Setting = tuple[float, float | None]
@@ -104,7 +107,8 @@ def draw_scene(seed: int) -> Scene:
     rng = np.random.default_rng([20261124, seed])
     leak = [complex(0.1 * rig_rng.random() * np.exp(2j * np.pi * rig_rng.random())) for _ in range(2)]
     plates: list[dict[str, Any]] = []
-    kinds = iter(rng.permutation([*KINDS[:2] * 2, KINDS[2], KINDS[seed % 2]]).tolist())
+    sheets = (IN_AIR, ON_METAL)
+    kinds = iter(rng.permutation([*sheets, *sheets, LIQUID, sheets[seed % 2]]).tolist())
     for i, (x, y) in enumerate(PLACES):
         place = {
             "centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)],
@@ -116,9 +120,9 @@ def draw_scene(seed: int) -> Scene:
         real = rng.uniform(2, 7)
         sheet = {"permittivity": [real, real * rng.uniform(0, 0.1)], "thickness_mm": rng.uniform(0.5, 5)}
         layers = [sheet]
-        if kind == KINDS[1]:
+        if kind == ON_METAL:
             layers = [sheet, {"permittivity": list(CONDUCTOR)}]
-        elif kind == KINDS[2]:
+        elif kind == LIQUID:
             wall = {"permittivity": list(GLASS), "thickness_mm": rng.uniform(1, 3.5)}
             layers = [wall, {"permittivity": [rng.uniform(3, 15), rng.uniform(2, 20)]}]
         plates.append({**place, "name": f"{kind} {i}", "layers": layers})
@@ -178,11 +182,11 @@ def process_scene(
 
 def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
     """Return the stack as a user would give it, the thickness of a sheet free or within a share of the truth."""
-    if plate.name.startswith(KINDS[2]):
+    if plate.name.startswith(LIQUID):
         wall = plate.layers[0]
         return [Layer("glass", wall.epsilon, (wall.thickness_mm or 0.0) / 1e3), Layer("liquid")]
     behind = []
-    if plate.name.startswith(KINDS[1]):
+    if plate.name.startswith(ON_METAL):
         behind = [Layer("metal", METAL)]
     size = (plate.layers[0].thickness_mm or 0.0) / 1e3
     limits = RANGE_M
@@ -194,7 +198,7 @@ def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
 def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -> Case:
     """Compare the fit of one plate with its truth."""
     kind = next(k for k in KINDS if plate.name.startswith(k))
-    if kind == KINDS[2]:
+    if kind == LIQUID:
         layer = plate.layers[1]
     else:
         layer = plate.layers[0]
@@ -308,11 +312,12 @@ def run(args: argparse.Namespace) -> int:
         rows = [case for group in pool.map(cases, rigs) for case in group]
     out: dict[str, dict[str, float]] = {}
     for setting in SETTINGS:
-        if setting[1] is None:
+        trusted, within = setting
+        if within is None:
             near = f"{1e3 * RANGE_M[0]:g} to {1e3 * RANGE_M[1]:g} mm"
         else:
-            near = f"+-{100 * setting[1]:g} %"
-        print(f"|H| trusted to {100 * setting[0]:g} %, thickness looked for in {near}")
+            near = f"+-{100 * within:g} %"
+        print(f"|H| trusted to {100 * trusted:g} %, thickness looked for in {near}")
         same = [r for r in rows if r.setting == setting]
         for kind in (*KINDS, "all"):
             out[f"{kind}, {setting}"] = table([r for r in same if kind in (r.kind, "all")], kind)

@@ -578,7 +578,7 @@ def _describe_pair(a: PatchFigures, b: PatchFigures) -> PatchPair:
 
 
 def _read_covariance(permittivity: PermittivityFigures) -> Real:
-    """Return the covariance of (real, imaginary); nan if an earlier release did not write it."""
+    """Return the covariance [2, 2] of (real, imaginary); nan if an earlier release did not write it."""
     if permittivity.covariance is None:
         return np.full((2, 2), np.nan)
     return np.array(permittivity.covariance, np.float64)

@@ -75,6 +75,8 @@ class Summary(msgspec.Struct, frozen=True):
         `silent` (its folder does not answer: a network drive that is gone), ...
     rows, committed
         Of the plan, and those that count.
+    reason
+        Why its program ended, or failed; "" if it is not known.
     verdict
         Level of its products' verdict; "" where it was not processed or not judged, "damaged" where they cannot be
         read.
@@ -88,6 +90,8 @@ class Summary(msgspec.Struct, frozen=True):
         Changes whenever its products do, see :func:`read_generation`.
     labelled
         Names of boxes drawn by hand.
+    notes, tags
+        The operator's; `notes` says what is wrong with a damaged file of them.
     """
 
     name: str
@@ -155,7 +159,8 @@ def summarise(folder: Path, name: str) -> Summary:
     with suppress(PolysightError):
         drawn = find_labels(folder)
         if drawn is not None:
-            summary = replace(summary, labelled=tuple(drawn[1].boxes)[:MAX_NAMES])
+            _, labels = drawn
+            summary = replace(summary, labelled=tuple(labels.boxes)[:MAX_NAMES])
     summary = _add_products(folder, summary)
     content = _read_manifest(folder)
     if content is None:

@@ -663,9 +663,9 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
             if len(place_before) != len(place_after):
                 yield f"{name} has {len(place_after) - 2} antennas in use, not {len(place_before) - 2}"
                 continue
-            distance_m = max(math.dist(a, b) for a, b in zip(place_before, place_after, strict=True))
-            if distance_m > SAME_MM:
-                yield f"{name} or its antennas moved or turned, by up to {distance_m:.2g} mm"
+            distance_mm = max(math.dist(a, b) for a, b in zip(place_before, place_after, strict=True))
+            if distance_mm > SAME_MM:
+                yield f"{name} or its antennas moved or turned, by up to {distance_mm:.2g} mm"
         if abs(self.object_distance_mm - now.object_distance_mm) > SAME_MM:
             yield f"the object plane is at {now.object_distance_mm:.2f} mm, not {self.object_distance_mm:.2f} mm"
         difference_hz = max(abs(a - b) for a, b in zip(self.band_hz, now.band_hz, strict=True))

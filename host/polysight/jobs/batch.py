@@ -462,7 +462,8 @@ def format_table(outcomes: Sequence[Outcome], out: Path) -> str:
     for row in rows:
         words = [cell.ljust(width) for cell, width in zip(row[:2], widths[:2], strict=True)]
         numbers = [cell.rjust(width) for cell, width in zip(row[2:6], widths[2:], strict=True)]
-        lines.append("  ".join([*words, *numbers, row[6]]).rstrip())
+        *_, text = row
+        lines.append("  ".join([*words, *numbers, text]).rstrip())
     statuses = [outcome.status for outcome in outcomes]
     counts = ", ".join(f"{statuses.count(s)} {s}" for s in ("done", "skipped", "failed", "stopped") if s in statuses)
     end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY}"

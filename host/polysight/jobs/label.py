@@ -124,7 +124,8 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         )  # fmt: skip
     labels = Labels({}, "mm")
     if saved_labels:
-        labels = saved_labels[1].in_mm(products.x_m, products.y_m)
+        _, by_hand = saved_labels
+        labels = by_hand.in_mm(products.x_m, products.y_m)
     if edits.has_changes:
         labels, left_out = apply_edits(labels, patches, edits)
     elif list_only or ask is None:
@@ -435,8 +436,9 @@ def _describe_boxes(
     lines = [f"{products.folder}: {name_scan(products.scan_id, bool(products.simulated))}"]
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
     if saved_labels:
-        boxes = saved_labels[1].in_mm(products.x_m, products.y_m)
-        lines += [f"drawn by hand: {saved_labels[0]}", *(f"  {line}" for line in _format_table(boxes))]
+        path, by_hand = saved_labels
+        boxes = by_hand.in_mm(products.x_m, products.y_m)
+        lines += [f"drawn by hand: {path}", *(f"  {line}" for line in _format_table(boxes))]
     if patches:
         lines += ["patches that were found, a box inside each:"]
         lines += [f"  {patch.number:>3}  {format_box(patch.box)}  {patch.description}" for patch in patches]

@@ -235,6 +235,8 @@ def scan(
         processing.check_new(rig, truth)
 
     def run_rows(on_row: OnRow | None, on_progress: OnProgress, stop: StopRequest) -> ScanResult:
+        """Record the scan; `truth` is copied into its folder once that is there."""
+
         def copy_truth_and_show(progress: ScanProgress) -> None:
             if truth is not None and progress.phase == "row" and not (folder / TRUTH).exists():
                 # A failed copy must not end the scan; it is reported after the last row.

@@ -70,6 +70,8 @@ class Shown:
 
     Attributes
     ----------
+    revision
+        Number of the replacement, so that pages know new pictures.
     rows
         Rows that are in the images, ascending.
     pictures
@@ -123,10 +125,18 @@ class Inputs:
 
     Attributes
     ----------
+    history
+        The scan by its manifest; None before there is a plan.
+    signs, pi, shown
+        Signs of life, state of the Pi, and results of the rows so far.
+    control
+        True if pages may offer to pause and stop the scan.
+    problem
+        Why the manifest cannot be read; "" if it can.
     program
-        The last program of this scan that a page started, `scan` or `process`.
+        The last program of this scan that a page started, `scan` or `process`; None without any.
     failure
-        Why that program failed, from its log.
+        Why that program failed, from its log; None if it did not.
     gone
         True if the folder was there, and is not any more.
     verdict

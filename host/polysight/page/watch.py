@@ -180,7 +180,7 @@ class RowViewer:
             phases = {stage: phase_rad for stage, (_, phase_rad, _) in figures.residuals.items()}
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)
-            scatter = figures.residuals.get("averaged", (math.nan,) * 3)[2]
+            _, _, scatter = figures.residuals.get("averaged", (math.nan,) * 3)
             sync = RowSync(object_rad, direct_rad, figures.positions_masked)
             if scatter > 0:
                 sync = sync._replace(snr_db=-20 * math.log10(scatter))

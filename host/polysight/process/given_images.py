@@ -51,7 +51,8 @@ chosen."""
 OTHER_SIGN = 0.3
 PUBLISHED_OTHER_SIGN = 0.05
 """Probability a priori that images of another program have the other sign of phase, if their file does not say it; and
-that images of the published form have it, after `restore_phase_sign`. Chosen: the patches decide where they can."""
+that images of the published form have it, after materials' `restore_phase_sign`. Chosen: the patches decide where they
+can."""
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
@@ -220,7 +221,7 @@ def _shape(array: npt.NDArray[Any]) -> str:
 def _make_axis(
     path: Path, arrays: Mapping[str, npt.NDArray[Any]], name: str, size: int, rig: Instrument, assumed: list[str]
 ) -> npt.NDArray[np.float64]:
-    """Return the `size` pixel centres along one axis, metres; the rig file's pixel, centred, if the file has none.
+    """Return the pixel centres [size] along one axis, metres; the rig file's pixel, centred, if the file has none.
 
     What is assumed is added to `assumed`. Raises DataError if the axis has another size or is not evenly spaced.
     """
@@ -512,8 +513,8 @@ def analyse_given_images(
 ) -> tuple[ProcessedScan, Findings, str]:
     """Find the materials of given images; return the result, its findings, and why nothing was named, or "".
 
-    `plates` are the true ones of a simulated scene, if known. Raises PolysightError as `Pipeline.examine` for a
-    recorded scan.
+    `plates` are the true ones of a simulated scene, if known. Raises PolysightError as `polysight.pipeline.Pipeline`
+    for a recorded scan.
     """
     started_s = time.perf_counter()
     angle = choose_angle(pair, settings, rig)

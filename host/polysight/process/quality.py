@@ -182,7 +182,8 @@ class BoardRows:
 
     def residual(self, stage: str) -> float | None:
         """Return the phase's standard deviation after a synchronisation stage, median over rows, radians, or None."""
-        phases = [r.residuals[stage][1] for r in self.figures.values() if stage in r.residuals]
+        residuals = [r.residuals[stage] for r in self.figures.values() if stage in r.residuals]
+        phases = [phase_rad for _, phase_rad, _ in residuals]
         if phases:
             return float(np.median(phases))
         return None
@@ -259,7 +260,7 @@ def _compute_direct_snr(row: SyncedRow) -> NDArray[np.float64]:
 
 
 def _collect_finite_values(rows: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the finite values of all rows in one array."""
+    """Return the finite values of all rows in one array [value]."""
     if not rows:
         return np.zeros(0)
     values = np.concatenate(rows)

@@ -334,7 +334,8 @@ def _fill_patches(
 
     `scale` is the colour map, the values at its ends, and the colour bar's label.
     """
-    colours = ScalarMappable(Normalize(scale[1], scale[2]), scale[0])
+    colour_map, low, high, bar_label = scale
+    colours = ScalarMappable(Normalize(low, high), colour_map)
     for patch in scan.segments:
         fill: Any = style.METAL_COLOUR if patch.metal_reference else "#e4e7ec"
         if patch.label in values:
@@ -356,7 +357,7 @@ def _fill_patches(
         )  # fmt: skip
     _crop_to_plates(ax, scan)
     ax.set_aspect("equal")
-    style.colour_bar(fig, ax, colours, scale[3])
+    style.colour_bar(fig, ax, colours, bar_label)
 
 
 def find_masked_positions(scan: ProcessedScan) -> dict[str, npt.NDArray[np.bool_]]:

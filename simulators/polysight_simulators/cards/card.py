@@ -131,7 +131,8 @@ class CardSender:
         queue_state = self._receiver.look()
         if queue_state is None:
             return None
-        return queue_state[1]
+        _, dropped = queue_state
+        return dropped
 
     def reply(self, message: bytes) -> None:
         """Send a command's reply at once."""

@@ -35,7 +35,7 @@ SEED = 20260
 
 
 def _draw_noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float) -> Complex:
-    """Draw complex white noise whose power is `snr_db` below that of a tone of amplitude one."""
+    """Draw complex white noise of this shape, whose power is `snr_db` below that of a tone of amplitude one."""
     sigma = 10 ** (-snr_db / 20) / np.sqrt(2)
     return sigma * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))
 

@@ -113,6 +113,7 @@ class RepeatedRows:
         return iter(range(self.plan.rows))
 
     def read_row(self, board_name: str, row: int) -> RowData:
+        """Return a row of a board; the rig has one chirp a frame."""
         files = self.files[board_name]
         frames = self.plan.columns * self.instrument.burst.pulses
         return RowData(

@@ -198,7 +198,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def random_samples(aperture: Aperture) -> NDArray[np.complex64]:
-    """Return new random samples of an aperture: a wrong image of them is nowhere zero."""
+    """Return new random samples [rx, frequency, row, column] of an aperture: every pixel of their image counts."""
     rng = np.random.default_rng()
     parts = rng.standard_normal((2, *aperture.shape), np.float32)
     return parts[0] + 1j * parts[1]

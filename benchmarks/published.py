@@ -234,7 +234,7 @@ def form_image(
 
 
 def _make_lattice(axis_m: NDArray[np.float64], positions: int) -> NDArray[np.float64]:
-    """Return every pixel minus every position along one axis, ascending, metres."""
+    """Return every pixel minus every position along one axis, [lag], ascending, metres."""
     pixel = axis_m[1] - axis_m[0]
     first = axis_m[0] - (positions - 1) / 2 * pixel
     return first + pixel * np.arange(axis_m.size + positions - 1)

@@ -134,7 +134,7 @@ def _transfer(shape: tuple[int, ...], cells_mm: NDArray[np.float64], tapered: bo
 
 
 def _draw_uneven_light(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.complex128]:
-    """Return a complex random field of unit scatter, correlated over about 30 mm."""
+    """Return a complex random field [ny, nx] of unit scatter, correlated over about 30 mm."""
     wavenumbers = [np.fft.fftfreq(count, PIXEL_MM) for count in shape]
     passed = np.exp(-((wavenumbers[0][:, None] * 60) ** 2) - (wavenumbers[1][None, :] * 60) ** 2)
     white = rng.standard_normal((2, *shape))

@@ -179,6 +179,7 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
 
 
 def _check_chip(pi: Pi) -> str:
+    """Return path and label of the GPIO chip. Raises DeviceError if it cannot be opened."""
     path = find_chip(pi.gpio_chip)
     try:
         with load_gpiod().Chip(path) as c:

@@ -508,6 +508,7 @@ class Machine:
         self._journal.add(m.RowStarted, row=row, take=take)
 
     def _hold(self) -> None:
+        """Have the stage brake in its row; it rests some time later."""
         self._current.edges.note_hold()
         self._rests_in_hold = False
         self._resumes_at_rest = False
@@ -562,6 +563,7 @@ class Machine:
         return self.row is not None
 
     def _fail_row(self, number: int, reason: str, lasting: bool = False) -> str | None:
+        """End row or jog with a fault and stop the stage; return as `_stop`."""
         self._report_fault(number, reason)
         self._finish_jog("fault", number, reason)
         self._decide("fault", number, reason, lasting)

@@ -187,6 +187,7 @@ class Server:
             self._reply(envelope, m.pack(reply))
 
     def _reply(self, envelope: Envelope, raw: bytes) -> None:
+        """Send an encoded reply to the client that `envelope` names, if it takes it at once."""
         try:
             self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
         except zmq.ZMQError:
@@ -319,6 +320,7 @@ class Service:
         self._opened.close()
 
     def _close_journal(self) -> None:
+        """Write what waits and close the journal; log it if the disk is full."""
         try:
             self._journal.stop(END_TIMEOUT_S)
         except JournalFullError as e:

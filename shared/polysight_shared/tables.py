@@ -154,6 +154,7 @@ def _lookup(data: Any, path: str) -> str:
 
 
 def _remove_none(node: Any) -> Any:
+    """Return nested dicts and lists without the keys whose value is None; tuples become lists."""
     if isinstance(node, dict):
         return {k: _remove_none(v) for k, v in node.items() if v is not None}
     if isinstance(node, list | tuple):

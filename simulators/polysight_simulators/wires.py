@@ -115,6 +115,7 @@ class WireHub:
         self._path.unlink(missing_ok=True)
 
     def _accept(self) -> None:
+        """Accept a client and number it."""
         connection, _ = self._listener.accept()
         connection.setblocking(False)
         self._accepted += 1

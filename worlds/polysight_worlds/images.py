@@ -238,7 +238,7 @@ def disturb_data(
 
 
 def _draw_noise(rng: Generator, shape: tuple[int, ...]) -> NDArray:
-    """Draw complex noise of mean power 1, complex64."""
+    """Draw complex noise of mean power 1, complex64 of this shape."""
     pair = rng.standard_normal((2, *shape), dtype=np.float32)
     return (pair[0] + 1j * pair[1]) * np.float32(np.sqrt(0.5))
 
@@ -270,7 +270,7 @@ def _draw_drift(rng: Generator, shape: tuple[int, int], nuisances: Nuisances) ->
 
 
 def _clip(echoes: NDArray, direct: NDArray, share: float) -> tuple[NDArray, NDArray]:
-    """Limit direct path plus echo to (1 - share) of its largest amplitude.
+    """Limit direct path plus echo, both [frequencies, rows, columns], to (1 - share) of the largest amplitude.
 
     Each frequency is a time of the chirp. What the limiter leaves is split again: the direct path has its mean gain.
     """
@@ -283,7 +283,7 @@ def _clip(echoes: NDArray, direct: NDArray, share: float) -> tuple[NDArray, NDAr
 
 
 def pixel_centres(rig: Rig, pixels: int) -> tuple[NDArray, NDArray]:
-    """Coordinates of the picture's pixel centres in the rig frame, metres."""
+    """Coordinates of the picture's pixel centres in the rig frame, x and y [pixels], metres."""
     along = (np.arange(pixels) - (pixels - 1) / 2) * rig.step_m
     return rig.centre_m[0] + along, rig.centre_m[1] + along
 

@@ -204,7 +204,7 @@ def respond(waves: Waves, normals: NDArray) -> Response:
 
 
 def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> NDArray:
-    """Return the integral of the linear phase over a parallelogram, relative to its area.
+    """Return the integral of the linear phase over a parallelogram, relative to its area, of the steps' shape.
 
     `steps_m`: change of the path along both edges, see `Response.path_steps`.
     """
@@ -213,7 +213,7 @@ def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> ND
 
 
 def turn_back(path_m: NDArray, frequency_hz: float) -> NDArray:
-    """exp(-j k path), complex64: less than a turn is left, which single precision holds to 4e-7 rad."""
+    """exp(-j k path), complex64 [...]: less than a turn is left, which single precision holds to 4e-7 rad."""
     turns = frequency_hz / LIGHT_M_PER_S * path_m
     angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     phasors = np.empty(angle.shape, np.complex64)

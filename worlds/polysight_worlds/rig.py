@@ -36,7 +36,7 @@ class Rig:
 
     @property
     def centre_m(self) -> NDArray:
-        """x, y at which TX and H see the object plane as a mirror at stage offset zero; the picture's middle."""
+        """x, y [2] at which TX and H see the object plane as a mirror at stage offset zero; the picture's middle."""
         return find_mirror_point(self.tx.position, self.h.position, self.plane_m)[:2]
 
     def incidence_deg(self, channel: str) -> float:
@@ -53,7 +53,7 @@ class Rig:
 
 
 def turn(axis: NDArray, angle_deg: float) -> NDArray:
-    """Rotation matrix about a unit axis (Rodrigues)."""
+    """Rotation matrix [3, 3] about a unit axis [3] (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.radians(angle_deg)
@@ -67,7 +67,7 @@ def find_mirror_point(tx: NDArray, rx: NDArray, plane_m: float) -> NDArray:
 
 
 def place(steps: list[dict], antenna_mm: NDArray) -> tuple[NDArray, NDArray]:
-    """Return position (metres) and boresight of a board's antenna after the steps of its mount, in their order."""
+    """Return position (metres) and boresight [3] of a board's antenna after the steps of its mount, in their order."""
     position = np.asarray(antenna_mm, float)
     boresight = np.array([0.0, 0.0, 1.0])
     for step in steps:

@@ -79,7 +79,7 @@ def make_surface(plate: Plate, step_m: float, rng: np.random.Generator) -> Surfa
 
 
 def _draw_surface(rng: np.random.Generator, shape: tuple[int, int], length_cells: float) -> NDArray:
-    """Gaussian random surface of rms 1 and correlation exp(-(d / length)^2)."""
+    """Gaussian random surface of this shape, of rms 1 and correlation exp(-(d / length)^2)."""
     # White noise filtered with sigma has the correlation exp(-d^2 / 4 sigma^2).
     sigma = length_cells / 2
     pad = int(np.ceil(4 * sigma))
@@ -208,7 +208,7 @@ def ifft2(spectrum: NDArray) -> NDArray:
 
 
 def signed_lags(length: int, positive: int) -> NDArray:
-    """Lags 0 .. positive - 1, then the negative ones, of a circular convolution."""
+    """Lags [length] of a circular convolution: 0 .. positive - 1, then the negative ones."""
     lags = np.arange(length)
     return np.where(lags < positive, lags, lags - length)
 
@@ -224,7 +224,7 @@ class _PhaseSteps:
         self._index = 0
 
     def phases(self, index: int) -> NDArray:
-        """Phases of frequency `index`; indices are asked for in rising order."""
+        """Phases of frequency `index`, of the path's shape; indices are asked for in rising order."""
         while self._index < index:
             self._now = self._now * self._factor
             self._index += 1

@@ -43,7 +43,7 @@ class Patch:
 
     @property
     def area(self) -> NDArray:
-        """Area per unit of a times b."""
+        """Area per unit of a times b, [...]."""
         return np.linalg.norm(np.cross(self.d_b, self.d_a, axis=0), axis=0)
 
     def tangents(self) -> NDArray:
@@ -201,7 +201,7 @@ class Revolved(Shape):
         return 1.0, self.radius_m
 
     def profile(self, a: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Radius along the axis and its first and second derivative."""
+        """Radius at places along the axis and its first and second derivative, each of the shape of `a`."""
         radius = self.radius_m + self.slope * a - self.bulge / 2 * a**2
         first = self.slope - self.bulge * a
         second = -self.bulge + 0 * a

@@ -40,12 +40,12 @@ def place_antennas(tx: Antenna, rx: Antenna, offsets: NDArray) -> tuple[NDArray,
 
 
 def window_units() -> NDArray:
-    """Distances in Fresnel zones at which the window is sampled."""
+    """Distances [sample] in Fresnel zones at which the window is sampled."""
     return np.arange(-np.floor(END / SPACING), np.floor(END / SPACING) + 1) * SPACING
 
 
 def window(units: NDArray) -> NDArray:
-    """Smooth window over distances in Fresnel zones."""
+    """Smooth window at distances in Fresnel zones, of any shape."""
     x = (units / WIDTH) ** 2 / 2
     return np.exp(-x) * (1 + x * (1 + x / 2 * (1 + x / 3 * (1 + x / 4))))
 

@@ -285,7 +285,7 @@ def fit_filter(scans: list[RawSource], board_name: str) -> BoardFilter:
 def _measure_power_of_scan(
     scan: RawSource, board: Board, setups: dict[str, sync.BoardSetup]
 ) -> tuple[Real, Real, Real]:
-    """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in the chirps of some rows."""
+    """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in chirps of some rows, [chirp]."""
     rig = scan.instrument
     # Scans of one sweep share the setup.
     key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"
@@ -324,7 +324,7 @@ def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, 
 
 
 def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple[Real, float]:
-    """Return the standard errors of the corners (Hz), and the residual of the levels (dB, RMS)."""
+    """Return the standard errors of the corners [corner], Hz, and the residual of the levels [bin], dB (RMS)."""
 
     def residual(logs: Real) -> Real:
         log_misfit = np.log(level) - np.log(np.abs(sync.HighPass(tuple(np.exp(logs))).response(if_hz)))

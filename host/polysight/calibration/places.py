@@ -126,7 +126,7 @@ class PlacesFit:
 
     @property
     def errors(self) -> Real:
-        """Standard errors of the unknowns, millimetres and degrees."""
+        """Standard errors of the unknowns, millimetres and degrees, in the order of `values`."""
         return np.sqrt(np.diag(self.covariance))
 
 
@@ -269,7 +269,7 @@ def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray
 
 
 def _rotate_phase(cycles: Real) -> NDArray[np.complex128]:
-    """Return exp(2j pi cycles), accurate for many cycles."""
+    """Return exp(2j pi cycles), of any shape, accurate for many cycles."""
     return np.exp(2j * np.pi * (cycles - np.round(cycles)))
 
 

@@ -199,6 +199,7 @@ def check_disk(context: CheckContext) -> Finding:
 
 
 def _find_existing_parent(folder: Path) -> Path:
+    """Return the folder, or the nearest one above it that exists. Raises ConfigError if that is a file."""
     existing = folder.resolve()
     while not existing.exists():
         existing = existing.parent

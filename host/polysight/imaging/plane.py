@@ -187,7 +187,7 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
 def _interpolate_stack(
     stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the intensity on a surface through the stack, by cubic convolution between planes (Keys 1981)."""
+    """Return the intensity [ny, nx] on a surface z through a stack [plane, ny, nx] by cubic convolution (Keys 1981)."""
     place = (z - depths[0]) / (depths[1] - depths[0])
     base = np.clip(np.floor(place).astype(np.intp), 0, len(depths) - 2)
     t = place - base
@@ -427,7 +427,7 @@ def _estimate_heights_by_phase(
     places: NDArray[np.float64],
     plane: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the height of each patch from its phase, unwrapped with a plane near `plane`; and radians per metre."""
+    """Return heights [patch] by phase (NaN: not coherent), unwrapped with a plane near `plane`; radians per metre."""
     image, footprint, _ = board.image()
     moved_image = board.mirror_image(_STEP_M)
     phases = np.full(len(masks), np.nan)
@@ -469,7 +469,7 @@ def _estimate_heights_by_phase(
 def _fit_plane(
     places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a plane (height, rise along x, rise along y) with a prior on its tilt; return it and its covariance.
+    """Fit a plane [3] (height, rise along x, along y) with a prior on its tilt; return it and its covariance [3, 3].
 
     The covariance is scaled up if the scatter around the plane exceeds the standard deviations of the heights.
     """

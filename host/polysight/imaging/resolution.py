@@ -88,7 +88,7 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
 def _combine_positions(
     aperture: Aperture, weights: NDArray[np.floating], most: tuple[int, int]
 ) -> tuple[Aperture, NDArray[np.float64]]:
-    """Return the aperture with neighbours combined into at most so many (rows, columns), and the sums of weights."""
+    """Return the aperture with neighbours combined into at most so many (rows, columns), and their weights."""
     at_rows, at_columns = (
         np.unique(np.linspace(0, count, blocks + 1).astype(int)[:-1])
         for count, blocks in zip(weights.shape, most, strict=True)

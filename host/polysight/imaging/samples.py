@@ -373,7 +373,7 @@ class BoardSamples:
         return self.taper * self.valid
 
     def _compute_row_weights(self, index: int) -> NDArray[np.float32]:
-        """Return one row of :attr:`weights`."""
+        """Return one row of :attr:`weights`, [column]."""
         return self.taper[index] * self.valid[index]
 
     @property

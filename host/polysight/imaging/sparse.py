@@ -136,7 +136,7 @@ def reconstruct(
 
 
 def _shrink_amplitudes(x: NDArray[np.complexfloating], threshold: float) -> NDArray[np.complex64]:
-    """Reduce amplitudes by a threshold and keep phases: the proximal operator of the 1-norm."""
+    """Reduce amplitudes [ny, nx] by a threshold and keep phases: the proximal operator of the 1-norm."""
     size = np.abs(x)
     return (x * (np.maximum(size - threshold, 0) / np.maximum(size, 1e-30))).astype(np.complex64)
 

@@ -273,7 +273,7 @@ def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
 
 
 def _compute_tapers(rig: Instrument) -> tuple[Real, Real]:
-    """Return the taper over the rows and that over the columns, as the rig file names them."""
+    """Return the tapers over the rows [row] and over the columns [column], as the rig file names them."""
     name = imaging.TAPERS[rig.image.apodisation]
     return imaging.window_weights(name, rig.grid.rows), imaging.window_weights(name, rig.grid.columns)
 

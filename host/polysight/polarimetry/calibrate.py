@@ -50,7 +50,7 @@ from polysight_shared.errors import DataError, PolysightError
 
 
 def ratio(h: Image, v: Image) -> Image:
-    """Return the polarisation ratio h / v, complex; NaN where v is zero or either is not finite."""
+    """Return the polarisation ratio h / v, complex, broadcast; NaN where v is zero or either is not finite."""
     is_usable = (v != 0) & np.isfinite(v) & np.isfinite(h)
     quotient = np.full(np.broadcast_shapes(h.shape, v.shape), complex(np.nan, np.nan), np.result_type(h, v))
     np.divide(h, v, out=quotient, where=is_usable)

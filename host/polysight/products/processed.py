@@ -458,7 +458,7 @@ class ProcessedScan:
 
 
 def _find_nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]) -> npt.NDArray[np.intp]:
-    """Return the indices of the nearest values of an evenly spaced axis."""
+    """Return the indices [place] of the values of an evenly spaced axis that are nearest to places [place]."""
     return np.rint((places - axis[0]) / (axis[1] - axis[0])).astype(np.intp)
 
 

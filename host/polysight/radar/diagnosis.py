@@ -431,6 +431,7 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
 
 
 def _parse_trace_line(file: Path, number: int, value: object) -> TraceLine:
+    """Return a line of a trace from its decoded JSON. Raises ConfigError if it is none."""
     try:
         return msgspec.convert(value, TraceLine)
     except ValueError:

@@ -456,6 +456,7 @@ class _TcpPort:
         self._connection.close()
 
     def _send(self, data: bytes) -> None:
+        """Send bytes. Raises DeviceError if the connection is lost."""
         try:
             self._connection.sendall(data)
         except OSError as e:

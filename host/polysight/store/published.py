@@ -183,7 +183,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
 
 
 def _spread(raw: NDArray[np.uint8], start: NDArray[np.int64], size: NDArray[np.int64], end: int) -> NDArray[np.uint8]:
-    """Move the packets of a file without the lost ones to their offsets."""
+    """Move the packets of a file without the lost ones to their offsets, [byte]."""
     data = np.zeros(end, np.uint8)
     source = np.concatenate([[0], np.cumsum(size)])
     # Runs of packets without a loss.

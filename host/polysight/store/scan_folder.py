@@ -156,6 +156,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def _release(package: str) -> str:
+    """Return the release of an installed package as text."""
     try:
         return version(package)
     except PackageNotFoundError:

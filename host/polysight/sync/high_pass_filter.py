@@ -154,7 +154,7 @@ def fit_high_pass(
     turns = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
 
     def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the deviations of the log amplitudes, and of the phases if known, from those of a filter."""
+        """Return the deviations [value] of log amplitudes, then of phases if known, from those of a filter."""
         h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
         gain = measured - np.log(np.abs(h))
         deviation = gain - gain.mean()

@@ -359,7 +359,7 @@ def _convert_to_complex(words: NDArray[np.int16]) -> NDArray[np.complex64]:
 
 @lru_cache(maxsize=4)
 def _weigh_bins(size: int) -> NDArray[np.float32]:
-    """Return factors of a spectrum's bins: of two equal peaks, the one nearer the band's middle counts."""
+    """Return factors of a spectrum's bins [bin]: of two equal peaks, the one nearer the band's middle counts."""
     return np.sinc(np.fft.fftfreq(size)).astype(np.float32)
 
 
@@ -668,7 +668,7 @@ class Library:
 
 
 def _take_apart(values: NDArray[np.complex64], axis: int = 0) -> NDArray[np.float32]:
-    """Return real and imaginary parts, along a new axis."""
+    """Return real and imaginary parts along a new axis, [2, ...]."""
     return np.stack([values.real, values.imag], axis=axis)
 
 

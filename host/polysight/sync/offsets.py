@@ -345,7 +345,7 @@ def _find_disturbed(
 
 
 def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the lower median of the usable values along the second axis; 0 without any."""
+    """Return the lower median [position] of the usable values [position, chirp]; 0 without any."""
     rising = np.sort(np.where(usable, values, np.inf), axis=1)
     middle = np.maximum(usable.sum(axis=1, keepdims=True) - 1, 0) // 2
     median = np.take_along_axis(rising, np.broadcast_to(middle, (*middle.shape[:2], *values.shape[2:])), axis=1)
@@ -562,7 +562,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
 
 
 def _make_window(blocks: int) -> NDArray[np.float32]:
-    """Return the window of the search, a Hann window without zeros at its ends."""
+    """Return the search's window [sample]: a Hann window without zeros at its ends."""
     return np.hanning(blocks + 2)[1:-1].astype(np.float32)
 
 

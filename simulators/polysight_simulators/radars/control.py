@@ -299,6 +299,7 @@ class RadarSocket(_Server):
         super()._accept()
 
     def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        """Execute whole requests: read from a port (R, answered) or write to it; return the bytes that are left."""
         while len(data) >= _HEAD.size:
             channel, operation, size = _HEAD.unpack_from(data)
             port = channel.decode("ascii")
@@ -324,6 +325,7 @@ class LineServer(_Server):
         self.lines = 0
 
     def _execute(self, client: socket.socket, data: bytes) -> bytes:
+        """Rearm for each whole line, but as the faults say; return the bytes that are left."""
         *lines, rest = data.split(b"\n")
         for line in lines:
             if line.strip() != LINE:

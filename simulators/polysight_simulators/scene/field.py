@@ -56,7 +56,7 @@ _LEVEL_MM = 2.0
 
 
 def cheb_nodes(q: int) -> optics.Real:
-    """Return the q zeros of the Chebyshev polynomial of order q, descending."""
+    """Return the zeros [q] of the Chebyshev polynomial of order q, descending."""
     return np.cos(np.pi * (np.arange(q) + 0.5) / q)
 
 

@@ -131,7 +131,7 @@ def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Com
 
 
 def plate_reflection(plate: Plate, frequency_hz: float, theta_rad: NDArray[np.floating]) -> tuple[Complex, Complex]:
-    """Return the reflection coefficients (r_s, r_p) of a plate: metal, strips, half space, slab or stack."""
+    """Return the reflection coefficients (r_s, r_p) of a plate, broadcast: metal, strips, half space, slab or stack."""
     if plate.strips_deg is not None:
         return strips(np.radians(plate.strips_deg), theta_rad)
     if plate.metal:

@@ -349,6 +349,7 @@ class SimulatedRig:
         return direction * stage.speed_mm_s * after_s + backlash_mm
 
     def _make_receiving_board(self, name: str) -> _ReceivingBoard:
+        """Return the simulation of a receiving board, made at its first use."""
         if name not in self._boards:
             board = self.rig.by_name(name)
             self._boards[name] = _ReceivingBoard(self.rig, self.scene, board, self.seed, self._cache_dir)

@@ -60,7 +60,7 @@ def pulse_normal(key: int, first: int, out: NDArray[np.float32]) -> None:
 
 @cache
 def _tabulate_normal() -> NDArray[np.float32]:
-    """Return the middles of 65536 equally likely intervals of the normal distribution, variance 1."""
+    """Return the middles [65536] of equally likely intervals of the normal distribution, variance 1."""
     middles = scipy.special.ndtri((np.arange(1 << 16) + 0.5) / (1 << 16))
     return (middles / middles.std()).astype(np.float32)
 

@@ -195,6 +195,7 @@ class StageLogic:
         self.alarm = None
 
     def _home(self) -> None:
+        """Begin homing; positions are not known until its end."""
         self._begin("home")
         self._engine.set_accel(HOME_ACCEL)
         self._was_homed = self.homed
@@ -227,6 +228,7 @@ class StageLogic:
         return Event.NONE
 
     def _move(self, x: int, y: int, rate: int) -> None:
+        """Begin a move to a place (steps) at a rate (steps/s), if both are allowed."""
         _require(rate >= MIN_RATE, StageError.OUT_OF_RANGE)
         _require(rate <= MAX_RATE, StageError.TOO_FAST)
         _require(self._is_within(x, y), StageError.SOFT_LIMIT)

@@ -51,7 +51,7 @@ class PythonStage:
         self._next = 0
         self._armed = False
         self._fall: int | None = None
-        # True place of the motors, steps from the switches; the engine counts from `_zero` after homing.
+        # True place of the motors, steps from the switches; the engine counts from the zero of the last homing.
         self._x = rig.x
         self._y = rig.y
         self._zero_x = 0

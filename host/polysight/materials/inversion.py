@@ -10,9 +10,9 @@ brightness relative to an ideal one (thickness, roughness, illumination). A plat
 incidence turns this plane about x, and both waves meet its s axis at d = w sin(theta): to first order H receives
 (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the image of the transmitter in a tilted mirror confirms. So a plate
 has a and b of its own, smaller and larger by d, and G is 4 sin(theta) across, up to the patterns of boards that see the
-plate from other points. r_s and r_p follow from t and the incidence angle by Eq. 2 and 3. Unknown are a, b, rho, c, G,
-the turn, the angle's error, the metal's brightness, the usual size of ln kappa, whether the mount has moved, the share
-of the library's materials, and t of every patch.
+plate from other points. r_s, r_p follow from t and the angle by Eq. 2, 3 (POLySIGHT paper). Unknown are a, b, rho, c,
+G, the turn, the angle's error, the metal's brightness, the usual size of ln kappa, whether the mount has moved, the
+share of the library's materials, and t of every patch.
 
 The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
 Other evidence on the common errors is that every patch has to be some material (`Kinds`): the library's, the

@@ -2,8 +2,8 @@
 
 A library's file is an .npz with plain arrays and a JSON text; it is read with `allow_pickle=False`, so that a library
 of unknown origin cannot run code. `Samples` holds features, material, scan and patch of each pixel; `channel_distances`
-are the paper's distances of pixels. A `Model` is fitted to samples and names pixels; the result for one scan is a
-`NamedScan`, whose patches are named by `majority` or by the model itself.
+are the POLySIGHT paper's distances of pixels. A `Model` is fitted to samples and names pixels; the result for one scan
+is a `NamedScan`, whose patches are named by `majority` or by the model itself.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 It is given as a box or a patch, or it is the patch that is brightest in both channels. Evidence is its own: V / H
 against the direct path, which reaches both boards with equal strength. Metal reflects both polarisations fully, a
-dielectric loses most of p at these angles. Nothing else contradicts a declared metal; other patches that do not fit it
-only make it uncertain.
+dielectric loses most of p at these angles (Eq. 2 of the POLySIGHT paper: Fresnel's r_s and r_p). Nothing else
+contradicts a declared metal; other patches that do not fit it only make it uncertain.
 
 The other patches give evidence, too: beside metal their ratios are those of materials. Beside a dielectric of inverse
 ratio t0 they are those of materials divided by t0, too large by far, and their |H| is too large by 1 / |r_s|. The score
@@ -319,7 +319,7 @@ def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
 
 
 def no_metal(usable: Mask) -> MetalReference:
-    """Return the reference of a scene without patches: images are scaled by their own root mean squares."""
+    """Return the reference of a scene without patches: images are scaled as if all of them were metal."""
     return MetalReference(usable, None, "none: no patch was found")
 
 

@@ -1,4 +1,4 @@
-"""The paper's nearest-neighbour classifier as an estimator of scikit-learn.
+"""The POLySIGHT paper's nearest-neighbour classifier as an estimator of scikit-learn.
 
 It imports scikit-learn, which takes a second: import it where it is used.
 """

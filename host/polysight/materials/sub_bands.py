@@ -8,8 +8,8 @@ covariance is stored.
 `add_bands` measures them; `bands_of_row` reads them back from a segment of materials.json (that is what files call a
 patch), and `fit_row` fits the unknown layer of a stack to it.
 
-The polarisation angle Phi = arctan |P| (Eq. 8) falls steadily as sugar is dissolved (section 9.4 of the paper).
-`fit_concentration` fits a straight line through known concentrations, which gives unknown ones with a prediction
+The polarisation angle Phi = arctan |P| (Eq. 8 of the POLySIGHT paper) falls steadily as sugar is dissolved (section
+9.4). `fit_concentration` fits a straight line through known concentrations, which gives unknown ones with a prediction
 interval. It is judged by cross-validation: all patches of one concentration are left out together.
 """
 

@@ -7,8 +7,8 @@ scores are unbiased.
 
 To judge a model (`score`), whole groups are left out (scans, or physical samples): pixels of one patch share speckle,
 placement and metal reference, so that a split by pixel compares a patch with itself. That score is given too, because
-the paper seems to use it; it is labelled optimistic. A material of a single scan cannot be judged: it stays among the
-candidates, counts neither as right nor as wrong, and is listed.
+the POLySIGHT paper seems to use it; it is labelled optimistic. A material of a single scan cannot be judged: it stays
+among the candidates, counts neither as right nor as wrong, and is listed.
 
 Two parts of the published data set are read:
 

@@ -1,4 +1,4 @@
-"""Fig. 18 (solids under one and two angles, liquids, powders, with confusion matrices) and Fig. 20 (channels).
+"""Fig. 18 of the POLySIGHT paper (solids under one and two angles, liquids, powders, confusions), Fig. 20 (channels).
 
 Pixels are drawn with the errors of `patches.py`. `pixel_bound` is the share that no classifier can pass.
 

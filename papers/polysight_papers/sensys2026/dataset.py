@@ -1,4 +1,4 @@
-"""The published data set as libraries: its `materials/`, its `labels/`, and our own images of its raw data.
+"""The POLySIGHT paper's data set as libraries: its `materials/`, `labels/`, and our own images of its raw data.
 
 Each source is judged separately. Materials get the names of Table 2's rows, if `find_row` finds a row for their names.
 `train_authors` makes one library of the first two sources for `polysight train`.

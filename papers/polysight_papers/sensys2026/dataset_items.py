@@ -1,4 +1,4 @@
-"""`polysight reproduce --authors`: Table 2, Fig. 18, 20 and 21 from the published files, beside the paper's values.
+"""`polysight reproduce --authors`: the POLySIGHT paper's Table 2, Fig. 18, 20 and 21 from the published files.
 
 Two ways to keep training and test apart: whole scans left out, which judges materials that at least two scans hold; and
 by pixel, which is optimistic, because pixels of one patch know each other. Table 2 is made by three recipes, the

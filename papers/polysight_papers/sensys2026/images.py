@@ -1,6 +1,6 @@
 """Scenes simulated with the simulated rig and processed like recorded scans, and the figures of their images.
 
-Fig. 4 (front-on and steep), Fig. 13 and 19 (materials), Fig. 14 (phase).
+Of the POLySIGHT paper: Fig. 4 (front-on and steep), Fig. 13 and 19 (materials), Fig. 14 (phase).
 """
 
 from __future__ import annotations

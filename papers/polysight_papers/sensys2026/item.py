@@ -1,4 +1,7 @@
-"""Structure of a reproduced table or figure, and the published numbers beside it (`table2.json`, `published.json`)."""
+"""Structure of a reproduced table or figure of the POLySIGHT paper, and the published numbers beside it.
+
+These are in `table2.json` and `published.json`.
+"""
 
 from __future__ import annotations
 

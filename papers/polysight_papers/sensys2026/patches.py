@@ -7,8 +7,8 @@ The reflection of material m seen in scan i, pixel k, divided by the scan's meta
 a (speckle, gain over the plane) and b (synchronisation) are normal, independent in H and V. Half of their variance is
 one draw for a whole patch (its placement), half is drawn for each pixel; the reference, a mean over many pixels, has
 the first half alone and is shared by all patches of a scan. The standard deviation of b is the paper's residual phase
-of synchronisation. That of a is not in the paper: it is set, for each group of materials, so that the paper's KNN on
-|H| alone, judged by the paper's split by pixel, reaches the published accuracy of H alone. Nothing else is set.
+of synchronisation (POLySIGHT). That of a is not in it: it is set, for each group of materials, so that the paper's KNN
+on |H| alone, judged by the paper's split by pixel, reaches the published accuracy of H alone. Nothing else is set.
 
 `spread_table` shows the effect of the spread of specimens on names, beside the Bayes limit (a table of Fig. 18).
 """

@@ -1,8 +1,8 @@
-"""Permittivity in figures and in Table 2: Fig. 3, 16, 17 and 21.
+"""Permittivity in figures and in Table 2 of the POLySIGHT paper: Fig. 3, 16, 17 and 21.
 
 Fig. 3 is reflectance and ratio against angle, Fig. 16 the contrast of materials at three angles, Fig. 17 the estimates
 with plates at other places, Fig. 21 the concentration of a sugar solution by regression on the polarisation angle.
-Table 2 goes through Eq. 3 with pixels drawn at its own values.
+Table 2 goes through Eq. 3 (permittivity from the ratio of H to V) with pixels drawn at its own values.
 """
 
 from __future__ import annotations

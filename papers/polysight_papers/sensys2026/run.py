@@ -1,4 +1,4 @@
-"""`polysight reproduce`: make items (tables and figures), write their files, then the page."""
+"""`polysight reproduce`: make items (tables and figures of the POLySIGHT paper), write their files, then the page."""
 
 from __future__ import annotations
 

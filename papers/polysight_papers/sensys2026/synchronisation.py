@@ -1,7 +1,7 @@
 """Fig. 12 (before and after synchronisation), Fig. 15 (errors by stage), Fig. 9 (spectrogram, high-pass response).
 
-The first two come from one scan of metal plates with the simulated rig, the last from the direct path alone, received
-at ten start frequencies.
+They are of the POLySIGHT paper. The first two come from one scan of metal plates with the simulated rig, the last from
+the direct path alone, received at ten start frequencies.
 """
 
 from __future__ import annotations

@@ -256,7 +256,7 @@ def reduce_chirps(
     words
         int16 [position, chirp, sample, 2, rx].
     frequency
-        float64 [position, chirp].
+        float64 [position, chirp], cycles per sample.
     taps
         complex64 [position, chirp, 3]: one block apart (`high_pass_filter.Equaliser`).
     linear

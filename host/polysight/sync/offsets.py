@@ -54,8 +54,8 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _REFERENCES = 4
 # A good chirp has at least this part of the coherence of the position's median chirp; chosen.
 _GOOD = 0.5
-# A chirp is disturbed if the others leave this many times the usual energy of a part of it unexplained; noise leaves
-# twice as much.
+# A chirp is disturbed if the others leave this many times the usual energy of a part of it unexplained (chosen); noise
+# leaves twice as much.
 _UNEXPLAINED = 8.0
 # Share of a part's energy that is no disturbance: -30 dB, above the effect of frequencies wrong by 0.1 bins.
 _NEGLIGIBLE = 1e-3

@@ -58,7 +58,7 @@ class Reconstruction:
 
 
 class _Model:
-    """Forward model of one board and its adjoint, both with weights [row, column]."""
+    """Forward model of one board and its adjoint, `G A` and `A^H G^H` of the module, without the weights W."""
 
     def __init__(self, board: BoardSamples) -> None:
         self.imager, _ = choose_imager(board.aperture)

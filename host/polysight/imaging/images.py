@@ -53,7 +53,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 Image = NDArray[np.complexfloating]
 Mask = NDArray[np.bool_]
 Rise = tuple[float, float]
-"""Growth of a plate's height along x and along y."""
+"""Growth of a plate's z, which points away from the antennas, along x and along y."""
 MAX_RISE = 0.06
 """Largest tilt of a plate (3.4 degrees); a steeper phase has another cause; chosen."""
 MIN_RISE = 2e-3
@@ -308,7 +308,7 @@ class Images:
         return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, illumination=illumination, dispersion=dispersion)
 
     def level(self, plate: Mask) -> Images:
-        """Return the images with the tilt of one plate, bool [ny, nx], corrected."""
+        """Return the images with the tilt of one plate, bool [ny, nx], corrected if it is at most `MAX_RISE`."""
         if self.illumination is None:
             return self
         rise = self.illumination.rise(self.h, self.v, plate)
@@ -452,7 +452,7 @@ class ImageBuilder:
         Raises
         ------
         DataError
-            if the row is not in the plan.
+            if board or row is not in this scan, or the row has another number of positions.
         """
         if board_name not in self.boards:
             raise DataError(

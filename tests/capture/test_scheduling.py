@@ -87,8 +87,24 @@ def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):
     assert "`sysctl -w net.core.rmem_max=8388608`" in warning
     with refused(ErrorCode.VALUE_INVALID, "`sysctl -w net.core.rmem_max=8388608`"):
         check_receive_buffer("RH", 100_000, 8 << 20, burst, limit)
-    with pytest.raises(DeviceError) as e:
+    with refused(ErrorCode.VALUE_INVALID, "`sysctl -w net.core.rmem_max=", "net.core.rmem_max limits it"):
+        check_receive_buffer("RH", 8192, 1 << 20, burst, tmp_path / "absent")
+    with refused(ErrorCode.VALUE_INVALID, "card.receive_buffer_bytes"):
         check_receive_buffer("RH", 8192, 8192, burst, tmp_path / "absent")
+
+
+@pytest.mark.parametrize(("granted", "needed"), [(8192, 8192), (16384, 8192), (8192, 8193), (8192, 1 << 23)])
+def test_what_limits_the_buffer_is_the_kernel_or_the_rig_file_that_asks_for_no_more(tmp_path, granted, needed):
+    burst = 16 * 4096
+    limit = tmp_path / "rmem_max"
+    limit.write_text("8192\n")
+    with pytest.raises(DeviceError) as e:
+        check_receive_buffer("RH", granted, needed, burst, limit)
+    if granted < needed:
+        assert e.value.why == "net.core.rmem_max is 8192"
+        assert "receive_buffer_bytes" not in e.value.remedy
+        return
+    assert "card.receive_buffer_bytes" in e.value.why
     enough = int(e.value.remedy.split("receive_buffer_bytes = ")[1].split()[0])
     assert usable_packets(enough) * FULL >= 2 * burst
     assert check_receive_buffer("RH", enough, enough, burst, limit) == ""

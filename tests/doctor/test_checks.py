@@ -79,10 +79,11 @@ def test_a_lost_clock_is_an_error_and_an_unsynchronised_one_a_warning(system, ve
 
 
 @pytest.mark.parametrize(("mode", "verdict"), [(0o600, "ok"), (0o640, "warning"), (None, "error")])
-def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, mode, verdict):
-    for name in HOST_KEYS if mode else ():
-        (tmp_path / name).touch(mode)
-        (tmp_path / name).chmod(mode)
+@pytest.mark.parametrize("public_mode", [0o600, 0o644])
+def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, public_mode, mode, verdict):
+    for name, its_mode in zip(HOST_KEYS, (public_mode, mode), strict=True) if mode else ():
+        (tmp_path / name).touch(its_mode)
+        (tmp_path / name).chmod(its_mode)
     addresses = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
     assert check_keys(make_context(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
 

@@ -1,5 +1,7 @@
 """Checks of captured frames: simulated ones, each with one fault."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.support.doctor.case import FRAMES, RIG, direct_signal, make_context, simulate_frames
@@ -9,6 +11,7 @@ from polysight.capture.receiver import RowCapture
 from polysight.doctor.context import CapturedFrames
 from polysight.doctor.rig_checks import check_direct_path, check_level, check_radar, judge_direct_path, judge_skew
 from polysight.radar.commands import direct_if_hz
+from polysight.radar.control import BoardState, RadarState
 
 
 def judge_signal(board="RH", rig=RIG, **disturbances):
@@ -117,6 +120,15 @@ def test_an_rx_without_a_signal_is_an_error():
 )
 def test_frames_that_are_missing_are_an_error_and_lost_packets_a_warning(row, verdict):
     assert check_radar(with_frames(simulate_frames("RH"), **row), RIG.by_name("RH")).level == verdict
+
+
+@pytest.mark.parametrize("state", RadarState)
+def test_only_a_fault_of_the_radar_itself_is_an_error_beside_complete_frames(state):
+    context = with_frames(simulate_frames("RH"))
+    context.captured["RH"] = replace(context.captured["RH"], radar=BoardState(state, "hot"))
+    finding = check_radar(context, RIG.by_name("RH"))
+    assert finding.level == ("error" if state is RadarState.FAULT else "ok")
+    assert ("hot" in finding.what) is (state is RadarState.FAULT)
 
 
 def test_the_transmitter_has_no_direct_path():

@@ -10,7 +10,7 @@ import scipy.signal
 from tests.support.refusals import refused
 
 from polysight.imaging import UNKNOWN_PLANE, ImageBuilder, Images, backproject, image_grid, move_to_plane, plane
-from polysight.imaging.geometry import Antennas, row_offsets_m
+from polysight.imaging.geometry import Antennas, find_ends, row_offsets_m
 from polysight.imaging.images import Dispersion
 from polysight.imaging.samples import mirror_samples, reduction, scene_gate_m
 from polysight.materials.layers import Spectrum
@@ -391,3 +391,14 @@ def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeyp
     expected = nominal + (offset_m if moved else 0.0)
     np.testing.assert_array_equal(on_plane.h, expected.T if transposed else expected)
     np.testing.assert_array_equal(on_plane.dispersion.h, on_plane.h)
+
+
+@pytest.mark.parametrize("level", [0.1, 1.0, 30.0])
+def test_a_plate_ends_where_its_amplitude_falls_to_half_of_that_inside(level):
+    pixels = np.arange(60)
+    # 20.25 to 41.75, with slopes of four pixels
+    profile = level * np.clip(0.5 + (10.75 - np.abs(pixels - 31.0)) / 4, 0, 1)
+    ends = find_ends(profile, np.ones(60, bool), np.arange(26, 37))
+    np.testing.assert_allclose(ends, [20.25, 41.75])
+    lit = pixels >= 22
+    np.testing.assert_allclose(find_ends(profile, lit, np.arange(26, 37)), [-np.inf, 41.75])

@@ -6,25 +6,29 @@ import select
 import socket
 import stat
 import threading
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+import zmq
 from hypothesis import given, settings, strategies as st
 from tests.support.pi.fakes import FakeDriver, FakeLines
 from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
+from tests.support.refusals import refused
 from tests.support.rigs import at_stage_port
 
 from polysight_pi import executor as executors, system
-from polysight_pi.client import take_over
+from polysight_pi.client import home_by_service, take_over
 from polysight_pi.executor import REPLAYED_IN_A_ROW, Executor
 from polysight_pi.journal import Journal, JournalThread
 from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.trigger import TriggerLoop
 from polysight_shared import messages as m
+from polysight_shared.error_codes import ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.raster import RasterPlan
 from polysight_shared.stage_line import Reply
@@ -307,6 +311,22 @@ def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):
     assert owner_in_row.wait(m.RowFinished).status == "aborted"
     owner_in_row.until_state("ready")
     assert take_over(second_host, "end") == "homed"
+
+
+def test_the_commands_on_the_pi_wait_for_a_service_that_answers_late(rig):
+    def answer() -> None:
+        service.recv()
+        time.sleep(0.1)
+        service.send(m.pack(m.Refused(number=PiFault.NOT_OWNER, problem="the host is alive")))
+
+    with zmq.Context() as context, context.socket(zmq.REP) as service:
+        port = service.bind_to_random_port("tcp://127.0.0.1")
+        pi = msgspec.structs.replace(rig.pi, command_address=f"tcp://127.0.0.1:{port}")
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with refused(ErrorCode.REFUSED_BY_PEER, "the host is alive"):
+            home_by_service(msgspec.structs.replace(rig, pi=pi))
+        thread.join()
 
 
 def test_a_run_without_a_heartbeat_can_be_replaced(pi):

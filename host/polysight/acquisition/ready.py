@@ -58,10 +58,10 @@ def make_ready(
 def measure_lost_steps(
     pi: PiClient, stop: StopRequest, notify: Callable[[str, str], None]
 ) -> tuple[float, float] | None:
-    """Home again after the last row; return the lost steps in x and y, millimetres, or None if not possible or wanted.
+    """Home again after the last row; return the lost steps in x and y, millimetres.
 
     Lost steps are the distance between the switches and where the count of steps expects them since the last homing.
-    Raises ScanError if homing fails.
+    Returns None if the stage is not ready, or a stop was asked for. Raises ScanError if homing fails.
     """
     if stop.after_row or pi.status().state != "ready":
         return None

@@ -18,7 +18,7 @@ from polysight_shared.errors import PolysightError, no_such, os_error
 from polysight_shared.findings import Finding
 from polysight_shared.messages import is_simulated
 
-# The operator's page parses these columns.
+# The operator's page parses these columns (serve/static/new.js).
 _VERDICT_WIDTH = 12
 _NAME_WIDTH = 16
 

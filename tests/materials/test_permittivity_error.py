@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polysight.materials.measure import border_errors, estimate_permittivity
+from polysight.materials.measure import Scatter, border_errors, estimate_permittivity, relative_errors
 from polysight.polarimetry import PlaneReference, permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
@@ -26,6 +26,13 @@ def test_the_error_grows_towards_metal():
     slope = abs(permittivity_from_ratio(q + step, THETA) - permittivity_from_ratio(q - step, THETA)) / (2 * step)
     h, v = pixels(4.0 - 0.1j, 0.004, 4000, np.random.default_rng(4))
     assert estimate_permittivity(h, v, THETA).real_std == pytest.approx(slope * 0.004, rel=0.05)
+
+
+def test_errors_of_a_plate_fall_with_the_root_of_its_independent_places():
+    usual = (0.03, 0.04)
+    none = np.zeros(2, complex)
+    errors = [relative_errors(Scatter(*usual, blocks, none, none, (0, 0)), usual) for blocks in (1.0, 4.0, 25.0)]
+    np.testing.assert_allclose(errors, np.array([relative_errors(None, usual)]) / [[1], [2], [5]])
 
 
 def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):

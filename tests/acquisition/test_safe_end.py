@@ -17,7 +17,7 @@ from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
-from polysight.acquisition import scan as running
+from polysight.acquisition import pi_client, scan as running
 from polysight.acquisition.control import StopRequest, ignore_hangup
 from polysight.acquisition.pi_client import PiClient
 from polysight.acquisition.ready import make_ready
@@ -34,6 +34,41 @@ from polysight_shared.faults import explain
 
 def commands(pi) -> list[type]:
     return [type(c) for c in pi.commands if not isinstance(c, m.Status | m.Replay | m.Alive)]
+
+
+class MovingPi(PiClient):
+    """A client of a Pi whose stage passes through `states` while `scan_id` runs, a state an answer."""
+
+    def __init__(self, scan_id: str, states: list[str]) -> None:
+        self._scan_id = "mine"
+        self.running_id = scan_id
+        self.states = states
+        self.aborts: list[str] = []
+
+    def status(self) -> SimpleNamespace:
+        state = self.states.pop(0) if self.aborts and len(self.states) > 1 else self.states[0]
+        return SimpleNamespace(scan_id=self.running_id, state=state)
+
+    def abort(self, reason: str) -> None:
+        self.aborts.append(reason)
+
+
+def test_after_an_abort_the_stage_is_waited_for_but_not_for_ever(monkeypatch):
+    monkeypatch.setattr(pi_client, "_POLL_S", 0.001)
+    pi = MovingPi("mine", ["running", "held", "done", "ready"])
+    pi.come_to_rest("an error")
+    assert (pi.aborts, pi.states) == (["an error"], ["ready"])
+    monkeypatch.setattr(pi_client, "_REST_TIMEOUT_S", 0.01)
+    endless = MovingPi("mine", ["running"])
+    endless.come_to_rest("an error")
+    assert endless.aborts == ["an error"]
+
+
+@pytest.mark.parametrize("other", ["", "another", "z"])
+def test_a_run_of_another_host_is_not_aborted(other):
+    pi = MovingPi(other, ["running"])
+    pi.come_to_rest("an error")
+    assert pi.aborts == []
 
 
 def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):

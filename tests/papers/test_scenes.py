@@ -1,7 +1,10 @@
 """Scenes, rig files and estimators behind the figures that come from images."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
@@ -11,7 +14,7 @@ from polysight_papers.sensys2026 import images, run as catalogue
 from polysight_papers.sensys2026.images import FIG13_DISTANCE_MM, front_on, plate, simulate_scan
 from polysight_papers.sensys2026.item import Run, table2
 from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
-from polysight_papers.sensys2026.synchronisation import tones
+from polysight_papers.sensys2026.synchronisation import _draw_skirts, tones
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 
@@ -98,3 +101,23 @@ def test_plates_of_a_scan_have_the_permittivities_of_their_rows_of_table_2(monke
         published = table2()[row - 1]
         assert scene_plate["name"] == published.name
         assert complex(scene_plate["permittivity"][0], -scene_plate["permittivity"][1]) == published.permittivity
+
+
+def test_names_stand_in_the_middle_of_the_plates():
+    boxes_mm = [(-60.0, -50.0, -20.0, -10.0), (10.0, 30.0, 40.0, 80.0)]
+    plates = [SimpleNamespace(name="glass (float)", box_mm=box) for box in boxes_mm]
+    axes = Figure().add_subplot()
+    images._label_plates(axes, SimpleNamespace(plates=plates, extent_mm=(-150, 150, -150, 150)))
+    assert [t.get_position() for t in axes.texts] == [(-40, -30), (25, 55)]
+    assert {t.get_text() for t in axes.texts} == {"glass"}
+
+
+def test_the_smear_beside_a_tone_rises_with_the_power_of_its_noise():
+    chirp = published_rig().chirp
+    noise = np.random.default_rng(1).standard_normal((1, 20, chirp.samples, 2)) @ [1, 1j]
+    tone = np.exp(2j * np.pi * 0.2 * np.arange(chirp.samples))
+    axes = Figure().add_subplot()
+    quiet, loud = (_draw_skirts(axes, (tone + size * noise).astype(np.complex64), chirp) for size in (0.01, 0.1))
+    for part, level_db in quiet.items():
+        assert level_db < -30
+        assert loud[part] - level_db == pytest.approx(20, abs=1)

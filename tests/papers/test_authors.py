@@ -15,6 +15,7 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import main
 from polysight.materials import Library, classify
+from polysight.materials.library import Entry
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_papers.sensys2026 import dataset_items as authors_items
 from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, find_row, read_authors, read_names
@@ -328,3 +329,14 @@ def test_refusals(dataset, tmp_path, capsys):
     assert main(["reproduce", "--authors", str(tmp_path), "--out", str(tmp_path / "a")]) == 3
     assert "neither materials/" in capsys.readouterr().err
     assert main(["reproduce", "--names", "x.json", "--out", str(tmp_path / "a")]) == 2
+
+
+@pytest.mark.parametrize(("patches", "pixels_of_each"), [(5, 300), (10, 150), (60, 25), (400, 6)])
+def test_a_task_is_judged_with_equally_many_pixels_of_each_patch(patches, pixels_of_each):
+    ones = np.ones(310, np.float32)
+    entries = [
+        Entry(name=f"{i % 2}", scan=f"{i}", h=ones, v=ones, p=ones + 0j, incidence_deg=60.0, simulated=True)
+        for i in range(patches)
+    ]
+    samples = authors_items._samples(Library(tuple(entries)))
+    assert np.bincount(samples.patches).tolist() == [pixels_of_each] * patches

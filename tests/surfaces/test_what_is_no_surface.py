@@ -11,6 +11,8 @@ import pytest
 from polysight.jobs.surface import check_is_metal
 from polysight.surfaces import Seen, Segment, Uncertainty, analyse_surface, find_shape, find_voltages, learn_gains
 from polysight.surfaces.gains import receive, reflect_points
+from polysight.surfaces.measure import group_echoes
+from polysight.surfaces.paths import STRIDE_M
 from polysight.surfaces.permittivity import find_interior, find_reflecting, find_shares, fit_permittivity
 from polysight.surfaces.points import find_offset_that_sees, predict_echo
 from polysight.surfaces.result import (
@@ -346,3 +348,14 @@ def test_a_permittivity_at_the_end_of_the_fit_is_none():
     sources = {"scatter": np.eye(2)}
     assert add_permittivity(segment, 38.0 - 9j, sources).permittivity == 38.0 - 9j
     assert add_permittivity(segment, 40.0 - 9j, sources).reason == NO_SINGLE_MEDIUM
+
+
+@pytest.mark.parametrize(("missing_columns", "pieces"), [(1, 1), (3, 2), (9, 2)])
+def test_a_gap_of_one_window_does_not_part_a_surface_and_a_wider_one_does(metal, optics, missing_columns, pieces):
+    x_m = metal.h.at_m[:, 0]
+    column = x_m[np.argmin(np.abs(x_m - np.median(x_m)))]
+    kept = np.abs(x_m - column) > (missing_columns / 2) * STRIDE_M
+    groups = group_echoes(metal.h[kept], optics)
+    is_right = x_m[kept] > column
+    assert set(groups) == set(range(pieces))
+    assert set(groups[is_right]).isdisjoint(groups[~is_right]) is (pieces == 2)

@@ -182,7 +182,7 @@ def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
         (lambda probability: rules.judge_drift(0.0, 0.05, probability), 0.9, 0.901, ("good", "care")),
         (rules.judge_fringes, 0.5, 0.501, ("good", "care")),
         (lambda error: rules.judge_disturbed_plates({1: error}), 0.025, 0.0251, ("good", "care")),
-        (rules.judge_moved_boards, 0.8, 0.801, ("good", "care")),
+        (rules.judge_moved_boards, 0.9, 0.901, ("good", "care")),
         (rules.judge_halo, 0.005, 0.0051, ("good", "care")),
         (rules.judge_background, 0.04, 0.0401, ("good", "care")),
         (lambda ripple: rules.judge_flatness((ripple, 0.0), 0.0), 0.03, 0.0301, ("good", "care")),

@@ -94,11 +94,16 @@ def _positions(operator: str, node):
 
 
 def judge(mutant: Mutant, copy: Path) -> str:
-    """Return `survived`, `invalid` (no change) or `killed by TEST` for a mutant, tried in a copy of the repository."""
+    """Return `survived`, `invalid` (no change, no Python) or `killed by TEST`, tried in a copy of the repository."""
     path = copy / mutant.file
     original = path.read_text(encoding="utf-8")
     mutated = mutate_code(original, get_operator(mutant.operator)(), mutant.occurrence)
     if mutated is None or mutated == original:
+        return "invalid"
+    try:
+        compile(mutated, path, "exec")
+    except SyntaxError:
+        # Two stars before a dictionary are no power, but the operator takes them for one.
         return "invalid"
     path.write_text(mutated, encoding="utf-8")
     try:

@@ -29,6 +29,7 @@ NAMES = (
     "shapes",
     "touching",
     "foreign",
+    "widths",
     "pi",
 )
 

@@ -1,0 +1,158 @@
+"""Are the error bars as narrow as the data allow? Beside a rival that learnt from the nuisances' own generator.
+
+The narrowest honest error bar of a plate follows from all nuisances, marginalised over the prior that they are drawn
+from. That bound has no closed form here. The rival comes near it from above: it is told which nuisance a scene has, and
+learns the error of the plain estimate (Eq. 3 of the mean images, relative to copper, the measured leakage removed) from
+other scenes of the same generator, as gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of
+all plates. Its intervals are widened until they hold 95 % in each row. It does not know which materials there are; the
+program does, but neither the nuisance nor its size. For each nuisance: median relative half widths of 95 % regions of
+both, and their ratio, of which 2 was asked. All is simulated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from benchmarks.worlds import draw_calibration, draw_pair, judge_world, pixel_boxes
+from polysight.polarimetry import permittivity_from_ratio
+from polysight_worlds import NUISANCES
+
+Real = npt.NDArray[np.float64]
+Complex = npt.NDArray[np.complex128]
+
+ROWS = ("none", *NUISANCES, "all")
+# Pixels that are cut off at each edge of a plate.
+EDGE_PX = 2
+# Groups of scenes for cross-validation.
+FOLDS = 5
+
+
+@dataclass(frozen=True)
+class SceneData:
+    """One scene: number of its row in `ROWS`, its seed, and of each plate [plate] what the rival sees and the truth.
+
+    `features` float64 [plate, feature]; `plain`, `true` complex [plate]: the plain estimate and the true permittivity;
+    `half_widths` [patch]: relative half widths of the program's regions, of the patches that have one.
+    """
+
+    row: int
+    seed: int
+    features: Real
+    plain: Complex
+    true: Complex
+    half_widths: tuple[float, ...]
+
+
+def describe_plate(h: Complex, v: Complex) -> tuple[complex, complex, list[float]]:
+    """Return the means of H and V over the pixels [ny, nx] of a plate, and their slopes, bends and scatter."""
+    known = np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
+    count = max(int(known.sum()), 1)
+    means = complex(np.sum(h, where=known) / count), complex(np.sum(v, where=known) / count)
+    y, x = np.mgrid[-1 : 1 : complex(0, h.shape[0]), -1 : 1 : complex(0, h.shape[1])]
+    features = [float(known.mean())]
+    for image, mean in zip((h, v), means, strict=True):
+        relative = np.where(known, image / mean, 0)
+        for shape in (x, y, x * y, x**2 - 1 / 3, y**2 - 1 / 3):
+            part = np.sum(relative * shape) / np.sum(shape**2)
+            features += [float(part.real), float(part.imag)]
+        features += [float(np.log(np.abs(relative[known])).std()), float(np.angle(relative[known]).std())]
+    ratio = v[known] / h[known] * (means[0] / means[1])
+    for part in (np.log(np.abs(ratio)), np.angle(ratio)):
+        features += [float(np.std(part)), float(np.median(part))]
+    return *means, features
+
+
+def collect_scene(job: tuple[str, int]) -> SceneData | None:
+    """Draw one scene; return what the rival sees of it, and the program's half widths; None without copper in it."""
+    nuisance, seed = job
+    pair = draw_pair(nuisance, seed)
+    leakage, theta_error_rad = draw_calibration(nuisance, seed)
+    into_h, into_v = leakage or (0j, 0j)
+    plates = []
+    for plate, (left, bottom, right, top) in pixel_boxes(pair):
+        inner = slice(bottom + EDGE_PX, top - EDGE_PX), slice(left + EDGE_PX, right - EDGE_PX)
+        plates.append((plate, *describe_plate(pair.h[inner], pair.v[inner])))
+    metal = next((entry for entry in plates if entry[0].stack.is_metal), None)
+    if metal is None:
+        return None
+    dielectrics = [entry for entry in plates if not entry[0].stack.is_metal]
+    # Relative to metal, with leakage: V / H = (t + b) / (1 + a t) * (1 + a) / (1 + b).
+    measured = np.array([v / h for _, h, v, _ in dielectrics]) * (metal[1] / metal[2]) * (1 + into_v) / (1 + into_h)
+    t = (measured - into_v) / (1 - into_h * measured)
+    plain = permittivity_from_ratio(1 / t, np.radians(pair.incidence_deg) + theta_error_rad)
+    own = np.array([features for *_, features in dielectrics])
+    places = np.array([plate.box_m for plate, *_ in dielectrics]) - np.tile(metal[0].centre_m[:2], 2)
+    levels = np.log(np.abs([(h / metal[1], v / metal[2]) for _, h, v, _ in dielectrics]))
+    of_scene = np.concatenate(
+        [metal[3], np.median(own, axis=0), [plain.imag.mean(), plain.imag.max()], levels.std(axis=0)]
+    )
+    columns = [plain.real, plain.imag, t.real, t.imag, levels, places, own, np.tile(of_scene, (len(own), 1))]
+    features = np.column_stack([np.full(len(own), ROWS.index(nuisance)), *columns])
+    figures = judge_world(nuisance, seed)
+    widths = tuple(patch.half_width for patch in figures.patches if patch.half_width is not None)
+    true = np.array([complex(plate.stack.below) for plate, *_ in dielectrics])
+    return SceneData(features[0, 0].astype(int), seed, features, plain, true, widths)
+
+
+def learn_half_widths(features: Real, deviation: Real, row: npt.NDArray[np.intp], seed: npt.NDArray[np.intp]) -> Real:
+    """Return half widths [plate] of intervals that hold 95 % of `deviation` [plate] in each row, each scene left out.
+
+    A scene's intervals are learnt from the scenes of other folds.
+    """
+    from sklearn.ensemble import HistGradientBoostingRegressor
+    from sklearn.model_selection import GroupKFold
+
+    ends = np.empty((2, deviation.size))
+    for train, test in GroupKFold(FOLDS).split(features, deviation, seed):
+        for end, quantile in zip(ends, (0.025, 0.975), strict=True):
+            model = HistGradientBoostingRegressor(
+                loss="quantile", quantile=quantile, max_iter=150, learning_rate=0.06, min_samples_leaf=15,
+                l2_regularization=1.0,
+            )  # fmt: skip
+            end[test] = model.fit(features[train], deviation[train]).predict(features[test])
+    half_width = np.maximum(ends[1] - ends[0], 1e-4) / 2
+    distance = np.abs(deviation - ends.mean(axis=0)) / half_width
+    for number in np.unique(row):
+        half_width[row == number] *= np.quantile(distance[row == number], 0.95)
+    return half_width
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    parser.add_argument("--scenes", type=int, default=20, help="scenes of each nuisance")
+    parser.add_argument("--first", type=int, default=300_000, help="seed of the first scene")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--json", type=Path, default=None, help="write the figures there")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw the scenes, let the rival learn, print the table. Return 0."""
+    jobs = [(nuisance, seed) for nuisance in ROWS for seed in range(args.first, args.first + args.scenes)]
+    with ProcessPoolExecutor(args.jobs) as pool:
+        scenes = [scene for scene in pool.map(collect_scene, jobs) if scene is not None]
+    features = np.concatenate([scene.features for scene in scenes])
+    plain = np.concatenate([scene.plain for scene in scenes])
+    true = np.concatenate([scene.true for scene in scenes])
+    row = features[:, 0].astype(np.intp)
+    seed = np.concatenate([np.full(scene.true.size, scene.seed) for scene in scenes])
+    deviation = (true - plain) / plain.real
+    parts = [learn_half_widths(features, part, row, seed) for part in (deviation.real, deviation.imag)]
+    rival = np.hypot(*parts) / np.sqrt(2) * plain.real / np.abs(true)
+    figures = {}
+    print(f"{len(scenes)} scenes, {true.size} plates; median half widths of 95 % regions")
+    print("nuisance       rival %  ours %  ratio")
+    for number, nuisance in enumerate(ROWS):
+        of_rival = 100 * float(np.median(rival[row == number]))
+        ours = 100 * float(np.median(np.concatenate([s.half_widths for s in scenes if s.row == number])))
+        figures[nuisance] = {"rival_percent": of_rival, "ours_percent": ours}
+        print(f"{nuisance:13s} {of_rival:8.2f} {ours:7.2f} {ours / of_rival:6.2f}")
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=1))
+    return 0

@@ -119,3 +119,14 @@ def test_the_reference_is_the_best_shown_metal_of_those_that_may_be_one():
     assert most_like_metal([brightest, relative_to(2, 9.0, refused=[1])]).metal.label == 2
     nothing_like_metal = [relative_to(1, 5.0, refused=[1, 2]), relative_to(2, 9.0, refused=[1, 2])]
     assert most_like_metal(nothing_like_metal).metal.label == 1
+
+
+@pytest.mark.parametrize(
+    ("score", "channel_ratio_db", "contradicted"),
+    [(20.0, -7.1, True), (-7.0, -3.1, True), (-7.0, -2.4, False), (-4.0, -6.9, False), (-30.0, None, False)],
+)
+def test_a_declared_metal_is_contradicted_by_its_own_v_over_h_alone_or_with_the_others(
+    score, channel_ratio_db, contradicted
+):
+    """Odd patches alone never contradict it: they may be liquids or sheets."""
+    assert MetalEvidence(score, score, 6, channel_ratio_db).against == contradicted

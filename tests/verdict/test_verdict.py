@@ -233,6 +233,14 @@ def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reaso
     assert never not in text, text
 
 
+def test_paint_is_no_cause_where_a_dielectric_reference_explains_the_others_better():
+    """The other patch that fits metal least is known only if the evidence, paint included, speaks against metal."""
+    (doubt,) = rules.judge_metal("patch 5", False, False, True, False, False, culprit=2, painted=1.0, paint_mm=0.1)
+    (paint,) = rules.judge_metal("patch 5", False, False, True, False, False, painted=1.0, paint_mm=0.1)
+    assert "may be no metal: patch 2" in doubt.what
+    assert "may be painted" in paint.what
+
+
 @pytest.mark.parametrize(("stronger_v", "plates"), [([], 8), ([3], 1), ([1, 2], 4)])
 def test_a_single_plate_or_half_of_them_do_not_show_that_h_and_v_are_exchanged(stronger_v, plates):
     """Layers and liquids behind glass may reflect more V than H."""

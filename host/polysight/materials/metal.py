@@ -57,6 +57,10 @@ CONFLICT_SCORE = 0.0
 """Score below which a declared metal is reported as doubtful, with the patch that fits it least: a dielectric fits the
 others better. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this estimator, dielectrics
 declared as metal -0.3 to -8 in eleven."""
+CONTRADICTING_SCORE = -5.0
+"""Score below which the other patches and a weak V / H of its own (`DOUBTFUL_V_DB`) together contradict a declared
+metal. Chosen: nine half spaces declared as metal have -7 to -27 and -3 to -8 dB, metal 7 to 31 and -0.8 to 0.7 dB
+(scenes of another author's generator)."""
 PAINT_SCORE = 7.0
 """Cost of paint: a reference that counts as metal only if it is painted needs so much more score. Chosen."""
 ALIKE_DB = 2.5
@@ -124,8 +128,11 @@ class MetalEvidence:
 
     @property
     def against(self) -> bool:
-        """True if its own V / H contradicts metal, even if the user declares it."""
-        return self.channel_ratio_db is not None and self.channel_ratio_db < WEAK_V_DB
+        """True if its own V / H contradicts metal, even if the user declares it; a doubtful one beside odd patches."""
+        if self.channel_ratio_db is None:
+            return False
+        is_odd = self.score < CONTRADICTING_SCORE
+        return self.channel_ratio_db < WEAK_V_DB or (is_odd and self.channel_ratio_db < DOUBTFUL_V_DB)
 
     @property
     def enough(self) -> bool:

@@ -257,15 +257,9 @@ def judge_metal(
         return [reason(
             "care" if likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
-            "relative to the direct path it reflects far less of V than of H, as no metal does", do, 8.0,
+            "relative to the direct path it reflects less of V than of H, as no metal does", do, 8.0,
         )]  # fmt: skip
-    if is_given and painted > PAINT_TOLD:
-        return [reason(
-            "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
-            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet"
-            " plate in the place of metal; permittivities are corrected for a coating, with its error",
-            f"take the paint or film off {patch}, or use bare metal", 2.7,
-        )]  # fmt: skip
+    # First: with this score paint explains the others less well than a dielectric does.
     if is_given and culprit is not None and not likely:
         return [reason(
             "care",
@@ -273,6 +267,13 @@ def judge_metal(
             "the others fit a dielectric reference better; so may thin plates, liquids, or H and V of different"
             " places",
             f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
+        )]  # fmt: skip
+    if is_given and painted > PAINT_TOLD:
+        return [reason(
+            "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
+            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet"
+            " plate in the place of metal; permittivities are corrected for a coating, with its error",
+            f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
     if is_given or certain:
         return []

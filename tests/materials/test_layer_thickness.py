@@ -14,7 +14,7 @@ from polysight.imaging import sub_bands
 from polysight.materials import METAL, Layer, parse_layer
 from polysight.materials.layers import Bands, Spectrum, _Model, fit_layer, predict
 from polysight.materials.sub_bands import bands_of_row
-from polysight.results import ScanMaterials
+from polysight.results import NoResult, ScanMaterials
 
 THETA = np.radians(55.0)
 CHIRP = published_rig().chirp
@@ -176,6 +176,16 @@ def test_a_sheet_on_metal_as_typed(folder, capsys):
     assert " mm" in out
     assert main(["permittivity", str(folder), "--patch", "9"]) != 0
     assert "no patch 9" in capsys.readouterr().err
+
+
+def test_products_without_patches_print_none_and_their_verdict(folder, capsys):
+    """No patch was asked for by its number, so none is missing."""
+    (folder / "materials.json").write_text(json.dumps({"segments": []}))
+    assert main(["permittivity", str(folder), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == []
+    (folder / "materials.json").write_text(json.dumps({"segments": [], "verdict": {"level": "none", "reasons": []}}))
+    assert main(["permittivity", str(folder)]) == NoResult.exit_status
+    assert "no patch" not in capsys.readouterr().err
 
 
 def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder):

@@ -137,7 +137,7 @@ def permittivity(
     if stack and products.verdict is not None and not products.verdict.usable:
         raise products.verdict.error("the images are kept")
     patches = [patch for patch in products.segments if number is None or patch.label == number]
-    if not patches:
+    if number is not None and not patches:
         raise DataError(
             f"{products.folder}: no patch {number}",
             f"its number is not in {MATERIALS}",

@@ -12,7 +12,7 @@ from tests.support.refusals import refused
 
 import polysight
 from polysight.cli.main import main
-from polysight.results import PatchFigures, PermittivityFigures, check_plate, check_reasons
+from polysight.results import WARNING_SIGMAS, PatchFigures, PermittivityFigures, check_plate, check_reasons
 from polysight_shared.config import CheckPlate
 from polysight_shared.error_codes import ErrorCode
 
@@ -91,10 +91,14 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
     assert table["sigmas"].item() == check["sigmas"]
     assert table["expected_permittivity"].item() == complex(permittivity[0], -permittivity[1])
     assert all({"units", "long_name"} <= set(variable.attrs) for variable in table.variables.values())
-    chart_axes = polysight.plot_check(products_copy, polysight.open_scan(products_copy)).axes
+    figure = polysight.plot_check(products_copy, polysight.open_scan(products_copy))
+    assert f"{WARNING_SIGMAS} standard deviations" in figure.get_suptitle()
+    chart_axes = figure.axes
     assert [ax.get_ylabel() for ax in chart_axes] == ["real part", "loss"]
     points = chart_axes[0].get_lines()[0].get_ydata()
     assert points == pytest.approx([table["permittivity"].real.item()] * 2)
+    bar = chart_axes[0].containers[0].get_children()[-1].get_segments()[0][:, 1]
+    assert np.ptp(bar) == pytest.approx(2 * WARNING_SIGMAS * check["measured_std"][0])
 
 
 def test_a_check_of_nothing_says_so():

@@ -25,6 +25,7 @@ import polysight
 from polysight.catalogue import Notes, find_program, read_notes, write_notes
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
+from polysight.results import WARNING_SIGMAS
 from polysight.serve import programs, reading
 from polysight_shared.config import CheckPlate
 from polysight_shared.errors import DataError
@@ -234,6 +235,7 @@ def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):
     page.open("/check")
     assert "1 good" in page.browser.text("told")
     assert "1 action" in page.browser.text("told")
+    assert f"± {WARNING_SIGMAS} standard deviations" in page.browser.text("limits")
     for name in KNOWN_PERMITTIVITY:
         measured = polysight.check(scans / name)["permittivity"].item().real
         # The tick's place gives the scale of the axis.

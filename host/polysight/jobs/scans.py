@@ -407,7 +407,11 @@ def _describe(scan: ProcessedScan, result: CheckResult) -> str:
 
 
 def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> None:
-    """Draw real part and loss of the check plate over the scans, with the known value and its limits."""
+    """Draw real part and loss of the check plate over the scans, and the known value.
+
+    Bars of the scans and the band of the known value are `WARNING_SIGMAS` standard deviations to either side. A scan's
+    level is that of its distance in both parts together, which the chart does not show.
+    """
     axes = fig.subplots(2, 1, sharex=True)
     names = []
     measured = []
@@ -431,4 +435,5 @@ def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, Check
     axes[-1].set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
     # A scan that does not say whether it was simulated may be: the chart is marked.
     stamp = " (simulated)" if any(scan.simulated is not False for scan, _ in checked) else ""
-    fig.suptitle(f"Check plate {latest.name}{stamp}: bars and band hold 95 % of good scans", fontsize=11)
+    title = f"Check plate {latest.name}{stamp}: bars and band are ± {WARNING_SIGMAS} standard deviations"
+    fig.suptitle(title, fontsize=11)

@@ -47,7 +47,7 @@ function show() {
   const count = (level) => scans.filter((s) => s.check.level === level).length;
   const last = scans.at(-1);
   by("told").textContent = `Latest scan ${last.name}: ${last.check.level}. Of ${scans.length} scan${scans.length === 1 ? "" : "s"}: ${count("good")} good, ${count("warning")} warning, ${count("action")} action, ${count("missing")} missing.${unreadable}`;
-  by("limits").textContent = `Warning above ${told.warning_sigmas} standard deviations (5 % of good scans), action above ${told.action_sigmas} (0.3 %).`;
+  by("limits").textContent = `Warning above ${told.warning_sigmas} standard deviations (5 % of good scans), action above ${told.action_sigmas} (0.3 %). Bars and band: ± ${told.warning_sigmas} standard deviations of each part.`;
   control(by("real"), points(scans, 0), "real part");
   control(by("loss"), points(scans, 1), "loss");
   fill(by("rows"), [...scans].reverse().map(row));

@@ -16,6 +16,7 @@ from polysight.cli.main import main
 from polysight.jobs.train import training_scan
 from polysight.materials import Library
 from polysight.materials.train import make_entries
+from polysight.products import IMAGE
 from polysight_shared.errors import DataError
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -121,3 +122,19 @@ def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     with pytest.raises(DataError) as caught:
         training_scan(scan, RIG_FILE)
     assert all(value in str(caught.value) for value in ("labels.json", "tin", MINE, "10.0 x 20.0 mm"))
+
+
+def test_a_box_without_a_finite_ratio_is_noted(scans, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main(["image", str(scans[0]), "--out", str(out)]) == 0
+    assert main(["label", str(out), *drawn()]) == 0
+    with np.load(out / IMAGE) as saved:
+        arrays = dict(saved)
+    # The board's half of both images is not a number.
+    for channel in ("h", "v"):
+        arrays[channel][:, arrays["x_m"] > arrays["x_m"].mean()] = np.nan
+    np.savez(out / IMAGE, **arrays)
+    capsys.readouterr()
+    scan = training_scan(out, RIG_FILE)
+    assert [e.name for e in make_entries(scan)] == ["copper"]
+    assert f"the box of {MINE} holds no pixel that can be used" in capsys.readouterr().err

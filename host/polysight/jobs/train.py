@@ -192,7 +192,7 @@ def _add_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: 
     """Return the training scan with names and specimens of the boxes."""
     boxes = dict(enumerate(labels.boxes, 1))
     for patch in materials.patches:
-        if patch.patch.label in boxes and not (patch.patch.interior & (materials.p != 0)).any():
+        if patch.patch.label in boxes and not materials.usable_pixels(patch.patch).any():
             sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
     names = {label: material_name(box) for label, box in boxes.items()}
     specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}

@@ -189,6 +189,10 @@ class MaterialsResult:
     relief_rad: float = 0.0
     other_sign: float = 0.0
 
+    def usable_pixels(self, patch: Patch) -> npt.NDArray[np.bool_]:
+        """Return a mask [ny, nx] of a patch's interior pixels whose P is known, and not zero."""
+        return patch.interior & np.isfinite(self.p) & (self.p != 0)
+
     def rows(self) -> list[PatchFigures]:
         """Return the figures of each patch, for materials.json."""
         figures = [self._describe_patch(r) for r in self.patches]

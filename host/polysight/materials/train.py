@@ -651,7 +651,7 @@ def make_entries(scan: TrainingScan) -> list[Entry]:
     r = scan.result
     for patch in r.patches:
         name = (scan.names or {}).get(patch.patch.label) or (patch.truth.name if patch.truth else None)
-        rows, cols = np.nonzero(patch.patch.interior & np.isfinite(r.p) & (r.p != 0))
+        rows, cols = np.nonzero(r.usable_pixels(patch.patch))
         if name is None or rows.size == 0:
             continue
         pick = np.unique(np.linspace(0, rows.size - 1, min(PIXELS, rows.size)).round().astype(int))

@@ -139,6 +139,6 @@ def name_placement(library):
 def library(analyse_placement) -> Library:
     """Six placements that no test scene repeats."""
     return make_library(
-        [TrainingScan(f"train-{s}", analyse_placement(s), True, s, {"made by": "test"}) for s in range(1000, 1006)],
+        [TrainingScan(f"train-{s}", analyse_placement(s), True, {"made by": "test"}) for s in range(1000, 1006)],
         note="synthetic images",
     )

@@ -35,7 +35,7 @@ def two_angles(synthetic, analyse_placement):
         entry
         for angle in ANGLES
         for seed in range(1000, 1002)
-        for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analyse_placement(seed, angle), True, seed))
+        for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analyse_placement(seed, angle), True))
     ]
     scene = synthetic(1)
     packed = {

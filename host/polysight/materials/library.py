@@ -52,8 +52,8 @@ class Entry:
         Angle of incidence.
     simulated
         True if the scan was simulated.
-    seed, thickness_mm, permittivity
-        Seed of the simulated placement, thickness of the sample, true [eps', eps'']; None if not known.
+    thickness_mm, permittivity
+        Thickness of the sample, true [eps', eps'']; None if not known.
     versions
         Versions of the programs that made it.
     reference
@@ -69,7 +69,6 @@ class Entry:
     p: npt.NDArray[np.complex64]
     incidence_deg: float
     simulated: bool
-    seed: int | None = None
     thickness_mm: float | None = None
     permittivity: tuple[float, float] | None = None
     versions: dict[str, str] = field(default_factory=dict)
@@ -236,7 +235,8 @@ def _read_entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p:
     start = 0
     for row in rows:
         stop = start + row["pixels"]
-        fields = {k: value for k, value in row.items() if k != "pixels"}
+        # Entries of earlier releases have a `seed`, which says nothing.
+        fields = {k: value for k, value in row.items() if k not in ("pixels", "seed")}
         if fields.get("permittivity") is not None:
             fields["permittivity"] = tuple(fields["permittivity"])
         out.append(

@@ -623,8 +623,6 @@ class TrainingScan:
         Result of :func:`polysight.materials.analyse`, made with the truth's plates.
     simulated
         True if it was simulated.
-    seed
-        Seed of the simulated placement, if any.
     versions
         Versions of the programs that made it.
     names
@@ -636,7 +634,6 @@ class TrainingScan:
     scan: str
     result: MaterialsResult
     simulated: bool
-    seed: int | None = None
     versions: Mapping[str, str] | None = None
     names: Mapping[int, str] | None = None
     specimens: Mapping[int, str] | None = None
@@ -667,7 +664,6 @@ def make_entries(scan: TrainingScan) -> list[Entry]:
                 p=r.p[picked].astype(np.complex64),
                 incidence_deg=float(np.degrees(np.mean(theta))),
                 simulated=scan.simulated,
-                seed=scan.seed,
                 thickness_mm=patch.truth.thickness_mm if patch.truth else None,
                 permittivity=None if eps is None else (eps.real, -eps.imag),
                 versions=dict(scan.versions or {}),

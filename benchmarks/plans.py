@@ -64,7 +64,7 @@ def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilde
         for row in plan:
             x, y = row_offsets_mm(radar, row)
             payload = radar.chirps(board.name, x, y, row.index * len(x)).view(np.uint8).ravel()
-            frames, valid = row_words(payload, [], len(x), rig.chirp.samples)
+            frames, valid = row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
             synced = synchronise_row(frames, valid, setup)
             true.add_row(board.name, row.index, synced)
             triggers = np.stack([row.x_mm, np.full(row.points, row.y_mm)], axis=1) / 1e3

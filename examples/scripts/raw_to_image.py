@@ -18,12 +18,13 @@ from polysight.sync import BoardSetup, synchronise_row
 # %%
 scan = ScanFolder.load(Path("out/points"))
 rig = scan.instrument
+rx = len(rig.antennas.rx_mm)
 builder = ImageBuilder(rig)
 for board in rig.receivers:
     setup = BoardSetup.from_rig(rig, board)
     for row in scan.rows():
         raw = scan.read_row(board.name, row)
-        frames, valid = row_words(raw.payload, raw.missing, raw.frames_expected, rig.chirp.samples)
+        frames, valid = row_words(raw.payload, raw.missing, raw.frames_expected, rig.chirp.samples, rx)
         builder.add_row(board.name, row, synchronise_row(frames, valid, setup))
 images = builder.finish()
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import runpy
+import shutil
 
 import numpy as np
 import pytest
 from tests.support.paths import REPO
-from tests.support.rigs import published_rig
+from tests.support.rigs import published_rig, rig_table, rig_with
 
 from polysight.materials import Library
 from polysight_simulators.scene import decode_scene, simulate
@@ -34,12 +35,15 @@ def folder(tmp_path_factory):
         yield new_folder
 
 
-def test_raw_to_image(folder):
+@pytest.mark.parametrize("rx", [4, 2])
+def test_raw_to_image(folder, rx):
     grid = {"columns": 21, "rows": 21, "step_x_mm": 8.0, "step_y_mm": 6.0}
     image = {"columns": 40, "rows": 40, "pixel_mm": 2.0}
     raw = {"name": "a point", "grid": grid, "burst": {"pulses": 2}, "image": image}
     scene = decode_scene({**raw, "points": [{"position_mm": [10.0, -6.0]}]}, "test")
-    simulate(published_rig(), scene, folder / "out" / "points")
+    antennas = {"rx_mm": rig_table()["antennas"]["rx_mm"][:rx]}
+    shutil.rmtree(folder / "out" / "points", ignore_errors=True)
+    simulate(rig_with(antennas=antennas), scene, folder / "out" / "points")
     images = run("raw_to_image")["images"]
     row, column = np.unravel_index(np.argmax(np.abs(images.h_raw)), images.h_raw.shape)
     centre = (images.x_m.mean(), images.y_m.mean())

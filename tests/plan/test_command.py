@@ -10,6 +10,8 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
+from tests.support.rigs import rig_table, rig_with
+from tests.support.scenes import EVERYWHERE, scene_of
 from tests.support.store.facts import facts_of
 
 from polysight.cli.main import main
@@ -196,6 +198,13 @@ def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
     empty = ScanFolder.create(tmp_path / "empty", empty_scan.instrument, empty_scan.plan, simulated=True)
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         measure_noise(empty)
+
+
+def test_noise_is_measured_in_a_scan_with_two_antennas(tmp_path):
+    two = rig_with(antennas={"rx_mm": rig_table()["antennas"]["rx_mm"][:2]})
+    scene = scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, disturbances={"direct_snr_db": SNR_DB})
+    scan = simulate(two, decode_scene(scene, "test"), tmp_path / "scan")
+    assert measure_noise(ScanFolder.load(scan)).direct_snr_db == pytest.approx(SNR_DB, abs=0.7)
 
 
 def test_options_override_the_scan(scan, rig, read_plan):

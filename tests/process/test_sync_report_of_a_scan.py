@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.support.processes import read_output
-from tests.support.rigs import published_rig, rig_with
+from tests.support.rigs import published_rig, rig_table, rig_with
 from tests.support.scenes import EVERYWHERE, scene_of
 from tests.support.store.facts import facts_of
 
@@ -50,6 +50,15 @@ def _believe_programmed(scan):
     facts = facts_of(scan)
     facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}
     (scan / "manifest.jsonl").write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
+
+
+def test_a_scan_with_two_antennas_has_a_report_and_an_image(scan_of, tmp_path):
+    two = rig_with(antennas={"rx_mm": rig_table()["antennas"]["rx_mm"][:2]})
+    scan = scan_of(tmp_path / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES), two)
+    read_output("sync-report", scan, "--out", tmp_path / "report")
+    read_output("image", scan, "--out", tmp_path / "image")
+    assert (tmp_path / "report" / "sync.json").exists()
+    assert (tmp_path / "image" / "image.npz").exists()
 
 
 def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path):

@@ -37,7 +37,7 @@ def synchronise_burst(burst: Burst, speed_mm_s: float):
     x, y = row_offsets_mm(radar, row)
     words = radar.chirps("RH", x, y, 0)
     payload = words.reshape(-1).view(np.uint8)
-    decoded, valid = row_words(payload, [], len(x), rig.chirp.samples)
+    decoded, valid = row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
     return synchronise_row(decoded, valid, BoardSetup.from_rig(rig, rig.by_name("RH")))
 
 

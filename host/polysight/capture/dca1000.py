@@ -184,7 +184,7 @@ def row_words(
     missing: Gaps,
     frames: int,
     samples: int,
-    rx: int = 4,
+    rx: int,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
     """Return the words of a 4-lane recording in their own order, without a copy, as `polysight.sync` takes them.
 

@@ -437,11 +437,12 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     reports = {}
     for board in rig.receivers:
         setup = BoardSetup.from_rig(rig, board, model=calibration.high_pass(board.name))
-        report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, len(setup.path.beam))
+        rx = len(setup.path.beam)
+        report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx)
         say(f"rows of {board.name}")
         for row in source.rows():
             recorded = source.read_row(board.name, row)
-            words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples)
+            words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples, rx)
             report.add(synchronise_row(words, valid, setup))
     sys.stdout.write(write_sync_report(out, reports, source.scan_id, source.simulated))
     return 0

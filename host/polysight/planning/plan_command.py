@@ -422,15 +422,16 @@ def measure_noise(source: RawSource) -> Noise:
     from polysight.report import SyncReport
 
     rig = source.instrument
+    rx = len(rig.antennas.rx_mm)
     rows = list(source.rows())
     spaced = np.linspace(0, len(rows) - 1, min(_NOISE_ROWS, len(rows))).astype(int)
     ratios = []
     for board in rig.receivers:
         setup = BoardSetup.from_rig(rig, board)
-        report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, len(rig.antennas.rx_mm))
+        report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, rx)
         for row in (rows[i] for i in spaced):
             data = source.read_row(board.name, row)
-            words, valid = row_words(data.payload, data.missing, data.frames_expected, rig.chirp.samples)
+            words, valid = row_words(data.payload, data.missing, data.frames_expected, rig.chirp.samples, rx)
             report.add(synchronise_row(words, valid, setup))
         ratios.append(report.snr)
     if not np.isfinite(ratios).all():

@@ -307,7 +307,7 @@ class RowSynchroniser:
         rig = self._source.instrument
         chirp_bytes = rig.frame_bytes // rig.burst.chirps
         for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * chirp_bytes):
-            yield row_words(piece, (), piece.size // chirp_bytes, rig.chirp.samples)[0]
+            yield row_words(piece, (), piece.size // chirp_bytes, rig.chirp.samples, len(rig.antennas.rx_mm))[0]
 
     @property
     def direct_path_known(self) -> bool:

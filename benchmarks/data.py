@@ -113,12 +113,10 @@ class RepeatedRows:
         return iter(range(self.plan.rows))
 
     def read_row(self, board_name: str, row: int) -> RowData:
-        """Return a row of a board; the rig has one chirp a frame."""
+        """Return a row of a board."""
         files = self.files[board_name]
-        frames = self.plan.columns * self.instrument.burst.pulses
-        return RowData(
-            partial(_read_repeatedly, files[row % len(files)], frames * self.instrument.frame_bytes), [], frames
-        )
+        chirps = self.plan.columns * self.instrument.burst.chirps_a_position
+        return RowData(partial(_read_repeatedly, files[row % len(files)], self.instrument.row_bytes), [], chirps)
 
 
 def _read_repeatedly(path: Path, wanted_bytes: int, size: int) -> Iterator[NDArray[np.uint8]]:

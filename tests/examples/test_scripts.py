@@ -9,7 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from tests.support.paths import REPO
-from tests.support.rigs import published_rig, rig_table, rig_with
+from tests.support.rigs import rig_table, rig_with
 
 from polysight.materials import Library
 from polysight_simulators.scene import decode_scene, simulate

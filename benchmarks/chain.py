@@ -1,11 +1,12 @@
 """The instrument's processing of a whole scan in a process of its own, `python -m benchmarks.chain SOURCE.json HOW`.
 
-SOURCE.json names a scan folder (`scan`), or rows that are repeated to a grid (`files`, `grid`). HOW is "batch", or
+SOURCE.json names a scan folder (`scan`), or rows that are repeated to a grid: `files` has the paths of each board's
+recorded rows by its name, `grid` the keys of the scene's grid that differ (`published_scene`). HOW is "batch", or
 "live" as beside a running scan, with the images updated by every row. Every line on the standard input processes all of
-it once, from reading to the two images, and is answered by one line of JSON.
+it once, from reading to the images of H and V, and is answered by one line of JSON.
 
-Nothing of the published method is imported here: SciPy's signal and statistics, which it needs, would count 45 MB as
-memory of the instrument.
+The rig's publication has a processing method of its own, to which other benchmarks compare. Nothing of it is imported
+here: SciPy's signal and statistics, which it needs, would count 45 MB as memory of the instrument.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Client of the running service, for the commands `home`, `take-over` and `events`. The host has its own."""
+"""Client of the running service, for the commands `home`, `take-over` and `events`. The host has its own.
+
+Commands that use the hardware themselves are refused while the service runs (`refuse_beside_service`).
+"""
 
 from __future__ import annotations
 
@@ -76,7 +79,7 @@ def _is_listening(address: str) -> bool:
 
 
 def refuse_beside_service(instrument: Instrument) -> None:
-    """Raise DeviceError if the service of this rig runs: it holds lines, stage and ports."""
+    """Raise DeviceError if the service of this rig runs: it holds the trigger's GPIO lines, stage and ports."""
     if _is_listening(instrument.pi.command_address):
         raise DeviceError(
             f"polysight-pi run serves at {instrument.pi.command_address}",
@@ -90,7 +93,8 @@ def refuse_beside_service(instrument: Instrument) -> None:
 def home_by_service(instrument: Instrument) -> m.StatusReply | None:
     """Home through the running service and wait for the end; return None if no service runs.
 
-    Raises DeviceError if the service refuses, for example because the host of a run is alive, or if homing fails.
+    Raises DeviceError if the service refuses, for example because the host of a run is alive, if it does not answer, or
+    if homing fails.
     """
     if not _is_listening(instrument.pi.command_address):
         return None
@@ -167,5 +171,5 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)
-            # A lost journal leaves a gap in the numbers.
+            # Not from_seq plus their count: where a journal file was lost during a scan, numbers are missing.
             from_seq = reply.events[-1].seq + 1

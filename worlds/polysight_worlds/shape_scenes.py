@@ -3,8 +3,8 @@
 `draw_shapes` makes a scene of one object of a kind, with or without a table behind; `scan_shapes` gives its samples as
 the instrument holds them, with noise and a rig whose boards stand a little beside their nominal places.
 
-Each quantity has a random stream of its own, numbered after the seed (`[seed, 11]`), so that switching one disturbance
-on does not change the others.
+Boards (places, axes, leakage), gains, noise and scene have random streams of their own, numbered after the seed
+(`[seed, 11]`), and what is switched off is drawn, too: switching one disturbance on does not change the others.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from polysight_worlds.rig import Boards, published_boards, published_rig, turn
 from polysight_worlds.shape_echoes import record_shapes
 from polysight_worlds.shapes import Shape, Sphere, bottle, cylinder, plate, sphere
 
-# The linear part of the chirp of the published rig (instrument.toml), in as many frequencies as hold a range gate of
-# 0.5 m, a path of 1 m: at steps of 151 MHz paths that differ by 2 m look alike.
+# The linear part of the chirp of the published rig (instrument.toml). Its range gate of 0.5 m holds paths that differ
+# by up to 1 m; 24 frequencies are enough for it: at their steps of 151 MHz only paths that differ by 2 m look alike.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 24)
 # Linear samples of the published chirp.
 SAMPLES = 192
@@ -51,12 +51,15 @@ class ShapeScene:
     background: tuple[Shape, ...] = ()
 
     def nearest_surface(self, points_m: NDArray) -> tuple[NDArray, NDArray]:
-        """Signed distances [n] of points [n, 3] from the object's nearest surface that faces the antennas, and its
-        normals there [n, 3]; infinite and zero where no piece of it lies before or behind a point.
+        """Signed distances [n] of points [n, 3] from the nearest surface that faces the antennas, and normals [n, 3].
+
+        Distances are positive in front of the surface. They are infinite and normals zero where no piece lies before or
+        behind a point, or only its back does. The surface of a single piece counts beyond its edges, too.
         """
         distances = np.full(len(points_m), np.inf)
         normals = np.zeros((len(points_m), 3))
         for shape in self.shapes:
+            # `a` and `b` are the surface's parameters.
             projected, a, b = shape.project(points_m)
             facing = shape.evaluate(a, b).normal.T
             # The back of a body is no surface that antennas see.
@@ -113,6 +116,7 @@ def scan_shapes(
 ) -> dict[str, NDArray]:
     """Samples of shapes, complex64 [rx, frequency, ...] for "h" and "v", as of `record_shapes`, disturbed.
 
+    `offsets_m` [..., 3]: stage offsets. `boards`: as the rig file has them, or None for the published rig.
     Scans of one rig, a reference and an object, have the same nuisances; `number` makes their noise differ.
     """
     nuisances = ShapeNuisances() if nuisances is None else nuisances
@@ -176,7 +180,7 @@ def _draw_sphere(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[S
 
 
 def _draw_cylinder(low_m: float, high_m: float) -> Callable[[_Draw], tuple[tuple[Shape, ...], float]]:
-    """Return a function that draws a cylinder of 0.4 m with a radius between these, and returns it and its radius."""
+    """Return a function that draws a cylinder 0.4 m long, a radius between these, and returns it and its radius."""
 
     def draw(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
         radius_m = draws.rng.uniform(low_m, high_m)
@@ -221,7 +225,7 @@ def _draw_saddle(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
 
 
 def _draw_sheet(draws: _Draw) -> tuple[tuple[Shape, ...], float]:
-    """Draw a bent sheet without a back; return it and its radius."""
+    """Draw a bent sheet, so thick that its back does not reflect; return it and its radius."""
     radius_m = draws.rng.uniform(0.15, 0.6)
     turn_deg = float(draws.rng.uniform(0, 180))
     bends = (1 / radius_m, 0.0, 0.0)

@@ -1,6 +1,6 @@
-"""`fresnel`, `permittivity_from_ratio`, `multilayer` for people: they keep xarray's labels and refuse degrees.
+"""`fresnel`, `permittivity_from_ratio`, `multilayer` for users' programs: they keep xarray's labels, refuse degrees.
 
-Rooms use the plain functions of `fresnel.py`.
+The package itself uses the plain functions of `fresnel.py`.
 """
 
 from __future__ import annotations
@@ -54,7 +54,10 @@ class _PermittivityFromRatio(Protocol):
 
 
 class _Multilayer(Protocol):
-    """Type of :func:`multilayer`; a list of media that mixes arrays with and without labels counts as one without."""
+    """Type of :func:`multilayer`: labelled arrays if an argument, or all media of a list, are labelled.
+
+    One labelled array in a list is enough when it runs; the type of such a list cannot be told from one without.
+    """
 
     @overload
     def __call__(
@@ -89,8 +92,9 @@ class _Multilayer(Protocol):
 def keep_labels(*results: str) -> Callable[[Function], Function]:
     """Decorate a function of arrays that broadcast: with a `DataArray` among its arguments it returns such arrays.
 
-    `results` are the long names of what it returns. An argument may be a list of arrays. Coordinates are aligned as
-    xarray aligns them; attributes are those of the first argument, with the result's own unit (1) and long name.
+    `results` are the long names of what it returns. An argument may be a list of arrays. Dimensions broadcast by name;
+    coordinates that arrays share must be equal, else xarray raises a ValueError. Attributes are those of the first
+    `DataArray`, with the result's own unit (1) and long name.
     """
 
     def decorate(function: Function) -> Function:
@@ -138,7 +142,7 @@ def _fill(value: Any, arrays: Iterator[Any]) -> Any:
 
 
 def _refuse_degrees(function: Function) -> Function:
-    """Decorate a function of `theta_rad`: raise ConfigError for an angle above pi / 2, which must be in degrees."""
+    """Decorate a function of `theta_rad`: raise ConfigError for an angle above pi / 2, which may be in degrees."""
 
     @wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:

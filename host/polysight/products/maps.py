@@ -106,7 +106,7 @@ def map_images(
     top_db
         Upper end of |H| and |V|; None: that of the brightest pixels.
     patches_db
-        |P| of patches: the range of |P| holds them and metal's 0 dB. Empty: it is that of the bright pixels.
+        |P| of patches: the range of |P| holds them. Empty: it is that of the bright pixels.
     """
     if channel == "p":
         values = ratio(images.h, images.v) if images.p is None else images.p
@@ -125,7 +125,10 @@ def map_images(
 
 
 def map_scan(scan: ProcessedScan, channel: str, quantity: str) -> MapValues:
-    """Return the values of one map of a processed scan. Metal has 0 dB, and |P| the range of the patches."""
+    """Return the values of one map of a processed scan, with |P| in the range of the patches.
+
+    The colours of |H| and |V| end at metal's 0 dB, or at the brightest pixels if the scan is not relative to metal.
+    """
     top_db = 0.0 if scan.metal_referenced else None
     levels = [patch.p_abs_db for patch in scan.segments]
     patches_db = [level for level in levels if level is not None]
@@ -135,7 +138,8 @@ def map_scan(scan: ProcessedScan, channel: str, quantity: str) -> MapValues:
 def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[float]) -> Limits:
     """Return the range of |P| in whole dB: that of the patches if there are any, else of the opaque pixels.
 
-    It holds metal's 0 dB, with a decibel to spare at both ends.
+    It has a decibel to spare at both ends, and begins below metal's 0 dB, over which |P| of surfaces lies; if all values
+    are far below, 0 dB is beyond its upper end.
     """
     if patches_db:
         low = min(patches_db)
@@ -189,7 +193,7 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
 
     The permittivity is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle
     adds its own.
-    `p_sigma` holds noise, metal reference, and what is left of the leakage.
+    `Images.p_sigma`, the standard deviation of P, holds noise, metal reference, and what is left of the leakage.
     Without an incidence angle nothing is known.
     """
     budget = None
@@ -237,9 +241,9 @@ def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
 
 
 def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
-    """Return V / H without the estimated leakage, instead of without that which the pixels are free of.
+    """Return V / H with the estimated leakage removed, in place of the known one that was removed from the pixels.
 
-    Unchanged if the products do not say what was removed.
+    `inverse` is V / H of the pixels, complex [ny, nx]; it stays as it is if the products do not say what was removed.
     """
     removed_h = _join_parts(leakage.removed_h)
     removed_v = _join_parts(leakage.removed_v)

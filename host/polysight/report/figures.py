@@ -1,7 +1,9 @@
 """Figures of a report and of single commands: amplitude and phase of H, V and P in millimetres, and permittivities.
 
-Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight). `label_figure`
-shows the boxes of a label file, `focus_figure` a sweep over depth, `surface_figure` surfaces from three sides.
+Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight); the phase of P,
+where its colours span only a part of the circle, cividis. *Patches* (`ProcessedScan.segments`) are the regions that the
+processing found, *plates* the true ones of a simulated scan. `label_figure` shows the boxes of a label file,
+`focus_figure` a sweep over depth, `surface_figure` surfaces from three sides.
 """
 
 from __future__ import annotations
@@ -39,7 +41,8 @@ VIEWS = (
     ((2, 1), "From the side", ("z (mm), away from the rig", "y (mm)")),
     ((0, 2), "From above", ("x (mm)", "z (mm), away from the rig")),
 )
-# Normals drawn in a view of a surface, and their length; more of them would hide the points; chosen.
+# About how many normals are drawn in a view of a surface (up to twice as many), and their length; more of them would
+# hide the points; chosen.
 NORMALS_SHOWN = 60
 NORMAL_MM = 12.0
 # Most segments that are described below a surface; chosen.
@@ -79,10 +82,11 @@ _POSITION_COLOURS = ("#dfe5ec", "#882255")
 
 
 def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
-    """Return the range of the phase of P inside the judged patches, degrees; None if it is nearly the whole circle.
+    """Return the range of the phase of P inside the judged patches, degrees.
 
-    The metal reference, 0 degrees by definition, counts only if there is no other patch. The range is taken around the
-    circular mean, so that values on both sides of 180 degrees lie side by side: limits may pass 180.
+    None if it is nearly the whole circle, or without pixels of patches. The metal reference, 0 degrees by definition,
+    does not count; if no other patch was judged, all patches do. The range is taken around the circular mean, so that
+    values on both sides of 180 degrees lie side by side: limits may pass 180.
     """
     inside: list[npt.NDArray] = []
     judged_patches = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
@@ -108,7 +112,10 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
 
 
 def _name_amplitude_unit(scan: ProcessedScan) -> str:
-    """Return the unit of amplitudes, which says what 0 dB is: the metal, an unproved reference, or nothing."""
+    """Return the unit of amplitudes, which says what 0 dB is: the metal, or a reference that may be no metal.
+
+    The latter where the scan has no result (`judged`). Without a reference 0 dB means nothing.
+    """
     if not scan.metal_referenced:
         return "dB"
     return "dB (metal = 0)" if scan.judged else "dB (reference = 0)"
@@ -260,7 +267,7 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.M
             text = style.write_label(ax, (x0 + x1) / 2, y1 + 0.5, name, size, above=True)
             _keep_inside(ax, text, y1)
         else:
-            # The plate is larger than the image: a name above it would be far outside the picture.
+            # The plate reaches beyond the image's upper edge: a name above it would be far outside the picture.
             text = style.write_label(ax, (max(x0, left) + min(x1, right)) / 2, (max(y0, bottom) + top) / 2, name, size)
         labels.append(style.MapLabel(text, str(number), name, colour))
     return labels
@@ -280,7 +287,7 @@ def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[s
 def permittivity_map(scan: ProcessedScan) -> bytes | None:
     """Return a PNG of eps' with its standard error in each patch, and of the relative error; None without errors.
 
-    The relative error is the root of both variances over |eps|, in percent.
+    The relative error is the root of the sum of both parts' variances, over |eps|, in percent.
     """
     real: dict[int, float] = {}
     errors: dict[int, float] = {}
@@ -404,7 +411,10 @@ def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]
 
 
 def draw_overview(fig: Figure, axes: Sequence[Axes], scan: ProcessedScan, bar_labels: bool = False) -> None:
-    """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on the fourth if given."""
+    """Draw amplitude H, V, P with colour bars on the first three axes, and the materials on the fourth if given.
+
+    `bar_labels`: the bars have their unit, too.
+    """
     for ax, key, title in zip(
         axes[:3],
         ("amplitude_h", "amplitude_v", "amplitude_p"),
@@ -480,7 +490,7 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
 
 def focus_figure(
     sweep: dict[str, Any],
-    image_before: npt.NDArray[np.complexfloating],
+    before: npt.NDArray[np.complexfloating],
     after: npt.NDArray[np.complexfloating],
     x_m: npt.NDArray[np.float64],
     y_m: npt.NDArray[np.float64],
@@ -488,7 +498,8 @@ def focus_figure(
 ) -> bytes:
     """Return a PNG of a sweep over depth, and of H [ny, nx] before and after focusing.
 
-    `sweep` has the keys `depths_mm`, `sharpness`, `depth_mm`, `tilt_deg` and `certain`.
+    `sweep` has the keys `depths_mm`, `sharpness` (largest is 1), `depth_mm`, `tilt_deg` (x, y) and `certain`. Depths
+    are relative to the rig file's plane.
     """
     fig = Figure(figsize=(13.0, 4.2), dpi=140, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
@@ -504,11 +515,11 @@ def focus_figure(
         title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y"
     curve.set_title(title, loc="left", fontsize=10, color=style.INK)
     curve.legend(fontsize=8, frameon=False)
-    top = max(float(np.abs(image_before).max()), float(np.abs(after).max()), 1e-30)
+    top = max(float(np.abs(before).max()), float(np.abs(after).max()), 1e-30)
     x = axis_mm(x_m)
     y = axis_mm(y_m)
     for ax, image, title in zip(
-        pictures, (image_before, after), ("H on the rig file's plane", "H on the found plane"), strict=True
+        pictures, (before, after), ("H on the rig file's plane", "H on the found plane"), strict=True
     ):
         level = 20 * np.log10(np.maximum(np.abs(image) / top, 1e-6))
         mesh = ax.pcolormesh(

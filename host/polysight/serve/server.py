@@ -51,7 +51,7 @@ from polysight_shared.program import delay_interrupts, ignore_interrupts
 NICE = 10
 # A browser opens up to six connections for a page. The number is chosen.
 MAX_CONNECTIONS = 2048
-# Connections that may be accepted before the next one that has sent something is read; chosen.
+# Connections that the event loop accepts in one round, before it reads from those that it has; chosen.
 ACCEPTED_AT_ONCE = 128
 # Connections in the kernel's queue. A client that finds the queue full tries again after 1 s, and after 2 s more.
 BACKLOG = 4096
@@ -61,6 +61,7 @@ KEEP_ALIVE_S = 10**6
 CLOSE_S = 1
 # Pause before the reading process is started again, so that one that fails at once takes no processor.
 RESTART_S = 1.0
+# The cached list of scans, in the hidden folder of the scans.
 LIST_INDEX = "list.json"
 # Random bytes of a token: 144 bits, 24 characters in an address.
 TOKEN_BYTES = 18
@@ -129,7 +130,7 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
     Raises
     ------
     PolysightError
-        if the folder or a file is missing, or the address cannot be bound.
+        if the folder or a file of TLS is missing, the token's file is unsafe, or the address cannot be bound.
     """
     if not root.is_dir():
         raise ConfigError(f"{root}: no such folder", "scans are listed under it", "make it, or give another")
@@ -140,7 +141,10 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
 
 
 def preview(folder: Path, place: Place, control: bool) -> int:
-    """Serve the live view of one scan folder until Ctrl-C; returns the exit status. Raises as :func:`serve`."""
+    """Serve the live view of one scan folder, which may not exist yet, until Ctrl-C; returns the exit status.
+
+    Raises as :func:`serve`, except for a missing folder.
+    """
     folder = folder.absolute()
     return _run(Shown(folder.parent, folder.name, control), place, f"live view of {folder}")
 
@@ -168,7 +172,8 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             sys.stderr.write(describe_server(access, what, listener.getsockname()[:2]))
             sys.stderr.flush()
             server = make_server(front, place, door)
-            # By itself it takes signals when its event loop runs. Ctrl-C while the loop was made left half of one.
+            # By itself it takes signals only once its event loop runs: Ctrl-C before that would break off making the
+            # loop, and leave it half made.
             with server.capture_signals():
                 server.run(sockets=[listener])
     finally:
@@ -192,7 +197,8 @@ def make_access(place: Place, listener: socket.socket, control: bool) -> Access:
 def load_token() -> str:
     """Return the token of this user's servers, made at the first call: open pages keep control when a server restarts.
 
-    Raises ConfigError if its file can be read by others. If it is removed, the next server makes and prints a new one.
+    Raises ConfigError if its file can be read by others, is another user's, no plain file, or too short. If it is
+    removed, the next server makes and prints a new one.
     """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     path = Path(state) / "polysight" / "token"
@@ -211,6 +217,7 @@ def load_token() -> str:
     status = path.lstat()
     token = path.read_text(encoding="ascii", errors="replace").strip()
     is_safe = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077 and status.st_uid == os.getuid()
+    # Of the 24 characters of a token this many at least; a shorter one was edited.
     if not is_safe or len(token) < TOKEN_BYTES:
         raise ConfigError(
             f"{path} cannot be used as a token", "other users may read it, another user owns it, or it was edited",
@@ -255,7 +262,7 @@ def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Itera
                 process.join()
                 return
             process = context.Process(target=run_reader, args=(shown, path), name="reading", daemon=True)
-            # Start the tracker here: started by `start`, it would unblock Ctrl-C.
+            # Start multiprocessing's resource tracker here: started by `start`, it would unblock Ctrl-C.
             resource_tracker.ensure_running()
             with delay_interrupts():
                 process.start()
@@ -297,6 +304,7 @@ def run_reader(shown: Shown, path: Path) -> None:
     # Ctrl-C ends the server, which ends this process; without this line it would end first, with a traceback.
     ignore_interrupts(signal.SIGINT)
     programs = None
+    # Before the priority is lowered: started programs keep the present one.
     if shown.control and shown.only is None:
         programs = Programs()
     lower_priority()
@@ -329,7 +337,7 @@ def run_reader(shown: Shown, path: Path) -> None:
 
 
 def make_reader_app(site: Site) -> Starlette:
-    """Build the application of the reading process, with its queue; nobody but `front` reaches it."""
+    """Build the application of the reading process, with its queue of scans that wait; only `front` reaches it."""
     site.open_queue(lambda request: start_waiting(site, request))
     return Starlette(routes=reading_routes(site) + command_routes(site), exception_handlers=HANDLERS)
 
@@ -435,7 +443,7 @@ def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
 def find_addresses() -> list[str]:
     """Return the IPv4 addresses of this machine in its networks, that of the default route first.
 
-    An interface with several addresses counts with its first; systems without these calls have none.
+    An interface with several addresses counts with its first. Other systems than Linux give that of the default route.
     """
     addresses: list[str] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

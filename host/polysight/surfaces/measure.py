@@ -178,11 +178,14 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
 
 
 def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
-    """Replace the curvature of each echo's path by a fit to its neighbours in the same surface.
+    """Replace the curvature of each echo's path by a fit to its neighbours in the same surface; enlarge `slope_std`.
 
+    Echoes with too few neighbours stay as they are.
     What a fit leaves of the slopes is an error of each that its own window does not show: ripple of edges and of other
-    echoes. It is as long as the neighbourhood of the curvature, so it is judged over a larger one, in which curvature
-    may change. Its variance is averaged over the neighbours, for one fit leaves few independent residuals.
+    echoes, whose variance is added to that of the slope. Ripple is as long as the neighbourhood to which the curvature
+    is fitted, and a fit follows it there. So where there are enough windows it is judged over a larger one, by a fit in
+    which the curvature may change. The variance is averaged over the neighbours, for one fit leaves few independent
+    residuals.
     """
     bend = echoes.bend.copy()
     slope_std = echoes.slope_std.copy()
@@ -216,6 +219,9 @@ class SlopeFit:
 
     Slopes are g + Q d at the distance d. If curvature `may_change`, its four derivatives are fitted too. The windows'
     own curvatures count as slopes at the distance LEVER_OF_WINDOW_M.
+
+    `answer` [unknown, equation, n] turns slopes and curvatures of the windows into the unknown; `noise_left` and
+    `ripple_left` [2] are the shares of either error's variance that residuals of both slopes show.
     """
 
     def __init__(self, d: Array, *, may_change: bool) -> None:
@@ -270,9 +276,8 @@ def correlate_windows(d: Array) -> tuple[Array, Array]:
 
     Windows share data as far as they overlap; s is their distance over the width of a window. A sample's noise acts on
     the slope in proportion to its distance from the window's middle along the slope's axis, whatever its place across:
-    hence the correlation is 1 - 3 s + 2 s^3 along that axis and 1 - s across it. Ripple
-    is as long as a window or longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and
-    24 mm, about 1 - s.
+    hence the correlation is 1 - 3 s + 2 s^3 along that axis and 1 - s across it. Ripple is as long as a window or
+    longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and 24 mm, about 1 - s.
     """
     distance = np.minimum(1, np.abs(d[:, None] - d[None]) / WINDOW_M)
     across = np.moveaxis(1 - distance, -1, 0)

@@ -1,14 +1,15 @@
 """Permittivity of surface segments from the voltages of H and V, referenced to metal of known shape.
 
 A segment has one permittivity: least squares of b_H (M r)_V = b_V (M r)_H over its points (`fit_permittivity`), with r
-the coefficients of a curved surface, and b_H, b_V the voltages (`voltages`) over the gains (`gains`). Coefficients are
-arrays [n points, 2 receivers, 4]: r_s, r_p, s to p, p to s; the last two are 0 without a *twist*, a curvature whose
-axes lie askew to the plane of incidence.
+the coefficients of a curved surface, M what the antennas' polarisations make of them, and b_H, b_V the voltages over
+the gains (`Voltages.m` and `b`, `Gains`). Coefficients are arrays [n points, 2 receivers, 4], H before V: r_s, r_p,
+s to p, p to s; the last two are 0 without a *twist*, a curvature whose axes lie askew to the plane of incidence. A
+point is what one window of stage positions has measured. `wave_number` is that at the middle of the band, rad / m.
 
 The covariance is derived, source by source (`add_common_errors`): the scatter of the points over blocks of windows;
 leakage, axes and places of the antennas, each moved by one standard error for object and reference together; the
 reference's own error; and the next order of the expansion in the curvature. A common error changes the misses of the
-equations above; one step of Gauss and Newton turns that into a change of the permittivity.
+equations above; one Gauss-Newton step turns that into a change of the permittivity.
 
 Two figures that the permittivity does not use tell whether one medium reflected at one surface (`judge_medium`): the
 level of H over that of metal, and how both levels change over the band.
@@ -48,12 +49,13 @@ OUTLIER = 4.0
 RIPPLE_M = 0.04
 # Side of the square that is as large as a Fresnel zone (40 x 70 mm): ripples that edges make are as long.
 FRESNEL_ZONE_M = 0.053
-# The same for flat surfaces, whose misses have correlations of 0.6 and 0.3 at 8 and 16 mm (drawn plates, simulated).
+# Length of the ripple of flat surfaces, whose misses have correlations of 0.6 and 0.3 at 8 and 16 mm (plates of random
+# scenes, simulated).
 RIPPLE_OF_PLATES_M = 0.024
 # Ripple of V / H by which points are weighted, beside their noise; chosen.
 USUAL_RIPPLE = 0.02
-# Blocks that the scatter of the points is worth, if it were common to a block (chosen): the few blocks of a small
-# segment say little of their own scatter.
+# The few blocks of a small segment say little of their own scatter. So the scatter of the single points, as if it were
+# common to a block, is averaged with that of the blocks, and has the weight of so many blocks; chosen.
 EXPECTED_BLOCKS = 2.0
 # Error of the curvature, in proportion; chosen: those of 14 spheres and cylinders (50 to 190 mm, simulated) are 0.4 to
 # 3 % too large, 1.6 % in the root mean square (windows are not small to them).
@@ -61,8 +63,9 @@ CURVATURE_ERROR = 0.02
 # Second order of the reflection at a curved surface over the first, in K / (k cos^3 theta), K the curvature and k the
 # wave number: 1.9 by the exact series of spheres (100 and 200 mm, permittivity 2.8 to 8). Orders alternate in phase.
 SECOND_ORDER = 2.0
-# At the border of the zone that a surface reflects to, ln of the level is 0.69 below that inside. Patterns of antennas
-# change the level over the directions by about as much, where no reference takes that out.
+# At the border of the zone that a surface reflects to, ln of the level is 0.69 below that inside: half of that is
+# allowed. Where no reference takes that out, patterns of antennas change the level over the directions by about as
+# much: there 0.9 is allowed (chosen).
 LEVEL_TOLERANCE = 0.35
 LEVEL_TOLERANCE_WITHOUT_GAINS = 0.9
 # Share of a segment's power at one level: what edges diffract falls off with the angle. Three segments of edges alone
@@ -75,9 +78,9 @@ MIN_REFLECTION = 0.03
 # edges bend normals by degrees, and H / V of a plate with sharp edges is 10 % too large.
 BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
-# Points count for a permittivity by how full such a disc of interior points is, none for less than this share: ripples
-# of edges swing about zero, and a sum that begins and ends slowly averages them. Drawn plates (11, simulated) were
-# 2.2 % off in the root mean square where all points counted alike, and are 1.2 % off.
+# What a point counts for a permittivity rises from this share to 1 with the share of such a disc that interior points
+# fill: ripples of edges swing about zero, and a sum that begins and ends slowly averages them. The plates of 11 random
+# scenes (simulated) were 2.2 % off in the root mean square where all points counted alike, and are 1.2 % off.
 LEAST_SHARE = 0.01
 # Offsets closer than this are of one column of windows: rows start a little apart, as the stage moves within a burst.
 SAME_COLUMN_M = 1.5e-3
@@ -167,7 +170,7 @@ def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -
 class _Step:
     """Misses at one permittivity, their noise and weights [n], which points count, and `answer` as of the fit.
 
-    The step of Newton is the real part of `influence` times the misses, complex [2, n]. `answer` differs from it by
+    The step is the real part of `influence` times the misses, complex [2, n]. `answer` differs from it by
     what a change of a miss does to its weight.
     """
 
@@ -182,7 +185,7 @@ class _Step:
 def _linearise(
     eps: complex, v: Voltages, gains: Gains, wave_number: float, *, ripple: Array, share: Array | float
 ) -> _Step:
-    """Return the step of Gauss and Newton at a permittivity; outliers lose their weight.
+    """Return the Gauss-Newton step at a permittivity; outliers lose their weight.
 
     `ripple` [n] is the standard deviation of the misses beside their noise, `share` [n] what a point counts.
     """
@@ -213,13 +216,14 @@ def _linearise(
 def fit_permittivity(
     v: Voltages, gains: Gains, wave_number: float, share: Array | float = 1.0, ripple_m: float = FRESNEL_ZONE_M
 ) -> PermittivityFit:
-    """Weighted least squares of one permittivity over points, by Gauss and Newton; robust by iterated weights.
+    """Weighted least squares of one permittivity over points, by Gauss-Newton; robust by iterated weights.
 
     `share` [n]: what each point counts, beside its noise and ripple, which is `ripple_m` long.
     """
     of_points = point_permittivity(v, gains, wave_number)
     # The start has at least a small loss (chosen).
     eps = complex(np.median(of_points.real), min(np.median(of_points.imag), -0.01))
+    # Level of H in the unit of a miss: b_H times what V receives of r_p = 1.
     level = np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
     # What is common to a point's surroundings: no point counts for more than its ripple allows.
     ripple = USUAL_RIPPLE * level
@@ -245,9 +249,10 @@ def fit_permittivity(
 
 
 def measure_ripple(step: _Step, level: Array) -> Array:
-    """Ripple of the misses [n], what noise does not explain of them, in proportion to the `level` [n] of H.
+    """Ripple of the misses [n], what noise does not explain of them, in proportion to `level` [n], as in the fit.
 
-    It is slow: the few blocks of a small segment do not show how far it moves their mean. Points count as in the fit.
+    It may be as long as a small segment, whose few blocks do not show how far it moves their mean. Points count as in
+    the fit.
     """
     excess = step.weights @ (np.abs(step.miss) ** 2 - 2 * step.noise**2) / (step.weights @ level**2)
     return level * np.sqrt(max(0.0, float(excess)))
@@ -263,6 +268,7 @@ def _compute_covariance_of_scatter(
     The 95 % region of few blocks is wider than that of a known covariance, by Fisher's distribution.
     """
     measured_terms = (influence * miss).real.T
+    # Ripple may have any phase: its real and its imaginary part are separate errors.
     expected_terms = np.concatenate([influence.real * ripple, -influence.imag * ripple]).T / np.sqrt(2)
     measured, blocks = _sum_over_blocks(measured_terms, influence, at_m, BLOCK_M)
     parts = np.split(expected_terms, 2, axis=1)
@@ -280,7 +286,8 @@ def _compute_covariance_of_scatter(
 def _sum_over_blocks(terms: Array, influence: Complex, at_m: Array, block_m: float) -> tuple[Array, float]:
     """Covariance [2, 2] of the sum of `terms` [n, 2] that are common to a block, and how many blocks count.
 
-    The mean over shifted blocks weights two points by 1 - s on either axis, s their distance over the side of a block.
+    The mean over shifted blocks weights pairs of points, on average, by 1 - s on either axis, with s their distance
+    over the side of a block.
     """
     covariance = np.zeros((2, 2))
     blocks = 0.0
@@ -296,7 +303,7 @@ def _sum_over_blocks(terms: Array, influence: Complex, at_m: Array, block_m: flo
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard errors common to a scan: leakage (each part), axes of polarisation, places of the antennas (each).
+    """Standard errors common to a scan: leakage (each part), axes of polarisation, antennas' places (each coordinate).
 
     By default the leakage is that of a mount that was not measured, 0.058 in the root mean square; the other errors are
     chosen.
@@ -365,7 +372,7 @@ def add_common_errors(
     for scan in disturbed:
         add(scan.source, find_common_error(fit, miss, scan, wave_number))
 
-    # An error of ln(H / V) of the reference turns and scales b_H.
+    # An error of ln(H / V) of the reference turns and scales b_H; `list_errors` are real, [errors, n].
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
     reference_changes = (fit.answer * of_h) @ gains.list_errors(v.arrival).T
     flat_s, flat_p = reflect_flat(fit.eps, v.theta)
@@ -384,7 +391,8 @@ def add_common_errors(
 def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Complex:
     """Changes [2, n, 2, 4] of the coefficients by the slope of H's pattern, and of V's, over a finite path's angles.
 
-    A pattern weights the directions that a path L holds: r gets j / (k L) r' times its slope. Metal does not show it.
+    At a finite path L an echo is a sum over directions, which a pattern weights: r gets j / (k L) r' times the
+    pattern's slope, r' the derivative by the angle. Metal does not show it: its r is the same at all angles.
     """
     above = reflect_flat(eps, v.theta + ANGLE_STEP)
     below = reflect_flat(eps, v.theta - ANGLE_STEP)
@@ -413,7 +421,8 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
     Without path and spreading, a surface of one medium is equally strong everywhere. At the border of the zone that
     reflects half of that is left, and what an edge diffracts falls on from there. The usual level is the median
     weighted by power (`amplitude` [n] of H), for edges are seen from many more places than a small plate reflects to.
-    A segment without a level of its own, or with one that no medium has, is that of an edge alone.
+    A segment without a level of its own, or with one that no medium has, is that of an edge alone. Without `gains`
+    levels are not relative to metal, and the tolerance is larger.
     """
     level = np.log(np.maximum(np.abs(voltages.b[:, 0]), 1e-30))
     tolerance = LEVEL_TOLERANCE_WITHOUT_GAINS
@@ -438,7 +447,8 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
 def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, Array]) -> Array:
     """Return the share [n] of a disc about each point that its segment fills, in stage offsets `at_m` [n, 2].
 
-    `extent_m`: smallest and largest offset of the scan, [2] each: where it ends no surface does.
+    `extent_m`: smallest and largest offset of the scan, [2] each. Only what was scanned of a disc counts: the end of
+    the scan is no border of a surface.
     """
     filling = np.zeros(len(at_m))
     stride_m = np.array([_find_stride(column) for column in at_m.T])
@@ -480,7 +490,7 @@ def _find_stride(places_m: Array) -> float:
 def judge_medium(
     fit: PermittivityFit, v: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
 ) -> tuple[float, float]:
-    """Return what one medium does not explain: ln of the level of H over the expected, and the rise over the band.
+    """Return what one medium does not explain: ln of H's level over the expected, and the rise over the band (ln, too).
 
     A wall or a coating reflects twice: its level is that of no half space, or it changes over the band. The rise is
     that of H or of V, whichever is larger, less two standard deviations of its own. The level's square is given less
@@ -527,6 +537,7 @@ def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_numbe
     around = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)
     excess2 = np.array([fit.excess2[near].mean() for near in around])
     noise2 = np.sum((v.std / np.maximum(np.abs(v.b), 1e-30)) ** 2, axis=1)
+    # Change of b_H for a numerical derivative, in proportion; chosen.
     step = 1e-3
     changed = replace(v, b=v.b * np.array([1 + step, 1.0]))
     rate = (point_permittivity(changed, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step

@@ -78,10 +78,11 @@ class Samples:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Echoes [n]: stage offset `at_m` [n, 3], path, its gradient [n, 2] and curvature [n, 2, 2] (1 / m) there.
+    """Echoes [n]: stage offset `at_m` [n, 3], metres, and there the path, its derivatives `slope` [n, 2] and `bend`.
 
+    `bend` [n, 2, 2] is the curvature of the path over the stage offset, 1 / m, not that of the surface.
     `amplitude`: complex, with the path's phase exp(-j k path) at the middle of the band in it. `amplitude_std`: of its
-    real and of its imaginary part. `path_std_m`, `slope_std` [n, 2]: by the rest of the fit. `share`: of a window's
+    real and of its imaginary part. `path_std_m`, `slope_std` [n, 2]: by the residual of the fit. `share`: of a window's
     power, less that of its other echoes, that the echo explains. `band_rise`: ln of the amplitude in the upper half of
     the band over that in the lower half.
     """
@@ -163,7 +164,7 @@ class BoardFit:
         # The effect on echoes in the middle of the range gate, averaged over paths.
         if board.model is None:
             model = np.eye(self.omega.size)
-            # Any paths: without a model all weights are 1.
+            # Any paths: without a model the effect is 1 at all. 24 of them are enough for a mean (chosen).
             gate = np.linspace(0.05, 0.6, 24)
         else:
             model = board.model
@@ -200,7 +201,7 @@ def _find_gate(board: Samples) -> tuple[float, float]:
 
 
 def find_mirror_path(board: Samples, z_m: float) -> float:
-    """Return the path from TX over a level mirror at the height `z_m` to the middle of the RX, metres."""
+    """Return the path from TX over a mirror in the plane z = `z_m` of the rig frame to the middle of the RX, metres."""
     image = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
     return float(np.linalg.norm(board.middle_m - image))
 
@@ -280,13 +281,13 @@ def maximise(
     plane = weighted[:, :, :3]
     matrix = np.einsum("wnp,wnq->wpq", plane, basis[:, :, :3]) + 1e-12 * np.eye(3)
     plane_inverse = np.linalg.inv(matrix)
-    flat = np.einsum("wpq,wnq,wn->wp", plane_inverse, plane, sums, optimize=True)
-    residual = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], flat)) * valid
+    plane_terms = np.einsum("wpq,wnq,wn->wp", plane_inverse, plane, sums, optimize=True)
+    residual = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], plane_terms)) * valid
     # Less six values and the plane's three.
     power = (np.abs(residual) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
     # Variance of the mean's real part, and of its imaginary part.
     noise = power / count / 2
-    amplitude = flat[:, 0] / fit.gain
+    amplitude = plane_terms[:, 0] / fit.gain
     inverse = np.linalg.inv(scaled)
     spread = np.einsum("wpp->wp", inverse) / scale**2
     std = np.sqrt(spread * (noise / np.maximum(np.abs(amplitude) ** 2, 1e-30))[:, None])
@@ -308,8 +309,8 @@ def maximise(
 def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
     """Return the echoes of the maxima in windows."""
     path, slope, bend = unpack_values(maximum.values)
-    # The matched filter's phase is that at the weighted middle of the band, where samples turn as exp(+j k path);
-    # echoes have the other sign.
+    # The matched filter has taken exp(+j k path) out of the samples. It is put back at the weighted middle of the band,
+    # where an error of the path does not matter; echoes have the other sign.
     turned = maximum.amplitude * np.exp(1j * fit.middle * path)
     return Echoes(
         at_m=windows.at_m,

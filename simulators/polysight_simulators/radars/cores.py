@@ -47,7 +47,8 @@ def ones_sum(head: bytes) -> int:
 def frame(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
     """Encode a message with a CRC of 32 (`wide`) or 16 bits (ICD 2.3); the latter has its acknowledgement bits set.
 
-    `kind`: such as RESPONSE; `number`: message id; `body`: `count` encoded sub-blocks.
+    `direction`: code of sender and receiver, four bits; `kind`: such as RESPONSE; `number`: message id; `body`: `count`
+    encoded sub-blocks; `sequence`: the host's number of the command, four bits.
     """
     flags = sequence << 12 | 0xC
     crc_bytes = 2
@@ -75,7 +76,10 @@ _RF_AT = 0x880
 
 
 def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
-    """Make an image of `size` bytes from which a simulated board boots."""
+    """Make an image of `size` bytes from which a simulated board boots, with the versions above.
+
+    The four words between `MSTR` and the length mean nothing here.
+    """
     filler = bytes(n * 7 % 251 for n in range(size - 4))
     image = bytearray(filler)
     image[:0x80] = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4).ljust(0x5C, b"\0") + b"MEND".ljust(
@@ -159,7 +163,8 @@ RESTORE = 0x008B
 # Calibration data come in three parts.
 CHUNK_BYTES = 224
 CHUNKS = 3
-# Number of data bytes of each sub-block.
+# Number of data bytes of each sub-block. Numbers without a name are settings that are only stored, and in
+# docs/spec/mmwavelink.md: 0x0080 channels, 0x0082 ADC output, 0x4041 data format, 0x40C0 frame of the interface.
 SIZES = {
     0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, INIT_RF: 0,
     PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, READ_PROFILE: 4, READ_CHIRP: 4, READ_FRAME: 0,
@@ -169,7 +174,9 @@ SIZES = {
     0x4044: 4, 0x4045: 4, 0x4046: 4, SET_EVENT_CHECKSUM: 12, 0x40C0: 8, READ_MAIN_VERSION: 0,
 }  # fmt: skip
 # Commands without which frames do not start.
-_BEFORE_FRAMES = (0x0080, 0x0082, 0x0086, INIT_RF, PROFILE, CHIRP, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045)
+_BEFORE_FRAMES = (
+    0x0080, 0x0082, 0x0086, INIT_RF, PROFILE, CHIRP, FRAME, 0x4041, 0x4042, 0x4043, 0x4044, 0x4045, 0x40C0,
+)  # fmt: skip
 # Commands that are accepted before the RF power-up.
 _WITHOUT_RF = (DOWNLOAD, SET_EVENT_CHECKSUM, POWER_UP_RF, READ_MAIN_VERSION)
 
@@ -235,6 +242,7 @@ class Cores:
     def forget(self) -> None:
         """Reset: clear RAM and settings, keep the flash."""
         self.ram = b""
+        # The flash's image from which the main core booted; empty: from ROM alone.
         self._booted = b""
         self.main_up = False
         self.rf_up = False
@@ -242,7 +250,7 @@ class Cores:
         self.crc32_events = False
         # Negative: without end.
         self.frames_left = 0
-        # Frames are started and wait for SYNC_IN.
+        # Frames are started and wait for SYNC_IN, or run without end by a software trigger.
         self.armed = False
         # When the frame in progress ends, by the clock `now`.
         self.frame_ends = -1.0
@@ -251,7 +259,7 @@ class Cores:
         # Parts of calibration data that came so far, by their number.
         self._restored: dict[int, bytes] = {}
         # Content of the download so far.
-        self._part = b""
+        self._received = b""
         for table in (self.settings, self.profiles, self.chirps):
             table.clear()
 
@@ -306,8 +314,9 @@ class Cores:
             self.crc32_events = data[0] == 1
         elif number == POWER_UP_RF:
             # A first-generation board without a patch never reports the power-up, as observed.
-            if self._read_patch() or not self.first_generation:
+            if self._choose_image() or not self.first_generation:
                 self.rf_up = True
+                # Self-tests, and the duration of the power-up; chosen.
                 self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
         elif number == INIT_RF:
             self.calibrated = True
@@ -316,17 +325,19 @@ class Cores:
             self.destroyed = True
         elif number in (READ_RF_VERSION, READ_MAIN_VERSION):
             rom = self.main_rom if number == READ_MAIN_VERSION else self.rf_rom
+            # Three bytes of the hardware (chosen), the ROM's version, and its date as in _ROM.
             return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == READ_MAIN_VERSION)
         elif number == READ_DIE:
             if not self.die:
                 return bytes(32)
+            # Any words: only that they differ from board to board counts.
             return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
         elif number == READ_TEMPERATURES:
             # Device time in ms, then degrees Celsius of ten sensors; chosen.
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
         return b""
 
-    def _read_patch(self) -> bytes:
+    def _choose_image(self) -> bytes:
         """Return the image that the cores run: the downloaded one, else the flash's; b"" without."""
         if self.ram and not boot_errors(self.ram):
             return self.ram
@@ -334,7 +345,7 @@ class Cores:
 
     def _patch(self, main: bool) -> bytes:
         """Return the patch version of a core as in a version answer; zeros without a patch."""
-        image = self._read_patch()
+        image = self._choose_image()
         if image:
             return encode_patch_version(image, main)
         return bytes(6)
@@ -398,7 +409,7 @@ class Cores:
         return 0, b""
 
     def _start_or_stop(self, what: int) -> int:
-        """Start (1) or stop frames (0; 4: at once); return 0, or 21: not started, 23: another number."""
+        """Start (1) or stop frames (0; 4: at once); return 0, or 21: not started, 23: another number; see `_start`."""
         if what == 1:
             return self._start()
         if what not in (0, 4):
@@ -419,7 +430,7 @@ class Cores:
         """
         if self.armed:
             return 20
-        if not self.calibrated or any(n not in self.settings for n in (*_BEFORE_FRAMES, FRAME, 0x40C0)):
+        if not self.calibrated or any(n not in self.settings for n in _BEFORE_FRAMES):
             return 22
         _, _, _, _, frames, _, period, trigger = struct.unpack_from("<6HIH", self.settings[FRAME])
         self.frames_left = frames or -1
@@ -443,9 +454,9 @@ class Cores:
     def _download(self, data: bytes, remaining: int) -> tuple[int, bytes, float]:
         """Store a part of a file (ICD 5.18.1); return error number, answer, and extra delay in s.
 
-        A file of type 0 goes to RAM and boots when it is complete; the first part of another one erases the flash,
-        whose content is checked only at boot. `remaining`: how many parts follow. Errors: 7, the length is not the one
-        announced; 8, unknown type of file.
+        A file of type 0 goes to RAM and boots when it is complete; the first part of another one (4 to 7) erases the
+        flash, whose content is checked only at boot. `remaining`: how many parts follow. Errors: 7, the length is not
+        the one announced; 8, unknown type of file.
         """
         if not self.main_up:
             return WRONG_STATE, b"", 0.0
@@ -455,16 +466,16 @@ class Cores:
             if kind not in (0, 4, 5, 6, 7):
                 return 8, b"", 0.0
             self._file = (kind, length)
-            self._part = b""
+            self._received = b""
             data = data[8:]
             if kind:
                 self.flash = b""
             if self.fault_at == "download":
                 self.event(MAIN_FAULT, FAULT_DATA, 0.0)
         kind, missing = self._file
-        self._part += data
+        self._received += data
         if kind:
-            self.flash = self._part
+            self.flash = self._received
         missing -= len(data)
         self._file = (kind, missing)
         if (missing <= 0) != (remaining == 0) or missing < 0:
@@ -479,5 +490,5 @@ class Cores:
 
     def _boot_from_ram(self) -> None:
         """Take the download as the image in RAM, and report its boot."""
-        self.ram = self._part
+        self.ram = self._received
         self.event(BOOTED, struct.pack("<IQQ", POWER_UP_TIME, boot_errors(self.ram), 0), BOOT_S)

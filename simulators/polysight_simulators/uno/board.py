@@ -1,6 +1,6 @@
 """The emulated board in lockstep with a Python program: time advances only by command.
 
-Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` lists the packages needed.
+Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` lists missing packages.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PinEdge(NamedTuple):
     # Number of the pin on the Arduino; A0 is 14.
     pin: int
     value: int
-    # Motor steps, counted at the pins from where the stage stood when it was switched on.
+    # Positions of the motors: steps from the limit switches, counted at the pins.
     x: int
     left: int
     right: int
@@ -44,9 +44,12 @@ class PinEdge(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Worst cases since the last call of :meth:`EmulatedUno.cost`, in cycles."""
+    """Worst cases in cycles: of interrupts since the last call of :meth:`EmulatedUno.cost`, of pulses since power-on.
 
-    # Cycles from entry to the end of reti, by vector number.
+    Before the first pulse, the latter are the largest number of 64 bits.
+    """
+
+    # Cycles from entry to the end of reti, by vector number; those that did not occur are left out.
     interrupts: dict[int, int]
     # Shortest width of a step pulse.
     step_pulse: int
@@ -66,7 +69,7 @@ class EmulatedUno:
     start
         Position at power-on: steps from the switches.
     watch
-        Pins whose edges are stored in `edges`.
+        Pins whose edges are stored in `edges`; 2 is the trigger.
     pty
         Path of a pseudo terminal to make for the serial line; None: use :meth:`feed` and `received`.
     """
@@ -98,8 +101,9 @@ class EmulatedUno:
     def _collect(self) -> None:
         """Read the emulator's lines up to the end of an answer, and update the attributes. Raises DeviceError.
 
-        The first letter of a line: E edge, T byte sent by the board, C cost of an interrupt, W widths and times of
-        motor pulses, X trouble, and R, the last one: cycle, motors, and bytes sent to the pseudo terminal.
+        A line has a letter and numbers. E: an edge, as `PinEdge`. T: cycle, and byte sent by the board (hexadecimal).
+        C: vector, count and longest time of an interrupt. W: widths and times of motor pulses. X: cycle and trouble. R,
+        the last one: cycle, motors, and bytes sent to the pseudo terminal.
         """
         output = self._process.stdout
         if output is None:
@@ -144,11 +148,14 @@ class EmulatedUno:
         self.run(round(ms * HZ / 1000))
 
     def settle(self, pty_bytes: int = 0) -> None:
-        """Run until the serial line is idle; `pty_bytes`: total number written to the pseudo terminal."""
+        """Run until the serial line was idle for 4 ms, or 2 s beyond what it has to send.
+
+        `pty_bytes`: total number of bytes that were written to the pseudo terminal, which are waited for first.
+        """
         self._apply_action(f"settle {pty_bytes}")
 
     def rest(self, limit_s: float = 600.0) -> None:
-        """Run until no motor has stepped for 50 ms, or `limit_s` has passed on the board."""
+        """Run until no motor has stepped for 50 ms and the serial line is idle, at most `limit_s` by its clock."""
         self._apply_action(f"rest {round(limit_s * HZ)}")
 
     def press(self, mask: int) -> None:
@@ -172,7 +179,7 @@ class EmulatedUno:
         self._apply_action("watch " + ",".join(map(str, pins)))
 
     def cost(self) -> Cost:
-        """Return the worst cases since the last call."""
+        """Return the worst cases, and begin anew with those of interrupts."""
         self._counted = {}
         self._apply_action("cost")
         return Cost(self._counted, *self._cost_pins)

@@ -138,8 +138,8 @@ def map_scan(scan: ProcessedScan, channel: str, quantity: str) -> MapValues:
 def _find_ratio_limits_db(level: Real, is_opaque: Mask, patches_db: Sequence[float]) -> Limits:
     """Return the range of |P| in whole dB: that of the patches if there are any, else of the opaque pixels.
 
-    It has a decibel to spare at both ends, and begins below metal's 0 dB, over which |P| of surfaces lies; if all values
-    are far below, 0 dB is beyond its upper end.
+    It has a decibel to spare at both ends, and begins below metal's 0 dB, over which |P| of surfaces lies; if all
+    values are far below, 0 dB is beyond its upper end.
     """
     if patches_db:
         low = min(patches_db)

@@ -7,6 +7,7 @@ import hmac
 import json
 import re
 import socket
+import sys
 import threading
 from contextlib import suppress
 from typing import get_args
@@ -21,7 +22,7 @@ from tests.support.processes import HANG_S, wait_for
 from polysight.acquisition.control import ScanCommand
 from polysight.cli.main import build_parser
 from polysight.serve.commands import Format
-from polysight.serve.front import STATIC, EndingServer
+from polysight.serve.front import BACKLOG, STATIC, EndingServer
 from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight.serve.server import ELSEWHERE, Place, describe_server, draw_code, find_addresses, make_access
 from polysight_shared.error_codes import ErrorCode
@@ -131,6 +132,29 @@ def test_connections_end_with_their_server(request_head):
         # Whatever is still open is told as a ResourceWarning, which fails the test.
         gc.collect()
         assert not server.server_state.connections
+
+
+def read_queue_length(listener: socket.socket) -> int:
+    """Return how many connections the kernel queues for a listening socket: struct tcp_info, tcpi_sacked."""
+    return int.from_bytes(listener.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 32)[28:32], sys.byteorder)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="struct tcp_info is Linux's")
+def test_connections_wait_in_a_long_queue():
+    async def ignore(_scope, _receive, _send):
+        """Requests do not come."""
+
+    with socket.create_server(("127.0.0.1", 0), backlog=BACKLOG) as listener:
+        # At most what the kernel allows, net.core.somaxconn.
+        longest = read_queue_length(listener)
+        server = EndingServer(uvicorn.Config(ignore, lifespan="off", log_config=None, backlog=100))
+        thread = threading.Thread(target=server.run, args=([listener],))
+        thread.start()
+        wait_for(lambda: server.started, "the server serves")
+        length = read_queue_length(listener)
+        server.should_exit = True
+        thread.join(HANG_S)
+    assert length == longest > 100
 
 
 def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:

@@ -40,6 +40,8 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
 STATIC = Path(__file__).parent / "static"
+# Connections in the kernel's queue. A client that finds the queue full tries again after 1 s, and after 2 s more.
+BACKLOG = 4096
 # Name of a page's content and script, title, and style sheet.
 PAGES = {
     "/": ("catalogue", "Scans · polysight", "catalogue"),
@@ -485,7 +487,14 @@ class CountedConnection(H11Protocol):
 
 
 class EndingServer(uvicorn.Server):
-    """A server whose connections end with it, whatever their clients read or send."""
+    """A server whose connections end with it, whatever their clients read or send, and wait in a queue of `BACKLOG`."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to accept connections from `sockets`."""
+        await super().startup(sockets)
+        # asyncio takes one number for the connections that it accepts in a round and for the kernel's queue.
+        for listener in sockets or ():
+            listener.listen(BACKLOG)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Close connections as uvicorn does, and abort those that are open after its time for that."""

@@ -37,7 +37,15 @@ from polysight.catalogue import Scans
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
 from polysight.serve.door import PagesServer, close_after_each, open_door
-from polysight.serve.front import EndingServer, Front, Reader, make_app, make_command_app, make_counting_protocol
+from polysight.serve.front import (
+    BACKLOG,
+    EndingServer,
+    Front,
+    Reader,
+    make_app,
+    make_command_app,
+    make_counting_protocol,
+)
 from polysight.serve.guard import HANDLERS, HEAD_BYTES, Access
 from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
@@ -53,8 +61,6 @@ NICE = 10
 MAX_CONNECTIONS = 2048
 # Connections that the event loop accepts in one round, before it reads from those that it has; chosen.
 ACCEPTED_AT_ONCE = 128
-# Connections in the kernel's queue. A client that finds the queue full tries again after 1 s, and after 2 s more.
-BACKLOG = 4096
 # Idle connections are closed when there are too many, never for their age.
 KEEP_ALIVE_S = 10**6
 # Time that open connections have to end when the server stops; chosen.

@@ -2,11 +2,13 @@
 
 SOURCE.json names a scan folder (`scan`), or rows that are repeated to a grid: `files` has the paths of each board's
 recorded rows by its name, `grid` the keys of the scene's grid that differ (`published_scene`). HOW is "batch", or
-"live" as beside a running scan, with the images updated by every row. Every line on the standard input processes all of
-it once, from reading to the images of H and V, and is answered by one line of JSON.
+"live" as beside a running scan, with the images updated by every row. For every line on the standard input all of it is
+processed once, from reading to the images of H and V, then the last row a few times more; the answer is one line of
+JSON (:func:`process`).
 
-The rig's publication has a processing method of its own, to which other benchmarks compare. Nothing of it is imported
-here: SciPy's signal and statistics, which it needs, would count 45 MB as memory of the instrument.
+The rig's publication has a processing method of its own (`benchmarks/published.py`), to which other benchmarks compare.
+Nothing of it is imported here: SciPy's signal and statistics, which it needs, would count 45 MB as memory of the
+instrument.
 """
 
 from __future__ import annotations
@@ -21,18 +23,19 @@ from benchmarks.measure import AnonymousMemory, Child, Seconds
 from polysight.pipeline import Pipeline
 from polysight.store import ScanFolder
 
-# How often the last row is added again, to time it; chosen.
+# How often the last row is added again after the whole scan, to time it; chosen.
 LAST_ROWS = 5
 
 
 def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
-    """Process once.
+    """Process the whole scan once, then its last row `LAST_ROWS` times more.
 
     Returns
     -------
-    Number of `rows`; CPU and wall seconds in all (`cpu_s`, `wall_s`); CPU seconds of the steps done once, before the
-    first row and after the last (`once_cpu_s`); seconds from the last committed row to both images, again and again
-    (`last_row_wall_s`, `last_row_cpu_s`); wall seconds by stage (`stages`).
+    Number of `rows`; CPU and wall seconds of the whole scan (`cpu_s`, `wall_s`); CPU seconds of the steps done once,
+    before the first row and after the last (`once_cpu_s`); seconds of each repeat from the last row to both images
+    (`last_row_wall_s`, `last_row_cpu_s`, lists); wall seconds of each stage of the whole scan, without the repeats
+    (`stages`).
     """
     if "scan" in source:
         scan = ScanFolder.load(Path(source["scan"]))
@@ -54,6 +57,7 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
     for _ in range(LAST_ROWS):
         with last.time_block():
             pipeline.add_row(rows[-1])
+            # A live scan's images come from its running sums.
             pipeline.form_images(from_sums=live)
     return {
         "rows": len(rows),
@@ -67,7 +71,10 @@ def process(source: dict[str, Any], live: bool) -> dict[str, Any]:
 
 
 class Chain(Child):
-    """Such a process for a SOURCE, whose memory is watched. SOURCE.json is written into `folder`; `how` is HOW."""
+    """The process of this module, started for a source and watched for its memory.
+
+    `source` is written as SOURCE.json into `folder`; `how` is HOW.
+    """
 
     def __init__(self, folder: Path, how: str, source: dict[str, Any]) -> None:
         path = folder / "source.json"
@@ -87,7 +94,7 @@ class Chain(Child):
 
 
 def main(argv: list[str]) -> int:
-    """Answer lines of the standard input until it ends."""
+    """Process the source for each line of the standard input, until it ends, and print the figures as a line."""
     source = json.loads(Path(argv[1]).read_text(encoding="utf-8"))
     for _ in sys.stdin:
         sys.stdout.write(json.dumps(process(source, live=argv[2] == "live")) + "\n")

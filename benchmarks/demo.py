@@ -1,4 +1,4 @@
-"""CPU of the demo's scan, for each row and kind of process (host, receivers, Pi, simulators), and of `process`."""
+"""CPU seconds of the demo's scan, mean per row by kind of process (host, Pi, ...), and of `process`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["add_arguments", "run"]
 _POLL_S = 0.05
 # How often the scan is processed; chosen.
 REPEATS = 3
-# Kind of a process by a part of its command line; the first part that occurs decides.
+# Kind of a process by a part of its command line; the first part that occurs decides. Without any it is the host.
 KINDS = {
     "receiver_process": "receivers",
     "polysight_pi": "Pi",
@@ -33,13 +33,13 @@ QUICK = ROOT / "examples" / "own-scene.toml"
 
 def run(args: argparse.Namespace) -> int:
     """Scan and process the demo; print CPU seconds beside limits (chosen)."""
-    # Not in `args.folder`: paths of the rig's sockets must be short.
+    # Not in `args.folder`, which is not used here: paths of the rig's sockets must be short.
     with temporary(None) as folder:
         scene = ROOT / "examples" / "demo.toml"
         if args.quick:
             scene = QUICK
         rows, by_kind = scan_cpu_s(folder / "demo", scene)
-        # CPU seconds of each run
+        # CPU seconds of each run.
         processed = [
             command(["process", str(folder / "demo" / "scan"), "--out", str(folder / f"products{n}")])[0]
             for n in range(count_repeats(args.quick, REPEATS))
@@ -59,14 +59,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
-    """Run the demo; return the rows between the first commit and the last, and CPU seconds of each kind meanwhile.
+    """Run the demo; return the rows between the first commit seen and the last, and CPU seconds of each kind meanwhile.
 
-    The fields at the radars, which the simulator computes before the first row, and the products are not counted.
-    Raises RuntimeError if the demo fails, or no two commits were seen.
+    The fields at the radars, which the simulator computes before the first row, and the products are not counted, nor
+    are processes that ended before the last commit. Raises RuntimeError if the demo fails, or no two commits were seen.
     """
     words = [sys.executable, "-m", "polysight", "demo", "--scene", str(scene), "--out", str(out)]
     demo = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL)
-    # (Number of commits, CPU seconds of each process then) at the first and at the newest commit.
+    # Number of commits, and kind and CPU seconds of each process at that time: at the first commit seen and the newest.
     first = None
     last = None
     while demo.poll() is None:
@@ -84,7 +84,7 @@ def scan_cpu_s(out: Path, scene: Path) -> tuple[int, dict[str, float]]:
 
 
 def _count_commits(manifest: Path) -> int:
-    """Return the number of rows that a scan's manifest holds; 0 without the file."""
+    """Return the number of commits of rows in a scan's manifest (a row committed again counts again); 0 without it."""
     if not manifest.exists():
         return 0
     return manifest.read_text(encoding="utf-8").count('"row_committed"')
@@ -100,8 +100,8 @@ def _measure_cpu_of_tree(root: int) -> dict[int, tuple[str, float]]:
             above = parents.get(above, 0)
         if above == root:
             try:
-                words = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").replace("-", "_")
-                tree[pid] = next((name for part, name in KINDS.items() if part in words), "host"), cpu_s(pid)
+                line = Path(f"/proc/{pid}/cmdline").read_text(encoding="utf-8", errors="replace").replace("-", "_")
+                tree[pid] = next((name for part, name in KINDS.items() if part in line), "host"), cpu_s(pid)
             except (FileNotFoundError, ProcessLookupError):
                 continue
     return tree

@@ -1,10 +1,11 @@
-"""The published rig's own picture: patches, permittivities, names and verdict, in every form it can be given.
+"""The published rig's own picture: patches, permittivities, names and verdict, for each form of the input.
 
 The picture is no part of the repository: `--images DIR` or POLYSIGHT_PUBLISHED_IMAGES names its folder, with
-`<name>.npz` (h, v) and `<name>.json` (`boxes_px`). It is processed as `.npz` and as the published `labels/<scan>`, with
-its boxes and without. Table 2 of the POLySIGHT paper stands beside the figures; the incidence angle, which is not
-given, is 55 degrees. With `--table-2` the library is Table 2 as half spaces, all of it or the materials of these plates
-alone, and the names by a posterior of ten lines stand beside ours (`weigh_ratio_alone`).
+`<name>.npz` (h, v) and `<name>.json` (`boxes_px`); of several the first is taken. It is processed as `.npz` and as the
+published `labels/<scan>`, with its boxes and without. Table 2 of the POLySIGHT paper (permittivities of its plates)
+stands beside the figures; the incidence angle, which is not given, is assumed to be 55 degrees. With `--table-2` the
+library is Table 2 as half spaces, all of it or the materials of these plates alone, and the names by a posterior of
+ten lines stand beside ours (`weigh_ratio_alone`).
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ TABLE_2 = {
     "PCB": ("glass fiber", 4.69, 0.70),
     "wood_thin": ("wood (thin, smooth)", 2.61, 0.01),
 }
-"""Box to the paper's name, real part and loss."""
+"""Name of a box to the material's name in the paper, eps' and loss eps''."""
 WORLD_NAMES = {
     "rubber": "rubber",
     "cardboard_rough": "cardboard_rough",
@@ -51,13 +52,13 @@ WORLD_NAMES = {
     "PCB": "glass_fibre",
     "wood_thin": "wood_thin",
 }
-"""Box to the name in Table 2 of the independent generator (`benchmarks.worlds`)."""
+"""Name of a box to the name in Table 2 of the independent generator (`benchmarks.worlds`)."""
 # Box of the metal reference.
 METAL_BOX = "copper"
 RATIO_STD = 0.08
 PHASE_STD_RAD = np.radians(10)
 MOST_STDS = 3.0
-"""Standard deviations of ln |P| and of its phase in the short posterior; "unknown" weighs as much as a material that is
+"""Standard deviations of ln |P| and of its phase (`weigh_ratio_alone`); "unknown" weighs as much as a material that is
 `MOST_STDS` of them away. All chosen."""
 # Probability from which a wrong name counts as sure and wrong; chosen.
 SURE = 0.8
@@ -79,7 +80,7 @@ def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> lis
     with np.load(source) as arrays:
         h = arrays["h"]
         v = arrays["v"]
-    out = []
+    forms = []
     for with_boxes in (True, False):
         kind = "without boxes"
         if with_boxes:
@@ -93,14 +94,18 @@ def write_forms(source: Path, boxes: dict[str, list[int]], scratch: Path) -> lis
         # The picture is taken to be square, with pixels of 2 mm; its row 0 is the top.
         top_first = np.arange(h.shape[0])[::-1] * 2e-3
         archive = scratch / f"{folder.name}.npz"
-        # The published imaging code makes conjugate images (`restore_phase_sign`); the folders' reader knows that.
+        # The published imaging code makes conjugate images (materials' `restore_phase_sign`): the .npz says so, and the
+        # reader of `labels/` folders expects it.
         np.savez(archive, h=h, v=v, x_m=top_first[::-1], y_m=top_first, conjugate=True)
-        out += [Form(f".npz {kind}", archive, with_boxes), Form(f"labels/ {kind}", folder, with_boxes)]
-    return out
+        forms += [Form(f".npz {kind}", archive, with_boxes), Form(f"labels/ {kind}", folder, with_boxes)]
+    return forms
 
 
 def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tuple[ProcessedScan, dict[str, int]]:
-    """Process one form; return the result, and the number of the patch that covers most of each box (0: none)."""
+    """Process one form; return the result, and for each box the number of the patch that covers most pixels of it.
+
+    The number is 0 if all patches together cover no more than half of the box.
+    """
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     pair = read_given_images(form.path, rig)
     drawn = None
@@ -123,7 +128,7 @@ def process(form: Form, boxes: dict[str, list[int]], library: Path | None) -> tu
 
 @dataclass(frozen=True)
 class PlateFigures:
-    """One plate beside Table 2."""
+    """Result of one plate, compared with Table 2."""
 
     # Its line of the printed table.
     text: str
@@ -131,13 +136,14 @@ class PlateFigures:
     inside: bool = False
     # True if the name is right.
     right: bool = False
+    # True for a wrong material whose confidence is at least `SURE`.
     sure_and_wrong: bool = False
     # Relative half width of the real part's 95 % interval; None without a permittivity.
     half_width: float | None = None
 
 
 def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
-    """Compare a plate with Table 2."""
+    """Compare a plate with Table 2; `patch` is None if none was found in its box."""
     name, real, loss = TABLE_2[box]
     if patch is None:
         return PlateFigures(f"  {box:16} not found")
@@ -164,7 +170,7 @@ def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
 
 
 def table_2_library(extent: str) -> Library:
-    """Return a library of the paper's Table 2 as half spaces under the picture's angle: "all" or the "plates" only."""
+    """Return a library of the paper's Table 2 as half spaces under the picture's angle: "all" or these "plates"."""
     library = table_2_classifier(float(np.radians(ANGLE_DEG))).library
     paper_names = {world_name: TABLE_2[box][0] for box, world_name in WORLD_NAMES.items()}
     entries = []
@@ -190,10 +196,10 @@ def measure_ratios(source: Path, boxes: dict[str, list[int]]) -> dict[str, compl
 
 
 def weigh_ratio_alone(ratio: complex, library: Library) -> dict[str, float]:
-    """Return the probabilities of the library's materials by |P| and the size of its phase alone, and of "unknown".
+    """Return the probabilities of the library's materials and of "unknown", by |P| and the size of its phase alone.
 
-    All materials are as likely, and losses are absolute values as in the published table. It is the measure of what the
-    whole analysis has to be better than.
+    Copper is left out. All other materials are as likely, and losses are absolute values as in the published table. The
+    whole analysis has to be better than this.
     """
     weights = {"unknown": np.exp(-0.5 * MOST_STDS**2)}
     for entry in library.entries:
@@ -207,7 +213,7 @@ def weigh_ratio_alone(ratio: complex, library: Library) -> dict[str, float]:
 
 
 def print_names_of_ratio_alone(ratios: dict[str, complex], library: Library) -> None:
-    """Print the name that the short posterior gives each plate, and how many are right."""
+    """Print the likeliest name of each plate by `weigh_ratio_alone`, and how many are right."""
     names = []
     right_count = 0
     for box, (true_name, _, _) in TABLE_2.items():
@@ -234,7 +240,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print a table for each form; without the picture print that one benchmark is skipped. Return 0."""
+    """Print figures and a table for each form; without the picture print that one benchmark is skipped. Return 0."""
     sources = []
     if args.images:
         sources = sorted(Path(args.images).glob("*.npz"))
@@ -256,10 +262,11 @@ def run(args: argparse.Namespace) -> int:
             plates = [judge_plate(box, by_number.get(patch_of[box])) for box in TABLE_2]
             widths = [plate.half_width for plate in plates if plate.half_width is not None]
             metal = by_number.get(patch_of[METAL_BOX])
+            # Patches that are not the main one of any box.
             extra = len(by_number) - len({n for n in patch_of.values() if n})
-            level = ""
+            verdict = ""
             if scan.verdict:
-                level = scan.verdict.text
+                verdict = scan.verdict.text
             reference = "NOT copper"
             if metal is not None and metal.metal_reference:
                 reference = "copper"
@@ -267,7 +274,7 @@ def run(args: argparse.Namespace) -> int:
                 "patches": len(by_number),
                 "not_plates": extra,
                 "reference": reference,
-                "verdict": level,
+                "verdict": verdict,
                 "regions_hold_table_2": sum(plate.inside for plate in plates),
                 "estimated": len(widths),
                 "median_half_width_percent": round(100 * float(np.median(widths)), 1) if widths else None,

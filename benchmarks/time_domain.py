@@ -1,8 +1,8 @@
 """The best plain time-domain sum beside the spectral imager: bistatic, compiled, single precision, vectorised by LLVM.
 
-Samples at a few frequencies become an oversampled range profile a position and RX (one FFT); every pixel reads every
-profile at its own excess path by linear interpolation and turns it back by its phase. The distance to the TX is
-shared by the RX of a position. Sine and cosine are polynomials, so that the loop over pixels has no calls in it.
+Samples at a few frequencies become an oversampled range profile per position and RX (one FFT); every pixel reads every
+profile at its own excess path (TX to pixel to RX, less the direct path from TX to RX) by linear interpolation and turns
+it back by its phase. Sine and cosine are polynomials, so that the innermost loop, over positions, has no calls in it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ BLOCK = 128
 
 @numba.njit(fastmath=True, error_model="numpy")
 def _sum(
-    real: NDArray[np.float32],  # profiles [rx, position * bin]
+    real: NDArray[np.float32],  # profiles [rx, position * bin], `bins` bins after one another for each position
     imag: NDArray[np.float32],
-    offset_x: NDArray[np.float32],  # [position]
+    offset_x: NDArray[np.float32],  # stage offset [position]
     offset_y: NDArray[np.float32],
     tx: NDArray[np.float32],  # [3]
     rx: NDArray[np.float32],  # [rx, 3]
-    direct: NDArray[np.float32],  # [rx]
-    x: NDArray[np.float32],
+    direct: NDArray[np.float32],  # direct path to each RX [rx]
+    x: NDArray[np.float32],  # pixels [x], [y], and their plane
     y: NDArray[np.float32],
     z: np.float32,
     bins: np.int32,
@@ -45,7 +45,8 @@ def _sum(
 ) -> None:
     """Add every position's profile, at each pixel's excess path and turned back by its phase, to the image.
 
-    The image has real and imaginary part. Lengths are metres; a profile begins at the excess path `first_m`.
+    The image has real and imaginary part. Lengths are metres. A profile begins at the excess path `first_m`, has `bins`
+    bins and `bins_per_m` per metre; the phase of an echo turns by `cycles_per_m` cycles per metre.
     """
     unit = np.float32(1)
     half = np.float32(0.5)
@@ -75,7 +76,8 @@ def _sum(
                         re = real_part[k] + w * (real_part[k + np.uint64(1)] - real_part[k])
                         im = imaginary_part[k] + w * (imaginary_part[k + np.uint64(1)] - imaginary_part[k])
                         turns = -d * cycles_per_m
-                        # Half the angle, -pi/2..pi/2, where the series of sine (s) and cosine (c) are short.
+                        # Half the angle, -pi/2..pi/2, where the Taylor series of sine (s, to a^9) and cosine (c, to
+                        # a^8) are good to 3e-5.
                         a = (turns - np.floor(turns + half)) * pi
                         q = a * a
                         s = np.float32(-1 / 5040) + q * np.float32(1 / 362880)
@@ -104,11 +106,11 @@ def form_image(
     samples
         complex64 [rx, position, frequency], phase +2 pi f d / c.
     frequencies_hz
-        float64 [frequency], evenly spaced.
+        float64 [frequency], evenly spaced, at least two.
     offsets_m
         float64 [position, 2], stage offset (x, y).
     antennas, grid
-        Geometry.
+        Geometry; the pixels lie on a level plane (`grid.z_m` is one number).
 
     Returns
     -------
@@ -116,13 +118,15 @@ def form_image(
     """
     step_hz = float(frequencies_hz[1] - frequencies_hz[0])
     size = OVERSAMPLING * frequencies_hz.size
-    # Shortest and longest path, on 33 x 33 lags (chosen); linear interpolation needs the bins at and behind both.
+    # Shortest and longest excess path, on a grid of 33 x 33 differences of pixel and position (chosen).
     corners = np.array([offsets_m.min(axis=0), offsets_m.max(axis=0)])
     dx = np.linspace(grid.x_m[0] - corners[1, 0], grid.x_m[-1] - corners[0, 0], 33)
     dy = np.linspace(grid.y_m[0] - corners[1, 1], grid.y_m[-1] - corners[0, 1], 33)
     reach = antennas.excess_m(dx[None, :], dy[:, None], grid.z_m)
     middle_hz = frequencies_hz[len(frequencies_hz) // 2]
-    # Profile around the middle frequency, from the gate's first path on: exp(-j 2 pi (f - middle) d / c) summed.
+    # Profile at excess paths d from the shortest on: samples times exp(-j 2 pi (f - middle) d / c), summed over f. It
+    # repeats itself after `period_m`. Three bins more, for rounding and for the bin behind that linear interpolation
+    # needs.
     period_m = SPEED_OF_LIGHT_M_S / step_hz
     bins = math.ceil((float(reach.max()) - float(reach.min())) / period_m * size) + 3
     first_bin = math.floor(float(reach.min()) / period_m * size)
@@ -158,16 +162,16 @@ def single(a: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def timed_image(aperture: Aperture, samples: NDArray[np.complex64], every: int) -> tuple[NDArray[np.complex64], float]:
-    """Form the image of every so many-th row of reduced samples [rx, frequency, row, column].
+    """Form the image of one row in `every` of reduced samples [rx, frequency, row, column].
 
-    Return it, and the CPU seconds that all rows would take.
-    The cost is positions times pixels, nothing else.
+    Return it, complex64 [ny, nx], and the CPU seconds that all rows would take: the cost is proportional to the number
+    of positions.
     """
     part = samples[:, :, ::every]
     rx, frequencies, *_ = part.shape
     flat = np.ascontiguousarray(part.reshape(rx, frequencies, -1).swapaxes(1, 2))
     offsets = aperture.offsets_m[::every].reshape(-1, 3)[:, :2]
-    # Two positions, to compile.
+    # Untimed, of two positions: the first call compiles.
     form_image(flat[:, :2], aperture.frequencies_hz, offsets[:2], aperture.antennas, aperture.grid)
     took = Seconds()
     with took.time_block():

@@ -20,19 +20,19 @@ HOST_KEYS = ("pi.key", "host.key_secret")
 PI_KEYS = ("pi.key_secret",)
 # First frame of every event; the second is the packed event.
 EVENT_TOPIC = b"event"
-# The Pi closes the connection of a subscriber after a longer message (chosen).
+# Longest message of a subscriber to the Pi (its topics); after a longer one the Pi closes its connection; chosen.
 MAX_SUBSCRIPTION_BYTES = 1024
 # A local network takes a command within this time, or there is no connection (chosen).
 SEND_TIMEOUT_MS = 200
 # A connection without a handshake is closed after this time; chosen.
 HANDSHAKE_TIMEOUT_MS = 5000
-# Bits of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
+# Bit masks of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
 COMMAND_IO_THREAD = 0b01
 EVENT_IO_THREAD = 0b10
 
 
 def host_name(address: str) -> str:
-    """Return the host of `tcp://host:port`. Raises ConfigError for another form."""
+    """Return the host of `tcp://host:port` (port `*`: any free one). Raises ConfigError for another form."""
     scheme, _, rest = address.partition("://")
     host, _, port = rest.rpartition(":")
     if scheme != "tcp" or not host or not (port == "*" or port.isdigit()):
@@ -59,8 +59,8 @@ def is_loopback(address: str) -> bool:
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
 
-    `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth. The server's `authenticator` decides which clients
-    are accepted.
+    `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth. Which clients the
+    server accepts is decided by the program that answers at its `authenticator`.
     """
     if is_loopback(address):
         return
@@ -97,7 +97,7 @@ def _make(
 ) -> Socket:
     """Create a socket of the ZeroMQ type `kind`, set its options and keys, and bind or connect it.
 
-    Raises ConfigError for a wrong address or without usable keys, DeviceError if it cannot be bound.
+    Raises ConfigError for a wrong address or without usable keys, DeviceError if ZeroMQ cannot bind or connect it.
     """
     host_name(address)
     socket: Socket = context.socket(kind)
@@ -147,10 +147,10 @@ def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 
 
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the Pi's ROUTER socket, bound, for REQ sockets; a longer message than MAX_COMMAND_BYTES closes its
-    connection.
+    """Create the Pi's ROUTER socket, bound, for REQ sockets. `context`: from `make_server_context`.
 
-    `context`: from `make_server_context`.
+    A longer message than MAX_COMMAND_BYTES closes its connection. Sending to a client that is gone raises zmq.ZMQError
+    (ROUTER_MANDATORY) instead of dropping the reply silently.
     """
     options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
     options |= {zmq.HANDSHAKE_IVL: HANDSHAKE_TIMEOUT_MS, zmq.AFFINITY: COMMAND_IO_THREAD}
@@ -176,14 +176,14 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that was
     stopped, or whose machine is gone. The host's own `subscriber` is rather kept: it must lose no events.
     """
-    # Times in ms: a heartbeat each second, and five seconds until the silent one is dropped; chosen.
+    # Times in ms: a heartbeat each second; after five seconds without one the Pi drops this subscriber. Chosen.
     options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}
     options |= {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TTL: 5000}
     return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
 
 
 def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
-    """Create the host's REQ socket, connected; relaxed, so that it can send again after a lost reply.
+    """Create the host's REQ socket, connected; relaxed (REQ_RELAXED): it may send again when a reply was lost.
 
     If the server refused the handshake, `send` raises zmq.Again after `SEND_TIMEOUT_MS`.
     """
@@ -192,7 +192,10 @@ def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 
 
 class HandshakeMonitor:
-    """Detect that a server refused this client's key, as opposed to not answering. `socket`: the client's."""
+    """Detect that a server refused this client's key, as opposed to not answering. `socket`: the client's.
+
+    A wrong server key in this client is not detected: it looks like a server that does not answer.
+    """
 
     def __init__(self, socket: Socket) -> None:
         self._socket = socket
@@ -200,7 +203,7 @@ class HandshakeMonitor:
         self._refused = False
 
     def is_refused(self) -> bool:
-        """Return True if so far the server refused this client's key, or this client the server's."""
+        """Return True if so far the server refused this client's key, or is a server without CURVE."""
         while self._monitor.poll(0):
             recv_monitor_message(self._monitor)
             self._refused = True

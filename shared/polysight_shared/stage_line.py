@@ -1,4 +1,4 @@
-"""Protocol of the stage line: ASCII lines with sequence number and CRC, and single bytes that act during motion.
+"""Protocol of the stage line: ASCII lines with sequence number and CRC, and single bytes that act at any time.
 
 Specification: docs/spec/stage-line.md. The firmware's counterpart is arduino_stage/protocol.cpp.
 """
@@ -13,17 +13,17 @@ import msgspec
 
 from polysight_shared.errors import ProtocolError
 
-# docs/spec/stage-line.md: the version that the greeting names, and the longest line with its end, bytes.
+# docs/spec/stage-line.md: the version that the banner names, and the longest line including its line end, bytes.
 PROTOCOL_VERSION = 2
 MAX_LINE_BYTES = 96
-# Largest number of a line; 0 follows.
+# Largest sequence number of a line; 0 follows.
 MAX_SEQUENCE = 65535
-# An upper bound of a time that is not known.
+# Later than every time: the upper bound of a time that is not known.
 END_OF_TIME_NS = 2**63 - 1
 # The Pi waits so long for the end of homing (chosen, the search in short legs over the longest travel takes minutes);
 # programs that wait for the Pi need a longer timeout.
 HOMING_TIMEOUT_S = 300.0
-# An integer, a command line and a field of a reply, without checksum.
+# Patterns of an integer, of a command line without its checksum, and of one field of a reply.
 _VALUE = re.compile(r"-?[0-9]{1,10}")
 _COMMAND = re.compile(r"N([0-9]{1,5}) ([A-Z]+)((?: -?[0-9]{1,10})*)")
 _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
@@ -32,8 +32,8 @@ _FIELD = re.compile(r"([a-z]+)=([-+.:A-Za-z0-9]+)")
 class Immediate(IntEnum):
     """Bytes that the stage handles in its receive interrupt, even during motion.
 
-    Each differs in at least two bits from every byte of a command line. RESUME, which starts motion, differs in three
-    bits from these and from the other immediate bytes, and must be sent twice.
+    Each differs in at least two bits from every byte of a command line. RESUME, which starts motion, differs in at
+    least three bits from these and from the other immediate bytes, and must be sent twice.
     """
 
     HOLD = 0x81
@@ -64,7 +64,7 @@ class Parameter(IntEnum):
     TRAVEL_Y = 4
     # Speed between rows, steps/s.
     TRAVEL_SPEED = 5
-    # Steps; rows are approached from below in y, with at least this run-up in x; 0 = off.
+    # Backlash, steps: rows are approached from this much below in y, with at least this run-up in x; 0 = off.
     BACKLASH = 6
     # Bits of the pins whose level is inverted, in the order of raster.INVERTIBLE.
     PINS = 7
@@ -76,7 +76,11 @@ def crc16(body: bytes) -> int:
 
 
 def seal(body: str) -> bytes:
-    """Append `*CRC` and the line end. Raises ProtocolError if the line is too long or not plain ASCII."""
+    """Append `*CRC` and the line end.
+
+    Raises ProtocolError if the line is too long, not ASCII, or contains `*` or a line end. Other control characters are
+    refused by `unseal` only.
+    """
     try:
         raw = body.encode("ascii")
     except UnicodeEncodeError:
@@ -90,7 +94,10 @@ def seal(body: str) -> bytes:
 
 
 def unseal(line: bytes) -> str:
-    """Check length, line end and CRC, and return the body. Raises ProtocolError for a line not made by `seal`."""
+    """Check length, line end and CRC, and return the body. Raises ProtocolError for any other line than `seal` makes.
+
+    Bytes of the body are printable ASCII without `*`.
+    """
     if len(line) > MAX_LINE_BYTES:
         raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}")
     if len(line) < 6 or line[-1:] != b"\n" or line[-6:-5] != b"*":
@@ -146,8 +153,8 @@ class Reply(msgspec.Struct, frozen=True):
     * `alarm`: latched fault `number`
     * `status`: answer to the STATUS byte; fields state, x, y, points, pulses, alarm, limits, homed
 
-    x and y are motor steps in stage coordinates. `asked_ns` and `written_ns` are not sent: the receiver notes that the
-    reply was written between these times, on the clock of the trigger edges.
+    Values of `fields` are text; x and y are motor steps from the home corner. `asked_ns` and `written_ns` are not sent:
+    the receiver notes that the reply was written between these times, on the clock of the trigger edges.
     """
 
     kind: str
@@ -158,7 +165,7 @@ class Reply(msgspec.Struct, frozen=True):
     written_ns: int = END_OF_TIME_NS
 
     def encode(self) -> bytes:
-        """Return the sealed line."""
+        """Return the sealed line. Raises ProtocolError if it is too long or contains a reserved character."""
         tag = "-" if self.sequence is None else str(self.sequence)
         head = {
             "banner": "polysight-stage",

@@ -15,7 +15,9 @@ from tests.support.radar.boards import with_radar
 
 from polysight.cli.main import main
 from polysight.radar.commands import program
+from polysight.radar.diagnosis import ReplayedWords
 from polysight.radar.messages import decode
+from polysight_shared.errors import DeviceError
 from polysight_shared.tables import to_builtins
 from polysight_simulators.radars import RadarBoard, make_image
 from polysight_simulators.radars.__main__ import replay
@@ -216,6 +218,15 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
     text = "".join(r.get("in", "") for r in lines)
     assert text.count("badccdab") == levels.count(1)
     assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
+
+
+@pytest.mark.parametrize("act", [lambda words: words.read(3), lambda words: words.write([5])], ids=["read", "write"])
+def test_a_replay_names_the_line_that_differs(tmp_path, act):
+    trace = tmp_path / "day.jsonl"
+    lines = ('{"trace": 1}', '{"t": 0.1, "in": "01020304"}', '{"t": 0.2, "in": "0506"}')
+    trace.write_text("\n".join(lines) + "\n")
+    with pytest.raises(DeviceError, match=r"line 2 of the trace.*01020304"):
+        act(ReplayedWords(trace))
 
 
 @pytest.mark.usefixtures("opened_boards")

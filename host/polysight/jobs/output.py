@@ -1,4 +1,7 @@
-"""What commands print: results on stdout; progress on stderr, as bars on a terminal, a line now and then elsewhere."""
+"""What commands print: results and questions on stdout; progress on stderr.
+
+Progress is a line for each step, and, if it is counted, a bar on a terminal or a line now and then elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -26,26 +29,26 @@ def exit_status(worked: bool) -> int:
 
 
 def load_rig_file(config: Path | None) -> Instrument | None:
-    """Return the rig of a file; None without one. Raises ConfigError."""
+    """Return the rig of a file; None without a file (the scan's own rig counts). Raises ConfigError."""
     if config is None:
         return None
     return load_instrument(config)
 
 
 def name_scan(scan_id: str, is_simulated: bool) -> str:
-    """Return `scan NAME`, or `simulated scan NAME`."""
+    """Return how a scan is named in a text: `scan ID`, or `simulated scan ID`."""
     if is_simulated:
         return f"simulated scan {scan_id}"
     return f"scan {scan_id}"
 
 
 def print_json(content: Any) -> None:
-    """Print a result for programs."""
+    """Print a result that programs read, as JSON."""
     sys.stdout.write(json.dumps(content, indent=1) + "\n")
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print a result for people."""
+    """Print a result that people read."""
     sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
@@ -57,7 +60,7 @@ def say(step: str) -> None:
 
 
 def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
-    """Yield the things; print the name of each before it begins, and its time when it is done."""
+    """Yield the things, one a step; print the name of each before it begins, and its wall time when it is done."""
     for k, (thing, name) in enumerate(zip(things, names, strict=True), 1):
         sys.stderr.write(f"[{k}/{len(things)}] {name} ...")
         sys.stderr.flush()
@@ -67,7 +70,11 @@ def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
 
 
 def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:
-    """Yield the things with a bar; without a terminal a line at the start, then at tenths, 5 s apart or more."""
+    """Yield the things with a bar for the number that is done, of `total`.
+
+    Without a terminal it is a line at the start, then one each time another tenth is done, but not until 5 s after the
+    line before.
+    """
     from rich.console import Console
     from rich.progress import track
 
@@ -88,7 +95,10 @@ def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:
 
 @contextmanager
 def current_step(first: str) -> Iterator[Progress]:
-    """Show the current step, beginning with `first`: on a terminal as a status line, elsewhere as lines."""
+    """Show the current step, beginning with `first`; yield the function that shows the next one.
+
+    It is a status line on a terminal, a line for each step elsewhere.
+    """
     from rich.console import Console
 
     console = Console(stderr=True)
@@ -101,7 +111,10 @@ def current_step(first: str) -> Iterator[Progress]:
 
 
 def confirm(what: str, word: str, yes: bool) -> str:
-    """Print the planned action and return the typed answer; with `yes` return `word` without asking."""
+    """Print the planned action and return the typed answer, which confirms it if it is `word`.
+
+    With `yes` return `word` without asking. At the end of the input the answer is empty.
+    """
     sys.stdout.write(f"{what}\n")
     if yes:
         return word

@@ -33,17 +33,19 @@ Real = npt.NDArray[np.float64]
 
 UNKNOWN = "unknown"
 INCLUSIONS = 0.05
-"""Share of a patch's pixels that may be of another material (chosen); a pixel's prior is its patch's name otherwise."""
+"""Share of a patch's pixels that may be of any material of the library (chosen); the prior of the others is the patch's
+probabilities."""
 UNKNOWN_BUDGET = 0.03
 """Relative error of V / H, beside the spread of its pixels, assumed if the scan's error budget is not known; chosen."""
 LIKELY = 0.005
 """Materials of less probability are not listed; chosen."""
 LAYER = "possible layer"
-"""Name of a patch that is rather a thin plate than a half space."""
+"""Name of a patch that is rather a thin plate or a stack of layers than a half space."""
 MOST_NAMES = 3
 """Largest number of names in "like ... (literature)"; chosen."""
 MOST_OF_IT = 0.8
-"""Least share of the literature's probability that these names hold together; chosen."""
+"""Least share of the literature's probability that these names hold together, and of a family's that one material must
+hold to be named instead of it; chosen."""
 
 
 @dataclass(frozen=True)
@@ -55,17 +57,18 @@ class PatchName:
     name
         Material, "like ... (literature)", "possible layer", or "unknown".
     confidence
-        Probability of that name; for the KNN the share of its pixels.
+        Probability of that name; for the KNN (the paper's nearest-neighbour classifier) the share of its pixels.
     votes
         Share of the pixels with each name, largest first.
     distance
-        Distance to the material, in units of its threshold: above 1 is unknown.
+        Distance to the named material (of several: the least; of an unknown patch or a layer: to the nearest of the
+        library), in units of its threshold: above 1 is unknown. inf without usable pixels.
     pixels
-        Usable pixels.
+        Number of usable pixels.
     probabilities
         Of each likely name and of "unknown", largest first; their sum is 1. Empty for models without probabilities.
     why
-        Reason of the name in one sentence (:func:`add_explanation`); empty if permittivities are not known.
+        Reason of the name in one sentence; empty until :func:`add_explanation` adds it.
     nearest
         The library's nearest material, also of an unknown patch; None without usable pixels.
     literature
@@ -111,7 +114,8 @@ def summarise_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.
     """Return one name for the likely materials of the literature, and a mask of those it stands for, bool [kind].
 
     If at most `MOST_NAMES` materials hold most of the literature's probability, the name lists them; otherwise it lists
-    their families ("polymer"), or the one material that dominates a family. It is empty if even that takes more names.
+    their families ("polymer"), or the one material that dominates a family. The name is empty if there are too many
+    families, too, or the literature has no probability at all.
     """
     probability = np.where(kinds.in_library, 0.0, odds.kinds)
     names = np.array(kinds.names)
@@ -149,14 +153,14 @@ def name_patch(
 ) -> NamedPatch:
     """Name a patch and its pixels by its ratio in one scan, or in several at different incidence angles.
 
-    The name is the likeliest of: each material of the library, those of the literature together, a thin plate, and none
-    of these. A material whose value lies outside of the patch's own 99 % region (errors and specimens together) is
+    The name is the likeliest of: each material of the library, those of the literature together, a layer, and none of
+    these. A material whose value lies outside of the patch's own 99 % region (errors and specimens together) is
     never the name. Pixels are assumed to be of their patch's material, except for the share `INCLUSIONS`.
 
     Parameters
     ----------
     kinds
-        The possible materials at each scan's angle.
+        The possible materials at each scan's angle, at least one of them of the library.
     kind_evidence
         The patch's ratio in each scan, in the same order.
     inverse_ratios
@@ -176,7 +180,8 @@ def name_patch(
     verdict = _find_verdict(first_kinds, odds, literature_name, in_literature_name)
     verdict = replace(verdict, pixels=int(usable.sum()))
 
-    # Pixels get the corrections of their patch: leakage, tilt, and the common change over the plane.
+    # Pixels get the corrections of their patch (leakage, tilt, and the scene's common change of V / H over the plane):
+    # their median becomes the patch's corrected ratio.
     pixel_ratios = inverse_ratios[usable]
     middle = np.median(pixel_ratios.real, axis=0) + 1j * np.median(pixel_ratios.imag, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -248,7 +253,8 @@ def derive_evidence_from_pixels(inverse_ratios: npt.NDArray[np.complex128], kind
     """Return a patch's ratio and its covariance from its pixels alone, if the error budget of its scan is not known.
 
     The spread of the pixels is not divided by the root of their number: errors inside a patch are as wide as the patch.
-    `inverse_ratios` complex [n] is V / H of the pixels, NaN where not usable.
+    `inverse_ratios` complex [n] is V / H of the pixels, NaN where not usable. Without usable ones the ratio is 0 with
+    a covariance of 1, which says nothing.
     """
     usable_ratios = inverse_ratios[np.isfinite(inverse_ratios)]
     if not usable_ratios.size:
@@ -281,10 +287,11 @@ def _name_pixels(
     pixel_count = inverse_ratios.shape[0]
     usable = np.isfinite(inverse_ratios).all(axis=1)
     has_name = name_of_kind != UNKNOWN
-    # Real and imaginary part of each scan's ratio.
+    # Number of real and imaginary parts: two for each scan's ratio.
     parts = 2 * len(kind_evidence)
 
-    # Gaussian of each named kind: its specimens differ, the scans have errors, and the pixels scatter.
+    # Gaussian of each named kind: its specimens differ, the scans have errors, and the pixels scatter. 1e-10, far below
+    # any real variance, keeps the matrix invertible.
     values = split_complex(inverse_ratios[usable]).reshape(-1, parts)
     pixel_covariance = np.cov(values.T) if len(values) > 2 else np.zeros((parts, parts))
     scan_covariance = scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
@@ -299,7 +306,8 @@ def _name_pixels(
     difference = split_complex(ratios[:, None, :] - means).reshape(pixel_count, -1, parts)
     distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)
 
-    # Bayes: the prior is the patch's result, and for inclusions any material of the library. exp(-700) is not zero.
+    # Bayes: the prior is the patch's result, and for inclusions any material of the library. The
+    # exponent is limited to -700, so that a likelihood is never zero: of zeros alone the first name would be largest.
     in_library = np.take(kinds[0].in_library, np.flatnonzero(has_name))
     prior = (1 - INCLUSIONS) * patch_odds[has_name] + INCLUSIONS * in_library / max(in_library.sum(), 1)
     likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
@@ -310,6 +318,7 @@ def _name_pixels(
     best_name = name_likelihood.argmax(axis=1)
     best_likelihood = name_likelihood[np.arange(pixel_count), best_name]
     share = best_likelihood / np.maximum(name_likelihood.sum(axis=1), 1e-300)
+    # Kinds without a name take their part from the patch's probability; inclusions give some back.
     probability_of_named = min(1.0, float(patch_odds[has_name].sum()) + INCLUSIONS)
     confidence = np.where(usable, share * probability_of_named, 0.0)
 

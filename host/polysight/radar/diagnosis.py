@@ -1,7 +1,9 @@
 """Examine a board: check its bring-up step by step, log its traffic to a file (`TracedWords`), and replay such a file.
 
-A trace has one JSON object a line; docs/spec/mmwavelink.md ("Traces") has the format. A replay (`ReplayedWords`) stands
-for the board, so that a failure can be examined without it. Not run on hardware yet.
+A *word* is the 16 bits that SPI shifts at a time; a *word link* shifts them through the capture card's USB chip, and
+has the board's reset and interrupt lines. A trace has one JSON object a line; docs/spec/mmwavelink.md ("Traces") has
+the format. A replay (`ReplayedWords`) stands for the board, so that a failure can be examined without it. Not run on
+hardware yet.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, PolysightError
 from polysight_shared.files import read_bounded
 
-# Picture for a board that does not start.
+# Jumpers as they must be, printed if the reset fails.
 JUMPERS = """\
     SOP2      SOP1      SOP0          of the AWR2243BOOST, for control over SPI
    [ o o ]   [ o o ]   [ o=o ]        o=o  jumper set      o o  open
@@ -36,7 +38,10 @@ VOLTAGE_MONITOR_BIT = 57
 
 
 class Row(NamedTuple):
-    """Result of one step: success (`holds`), expected and actual outcome (`came`), remedy after a failure (`do`)."""
+    """Result of one step, as it is printed.
+
+    `holds`: True if the step passed; `came`: its outcome, or the error; `do`: the remedy, empty after a success.
+    """
 
     step: str
     holds: bool
@@ -58,7 +63,7 @@ def check_board(
     Parameters
     ----------
     open_words, make_board
-        Open the board's USB chip, and create the board with it.
+        Open the USB chip that leads to the board, and create the board with that link.
     transmits
         True if the board transmits.
     on_row
@@ -120,7 +125,7 @@ def _check_frame(board: RadarBoard, transmits: bool, on_row: Callable[[Row], Non
 
 
 def _describe_failure(step: Step | None, error: PolysightError) -> Row:
-    """Return the result of the step that failed; None: the failure is of no step."""
+    """Return the result of the step that failed; None: all steps had passed when the error came."""
     if step is None:
         return Row("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
     picture = ""
@@ -144,7 +149,7 @@ TRACE_VERSION = 1
 # Names in a trace of the board's two signals: host interrupt and reset (low: held in reset).
 INTERRUPT = "HOST_INTR"
 RESET = "NRST"
-# Largest file that is read as a trace (chosen).
+# Largest file that is read as a trace, bytes (chosen).
 MAX_BYTES = 2**26
 # Latest time in a trace, about four months: a later one is no time of a run.
 _MAX_S = 1e7
@@ -158,14 +163,15 @@ class TracedWords:
     words, clock
         The link, and the clock for the log.
     file
-        Overwritten; each line is flushed at once. A full disk ends only the log, and `ended` has the reason.
+        Overwritten; each line is flushed at once. A full disk ends only the log; `ended` then has the reason, and is
+        empty before.
     facts
         Content of the first line, see `trace_words`.
 
     Raises
     ------
     OSError
-        if the file cannot be written.
+        if the file cannot be opened for writing.
     """
 
     def __init__(self, words: WordLink, clock: Clock, file: Path, facts: dict[str, object]) -> None:
@@ -244,7 +250,11 @@ class TracedWords:
 
 
 def trace_words(words: WordLink, clock: Clock, file: Path, rig: Instrument, board: str) -> TracedWords:
-    """Log a board's link to `file`, whose first line has board, its place in the rig, rig, version and time."""
+    """Log a board's link to `file`.
+
+    Its first line has the board, its USB chip as the rig file gives it (serial number or path), the rig's name, the
+    version of this program and the Unix time.
+    """
     place = rig.radar.native[board].place
     now = round(time.time(), 3)
     facts: dict[str, object] = {
@@ -265,12 +275,15 @@ def new_trace(folder: Path, board: str) -> Path:
     return next(path for path in names if not path.exists())
 
 
-# Words of 16 bits in hexadecimal, the low byte first.
+# Words of 16 bits as hexadecimal digits, the low byte of each first.
 Words = Annotated[str, msgspec.Meta(pattern="^([0-9a-f]{4})*$")]
 
 
 class TraceLine(msgspec.Struct, omit_defaults=True):
-    """One line of a trace: a signal's level, words written, words read, or an error, at `t` seconds."""
+    """One line of a trace, `t` seconds after its beginning.
+
+    It has exactly one of these: `line` and its `level`, words written (`out`), words read (`in`), or an `error`.
+    """
 
     t: Annotated[float, msgspec.Meta(ge=0, le=_MAX_S)]
     line: Literal["HOST_INTR", "NRST"] | None = None
@@ -282,7 +295,7 @@ class TraceLine(msgspec.Struct, omit_defaults=True):
     error: str | None = None
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless the line has exactly one content."""
+        """Raise ValueError unless the line has exactly one content, and a level if it is a signal's."""
         contents = [value for value in (self.line, self.out, self.read, self.error) if value is not None]
         if len(contents) != 1 or (self.line is None) != (self.level is None):
             raise ValueError("a line of a trace has one content")
@@ -325,10 +338,9 @@ class ReplayedWords:
 
     def read(self, count: int) -> list[int]:
         """Return the board's words in the trace. Raises DeviceError."""
-        action = f"reads {count} words"
-        words = self._take(action, lambda line: line.read is not None).read or ""
-        if len(words) != 4 * count:
-            raise self._difference_error(action, f"{len(words) // 4} words")
+        # Each word is four digits.
+        line = self._take(f"reads {count} words", lambda line: line.read is not None and len(line.read) == 4 * count)
+        words = line.read or ""
         return list(struct.unpack(f"<{count}H", bytes.fromhex(words)))
 
     def interrupt(self) -> bool:
@@ -380,30 +392,37 @@ class ReplayedWords:
             raise DeviceError(line.error or "", "as in the trace", "see the error of the traced run")
 
     def _take(self, action: str, agrees: Callable[[TraceLine], bool]) -> TraceLine:
-        """Return the next line without changes of the interrupt. Raises DeviceError if it is not this action."""
+        """Replay up to the next line that is no change of the interrupt, and return it.
+
+        Raises DeviceError if `agrees` is False for that line, or the trace ends before it, and errors of the trace.
+        """
         while self._is_interrupt():
             self._play_level()
         self._raise_error()
         if self.done:
             raise DeviceError("the trace ends here", "the traced run ended or was killed", "")
         if not agrees(self._lines[self._at]):
-            raise self._difference_error(action, msgspec.json.encode(self._lines[self._at]).decode())
+            raise self._difference_error(action)
         line = self._step()
         self._raise_error()
         return line
 
-    def _difference_error(self, now: str, then: str) -> DeviceError:
-        """Return the error for an action that is not that of the trace."""
+    def _difference_error(self, action: str) -> DeviceError:
+        """Return the error for an action that the trace's next line does not have."""
+        recorded = msgspec.json.encode(self._lines[self._at]).decode()
         return DeviceError(
             # Lines count from 1, and the first has the facts.
-            f"line {self._at + 2} of the trace: the host does {now}, the trace has {then}",
+            f"line {self._at + 2} of the trace: the host does {action}, the trace has {recorded}",
             "another version of this program, another rig file or board, or another trace",
             "replay it with the rig file and the version of the traced run",
         )
 
 
 def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
-    """Read a trace: its first line, and the others without an incomplete last one. Raises ConfigError, OSError."""
+    """Read a trace: its first line, and the others without empty ones and an incomplete last one.
+
+    Raises ConfigError for another file, DataError if it is too large or no regular file, and OSError.
+    """
     lines = read_bounded(file, MAX_BYTES).split(b"\n")
     facts: dict[str, Any] | None = None
     records: list[TraceLine] = []

@@ -33,12 +33,13 @@ from polysight.report.style import (
 from polysight.results import PatchFigures, PermittivityFigures
 
 SHARES = {0.68: 2.279, 0.95: 5.991}
-"""Share of draws to the squared radius that holds it: quantiles of chi-squared with two degrees of freedom."""
+"""Share that an ellipse holds to its squared Mahalanobis radius: quantiles of chi-squared, two degrees of freedom."""
 _STYLES: dict[float, dict[str, Any]] = {
     0.68: {"linestyle": "-", "linewidth": 1.2},
     0.95: {"linestyle": "--", "linewidth": 0.8},
 }
-# Size of a patch's number and of its point in `permittivity_figure`, in points of 1/72 inch, measured on its PNG.
+# Room for a patch's number (width, height) and for its point in `permittivity_figure`, in points of 1/72 inch; chosen.
+# A digit is 6 wide and 8 high, so that numbers of two digits may touch; a point with its edge is 6.6.
 _LABEL_PT = (9.0, 9.0)
 _POINT_PT = 5.0
 # Places that `place_numbers` tries: rings around the point, and directions on each; chosen.
@@ -57,14 +58,17 @@ Estimate = tuple[PatchFigures, PermittivityFigures]
 
 
 def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
-    """Return width, height and angle in degrees of the ellipse that holds a share of draws with a covariance [2, 2]."""
+    """Return width, height and angle in degrees of the ellipse that holds a share (a key of `SHARES`).
+
+    `matrix` is the covariance [2, 2] of a normal distribution.
+    """
     values, vectors = np.linalg.eigh(matrix)
     width, height = 2 * np.sqrt(np.maximum(values, 0.0) * SHARES[share])
     return float(width), float(height), math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
 
 
 def region_matrix(e: PermittivityFigures, share: float) -> Array | None:
-    """Return the covariance [2, 2] of (eps', eps'') whose ellipse holds a share; None if no error is known.
+    """Return the covariance [2, 2] of (eps', eps'') whose :func:`fit_ellipse` holds a share; None if no error is known.
 
     The standard errors are such that their ellipse of 95 % holds 95 %. Errors have long tails, so that 68 % lie closer
     than in a normal distribution: `half_widths_68` says how close.
@@ -79,7 +83,7 @@ def region_matrix(e: PermittivityFigures, share: float) -> Array | None:
 
 
 def place_numbers(points: Array, obstacles: Array) -> Array:
-    """Place a label beside each point so that labels cover neither one another nor a point.
+    """Place a label beside each point so that, if there is room, labels cover neither one another nor a point.
 
     Parameters
     ----------
@@ -90,7 +94,7 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
 
     Returns
     -------
-    [n, 2]: the labels' middles: for each the nearest free place, else the one that covers least.
+    [n, 2]: the labels' middles, in the same unit: for each the nearest free place, else the one that covers least.
     """
     taken: list[Array] = []
     keep_clear = np.concatenate([points, obstacles.reshape(-1, 2)])
@@ -123,6 +127,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     if not estimates:
         return None
     colours = assign_colours(scan)
+    # Inches; the legend needs a line for each patch.
     size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
     fig = new_figure(*size_in, RIGHT_IN)
     ax = fig.add_subplot()
@@ -161,7 +166,7 @@ def _find_truth(patch: PatchFigures) -> Point | None:
 
 
 def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
-    """Draw a permittivity with its confidence regions; in old products, with the percentiles of its pixels."""
+    """Draw a permittivity with its confidence regions (old products: percentiles of pixels), and the truth."""
     centre = (e.real, e.loss)
     regions = {share: matrix for share in _STYLES if (matrix := region_matrix(e, share)) is not None}
     if regions:
@@ -204,11 +209,12 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
     low = np.minimum(low, lowest) - _MARGIN_SHARE * span
     high = np.maximum(high, highest) + _MARGIN_SHARE * span
     ax.set_xlim(low[0], high[0])
+    # A strip of negative losses always shows, to tell that they would be gain.
     ax.set_ylim(min(low[1], -0.1), high[1])
 
 
 def _measure_half_size(e: PermittivityFigures) -> Point:
-    """Return how far the drawing of an estimate reaches: its 95 % ellipse, or its bars."""
+    """Return how far the drawing of an estimate reaches in (real part, loss): its 95 % ellipse, or its bars."""
     if e.spread is not None:
         radius = math.sqrt(SHARES[0.95])
         return radius * e.spread.real_std, radius * e.spread.loss_std

@@ -1,7 +1,8 @@
-"""Draw and count the faults of a simulated capture card, reproducibly from a seed.
+"""Draw the faults of a simulated capture card, reproducibly from a seed.
 
-Every board and every kind of fault has its own generator, so that one fault does not shift another; draws do not depend
-on how packets, frames or pulses are grouped into calls.
+Every board has its own generators: one for lost, reordered, truncated and duplicated packets, which take a number each
+of every packet, one for corrupt packets, one for pulses and one for overflows. So the rate of one fault does not shift
+another; draws do not depend on how packets, frames or pulses are grouped into calls.
 """
 
 from __future__ import annotations
@@ -22,19 +23,23 @@ Rows = NDArray[np.uint8]
 
 
 def fault_generator(seed: int, board_name: str, generator_name: str) -> np.random.Generator:
-    """Return the generator of one kind of fault of one board."""
+    """Return the generator of one board for the faults of one name."""
     return np.random.default_rng([seed, zlib.crc32(f"{board_name}/{generator_name}".encode())])
 
 
 class NetworkFaults:
-    """Faults of data packets between card and host, counted in `counts`."""
+    """Faults of data packets between card and host, counted in `counts`.
+
+    Of several faults drawn for a packet the first of these counts: loss, reordering, truncation, duplication. A flipped
+    bit may come in addition.
+    """
 
     def __init__(self, faults: Faults, seed: int, board_name: str, counts: Counter[str]) -> None:
         self._faults = faults
         self._counts = counts
         self._rng = fault_generator(seed, board_name, "network")
         self._corrupt_rng = fault_generator(seed, board_name, "corrupt")
-        # Packets that the next packet overtakes.
+        # Packets held back, [1, size] each, until the next packet has overtaken them.
         self._held: list[Rows] = []
 
     def carry(self, rows: Rows) -> list[Rows]:
@@ -60,7 +65,7 @@ class NetworkFaults:
         return arrived
 
     def _carry_one(self, packet: Rows, draws: NDArray[np.float64]) -> list[Rows]:
-        """Return a packet with its faults, [n, size]; `draws` has a number for each kind of fault."""
+        """Return what arrives of one packet [1, size]; `draws` [4] are those for loss, reorder, truncate, duplicate."""
         f = self._faults
         loss, reorder, truncate, _ = draws
         if loss < f.loss:
@@ -94,14 +99,14 @@ class NetworkFaults:
         return rows
 
     def drain(self) -> list[Rows]:
-        """Return the packets held back, which arrive now."""
+        """Return the packets held back, which arrive now: behind the next packet, or at the end of a record."""
         held = self._held
         self._held = []
         return held
 
 
 class PulseFaults:
-    """SYNC_IN pulses that one radar misses, and edges that nobody sent."""
+    """SYNC_IN pulses that one radar misses (`missed`: their number), and edges that nobody sent."""
 
     def __init__(self, faults: Faults, seed: int, board_name: str) -> None:
         self._probability = faults.missed_pulse
@@ -111,7 +116,7 @@ class PulseFaults:
         self.missed = 0
 
     def select_seen(self, pulses: list[Pulse]) -> list[Pulse]:
-        """Return the edges that the radar sees."""
+        """Return the edges that the radar sees; one that nobody sent has the number of the pulse that it follows."""
         draws = self._rng.random(len(pulses))
         seen_pulses = [
             p for p, draw in zip(pulses, draws, strict=True) if p.number not in self._miss and draw >= self._probability
@@ -127,7 +132,7 @@ class PulseFaults:
 
 
 class LvdsRun(NamedTuple):
-    """LVDS data, int16, and the bytes lost at its end."""
+    """LVDS data, int16 of any shape in the order of sending, and the bytes lost at its end."""
 
     data: NDArray[np.int16]
     lost_bytes: int
@@ -141,7 +146,7 @@ class OverflowFaults:
         self._rng = fault_generator(seed, board_name, "overflow")
 
     def split(self, frames: NDArray[np.int16]) -> list[LvdsRun]:
-        """Split frames, int16 [n, ...], into runs with a loss at their end."""
+        """Split frames, int16 [n, ...], into runs that each end with a loss; the last may end without one."""
         runs = []
         first = 0
         for i in np.flatnonzero(self._rng.random(len(frames)) < self._probability):

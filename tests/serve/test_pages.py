@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
@@ -22,13 +23,16 @@ from tests.support.products import REASON, judged_products, name_check_plate
 from tests.support.scenes import COPPER, PET
 
 import polysight
-from polysight.catalogue import Notes, find_program, read_notes, write_notes
+from polysight.catalogue import PROGRAM, Notes, ProgramRecord, find_program, read_notes, write_notes
+from polysight.doctor.checks import _format_finding
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
 from polysight.results import WARNING_SIGMAS
 from polysight.serve import programs, reading
+from polysight.serve.site import HIDDEN
 from polysight_shared.config import CheckPlate
 from polysight_shared.errors import DataError
+from polysight_shared.findings import Finding
 
 # What each page shows when it is complete. Cards of the list have no text before they are painted (`content-visibility`
 # in catalogue.css).
@@ -264,6 +268,30 @@ def test_the_control_chart_says_what_is_missing_and_follows_new_products(page, s
     shutil.rmtree(scans / "one" / "products")
     page.open("/check?plate=none")
     page.browser.wait("document.getElementById('told').innerText.includes('No processed scan')", "the advice")
+
+
+def test_the_new_page_lists_the_checks_as_the_doctor_prints_them(page, scans):
+    findings = [
+        Finding("ok", "the rig file is right", where="config"),
+        Finding("warning", "it is weak", "far away", "turn it", where="direct path north-east"),
+        Finding("note", "`direct path north-east` has a fault", where="trigger skew"),
+        Finding("error", "no echo", "no power", "switch it on", where="radar south west 12"),
+    ]
+    record = ProgramRecord(pid=1, ticks=0, words=["polysight", "doctor"], started_utc="2026-01-01T00:00:00+00:00")
+    folder = scans / HIDDEN / PROGRAM
+    folder.mkdir(parents=True)
+    (folder / "doctor.json").write_bytes(msgspec.json.encode(record))
+    (folder / "doctor.log").write_text("".join(map(_format_finding, findings)) + "1 ok\n", encoding="utf-8")
+    page.open("/new")
+    page.browser.wait("document.querySelectorAll('#findings li').length == 4", "the findings")
+    shown = page.browser.value(
+        "[...document.querySelectorAll('#findings li')].map((n) => [n.querySelector('b').textContent,"
+        " n.querySelector('b').parentNode.textContent, n.querySelectorAll('.more').length])"
+    )
+    for (name, text, more), finding in zip(shown, findings, strict=True):
+        assert name == f"{finding.where}: "
+        assert text == name + finding.what.replace("`", "")
+        assert more == bool(finding.why) + bool(finding.do)
 
 
 def test_an_abort_goes_before_pictures_that_hang(page, scans, monkeypatch):

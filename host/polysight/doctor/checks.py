@@ -18,9 +18,10 @@ from polysight_shared.errors import PolysightError, no_such, os_error
 from polysight_shared.findings import Finding
 from polysight_shared.messages import is_simulated
 
-# The operator's page parses these columns (serve/static/new.js).
+# The operator's page (serve/static/new.js) parses these lines: a name, which may be longer than its column, ends at two
+# spaces.
 _VERDICT_WIDTH = 12
-_NAME_WIDTH = 16
+_NAME_WIDTH = 15
 
 
 @dataclass(frozen=True)
@@ -157,10 +158,10 @@ def run_doctor(
 
 def _format_finding(finding: Finding) -> str:
     """Format a finding as lines: verdict, check and problem; below them cause and remedy."""
-    lines = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}} {finding.what}".rstrip() + "\n"
+    lines = f"{verdict(finding):{_VERDICT_WIDTH}}{finding.where:{_NAME_WIDTH}}  {finding.what}".rstrip() + "\n"
     for word, text in (("why", finding.why), ("do", finding.do)):
         if text:
-            lines += f"{'':{_VERDICT_WIDTH + _NAME_WIDTH}} {word}: {text}\n"
+            lines += f"{'':{_VERDICT_WIDTH + _NAME_WIDTH}}  {word}: {text}\n"
     return lines
 
 

@@ -58,12 +58,12 @@ function inWords(error) {
   return error;
 }
 
-/** The doctor's lines: a verdict, a check and what was found, then why and what to do. */
+/** The doctor's lines: a verdict, a check, two spaces or more and what was found; then why and what to do. */
 function findings(log) {
   const found = [];
   for (const line of log.split("\n")) {
-    const head = /^(ok|warning|error|not checked)\s+(.{16}) ?(.*)$/.exec(line), more = /^\s+(why|do): (.*)$/.exec(line);
-    if (head) found.push({ verdict: head[1], check: head[2].trim(), text: head[3], more: [] });
+    const head = /^(ok|warning|error|not checked)\s+(.+?)(?: {2,}(.*))?$/.exec(line), more = /^\s+(why|do): (.*)$/.exec(line);
+    if (head) found.push({ verdict: head[1], check: head[2], text: head[3] ?? "", more: [] });
     else if (more && found.length) found.at(-1).more.push(more[2]);
   }
   return found;

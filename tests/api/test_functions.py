@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import fields
 from typing import assert_type
 
 import numpy as np
@@ -13,9 +14,10 @@ from tests.support.refusals import refused
 
 import polysight
 from polysight import compare, fresnel, multilayer, open_scan, permittivity_from_ratio
+from polysight.planning import Changes
 from polysight.products.processed import read_image
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import ConfigError, DataError
 
 from .conftest import COPPER, PET, simulate_plates
 
@@ -153,6 +155,13 @@ def test_a_plan_is_a_text_and_its_numbers():
     assert planned.forecast.time.total_s > 0
     assert "resolution" in str(planned)
     assert planned._repr_html_().startswith("<pre>")
+
+
+def test_an_unknown_change_of_a_plan_is_refused_with_those_that_are_known():
+    with pytest.raises(ConfigError) as caught:
+        polysight.plan(speed=1, spead_mm_s=2)
+    assert caught.value.code == ErrorCode.VALUE_INVALID
+    assert all(word in str(caught.value) for word in ("spead_mm_s", *(field.name for field in fields(Changes))))
 
 
 def test_a_scene_can_be_written_in_python(tmp_path):

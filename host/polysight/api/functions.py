@@ -8,7 +8,7 @@ import tomllib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from polysight.planning import Changes, Forecast, describe, find_scene_warnings,
 from polysight.products import PLANE, ProcessedScan, image_dataset
 from polysight.results import CheckResult
 from polysight_shared.config import Instrument, load_instrument
+from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, expand_paths
 
 if TYPE_CHECKING:
@@ -76,8 +77,17 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
     Raises
     ------
     ConfigError
-        if the rig file or a value is wrong.
+        if the rig file or a value is wrong, or a change has another name than these.
     """
+    known = [field.name for field in fields(Changes)]
+    unknown = [name for name in changes if name not in known]
+    if unknown:
+        raise ConfigError(
+            f"{', '.join(unknown)}: no change of a plan",
+            f"the changes are {', '.join(known)}",
+            "see help(polysight.plan)",
+            code=ErrorCode.VALUE_INVALID,
+        )
     instrument = rig if isinstance(rig, Instrument) else load_instrument(find_rig_file(rig))
     with _open_scene_file(scene) as path:
         return Plan(forecast_scene(instrument, Changes(**changes), path))  # type: ignore[arg-type]

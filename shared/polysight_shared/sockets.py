@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,17 @@ HANDSHAKE_TIMEOUT_MS = 5000
 # Bit masks of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
 COMMAND_IO_THREAD = 0b01
 EVENT_IO_THREAD = 0b10
+_CHANGE = "change the address in instrument.toml"
+_NO_ADDRESS = ("the address does not exist on this machine", _CHANGE)
+_NO_RIGHTS = ("this user may not use it", f"{_CHANGE}: ports below 1024 need rights")
+# Cause and remedy of what bind and connect answer.
+_CAUSES = {
+    zmq.EADDRINUSE: ("another program uses this port", f"stop it (ss -ltnp shows it), or {_CHANGE}"),
+    zmq.EADDRNOTAVAIL: _NO_ADDRESS,
+    errno.ENODEV: _NO_ADDRESS,
+    errno.EACCES: _NO_RIGHTS,
+    errno.EPERM: _NO_RIGHTS,
+}
 
 
 def host_name(address: str) -> str:
@@ -112,13 +124,10 @@ def _make(
             socket.connect(address)
     except zmq.ZMQError as e:
         socket.close()
-        # The likeliest cause of any other error, whose own text is told too.
-        cause = "the address does not exist on this machine"
+        cause, remedy = _CAUSES.get(e.errno, ("the system refuses it", _CHANGE))
         code = ErrorCode.OTHER
         if e.errno == zmq.EADDRINUSE:
-            cause = "another program uses this port"
             code = ErrorCode.BUSY
-        remedy = "stop the other program (ss -ltnp shows it), or change the address in instrument.toml"
         raise DeviceError(f"{address}: {e.strerror or e}", cause, remedy, code=code) from None
     except ConfigError:
         socket.close()

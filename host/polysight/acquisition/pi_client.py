@@ -45,7 +45,7 @@ _JOG_HEARTBEAT_MS = 100
 _POLL_S = 0.05
 # Events that one reply brings from the Pi's journal at most (chosen).
 _REPLAY_LIMIT = 1000
-# Characters of a reason that are sent; chosen, a message may hold 4,000.
+# Characters of a reason that are sent (chosen): the Pi repeats it in sentences of its own, which may hold 4,000.
 _MAX_REASON = 500
 R = TypeVar("R", bound=m.AnyReply)
 

@@ -178,8 +178,7 @@ class RunningScan:
             if begun:
                 # The first error is the one to report.
                 with suppress(PolysightError):
-                    # So much of a reason fits into the Pi's messages and a line of a log (chosen).
-                    self._pi.come_to_rest(self.result.reason[:500])
+                    self._pi.come_to_rest(self.result.reason)
             # If `_end` failed itself, the manifest gets a second `scan_ended`, with its error: the last one counts.
             with suppress(PolysightError):
                 self._end(begun)

@@ -359,7 +359,7 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
             sys.stderr.write(f"note: {angle:g} degrees left out: {e.what}\n")
     if not fitted:
         raise DataError(
-            f"{folder}: no angle has scans enough", "models are chosen with whole scans left out", "add more scans"
+            f"{folder}: no angle has scans enough", "a library is judged with whole scans left out", "add more scans"
         )
     library = materials.Library(tuple(fitted), {"angles": fits}, library.note)
     library.save(out)

@@ -20,9 +20,12 @@ from polysight.polarimetry import ratio_from_permittivity
 from polysight_papers.sensys2026 import dataset_items as authors_items
 from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, find_row, read_authors, read_names
 from polysight_papers.sensys2026.dataset_items import (
+    AXIAL_RATIO,
+    METAL_FACTOR,
     Judgements,
     authors_fig20,
     authors_recipe,
+    authors_table2,
     pair_scans,
     select_repeated,
     task_samples,
@@ -240,6 +243,20 @@ def test_leakage_is_taken_out_exactly_and_the_recipe_undoes_its_own_constants():
     p = complex(ratio_from_permittivity(eps, np.radians(60.0))) * 0.8
     measured = np.full(9, (p + 0.05) / (1 + 0.05 * p))
     assert authors_recipe(measured, 60.0) == pytest.approx(eps, rel=1e-6)
+
+
+@pytest.mark.parametrize("source", [MATERIALS, IMAGES])
+def test_the_recipe_takes_out_only_leakage_that_is_there(dataset, source):
+    """Images made here have none any more."""
+    acrylic = ROWS[3]
+    p = complex(ratio_from_permittivity(acrylic.permittivity, np.radians(60.0))) / METAL_FACTOR
+    if source != IMAGES:
+        p = (p + AXIAL_RATIO) / (1 + AXIAL_RATIO * p)
+    ones = np.ones(9, np.float32)
+    entry = Entry(acrylic.name, "a scan", ones, ones, np.full(9, p, np.complex64), 60.0, simulated=True)
+    data = replace(read_authors(dataset, RIG_FILE), sources={source: Library((entry,))})
+    (row,) = authors_table2(data).data["materials"]
+    assert row["authors_recipe"] == pytest.approx(acrylic.permittivity, rel=1e-5)
 
 
 def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, capsys, monkeypatch):

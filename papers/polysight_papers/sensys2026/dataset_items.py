@@ -513,9 +513,12 @@ def without_leakage(p: Complex, axial_ratio: float) -> Complex:
     return (p - axial_ratio) / (1 - axial_ratio * p)
 
 
-def authors_recipe(p: Complex, angle_deg: float) -> complex:
-    """Return the permittivity by the authors' recipe: leakage, factor, the middle pixels by |P|, mean of Eq. 3."""
-    used = without_leakage(p, AXIAL_RATIO) * METAL_FACTOR
+def authors_recipe(p: Complex, angle_deg: float, leakage: float = AXIAL_RATIO) -> complex:
+    """Return the permittivity by the authors' recipe: leakage, factor, the middle pixels by |P|, mean of Eq. 3.
+
+    `leakage` is 0 for ratios that have none any more.
+    """
+    used = without_leakage(p, leakage) * METAL_FACTOR
     low, high = np.percentile(np.abs(used), PERCENTILES)
     in_range = used[(np.abs(used) >= low) & (np.abs(used) <= high)]
     eps = permittivity_from_ratio(in_range, np.radians(angle_deg))
@@ -568,9 +571,7 @@ def authors_table2(data: AuthorsData) -> Item:
     """
     # Mean of the real parts: the authors' is real, and one for both channels.
     leakage = float(np.mean([data.base.polarimetry.leakage_h[0], data.base.polarimetry.leakage_v[0]]))
-    estimates = {
-        source: _estimate_materials(data, source, 0.0 if source == IMAGES else leakage) for source in data.sources
-    }
+    estimates = {source: _estimate_materials(data, source, leakage) for source in data.sources}
     if not any(estimates.values()):
         raise DataError(
             "no material of Table 2 is in the data", "its names are others, see the notices on them",
@@ -581,10 +582,10 @@ def authors_table2(data: AuthorsData) -> Item:
         "Table 2: permittivity of 36 materials",
         (
             "Three ways from the same pixels. “Eq. 3”: the median of V/H relative to metal, as it is in the files."
-            f" “Without leakage”: the rig file's cross-polar amplitude, {leakage:g}, is taken out first; images made"
-            f" here have it out already. “Authors' recipe”: leakage {AXIAL_RATIO:g}, |P| times {METAL_FACTOR:g}, the"
+            f" “Without leakage”: the rig file's cross-polar amplitude, {leakage:g}, is taken out first."
+            f" “Authors' recipe”: leakage {AXIAL_RATIO:g}, |P| times {METAL_FACTOR:g}, the"
             f" pixels between the {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over"
-            " them."
+            " them. Images made here have their leakage out already: neither takes it out again."
             " ± is the standard error of one patch.",
             "The recipe's factor makes up for something in the published measurements that is not explained; on data"
             " without it, simulated data for one, the recipe is off by it.",
@@ -602,7 +603,11 @@ def authors_table2(data: AuthorsData) -> Item:
 
 
 def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[Estimate]:
-    """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios."""
+    """Estimate all materials of Table 2 in a source; `leakage` is still in its ratios, unless they were made here."""
+    recipe_leakage = AXIAL_RATIO
+    if source == IMAGES:
+        leakage = 0.0
+        recipe_leakage = 0.0
     source_estimates = []
     for m in table2():
         pixels = _collect_pixels(data, source, m)
@@ -622,8 +627,7 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
                 pixels=p.size,
                 as_is=as_is,
                 clean=clean,
-                # The recipe removes its own leakage, even from ratios that have none any more.
-                recipe=authors_recipe(p, angle),
+                recipe=authors_recipe(p, angle, recipe_leakage),
             )
         )
     return source_estimates

@@ -90,8 +90,8 @@ def sync_scan(run: Run) -> SyncScan:
         chirp = rig.chirp
         board = rig.receivers[0].name
         setups = {b.name: BoardSetup.from_rig(rig, b) for b in rig.receivers}
-        # All boards of the rig have four RX.
-        reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx=4) for n in setups}
+        rx = len(rig.antennas.rx_mm)
+        reports = {n: SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx) for n in setups}
         builder_before = ImageBuilder(rig)
         builder_after = ImageBuilder(rig)
         middle = source.plan.rows // 2
@@ -101,10 +101,10 @@ def sync_scan(run: Run) -> SyncScan:
         for row in source.rows():
             for name, setup in setups.items():
                 data = source.read_row(name, row)
-                words, valid = row_words(data.payload, data.missing, data.frames_expected, chirp.samples)
+                words, valid = row_words(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
                 synced = synchronise_row(words, valid, setup)
                 reports[name].add(synced)
-                raw, _ = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples)
+                raw, _ = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
                 if carrier is None:
                     carrier = float(np.median(synced.direct_hz)) / chirp.sample_rate_hz
                 mixed = raw[:, :: rig.burst.pulses] * np.exp(-2j * np.pi * carrier * np.arange(chirp.samples))
@@ -291,8 +291,10 @@ def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.N
     for offset in OFFSETS_HZ:
         disturbances = {"if_offset_hz": offset}
         with simulate_scan("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
-            data = source.read_row(source.instrument.receivers[0].name, 0)
-            chirps, valid = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples)
+            rig = source.instrument
+            data = source.read_row(rig.receivers[0].name, 0)
+            rx = len(rig.antennas.rx_mm)
+            chirps, valid = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
         swept.append(tones(chirps[:, valid], chirp))
         if offset == USUAL_HZ:
             example = chirps[:, valid]

@@ -584,8 +584,8 @@ def authors_table2(data: AuthorsData) -> Item:
             "Three ways from the same pixels. “Eq. 3”: the median of V/H relative to metal, as it is in the files."
             f" “Without leakage”: the rig file's cross-polar amplitude, {leakage:g}, is taken out first."
             f" “Authors' recipe”: leakage {AXIAL_RATIO:g}, |P| times {METAL_FACTOR:g}, the pixels between the"
-            f" {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over them. Images made here"
-            " have their leakage out already: neither takes it out again. ± is the standard error of one patch.",
+            f" {PERCENTILES[0]}th and the {PERCENTILES[1]}th percentile of |P|, mean of Eq. 3 over them. Images made"
+            " here have their leakage out already: neither takes it out again. ± is the standard error of one patch.",
             "The recipe's factor makes up for something in the published measurements that is not explained; on data"
             " without it, simulated data for one, the recipe is off by it.",
         ),

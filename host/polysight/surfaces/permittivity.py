@@ -1,18 +1,29 @@
 """Permittivity of surface segments from the voltages of H and V, referenced to metal of known shape.
 
-A segment has one permittivity: least squares of b_H (M r)_V = b_V (M r)_H over its points (`fit_permittivity`), with r
-the coefficients of a curved surface, M what the antennas' polarisations make of them, and b_H, b_V the voltages over
-the gains (`Voltages.m` and `b`, `Gains`). Coefficients are arrays [n points, 2 receivers, 4], H before V: r_s, r_p,
-s to p, p to s; the last two are 0 without a *twist*, a curvature whose axes lie askew to the plane of incidence. A
-point is what one window of stage positions has measured. `wave_number` is that at the middle of the band, rad / m.
+A *point* is one echo, measured in one window of stage positions (`WINDOW_M` wide). A *segment* is a connected surface
+with many points, numbered n in the shapes below. Each segment gets one permittivity eps, by least squares over its
+points (`fit_permittivity`) of the equation
 
-The covariance is derived, source by source (`add_common_errors`): the scatter of the points over blocks of windows;
-leakage, axes and places of the antennas, each moved by one standard error for object and reference together; the
-reference's own error; and the next order of the expansion in the curvature. A common error changes the misses of the
-equations above; one Gauss-Newton step turns that into a change of the permittivity.
+    b_H (M r)_V = b_V (M r)_H
 
-Two figures that the permittivity does not use tell whether one medium reflected at one surface (`judge_medium`): the
-level of H over that of metal, and how both levels change over the band.
+* r: reflection coefficients of the curved surface at the point, which depend on eps; [n, 2 receivers, 4].
+* M: effect of the antennas' polarisations on r (`Voltages.m`); (M r)_H and (M r)_V are the voltages for gains of 1.
+* b_H, b_V: measured voltages of H and V (`Voltages.b`), divided by the receivers' gains (`Gains`).
+
+Receivers are in the order H, V. The four coefficients are r_s, r_p, s to p, p to s. The last two are 0 without a
+*twist*, a curvature whose axes lie askew to the plane of incidence. The difference of both sides of the equation is the
+*miss* of the point. `wave_number` is that at the middle of the band, rad / m. Permittivities are eps' - j eps''.
+
+The covariance of (real, imaginary) of eps is the sum over these sources (`add_common_errors`):
+* the scatter of the misses, summed over blocks of stage positions;
+* leakage, polarisation axes and places of the antennas: each is moved by one standard error, for the object and for the
+  metal reference together;
+* the error of the metal reference itself;
+* the model: error of the curvature, next order of the expansion in it, and slopes of the antennas' patterns.
+An error that all points share changes their misses; one Gauss-Newton step turns that into a change of eps.
+
+Two quantities that the fit does not use tell whether a single medium reflected at a single surface (`judge_medium`):
+the level of H relative to metal, and the change of the levels of H and V over the band.
 """
 
 from __future__ import annotations
@@ -43,71 +54,82 @@ from polysight.surfaces.paths import STRIDE_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# A point whose ratio lies so many usual misses from the segment's does not belong to it; chosen.
+# A point is left out of the fit if its miss, over its own standard deviation, is more than so many times the median of
+# the segment; chosen.
 OUTLIER = 4.0
-# Ripples of edges and of other echoes change over such a distance: points within it have the same scatter; chosen.
+# Radius in metres of the neighbourhood whose scatter a point is given; chosen: ripples by edges and by other echoes
+# change over such a distance.
 RIPPLE_M = 0.04
-# Side of the square that is as large as a Fresnel zone (40 x 70 mm): ripples that edges make are as long.
+# Side of the square with the area of a Fresnel zone (40 x 70 mm): ripples that edges make are as long.
 FRESNEL_ZONE_M = 0.053
-# Length of the ripple of flat surfaces, whose misses have correlations of 0.6 and 0.3 at 8 and 16 mm (plates of random
-# scenes, simulated).
+# Length of the ripple of flat surfaces: their misses at points 8 mm apart have a correlation of 0.6, at 16 mm 0.3
+# (plates of random scenes, simulated).
 RIPPLE_OF_PLATES_M = 0.024
-# Ripple of V / H by which points are weighted, beside their noise; chosen.
+# Relative standard deviation of V / H of a point by ripple. It is added to the noise where the points are weighted;
+# chosen.
 USUAL_RIPPLE = 0.02
-# The few blocks of a small segment say little of their own scatter. So the scatter of the single points, as if it were
-# common to a block, is averaged with that of the blocks, and has the weight of so many blocks; chosen.
+# A small segment has few blocks, whose scatter is uncertain. So it is averaged with a second estimate: the ripple of
+# the single points, taken as common to a square of `ripple_m`. The second estimate has the weight of so many blocks;
+# chosen.
 EXPECTED_BLOCKS = 2.0
-# Error of the curvature, in proportion; chosen: those of 14 spheres and cylinders (50 to 190 mm, simulated) are 0.4 to
-# 3 % too large, 1.6 % in the root mean square (windows are not small to them).
+# Relative error of the curvature; chosen: the curvatures of 14 spheres and cylinders (50 to 190 mm, simulated) were
+# measured 0.4 to 3 % too large, 1.6 % in the root mean square, because a window is not small beside such bodies.
 CURVATURE_ERROR = 0.02
-# Second order of the reflection at a curved surface over the first, in K / (k cos^3 theta), K the curvature and k the
-# wave number: 1.9 by the exact series of spheres (100 and 200 mm, permittivity 2.8 to 8). Orders alternate in phase.
+# The reflection at a curved surface is a series in K / (k cos^3 theta), with K the curvature, k the wave number, theta
+# the angle of incidence. This is its second term over the first, in that unit: 1.9 by the exact series of spheres (100
+# and 200 mm, permittivity 2.8 to 8). Each term is turned by 90 degrees against the one before.
 SECOND_ORDER = 2.0
-# At the border of the zone that a surface reflects to, ln of the level is 0.69 below that inside: half of that is
-# allowed. Where no reference takes that out, patterns of antennas change the level over the directions by about as
-# much: there 0.9 is allowed (chosen).
+# Largest difference of ln |H| of a point from its segment's usual value. At the border of the zone that a surface
+# reflects to the amplitude is half of that inside, 0.69 less in ln: about half of that is allowed.
+# Without a metal reference the antennas' patterns stay in the levels, too, and change them by about as much over the
+# directions: then 0.9 is allowed. Both are chosen.
 LEVEL_TOLERANCE = 0.35
 LEVEL_TOLERANCE_WITHOUT_GAINS = 0.9
-# Share of a segment's power at one level: what edges diffract falls off with the angle. Three segments of edges alone
-# had 0.36 to 0.56, surfaces 0.91 and more (simulated).
+# Smallest share of a segment's power in points at its usual level, if it is a surface. The echo that an edge diffracts
+# falls off with the angle, so it has no usual level: three segments of edges alone had 0.36 to 0.56, surfaces 0.91 and
+# more (simulated).
 MIN_SHARE_AT_LEVEL = 0.75
-# Reflection over metal's below which no surface counts: a half space of permittivity 1.04 at 55 degrees. What the end
-# of a cylinder diffracts had 0.02 (simulated).
+# Smallest amplitude of H relative to metal, if a segment is a surface: that of a half space of permittivity 1.04 at 55
+# degrees. The echo that the end of a cylinder diffracts had 0.02 (simulated).
 MIN_REFLECTION = 0.03
-# Less than 20 mm from the border of a zone that reflects, a disc of 50 mm radius is not filled to three quarters. There
-# edges bend normals by degrees, and H / V of a plate with sharp edges is 10 % too large.
+# A point is near the border of its segment if its segment fills less than three quarters of a disc of 50 mm radius
+# about it: at a straight border, nearer than 20 mm. There edges bend normals by degrees, and H / V of a plate with
+# sharp edges is 10 % too large.
 BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
-# What a point counts for a permittivity rises from this share to 1 with the share of such a disc that interior points
-# fill: ripples of edges swing about zero, and a sum that begins and ends slowly averages them. The plates of 11 random
-# scenes (simulated) were 2.2 % off in the root mean square where all points counted alike, and are 1.2 % off.
+# Weight of a point next to the border in the fit of its segment. The weight rises to 1 as interior points fill the disc
+# of `BORDER_DISC_M` about the point. Ripples of edges swing about zero, and a sum whose weights begin and end slowly
+# averages them. The permittivities of the plates of 11 random scenes (simulated) had errors of 2.2 % in the root mean
+# square where all points counted alike, and have 1.2 % so.
 LEAST_SHARE = 0.01
-# Offsets closer than this are of one column of windows: rows start a little apart, as the stage moves within a burst.
+# Stage offsets closer than this belong to one column of windows: rows start a little apart, as the stage moves within a
+# burst.
 SAME_COLUMN_M = 1.5e-3
-# Step of numerical derivatives by the permittivity; chosen.
+# Step of numerical derivatives with respect to the permittivity; chosen.
 EPS_STEP = 1e-4
-# Range of permittivities to which iterations are limited, eps' and the imaginary part of eps' - j eps'': solids and
-# water, and a little gain, which noise may give.
+# Limits of the permittivity during iterations, of eps' and of the imaginary part -eps''. They hold solids and water,
+# and a little gain (a positive imaginary part), which noise may give.
 REAL_LIMITS = (1.2, 40)
 IMAGINARY_LIMITS = (-20, 0.5)
 
 
 @dataclass(frozen=True)
 class PermittivityFit:
-    """Permittivity of a segment, fitted.
+    """Permittivity of a segment, fitted to its n points.
 
     Attributes
     ----------
     eps
-        The permittivity.
+        The permittivity, eps' - j eps''.
     covariance
-        Of (real, imaginary), from the scatter of the points alone.
+        Covariance [2, 2] of the real and imaginary part of `eps`, from the scatter of the points alone.
     share
-        What each point counts beside its noise and ripple, [n]; 0 for outliers.
+        Factor of each point's weight in addition to its noise and ripple, [n]; 0 for outliers.
     excess2
-        Squares of the points' misses over what their noise gives, [n]; 1 on average for noise alone.
+        |miss|^2 of each point over its expectation from noise alone, [n]; 1 on average if there is nothing but noise.
     answer
-        Complex [2, n]: the change of (real, imaginary) is the real part of `answer` times a change of the misses.
+        Complex [2, n]: if the misses change by d [n], (real, imaginary) of `eps` change by the real part of
+        `answer @ d`.
     """
 
     eps: complex
@@ -118,21 +140,26 @@ class PermittivityFit:
 
 
 def point_ratio(v: Voltages, gains: Gains) -> Complex:
-    """Return r_s / r_p of each point [n], as if no twist mixed both."""
+    """Return the measured r_s / r_p of each point, complex [n], neglecting the twist that mixes s and p."""
     b = v.b.copy()
     b[:, 0] /= gains.ratio(v.arrival)
     return _unmix(v, b)
 
 
 def _unmix(v: Voltages, b: Complex) -> Complex:
-    """Ratio r_s / r_p [n] that voltages [n, 2] would mean at a surface without twist."""
+    """Return r_s / r_p [n] of a surface without twist that gives the voltages `b` [n, 2]."""
     r = np.linalg.solve(v.m[..., :2], b[..., None])[..., 0]
     return r[:, 0] / np.where(r[:, 1] == 0, 1e-30, r[:, 1])
 
 
 def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex:
-    """Return the permittivity of each point [n]: a half space's by its ratio, corrected for curvature and iterated."""
+    """Return the permittivity of each point by itself, complex [n].
+
+    It starts from that of a flat half space with the point's r_s / r_p. Each iteration divides the ratio by the effect
+    of the curvature (`curved` over flat) at the last permittivity.
+    """
     ratio = point_ratio(v, gains)
+    # Incidence at H; that at V differs by some 0.1 degrees, which `receive` accounts for.
     theta = v.theta[:, 0]
     eps = clip_permittivity(permittivity_from_ratio(ratio, theta))
     # A fixed number of iterations; chosen.
@@ -144,23 +171,26 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
 
 
 def clip_permittivity(eps: NDArray) -> Complex:
-    """Limit permittivities [any] to `REAL_LIMITS` and `IMAGINARY_LIMITS`, so that iterations go on; 4 if not finite."""
+    """Return permittivities, of any shape, limited to `REAL_LIMITS` and `IMAGINARY_LIMITS`; 4 where not finite.
+
+    So an iteration that leaves the range can go on.
+    """
     finite = np.where(np.isfinite(eps), eps, 4.0)
     return np.clip(np.real(finite), *REAL_LIMITS) + 1j * np.clip(np.imag(finite), *IMAGINARY_LIMITS)
 
 
 def find_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Complex:
-    """Misses b_H (M r)_V - b_V (M r)_H of each point, complex [n], for coefficients r [n, 2, 4].
+    """Return the miss b_H (M r)_V - b_V (M r)_H of each point, complex [n], for coefficients r [n, 2, 4].
 
-    b are the voltages of both receivers, M r what the surface would give with gains of 1; b_H is divided by the gain of
-    H over that of V. A miss is 0 where the coefficients explain H / V.
+    Symbols are those of the module's docstring, except that only the ratio of the gains matters: b_H is divided by the
+    gain of H over that of V, b_V by nothing. A miss is 0 where the coefficients explain H / V.
     """
     expected = receive(v, coefficients)
     return v.b[:, 0] / gains.ratio(v.arrival) * expected[:, 1] - v.b[:, 1] * expected[:, 0]
 
 
 def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Array:
-    """Standard deviation of each part of the misses by the noise of both voltages, [n]."""
+    """Return the standard deviation of the real part, and of the imaginary part, of each miss by noise alone, [n]."""
     expected = np.abs(receive(v, coefficients))
     std_h = v.std[:, 0] / np.abs(gains.ratio(v.arrival))
     return np.hypot(std_h * expected[:, 1], v.std[:, 1] * expected[:, 0])
@@ -168,10 +198,12 @@ def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -
 
 @dataclass(frozen=True)
 class _Step:
-    """Misses at one permittivity, their noise and weights [n], which points count, and `answer` as of the fit.
+    """One Gauss-Newton step from a permittivity, for n points.
 
-    The step is the real part of `influence` times the misses, complex [2, n]. `answer` differs from it by
-    what a change of a miss does to its weight.
+    `miss` [n], `noise` [n] (standard deviation of either part) and `weights` [n] are those at this permittivity; `used`
+    [n] is False for outliers. The step of (real, imaginary) is the real part of `influence @ miss`, `influence` complex
+    [2, n]. `answer` is that of `PermittivityFit`: unlike `influence`, it accounts for a changed miss changing its own
+    weight.
     """
 
     miss: Complex
@@ -185,9 +217,10 @@ class _Step:
 def _linearise(
     eps: complex, v: Voltages, gains: Gains, wave_number: float, *, ripple: Array, share: Array | float
 ) -> _Step:
-    """Return the Gauss-Newton step at a permittivity; outliers lose their weight.
+    """Return the Gauss-Newton step at the permittivity `eps`; outliers have a weight of 0.
 
-    `ripple` [n] is the standard deviation of the misses beside their noise, `share` [n] what a point counts.
+    `ripple` [n] is the standard deviation of the misses in addition to their noise. `share` [n] is a factor of the
+    weights.
     """
     coefficients = reflect_points(eps, v, wave_number)
     miss = find_misses(v, gains, coefficients)
@@ -200,11 +233,11 @@ def _linearise(
     scale = np.hypot(noise, ripple)
     size = np.abs(miss) / scale
     usual = float(np.median(size)) + 1e-12
-    # Where points fit far better than their errors, good ones would else be outliers (0.3 is chosen).
+    # If all points fit far better than their errors, good ones must not become outliers (0.3 is chosen).
     used = size < OUTLIER * max(usual, 0.3)
     falloff = 1 / (1 + (size / (2 * usual)) ** 2)
     weights = share * used / scale**2 * falloff
-    # A miss that grows loses weight: what it counts changes by the square of the falloff, over all phases.
+    # A miss that grows loses weight. On average over the phases of its change, it counts by the square of the falloff.
     rate_weights = weights * falloff
     information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, rate_weights).real
     inverse = np.linalg.inv(information + 1e-15 * np.eye(2))
@@ -216,16 +249,17 @@ def _linearise(
 def fit_permittivity(
     v: Voltages, gains: Gains, wave_number: float, share: Array | float = 1.0, ripple_m: float = FRESNEL_ZONE_M
 ) -> PermittivityFit:
-    """Weighted least squares of one permittivity over points, by Gauss-Newton; robust by iterated weights.
+    """Fit one permittivity to points: weighted least squares by Gauss-Newton, with weights that fall for large misses.
 
-    `share` [n]: what each point counts, beside its noise and ripple, which is `ripple_m` long.
+    `share` [n] is a factor of each point's weight, in addition to noise and ripple; see `find_shares`. `ripple_m` is
+    the length over which the ripple of the misses is alike, metres; it widens the covariance.
     """
     of_points = point_permittivity(v, gains, wave_number)
-    # The start has at least a small loss (chosen).
+    # The iteration starts at a small loss at least: an imaginary part of -0.01 or below (chosen).
     eps = complex(np.median(of_points.real), min(np.median(of_points.imag), -0.01))
     # Level of H in the unit of a miss: b_H times what V receives of r_p = 1.
     level = np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
-    # What is common to a point's surroundings: no point counts for more than its ripple allows.
+    # Without ripple, points of little noise would outweigh all others.
     ripple = USUAL_RIPPLE * level
     step = _linearise(eps, v, gains, wave_number, ripple=ripple, share=share)
     # Number of iterations and their end are chosen.
@@ -249,10 +283,10 @@ def fit_permittivity(
 
 
 def measure_ripple(step: _Step, level: Array) -> Array:
-    """Ripple of the misses [n], what noise does not explain of them, in proportion to `level` [n], as in the fit.
+    """Return the root mean square of the misses beyond noise, `ripple` [n], taken as proportional to `level` [n].
 
-    It may be as long as a small segment, whose few blocks do not show how far it moves their mean. Points count as in
-    the fit.
+    Points count by the weights of the fit. Unlike the scatter of blocks, this also sees a ripple that is as long as the
+    segment, which shifts all of its few blocks together.
     """
     excess = step.weights @ (np.abs(step.miss) ** 2 - 2 * step.noise**2) / (step.weights @ level**2)
     return level * np.sqrt(max(0.0, float(excess)))
@@ -261,14 +295,17 @@ def measure_ripple(step: _Step, level: Array) -> Array:
 def _compute_covariance_of_scatter(
     influence: Complex, miss: Complex, ripple: Array, at_m: Array, ripple_m: float
 ) -> Array:
-    """Covariance of (real, imaginary) from the sums of the misses over blocks, with the expected ripple.
+    """Return the covariance [2, 2] of (real, imaginary) of the permittivity from the scatter of the points.
 
-    Ripple is expected to be `ripple_m` long; longer ones the blocks show. (Misses of bent surfaces have correlations of
-    0.7, 0.45, 0.2 and 0 at 8 to 32 mm, as windows overlap; simulated.)
-    The 95 % region of few blocks is wider than that of a known covariance, by Fisher's distribution.
+    Two estimates are averaged (see `EXPECTED_BLOCKS`): the measured one, from the sums of the misses over blocks of
+    `BLOCK_M`; and the expected one, from `ripple` [n] that is common to squares of `ripple_m`. `at_m` [n, 2] are the
+    stage offsets. (Misses of bent surfaces have correlations of 0.7, 0.45, 0.2 and 0 at 8, 16, 24 and 32 mm, as windows
+    overlap; simulated.)
+    The covariance is scaled up, because the 95 % region by few blocks is wider than that of a known covariance
+    (Fisher's F instead of chi-square).
     """
     measured_terms = (influence * miss).real.T
-    # Ripple may have any phase: its real and its imaginary part are separate errors.
+    # Ripple may have any phase: its real part and its imaginary part are independent errors of half the variance each.
     expected_terms = np.concatenate([influence.real * ripple, -influence.imag * ripple]).T / np.sqrt(2)
     measured, blocks = _sum_over_blocks(measured_terms, influence, at_m, BLOCK_M)
     parts = np.split(expected_terms, 2, axis=1)
@@ -278,16 +315,18 @@ def _compute_covariance_of_scatter(
     unbiased = measured * blocks / max(blocks - 1, 0.5)
     total = freedom + 2 * EXPECTED_BLOCKS
     mixed = (freedom * unbiased + 2 * EXPECTED_BLOCKS * expected) / total
-    # Quantiles of F and chi-square; scipy.stats takes a second to load.
+    # Quantiles of F and chi-square from scipy.special, because scipy.stats takes a second to load.
     wider = 2 * scipy.special.fdtri(2, total, 0.95) / scipy.special.chdtri(2, 0.05)
     return mixed * float(wider)
 
 
 def _sum_over_blocks(terms: Array, influence: Complex, at_m: Array, block_m: float) -> tuple[Array, float]:
-    """Covariance [2, 2] of the sum of `terms` [n, 2] that are common to a block, and how many blocks count.
+    """Return the covariance [2, 2] of the sum of `terms` [n, 2], and the effective number of blocks.
 
-    The mean over shifted blocks weights pairs of points, on average, by 1 - s on either axis, with s their distance
-    over the side of a block.
+    Terms of one block are taken as fully correlated, those of different blocks as independent. The effective number of
+    blocks is (sum w)^2 / sum w^2, with w the sum of |`influence`|^2 in a block.
+    Both results are means over four grids of blocks, shifted by half a block. So a pair of points counts, on average,
+    by 1 - s along either axis, with s its distance along the axis over `block_m` (0 for s above 1).
     """
     covariance = np.zeros((2, 2))
     blocks = 0.0
@@ -303,10 +342,12 @@ def _sum_over_blocks(terms: Array, influence: Complex, at_m: Array, block_m: flo
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Standard errors common to a scan: leakage (each part), axes of polarisation, antennas' places (each coordinate).
+    """Standard errors of the rig, which all points of a scan share.
 
-    By default the leakage is that of a mount that was not measured, 0.058 in the root mean square; the other errors are
-    chosen.
+    `leakage` is that of the real part, and of the imaginary part, of either receiver's leakage. By default it is that
+    of a mount that was not measured, 0.058 in the root mean square of the complex number. `axis_rad` is the error of
+    each antenna's polarisation axis, radians. `place_m` is that of each coordinate of each antenna, metres. The last
+    two are chosen.
     """
 
     leakage: float = 0.041
@@ -315,7 +356,11 @@ class Uncertainty:
 
 
 def disturb_optics(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, Optics]]:
-    """Return (source's name, rig) for rigs that differ by one standard error in one property."""
+    """Return pairs (source, rig): each rig has one property changed by one standard error.
+
+    Sources are "places" (three coordinates of each of three antennas), "axes" (each antenna) and "leakage" (both parts
+    of either receiver).
+    """
 
     def replace_antenna(name: str, antenna: Antenna) -> Optics:
         change: dict[str, Any] = {name: antenna}
@@ -337,12 +382,15 @@ def disturb_optics(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, 
 
 
 Reference = Callable[[Optics], Gains]
-"""Gains that a reference gives, if the rig is as stated."""
+"""Function that returns the gains by the metal reference, given the rig's antennas."""
 
 
 @dataclass(frozen=True)
 class DisturbedScan:
-    """Voltages of all points and gains, if the rig differs by one standard error in one property, the `source`."""
+    """Voltages of all points, and gains, computed with a rig that has one property changed by one standard error.
+
+    `source` names the property, as in `disturb_optics`.
+    """
 
     source: str
     voltages: Voltages
@@ -350,7 +398,10 @@ class DisturbedScan:
 
 
 def disturb_scan(seen: Seen, optics: Optics, reference: Reference, uncertainty: Uncertainty) -> list[DisturbedScan]:
-    """Return the scan as it would be understood with each disturbed rig; reference and object move together."""
+    """Return the measured scan evaluated with each rig of `disturb_optics`.
+
+    Voltages and gains use the same rig, so that an error of the rig that object and reference share cancels.
+    """
     rigs = disturb_optics(optics, uncertainty)
     return [DisturbedScan(source, find_voltages(seen, rig), reference(rig)) for source, rig in rigs]
 
@@ -358,9 +409,10 @@ def disturb_scan(seen: Seen, optics: Optics, reference: Reference, uncertainty: 
 def add_common_errors(
     fit: PermittivityFit, v: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
 ) -> dict[str, Array]:
-    """Return the covariances [2, 2] of a segment's permittivity by source, all points of the segment together.
+    """Return the covariance [2, 2] of (real, imaginary) of a segment's permittivity, by source; their sum is the total.
 
-    `disturbed` holds the same points as `v`.
+    Sources are "scatter", "places", "axes", "leakage", "reference" and "model". `v` and the voltages of `disturbed`
+    hold the same points, those of the segment that were fitted.
     """
     coefficients = reflect_points(fit.eps, v, wave_number)
     miss = find_misses(v, gains, coefficients)
@@ -372,7 +424,8 @@ def add_common_errors(
     for scan in disturbed:
         add(scan.source, find_common_error(fit, miss, scan, wave_number))
 
-    # An error of ln(H / V) of the reference turns and scales b_H; `list_errors` are real, [errors, n].
+    # An error of ln(H / V) of the reference changes b_H in proportion, and with it the first term of the miss, `of_h`.
+    # `list_errors` are real, [errors, n]: one standard deviation of either part of ln(H / V).
     of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
     reference_changes = (fit.answer * of_h) @ gains.list_errors(v.arrival).T
     flat_s, flat_p = reflect_flat(fit.eps, v.theta)
@@ -383,16 +436,18 @@ def add_common_errors(
         add("model", (fit.answer @ change).real)
     for change in find_pattern_changes(fit.eps, v, wave_number):
         add("model", (fit.answer @ (find_misses(v, gains, coefficients + change) - miss)).real)
-    # The phases of the reference's errors are not known: both parts of each count.
+    # The real and the imaginary part of ln(H / V) of the reference have the same, independent errors: both are added.
     sources["reference"] = (reference_changes @ reference_changes.conj().T).real
     return sources
 
 
 def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Complex:
-    """Changes [2, n, 2, 4] of the coefficients by the slope of H's pattern, and of V's, over a finite path's angles.
+    """Return the changes of the coefficients by the slope of H's pattern, and by that of V's, complex [2, n, 2, 4].
 
-    At a finite path L an echo is a sum over directions, which a pattern weights: r gets j / (k L) r' times the
-    pattern's slope, r' the derivative by the angle. Metal does not show it: its r is the same at all angles.
+    An echo over a finite path L (metres) is a sum over directions, which the pattern weights. To first order that adds
+    j / (k L) r' g to a coefficient r: k is the wave number, r' the derivative of r with respect to the angle, g the
+    slope of ln of the pattern (`UNKNOWN_SLOPE`, per radian). The metal reference does not show it, for r of metal is
+    the same at all angles.
     """
     above = reflect_flat(eps, v.theta + ANGLE_STEP)
     below = reflect_flat(eps, v.theta - ANGLE_STEP)
@@ -403,26 +458,32 @@ def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Compl
 
 
 def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, wave_number: float) -> Array:
-    """Return the change of a segment's permittivity, (real, imaginary) [2], if its scan is understood as `scan`."""
+    """Return the change of a segment's permittivity, (real, imaginary) [2], if its points are evaluated as `scan`.
+
+    `miss` [n] are the misses at `fit.eps` with the undisturbed rig.
+    """
     coefficients = reflect_points(fit.eps, scan.voltages, wave_number)
     change = find_misses(scan.voltages, scan.gains, coefficients) - miss
     return (fit.answer @ change).real
 
 
 def find_reflection(v: Voltages, gains: Gains) -> Array:
-    """Level of H over that of flat metal, [n]."""
+    """Return the amplitude of H over that of flat metal at the same point, [n]."""
     metal = np.array([-1.0, -1.0, 0.0, 0.0])
     return np.abs(v.b[:, 0]) / np.exp(gains.level(v)) / np.maximum(np.abs(receive(v, metal)[:, 0]), 1e-30)
 
 
 def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
-    """True for points [n] at which a surface reflects, False for those that only its edge diffracts to.
+    """Return True for points [n] where a surface reflects, False for those where only an edge diffracts.
 
-    Without path and spreading, a surface of one medium is equally strong everywhere. At the border of the zone that
-    reflects half of that is left, and what an edge diffracts falls on from there. The usual level is the median
-    weighted by power (`amplitude` [n] of H), for edges are seen from many more places than a small plate reflects to.
-    A segment without a level of its own, or with one that no medium has, is that of an edge alone. Without `gains`
-    levels are not relative to metal, and the tolerance is larger.
+    `segment` [n] is the number of each point's segment. A surface of one medium has the same level everywhere once path
+    and spreading are taken out. At the border of the zone that it reflects to half of the amplitude is left; beyond,
+    the echo that the edge diffracts falls further. So a point reflects if its level is near its segment's usual one:
+    the median, weighted by power (`amplitude` [n] of H, squared), as edges are seen from many more stage positions than
+    a small plate.
+    All points of a segment are False if too little of its power is at the usual level (`MIN_SHARE_AT_LEVEL`), or if
+    that level is too low for any medium (`MIN_REFLECTION`). If `gains` is None, levels are not relative to metal: the
+    second test is left out, and the tolerance of the first is larger.
     """
     level = np.log(np.maximum(np.abs(voltages.b[:, 0]), 1e-30))
     tolerance = LEVEL_TOLERANCE_WITHOUT_GAINS
@@ -445,10 +506,11 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
 
 
 def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, Array]) -> Array:
-    """Return the share [n] of a disc about each point that its segment fills, in stage offsets `at_m` [n, 2].
+    """Return the share [n] of a disc about each point that points of its segment fill.
 
-    `extent_m`: smallest and largest offset of the scan, [2] each. Only what was scanned of a disc counts: the end of
-    the scan is no border of a surface.
+    The disc has the radius `BORDER_DISC_M` in the plane of the stage offsets `at_m` [n, 2], metres. `extent_m` is the
+    smallest and the largest offset of the scan, [2] each. Only the part of the disc inside this extent counts, for the
+    end of the scan is no border of a surface.
     """
     filling = np.zeros(len(at_m))
     stride_m = np.array([_find_stride(column) for column in at_m.T])
@@ -470,18 +532,21 @@ def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, 
 
 
 def find_interior(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, Array]) -> NDArray[np.bool_]:
-    """True for points [n] that are not near the border of their segment; arguments as of `find_filling`."""
+    """Return True for points [n] that are not near the border of their segment; arguments as of `find_filling`."""
     return find_filling(at_m, segment, extent_m) > MIN_FILLING
 
 
 def find_shares(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, Array]) -> Array:
-    """Return what each interior point counts for the permittivity of its segment, [n]: 1 far from the border."""
+    """Return the factor of each point's weight in the fit of its segment, [n]: `LEAST_SHARE` to 1 far from the border.
+
+    Arguments are as of `find_filling`, of the interior points alone.
+    """
     filling = find_filling(at_m, segment, extent_m)
     return LEAST_SHARE + (1 - LEAST_SHARE) * np.clip((filling - MIN_FILLING) / (1 - MIN_FILLING), 0, 1)
 
 
 def _find_stride(places_m: Array) -> float:
-    """Return the usual distance of neighbouring windows on one axis, metres."""
+    """Return the median distance of neighbouring windows along one axis, metres; `STRIDE_M` if all are at one place."""
     steps = np.diff(np.unique(np.round(places_m, 3)))
     steps = steps[steps > SAME_COLUMN_M]
     return float(np.median(steps)) if steps.size else STRIDE_M
@@ -490,12 +555,16 @@ def _find_stride(places_m: Array) -> float:
 def judge_medium(
     fit: PermittivityFit, v: Voltages, gains: Gains, disturbed: Sequence[DisturbedScan], wave_number: float
 ) -> tuple[float, float]:
-    """Return what one medium does not explain: ln of H's level over the expected, and the rise over the band (ln, too).
+    """Return two deviations from a single medium, both in ln of an amplitude: level, and rise over the band.
 
-    A wall or a coating reflects twice: its level is that of no half space, or it changes over the band. The rise is
-    that of H or of V, whichever is larger, less two standard deviations of its own. The level's square is given less
-    that of two standard deviations, as a root: what errors of the rig explain is left out, but does not hide what is
-    larger. `fit`, `v` and `disturbed` hold the same points.
+    A wall or a coating reflects twice. So its level differs from that of a half space of its permittivity, or its
+    levels change over the band.
+    The level is |ln(H measured / H expected from `fit.eps`)|, averaged over the points. Twice its standard deviation is
+    subtracted as squares, sqrt(level^2 - (2 std)^2), and 0 is returned if that is negative: errors of the rig do not
+    count, and hide nothing that is larger.
+    The rise is the magnitude of ln(amplitude in the upper half of the band / lower half) relative to metal, minus twice
+    its standard deviation, of H or of V, whichever is larger. It is negative where there is nothing but errors.
+    `fit`, `v` and `disturbed` hold the same points.
     """
     used = fit.share > 0
     blocks = int(number_blocks(v.at_m[used], (0.0, 0.0)).max()) + 1
@@ -506,12 +575,12 @@ def judge_medium(
         return levels[used]
 
     levels = find_levels(fit.eps, v, gains)
-    # Ripples of a plate's edges change levels by 10 %: they average in the mean by shares, and not in the median.
+    # Ripples by a plate's edges change levels by 10 %. They cancel in the mean weighted by `share`, not in the median.
     level = float(np.average(levels, weights=fit.share[used]))
-    # Where the reference does not tell the ratio of the gains, it does not tell their level either.
+    # Includes the error in directions that the reference does not cover.
     unknown_std = float(np.median(gains.estimate_level_std(v)))
     variance = _spread(levels) ** 2 / blocks + unknown_std**2
-    # A rig that is known badly gives a wrong permittivity, and with it a wrong level.
+    # An error of the rig changes the permittivity, and with it the expected level, beside the measured one.
     miss = find_misses(v, gains, reflect_points(fit.eps, v, wave_number))
     for scan in disturbed:
         real, imaginary = find_common_error(fit, miss, scan, wave_number)
@@ -524,23 +593,24 @@ def judge_medium(
 
 
 def _spread(values: Array) -> float:
-    """Standard deviation of normally distributed values by the median of their distances from the median."""
+    """Return the standard deviation of values [n] by their median absolute deviation, times 1.48 (normal values)."""
     return 1.48 * float(np.median(np.abs(values - np.median(values))))
 
 
 def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_number: float) -> Array:
-    """Covariance of (real, imaginary) of each point's permittivity by the scatter around it, [n, 2, 2].
+    """Return the covariance of (real, imaginary) of each point's own permittivity by the scatter around it, [n, 2, 2].
 
-    What edges and other echoes do to a point is no part of its noise, and differs over a segment: the misses of all
-    points around it tell, those too that do not count for the segment.
+    Ripple by edges and other echoes is no part of a point's noise, and differs over a segment. So the noise's variance
+    is multiplied by the mean of `fit.excess2` over the points within `RIPPLE_M`, outliers included.
     """
     around = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)
     excess2 = np.array([fit.excess2[near].mean() for near in around])
     noise2 = np.sum((v.std / np.maximum(np.abs(v.b), 1e-30)) ** 2, axis=1)
-    # Change of b_H for a numerical derivative, in proportion; chosen.
+    # Relative change of b_H for a numerical derivative; chosen.
     step = 1e-3
     changed = replace(v, b=v.b * np.array([1 + step, 1.0]))
     rate = (point_permittivity(changed, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step
-    # The permittivity is an analytic function of the ratio: the same error in both parts.
+    # The permittivity is an analytic function of H / V, whose error is alike in all phases. So the real and the
+    # imaginary part have equal, independent errors.
     variance = np.abs(rate) ** 2 * noise2 * excess2
     return variance[:, None, None] * np.eye(2)

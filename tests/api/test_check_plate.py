@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from matplotlib.collections import LineCollection
 from tests.support.products import name_check_plate
 from tests.support.refusals import refused
 
@@ -97,7 +98,9 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
     assert [ax.get_ylabel() for ax in chart_axes] == ["real part", "loss"]
     points = chart_axes[0].get_lines()[0].get_ydata()
     assert points == pytest.approx([table["permittivity"].real.item()] * 2)
-    bar = chart_axes[0].containers[0].get_children()[-1].get_segments()[0][:, 1]
+    bars = chart_axes[0].containers[0].get_children()[-1]
+    assert isinstance(bars, LineCollection)
+    bar = np.asarray(bars.get_segments()[0])[:, 1]
     assert np.ptp(bar) == pytest.approx(2 * WARNING_SIGMAS * check["measured_std"][0])
 
 

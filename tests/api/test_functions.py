@@ -164,6 +164,12 @@ def test_an_unknown_change_of_a_plan_is_refused_with_those_that_are_known():
     assert all(word in str(caught.value) for word in ("spead_mm_s", *(field.name for field in fields(Changes))))
 
 
+@pytest.mark.parametrize("changes", [{"width_mm": "wide"}, {"columns": None}, {"pulses": [7]}])
+def test_a_change_of_a_plan_that_is_no_number_is_refused_by_name(changes):
+    with refused(ErrorCode.VALUE_INVALID, next(iter(changes)), "not a number"):
+        polysight.plan(**changes)
+
+
 def test_a_scene_can_be_written_in_python(tmp_path):
     scene = {
         "name": "one plate",

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from html import escape
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,6 +86,14 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
         raise ConfigError(
             f"{', '.join(unknown)}: no change of a plan",
             f"the changes are {', '.join(known)}",
+            "see help(polysight.plan)",
+            code=ErrorCode.VALUE_INVALID,
+        )
+    no_numbers = [f"{name} = {value!r}" for name, value in changes.items() if not isinstance(value, Real)]
+    if no_numbers:
+        raise ConfigError(
+            f"{', '.join(no_numbers)}: not a number",
+            "a change of a plan is a number in the unit of its name",
             "see help(polysight.plan)",
             code=ErrorCode.VALUE_INVALID,
         )

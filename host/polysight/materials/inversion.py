@@ -2,24 +2,24 @@
 
 Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measured as
 
-    V / H = (1 + rho) exp(j c + G w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
+    V / H = (1 + rho) exp(j c + G.w) (1 + a) / (1 + b) (t + b) / (1 + a t)        |H| = kappa |r_s + a r_p| / |1 + a|
 
-with a, b the leakage of p into H and of s into V, rho the error of the metal reference, c the phase by its paint (0 of
-bare metal), w the rise of the plate (in G w relative to the metal's) and G its effect on ln(V / H), kappa the patch's
-brightness relative to an ideal one (thickness, roughness, illumination). A plate that rises by w across the plane of
-incidence turns this plane about x, and both waves meet its s axis at d = w sin(theta): to first order H receives
-(1 - d) r_s - d r_p and V (1 + d) r_p + d r_s, as the image of the transmitter in a tilted mirror confirms. So a plate
-has a and b of its own, smaller and larger by d, and G is 4 sin(theta) across, up to the patterns of boards that see the
-plate from other points. r_s, r_p follow from t and the angle by Eq. 2, 3 (POLySIGHT paper). Unknown are a, b, rho, c,
-G, the turn, the angle's error, the metal's brightness, the usual size of ln kappa, whether the mount has moved, the
-share of the library's materials, and t of every patch.
+* a, b: leakage of p into H and of s into V; rho: relative error of the metal reference, complex.
+* c: phase by the metal's paint, radians; 0 of bare metal.
+* w: rise of the plate minus the metal's, along the plane of incidence and across it, radians; G: slope of ln(V / H).
+* r_s, r_p: reflection coefficients, which follow from t and the angle of incidence by Eq. 2, 3 (POLySIGHT paper).
+* kappa: brightness of the patch relative to an ideal one (thickness, roughness, illumination).
 
-The evidence is that of |V / H| and its phase; brightness is a nuisance of each plate, whose usual size the scene tells.
-Other evidence on the common errors is that every patch has to be some material (`Kinds`): the library's, the
-literature's, or at least passive. The posterior of the common errors is sampled (sequential Monte Carlo with tempering;
-Del Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006). A patch's permittivity and name come from one posterior, that
-of the common errors without the evidence of what this patch itself may be: its permittivity is measured, not drawn to
-the nearest material, and its name is the kind that fits this measurement.
+A plate that rises by w across the plane of incidence turns this plane. Both waves then meet an s axis that is turned by
+d = w sin(theta). To first order H receives (1 - d) r_s - d r_p, and V (1 + d) r_p + d r_s. So the plate's a is smaller
+by d, its b larger by d, and G across is 4 sin(theta), plus the effect of boards that see the plate from other points.
+
+The *common errors* of a scene are a, b, rho, c, G, the turn d / w, the error of the angle, the metal's brightness, the
+usual size of ln kappa, whether the mount has moved, and the share of the library's materials. Their posterior is
+sampled (sequential Monte Carlo with tempering; Del Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006). Its evidence
+is that each patch's t has to be of some material (`Kinds`), and that each |H| fits its t up to kappa.
+The permittivity and the name of a patch come from the common errors' posterior without the evidence of that patch's own
+material. So its permittivity is measured, not drawn to the nearest material, and its name is the kind that fits it.
 """
 
 from __future__ import annotations
@@ -53,47 +53,47 @@ Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 BRIGHTNESS_RANGE = (0.03, 0.7)
-"""Range of the standard deviation of ln kappa in a scene, uniform on a logarithmic scale: flat simulated plates differ
-by 3 %, thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
+"""Prior range of the standard deviation of ln kappa in a scene, uniform on a logarithmic scale. Flat simulated plates
+differ by 3 %; thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
 METAL_BRIGHTNESS_STD = 0.5
 """Prior standard deviation of the metal's own ln kappa; chosen."""
 LIBRARY_SHARE = (0.05, 0.95)
-"""Range of the share of a scene's patches that are of the library's materials; the scene tells it."""
+"""Prior range of the share of a scene's patches that are of the library's materials; uniform."""
 WEIGHT_OF_KINDS = 0.8
-"""Weight of what plates may be as evidence on leakage that was never measured (coarsened posterior; Miller and Dunson,
-2019): plates of a scene are alike, but each is drawn alone. In 33 simulated scenes 1 put losses 0.9 errors too low."""
+"""Weight of the patches' materials as evidence if the leakage was never measured (coarsened posterior; Miller and
+Dunson, 2019). The plates of a scene are alike, but the prior takes them as independent. With a weight of 1 the eps'' of
+33 simulated scenes were 0.9 standard errors too low."""
 MOVED = 0.5
 MOVED_STD = 0.025
-"""Probability that the mount has moved since its leakage was measured, even, for with 0.1 only 85 % of regions held in
-scenes where V's board had turned; and its error then, 1 to 3 degrees, chosen."""
+"""Probability that the mount has moved since its leakage was measured, and the standard deviation of the leakage then
+(1 to 3 degrees, chosen). With a probability of 0.1 only 85 % of the 95 % regions held where V's board had turned."""
 TURN = -0.82
 TURN_STD = 0.1
-"""Leakage by a plate's rise across the plane of incidence: -sin(theta) for the published rig, with a tenth for antennas
-whose polarisation turns off axis. A transmitter that is turned to the other side has the other sign."""
+"""Change of a per radian of rise across the plane of incidence, and its standard deviation: -sin(theta) of the
+published rig; 0.1 for antennas whose polarisation turns off axis. A TX turned to the other side has the other sign."""
 UNEVEN_LIGHT = (1.0, 1.0)
 EVEN_LIGHT = (0.3, 0.5)
-"""Standard deviations of the change of ln(V / H) per radian of rise, along x and across, by the patterns of boards that
-see the plate from other points: without and with the correction of its illumination. The independent generator has 0.6
-along x."""
+"""Standard deviations of G, per radian, along the plane of incidence and across it, as H's board and V's see a plate
+from different points; without and with the correction of illumination. The independent generator has 0.6 along."""
 PAINTED = 0.02
 POSSIBLY_PAINTED = 0.2
-"""Probability that the metal reference is painted or otherwise coated, and that from which on its paint is an error of
-pixels and sub-bands, too. Both chosen: below the second, paint would widen the errors of what is rather bare metal."""
+"""Prior probability that the metal is painted or coated; and posterior probability above which paint is an error of
+pixels and sub-bands, too. Both chosen: a lower second one would widen the errors of what is rather bare metal."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
-"""Largest phase of 1 / P by a coating of metal, and its phase per thickness: 4 pi / lambda sin^2 / cos (1 - 1 / eps) of
-a thin layer at 55 degrees with eps = 3.3 (2.3 to 2.9 for 2.5 to 4). p is delayed more than s, never less. Paint has
-0.05 to 0.25 mm."""
+"""Largest phase c by paint on metal, and c per thickness: 4 pi / lambda sin^2(theta) / cos(theta) (1 - 1 / eps) of a
+thin layer at 55 degrees with eps = 3.3 (2.3 to 2.9 for eps of 2.5 to 4). p is delayed more than s, never less. Paint is
+0.05 to 0.25 mm thick."""
 CHI2_95 = 5.991
 CHI2_997 = 11.8
-"""Squared distances in standard deviations that hold 95 and 99.7 % of a normal distribution of two dimensions."""
+"""Squared distances, in standard deviations, within which 95 and 99.7 % of a 2-D normal distribution lie."""
 OWN_FREEDOM = 3.0
 OWN_SCALE = float(np.sqrt(CHI2_95 / (OWN_FREEDOM * (0.05 ** (-2 / OWN_FREEDOM) - 1))))
-"""Degrees of freedom of a patch's own errors (Student's t of two dimensions), whose size a few places of the plate and
-a few slopes tell, and the scale at which the region that holds 95 % is the normal distribution's. Where own errors
-dominate, in drawn scenes 95 % lie within 2.1 to 3.6 times the interval that holds 68 % (normal: 1.96)."""
+"""Degrees of freedom of a patch's own errors (2-D Student's t), whose size is estimated from a few places of the plate;
+and the scale at which the 95 % region is as large as that of the normal distribution. Where own errors dominate, 95 %
+lie within 2.1 to 3.6 times the interval that holds 68 % (drawn scenes; normal: 1.96)."""
 LEAST_DISTANCE = 4.0
-"""|t - 1| in its standard deviations below which no permittivity is given; chosen."""
+"""Least distance of t, or of 1 / t, from 1 (metal) for a permittivity, in standard deviations of t; chosen."""
 SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
 """Sources of error in `PatchEstimate.shares`."""
 # Columns of a particle (see `SceneLikelihood`).
@@ -129,23 +129,23 @@ class RigPrior:
     Attributes
     ----------
     theta_std_rad
-        Standard deviation of the incidence angle's error, equal for all patches.
+        Standard deviation of the incidence angle's error, which all patches share.
     leakage, leakage_std
-        Leakage of p into H and of s into V, as measured, or zero; standard deviation of each real and imaginary part.
+        Leakage (a, b) as measured, or zero; standard deviation of the real part, and of the imaginary part, of either.
     leakage_measured
-        True if it was measured; otherwise it is the prior of the mount.
+        True if the leakage was measured; otherwise it is the prior of the mount.
     channels_known
         True if the images' amplitudes are relative to the direct path.
     reference_std
-        Relative standard deviation of metal's V / H, each part.
+        Standard deviation of the real part, and of the imaginary part, of rho.
     brightness_range
-        Range of the standard deviation of ln |H| relative to Eq. 2, of single patches.
+        Range of the standard deviation of ln kappa.
     moved
         Probability that a mount whose leakage was measured has moved since.
     metal_rise
         Rise of the metal reference along the plane of incidence and across it, radians.
     lighting_std
-        Standard deviation of G along the plane of incidence and across it: per radian of a plate's rise.
+        Standard deviations of G along the plane of incidence and across it, per radian of rise.
     painted
         Probability that the metal reference is painted.
     """
@@ -170,19 +170,19 @@ class PatchEstimate:
     Attributes
     ----------
     inverse_ratio
-        1 / P = r_p / r_s, corrected for all estimated errors.
+        t = 1 / P = r_p / r_s, corrected for all estimated errors.
     inverse_ratio_covariance
         float64 [2, 2] of its real and imaginary part.
     permittivity
-        eps' - j eps''; None if the patch is metal-like.
+        eps' - j eps''; None if t is too near to metal's (`LEAST_DISTANCE`), as are the next fields.
     covariance
-        float64 [2, 2] of its real and its imaginary part; None if metal-like.
+        float64 [2, 2] of the real and the imaginary part of `permittivity`.
     shares
-        Source to its share of the covariance's trace; the sum is 1. Empty if metal-like.
+        Source (`SOURCES`) to its share of the covariance's trace; the sum is 1. Empty without a permittivity.
     evidence
-        What its name rests on; None without kinds.
+        Evidence from which the patch is named; None if the scene was inverted without kinds.
     half_widths_68
-        Half widths of the intervals about the real and the imaginary part that hold 68 %; None if metal-like.
+        Half widths of the 68 % intervals about the real and the imaginary part of `permittivity`.
     """
 
     inverse_ratio: complex
@@ -208,27 +208,27 @@ class Inversion:
     patches
         Estimates of the patches, in the given order.
     leakage, leakage_std
-        Estimated leakage of p into H, of s into V; standard deviation of each: root mean variance of its two parts.
+        Estimated (a, b), and their standard deviations: root of the mean variance of the real and the imaginary part.
     prior_std
-        Standard deviation of each by the prior alone.
+        The same standard deviation by the prior alone.
     theta_error_rad, theta_std_rad
         True minus nominal incidence angle, and its standard deviation.
     brightness_off
-        ln of |H| over Eq. 2's of each patch, relative to the scene's; NaN if it was not used.
+        float64 [patch]: ln kappa, with the metal's own brightness taken out; NaN if |H| was not used.
     brightness_std
-        Usual size of the same in this scene.
+        Standard deviation of ln kappa in this scene.
     nuisance_covariance
-        float64 [6, 6] of a, b, rho (real and imaginary parts), in standard deviations of their prior.
+        float64 [6, 6] of the real and imaginary parts of a, b, rho, in standard deviations of their prior.
     moved
         Probability that the mount has moved since its leakage was measured.
     painted, log_bare
         Probability that the metal reference is painted, and the logarithm of the probability that it is bare.
     paint_rad
-        Phase of its 1 / P by the paint, if it is: the mean.
+        Mean of the phase c if the metal is painted; 0 if it is certainly bare.
     log_evidence
         Logarithm of the probability density of the measurements under the prior.
     fit
-        float64 [patch]: log density of each patch as a material beside this reference; empty without kinds.
+        float64 [patch]: log density of each patch as some material beside this reference; zeros without kinds.
     """
 
     patches: tuple[PatchEstimate, ...]
@@ -258,9 +258,9 @@ class Inversion:
         return max(self.leakage_std) < 0.5 * self.prior_std
 
     def known_leakage(self, prior: RigPrior) -> tuple[complex, complex]:
-        """Return the leakage that is removed from pixels: that of the scene if determined, else the prior's mean.
+        """Return the leakage (a, b) that is removed from pixels: the scene's if determined, else the prior's mean.
 
-        An undetermined estimate leans on what the patches may be.
+        An estimate that is not determined depends mostly on the assumed materials of the patches.
         """
         if self.leakage_determined:
             return self.leakage
@@ -268,7 +268,7 @@ class Inversion:
 
 
 def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: npt.ArrayLike = 0j) -> Complex:
-    """Return t of a measured V / H: the first formula of the module's docstring, solved for t, at the metal's place."""
+    """Return t of a measured V / H: the first formula of the module's docstring, solved for t, with c = 0 and w = 0."""
     a = np.asarray(a, np.complex128)
     b = np.asarray(b, np.complex128)
     without_reference = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
@@ -278,7 +278,7 @@ def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: 
 def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
     """Solve for all patches of a scene together.
 
-    `measurements` are the patches without the metal reference. With `kinds` each patch has to be one of them.
+    `measurements` are the patches without the metal reference. With `kinds` each patch has to be of some kind.
     """
     model = SceneLikelihood(measurements, prior, kinds)
     rng = np.random.default_rng(0)
@@ -290,7 +290,7 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
     patches = []
     parts = model.log_likelihoods(z)
     for i in range(model.patch_count):
-        # A patch is measured without the belief that it must be some material itself.
+        # A patch is measured without the evidence that it must be some material itself.
         without_patch = evidence.copy()
         without_patch[i + 1] = 0.0
         particles, _ = _anneal(model, z, evidence, without_patch, rng, parts)
@@ -301,8 +301,8 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
 def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float, float]:
     """Return particles of the posterior of the common errors, the log evidence, and the log probability of bare metal.
 
-    Whether the mount has moved and whether the metal is painted are sampled apart and weighed by their evidence: what
-    fits of each is so small a part of its prior that among few particles of all none may lie there.
+    The cases that the mount has moved or not, and that the metal is painted or not, are sampled separately and weighted
+    by their evidence. In one common sample, few particles or none would be of a case with a small prior that fits.
     """
     no_evidence = np.zeros(model.patch_count + 1)
     samples = []
@@ -327,9 +327,9 @@ class SceneLikelihood:
     A particle z [width] holds the common errors as deviations from the prior's mean in its standard deviations; its
     columns are named at the top of the module. Methods take z [..., width].
 
-    Of each patch: `measured` V / H, `rise` [patch, 2] and `theta` as in `PatchMeasurement`; `bright`: |H| is used, and
-    `log_level` is its logarithm; `own` [patch, 2, 2]: covariance of t by its own errors; `own_variance`: that of one
-    part of V / H; `densities`: of t as any kind (None without kinds); `log_layer_odds`: of its change over the sweep.
+    Arrays [patch]: `measured` V / H, `rise` [patch, 2] and `theta` as in `PatchMeasurement`; `bright`: True if |H| is
+    used; `log_level`: ln |H|; `own` [patch, 2, 2]: covariance of t by a patch's own errors; `own_variance`: that of
+    each part of V / H; `densities`: of t by kinds, or None; `log_layer_odds`: ln odds of layers by change over the sweep.
     """
 
     width = WIDTH
@@ -353,7 +353,7 @@ class SceneLikelihood:
         self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
 
     def _own_covariances(self, measurements: Sequence[PatchMeasurement]) -> Real:
-        """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: those of V / H, to first order."""
+        """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: V / H's, turned to first order."""
         if not measurements:
             return np.zeros((0, 2, 2))
         nominal = np.zeros((1, self.width))
@@ -363,7 +363,7 @@ class SceneLikelihood:
         return turn_covariance((at_next - at_measured) / step, np.stack([s.covariance for s in measurements]))
 
     def _densities(self, kinds: Kinds) -> DensityMaps:
-        """Return the density of each patch's ratio over its possible values."""
+        """Return maps of the density of t by kinds of materials, one for each patch around its possible values of t."""
         drawn_ratios = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, self.width)))
         maps = []
         for i in range(self.patch_count):
@@ -378,7 +378,7 @@ class SceneLikelihood:
         return DensityMaps.collect(maps)
 
     def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
-        """Return the same scene with each certainty on what the prior leaves open, and the probability of each."""
+        """Return the scene with the mount moved or not, and the metal painted or not; and the probability of each."""
         out: list[tuple[SceneLikelihood, float]] = []
         paint_cases = _certainties(self._estimate_paint_probability())
         for (moved, share), (painted, paint_share) in itertools.product(_certainties(self.prior.moved), paint_cases):
@@ -388,14 +388,14 @@ class SceneLikelihood:
         return out
 
     def within(self, prior: RigPrior, z: Real) -> Real:
-        """Return particles of this hypothesis as particles of a prior that leaves it open."""
+        """Convert particles of this hypothesis to particles of `prior`, in which it is one of several cases."""
         out = z.copy()
         out[:, HAS_MOVED] = _place(z[:, HAS_MOVED], self.prior.moved, prior.moved)
         out[:, PAINT] = _place(z[:, PAINT], self.prior.painted, prior.painted)
         return out
 
     def _estimate_paint_probability(self) -> float:
-        """Return the probability of paint: without kinds of materials nothing could tell it, there is none."""
+        """Return the probability of paint; 0 without kinds of materials, for nothing else could tell it."""
         return self.prior.painted if self.kinds is not None else 0.0
 
     def leakage(self, z: Real) -> tuple[Complex, Complex]:
@@ -411,17 +411,17 @@ class SceneLikelihood:
         return z[..., HAS_MOVED, None] > scipy.special.ndtri(1 - self.prior.moved)
 
     def leakage_of_patches(self, z: Real) -> tuple[Complex, Complex]:
-        """Return a and b of each patch as its rise turns the polarisations, [..., patch] each."""
+        """Return a and b of each patch, changed by its rise across the plane of incidence, [..., patch] each."""
         a, b = self.leakage(z)
         turned_by = self.turn(z) * self.rise[:, 1]
         return a + turned_by, b - turned_by
 
     def turn(self, z: Real) -> Real:
-        """Return the turn of the polarisations by a rise across the plane of incidence, [..., 1], per radian."""
+        """Return the change of a, and minus that of b, per radian of rise across the plane of incidence, [..., 1]."""
         return TURN + TURN_STD * z[..., TURN_BY_RISE, None]
 
     def lighting(self, z: Real) -> Complex:
-        """Return the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
+        """Return G.w, the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
         std_along, std_across = self.prior.lighting_std
         rise = self.rise - np.array(self.prior.metal_rise)
         # The phase of V / H is taken to change by a tenth of what the amplitude does (chosen).
@@ -435,15 +435,15 @@ class SceneLikelihood:
         return self.theta + self.prior.theta_std_rad * z[..., ANGLE, None]
 
     def reference_ratio(self, z: Real) -> Complex:
-        """Return t of the reference, [..., 1]: paint delays p of metal more than s."""
+        """Return t of the metal reference, exp(-j c), [..., 1]: paint delays p more than s."""
         return np.exp(-1j * self.paint(z))
 
     def log_reference_brightness(self, z: Real) -> Real:
-        """Return ln |r_s| of the reference, [..., 1]: 0 of metal."""
+        """Return ln |r_s| of the reference, [..., 1]: 0 for metal."""
         return np.zeros((*z.shape[:-1], 1))
 
     def paint(self, z: Real) -> Real:
-        """Return the phase of 1 / P by the metal's paint, [..., 1], radians: 0 of bare metal, else uniform."""
+        """Return c, [..., 1], radians: 0 of bare metal, else uniform up to `MOST_PAINT_RAD`."""
         painted = self._estimate_paint_probability()
         if painted <= 0:
             return np.zeros((*z.shape[:-1], 1))
@@ -451,7 +451,7 @@ class SceneLikelihood:
         return MOST_PAINT_RAD * np.maximum(beyond_bare, 0.0) / painted
 
     def ratios(self, z: Real, change: Real | float = 0.0) -> Complex:
-        """Return t of every patch, [..., patch]; of the measured V / H plus a `change` [patch]."""
+        """Return t of every patch, [..., patch], from the measured V / H plus a `change` [patch] of it."""
         measured = self.measured + change
         a, b = self.leakage_of_patches(z)
         rho = self.prior.reference_std * _complex(z, REFERENCE)
@@ -466,7 +466,7 @@ class SceneLikelihood:
         return HalfSpaces(self.ratios(z), self.angle(z))
 
     def brightness_off(self, z: Real, half_spaces: HalfSpaces) -> Real:
-        """Return ln |H| of every patch minus that of Eq. 2 and the metal's, [..., patch], given `half_spaces` of z."""
+        """Return ln kappa, [..., patch], without the metal's brightness, from `half_spaces` at z; at most +-10."""
         a, _ = self.leakage_of_patches(z)
         with np.errstate(divide="ignore", invalid="ignore"):
             model = half_spaces.log_brightness() + np.log(np.abs((1 + a * half_spaces.t) / (1 + a)))
@@ -475,23 +475,23 @@ class SceneLikelihood:
         return np.where(np.isfinite(difference), np.clip(difference, -10, 10), 10.0)
 
     def brightness_std(self, z: Real) -> Real:
-        """Return the usual size of ln kappa, [...]."""
+        """Return the standard deviation of ln kappa, [...]."""
         low, high = self.prior.brightness_range
         return low * (high / low) ** scipy.special.ndtr(z[..., SIZE_OF_BRIGHTNESS])
 
     def library_share(self, z: Real) -> Real:
-        """Return the share of the library's materials in this scene, [...]; uniform."""
+        """Return the share of the library's materials in this scene, [...]; 1e-12 without a library."""
         if self.kinds is None or not self.kinds.in_library.any():
             return np.full(z.shape[:-1], 1e-12)
         low, high = LIBRARY_SHARE
         return low + (high - low) * scipy.special.ndtr(z[..., SHARE_OF_LIBRARY])
 
     def log_likelihoods(self, z: Real) -> Real:
-        """Return log likelihoods [..., 1 + patch]: of all brightnesses, and of each patch to be some material."""
+        """Return log likelihoods [..., 1 + patch]: of all patches' |H| together, and of each patch as some material."""
         return self._log_likelihoods(z, self.half_spaces(z))
 
     def _log_likelihoods(self, z: Real, half_spaces: HalfSpaces) -> Real:
-        """Return the same, given the half spaces of these particles."""
+        """Return the `log_likelihoods` of z, given the half spaces of the patches at z."""
         density = brightness_density(self.brightness_off(z, half_spaces), self.brightness_std(z)[..., None])
         brightness_log = np.where(self.bright, np.log(density + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
@@ -508,14 +508,14 @@ class SceneLikelihood:
 
 
 def _certainties(probability: float) -> list[tuple[float, float]]:
-    """Return whether something is so, 0 or 1, with the probability of each that is possible."""
+    """Return pairs (0: it is not so, or 1: it is so; probability of that), without pairs of probability 0."""
     return [(value, share) for value, share in ((0.0, 1 - probability), (1.0, probability)) if share > 0]
 
 
 def _place(z: Real, certainty: float, probability: float) -> Real:
-    """Return a column z of a hypothesis (`certainty` 0 or 1) as a column of a prior with this `probability` of it.
+    """Convert a column z of a hypothesis (`certainty` 1: it is so, 0: not) to one of a prior with this `probability`.
 
-    The hypothesis holds in the uppermost part of the standard normal distribution that has its probability.
+    In the prior's column, a standard normal number, it is so in the uppermost part, which has that probability.
     """
     if certainty == probability:
         return z
@@ -525,17 +525,17 @@ def _place(z: Real, certainty: float, probability: float) -> Real:
 
 
 def _complex(z: Real, columns: tuple[int, int]) -> Complex:
-    """Return two columns of particles as real and imaginary part, [..., 1]."""
+    """Return the complex number whose real and imaginary part are two columns of particles, [..., 1]."""
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
 
 def _anneal(
     model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator, parts: Real | None = None
 ) -> tuple[Real, float]:
-    """Move particles of one posterior to another.
+    """Move particles `z` from one posterior to another; return them, and ln of the second's evidence over the first's.
 
-    `before`, `after` [1 + patch] weigh the log likelihoods (`parts`, if they are known). Return the particles with the
-    logarithm of the ratio of both evidences.
+    `before` and `after` [1 + patch] are the weights of the log likelihoods in the two posteriors. `parts` are the log
+    likelihoods of `z`; None: they are computed.
     """
     parts = model.log_likelihoods(z) if parts is None else parts
     change = after - before
@@ -550,7 +550,7 @@ def _anneal(
         chosen = _resample(np.exp(step * (gain - gain.max())), rng)
         z = z[chosen]
         parts = parts[chosen]
-        # Random walk of the usual size in so many dimensions, shaped as the particles lie.
+        # Random walk with the particles' covariance, scaled as usual by the number of dimensions.
         spread = np.linalg.cholesky(np.cov(z.T) + 1e-9 * np.eye(model.width)) * 2.0 / np.sqrt(model.width)
         for _ in range(MOVES):
             proposed = z + rng.standard_normal(z.shape) @ spread.T
@@ -563,7 +563,7 @@ def _anneal(
 
 
 def _choose_step(gain: Real, most: float) -> float:
-    """Return the largest step of the temperature that leaves half of the particles' weight effective."""
+    """Return the largest step of the temperature, up to `most`, that leaves half of the particles effective."""
 
     def effective_share(step: float) -> float:
         weight = np.exp(step * (gain - gain.max()))
@@ -667,7 +667,7 @@ def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) 
 
     They add up to 1; empty if the variance is zero or not finite.
     """
-    # A source alone: its columns vary as in the particles, all others stay at their mean.
+    # Effect of one source: its columns vary as in the particles, all others stay at their mean.
     mean = np.tile(z.mean(axis=0), (len(z), 1))
     of_all = model.permittivities(z)[:, i] - value
     slope_at_mean = permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])
@@ -685,7 +685,7 @@ def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) 
 
 
 def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
-    """Return what the scene says of a patch's ratio at the angle of the kinds."""
+    """Return the evidence for the name of patch `i`: its t at the incidence angle of `kinds`, with covariance."""
     half_spaces = model.half_spaces(z)
     t = half_spaces.move_to_angle(kinds.theta_rad)[:, i]
     covariance = np.cov(split_complex(t).T) + model.own[i]

@@ -329,7 +329,7 @@ class SceneLikelihood:
 
     Arrays [patch]: `measured` V / H, `rise` [patch, 2] and `theta` as in `PatchMeasurement`; `bright`: True if |H| is
     used; `log_level`: ln |H|; `own` [patch, 2, 2]: covariance of t by a patch's own errors; `own_variance`: that of
-    each part of V / H; `densities`: of t by kinds, or None; `log_layer_odds`: ln odds of layers by change over the sweep.
+    each part of V / H; `densities`: of t by kinds, or None; `log_layer_odds`: ln odds of layers by the sweep.
     """
 
     width = WIDTH

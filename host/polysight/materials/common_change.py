@@ -1,17 +1,18 @@
 """Changes of the gain of V over H during a scan, from the slopes of ln(V / H) over the plates.
 
-The stage moves the whole rig, so that ln(V / H) is constant over a plate, except for four causes. The slopes of
-ln(V / H) that they make differ:
+V and H are the complex images of both receivers, so ln(V / H) has the ratio of amplitudes as its real part and the
+phase difference (radians) as its imaginary part. The stage moves the whole rig. So ln(V / H) would be constant over a
+plate, and its slopes (per metre) along x and y would be 0, but for four causes:
 
-- a drift of the gains is a function of y, because rows are scanned one after the other;
-- a second path beside the direct path makes fringes over the stage's plane, of any direction, as large in amplitude as
-  in phase. Long ones change the gain from plate to plate; short ones lay copies of plates on each other;
-- images of H and V that are not in the same place give all plates the same slope;
-- each plate has slopes of its own: it is uneven, disturbed, or a copy of another lies on it.
+- The gains drift. The gain is then a function of y, because rows are scanned one after the other.
+- A second path beside the direct path makes fringes over the plane of the stage, in any direction. They are as large in
+  amplitude as in phase. Long fringes change the gain from plate to plate; short ones add shifted copies of plates.
+- Images of H and V are not in the same place: that gives all plates the same slope.
+- A plate has slopes of its own: it is uneven or disturbed, or a copy of another plate lies on it.
 
-The first two are one field g(x, y), drift and fringes together, seen by its derivatives (Gaussian process; Rasmussen
-and Williams, Gaussian Processes for Machine Learning, 2006, 9.4). The uncertainty that the plates' slopes leave is in
-the error of every plate.
+Drift and fringes together are one field g(x, y), of which the plates' slopes are the measured derivatives (Gaussian
+process; Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, 9.4). The uncertainty of g that these
+slopes leave becomes part of the error of each plate.
 """
 
 from __future__ import annotations
@@ -29,67 +30,70 @@ Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 STABLE = 0.5
-"""Probability of a rig that does not drift; what drifts in amplitude does so in phase. Chosen: an even drift has slopes
-like those that all plates have by themselves. With 0.8 such a drift is missed, with 0.4 the half widths of undisturbed
-scenes are 8 % larger than with 0.6 (scenes of the independent generator)."""
+"""Prior probability that the rig does not drift, neither in amplitude nor in phase. Chosen: an even drift makes the
+same slope on all plates, as shifted images do. With 0.8 such a drift is missed. With 0.4 the half widths of the error
+intervals of undisturbed scenes are 8 % larger than with 0.6 (scenes of the independent generator)."""
 DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.03, 0.06)}
-"""Standard deviations of the drift of ln(V / H) over a scan, each part, equally probable (chosen): of a stable rig, and
-of one that drifts, as usual or by 15 % and 9 degrees."""
+"""Standard deviations of the drift of either part of ln(V / H) over a scan (chosen). Key: True for a stable rig, False
+for one that drifts, as usual or by up to 15 % and 9 degrees. Values of one key are equally probable."""
 # Tried with equal probabilities.
 DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
-"""Lengths over which a drift changes, along the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
+"""Correlation lengths of the drift along y, the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
 SLOPE_SEEN = 0.88
-"""Slope of ln(V / H) within a plate's image over the slope of the gain over the scan. A pixel sees the gain averaged
-over a Fresnel zone, of which near a plate's edge only the plate's side echoes: it sees the gain nearer the middle. In
-100 drifting scenes of the independent generator the changes between plates are 1.1 to 1.2 times what slopes tell."""
+"""Slope of ln(V / H) within a plate's image over the slope of the gain. A pixel has the gain averaged over a Fresnel
+zone. Near a plate's edge only the plate's side of that zone echoes, so the average is nearer the gain in the middle of
+the plate. In 100 drifting scenes of the independent generator the gain changed between plates by 1.1 to 1.2 times the
+integral of the slopes."""
 FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
-"""Standard deviations of fringes in ln(V / H) by a second path beside the direct path, each part, with their prior
-probabilities; the published rig shows 10 to 20 %."""
+"""Standard deviation of the fringes in either part of ln(V / H), to its prior probability; 0: no fringes. The published
+rig shows 10 to 20 %."""
 FRINGE_LENGTHS_M = (0.03, 0.05)
 """Correlation lengths of fringes whose period is 0.2 to 0.3 m. Shorter ones average out over a plate."""
 COMMON_SLOPES = {0.15: 0.7, 0.5: 0.2, 2.0: 0.1}
-"""Standard deviations of the slope of ln(V / H) that all plates have by themselves, per metre, with their prior
-probabilities (chosen): H and V that see the same place (0.1 to 0.3 in scenes of the independent generator), images some
-millimetres apart (0.5), and a small aperture (1 to 3)."""
+"""Standard deviation of the slope of ln(V / H) that all plates share, per metre, to its prior probability (chosen). H
+and V in the same place have 0.1 to 0.3 (scenes of the independent generator), images some millimetres apart 0.5, and
+images of a small aperture 1 to 3."""
 OWN_SLOPES = (0.05, 1.0, 3.0)
-"""Standard deviations of the slope that each plate has of its own, per metre: flat plates, uneven or disturbed ones.
-All are equally probable: with flat plates preferred the published picture's ripple counts as fringes, and the half
-widths of its plates are 30 instead of 19 %."""
+"""Standard deviations of a plate's own slope, per metre: flat, uneven, and disturbed plates. All three are equally
+probable: if flat plates are preferred, the ripple of the published picture counts as fringes, and the half widths of
+its plates' intervals are 30 instead of 19 %."""
 ALIKE_BOTH_WAYS = 0.7
-"""Probability that the plates' own slopes are as large along x as along y; chosen. Bent plates have them along y alone,
-in which direction H and V see different places."""
+"""Prior probability that the plates' own slopes have the same standard deviation along x and y; chosen. Bent plates
+have slopes along y alone, the direction in which H and V see different places."""
 BORDER_SLOPE_STD = 100.0
-"""Standard deviation of the slope of a plate at the border of the image: it says nothing."""
+"""Standard deviation of the slope of a plate at the border of the image, per metre: so large that it is not used."""
 LEAST_SLOPE_STD = 1e-3
-"""Least standard deviation of a slope, per metre."""
+"""Smallest standard deviation of a measured slope, per metre."""
 RIPPLE_M = 0.015
-"""Error of a plate's ln(V / H) over its own slopes: copies of other plates turn their phase against the plate by
-50 to 100 radians per metre. 15 mm fits the errors of plates of the independent generator best (20 and 30 are worse)."""
+"""Error of a plate's ln(V / H) over the root mean square of its own slopes: a copy of another plate turns its phase
+against the plate by 50 to 100 radians per metre. 15 mm fits the errors of plates of the independent generator best (20
+and 30 mm are worse)."""
 PHASE_OF_CHANGE = 0.75
-"""Errors of a plate's phase by drift, fringes and its own slopes, over those that the slopes tell. The phase's slopes
-are larger than the amplitude's, its errors are not: the interval that holds 68 % is 0.73 of what the amplitude needs in
-scenes of the own simulator where these errors dominate, 0.83 in those of the independent generator."""
+"""Factor of the estimated error of a plate's phase by drift, fringes and its own slopes. The slopes of the phase are
+larger than those of the amplitude, but its errors are not. Where these errors dominate, the factor at which 68 % lie
+within the interval is smaller for the phase: 0.73 of the amplitude's in scenes of the own simulator, 0.83 in those of
+the independent generator."""
 USUAL_RIPPLE = 2.0
-"""Weight of the scene's usual slopes against a plate's own three; chosen."""
+"""Weight of the scene's usual squared slope, in the mean with the three squared slopes of a plate; chosen."""
 
 
 @dataclass(frozen=True)
 class CommonChange:
-    """Change of ln(V / H) over the scan.
+    """Estimated change of ln(V / H) from the origin, the metal reference, to each plate.
 
     Attributes
     ----------
     value, std
-        complex [plate]: ln(V / H) at each plate relative to the origin by drift and fringes, and the standard
-        deviations of its real and of its imaginary part.
+        complex [plate]: change by drift and fringes; its standard deviations, that of the real part as the real part of
+        `std`, that of the imaginary part as its imaginary part.
     drift, drift_std
-        complex [plate]: the part of them that drift makes.
+        complex [plate]: the same by drift alone.
     ripple
-        float64 [plate]: error of each part of the plate's ln(V / H) by its own slopes.
+        float64 [plate]: standard deviation of either part of the plate's ln(V / H) by its own slopes.
     fringes
-        Probability of fringes by a second path beside the direct path.
+        Probability that there are fringes by a second path beside the direct path.
     drifts
-        Probability that the gains drift, by more than those of a stable rig.
+        Probability that the gains drift by more than those of a stable rig.
     """
 
     value: Complex
@@ -101,7 +105,10 @@ class CommonChange:
     drifts: float
 
     def largest_drift(self) -> tuple[float, float]:
-        """Return the largest root mean square of the drift at a plate, of its real and of its imaginary part."""
+        """Return the largest root mean square of the drift over all plates, of its real and of its imaginary part.
+
+        The root mean square at a plate is that of the estimate and its standard deviation. 0 without plates.
+        """
         if not self.drift.size:
             return 0.0, 0.0
         amplitude = np.hypot(self.drift.real, self.drift_std.real)
@@ -109,7 +116,10 @@ class CommonChange:
         return float(amplitude.max()), float(phase.max())
 
     def log_ratio(self, plate: int) -> tuple[complex, tuple[float, float]]:
-        """Return ln(V / H) of a plate relative to the origin, and the standard deviations of both of its parts."""
+        """Return the change of ln(V / H) from the origin to a plate, and the standard deviations of both parts.
+
+        They include the plate's ripple.
+        """
         std = complex(self.std[plate])
         ripple = float(self.ripple[plate])
         of_phase = PHASE_OF_CHANGE * float(np.hypot(std.imag, ripple))
@@ -121,8 +131,8 @@ def estimate_common_change(
 ) -> CommonChange:
     """Estimate the change of ln(V / H) over the scan from the slopes of all plates of a scene.
 
-    It is zero at `origin_m`, (x, y) of the metal reference. The slopes of plates `at_border` of the image (one value
-    for each plate; none if empty) tell nothing; these plates have an estimate as all others.
+    The change is zero at `origin_m`, (x, y) of the metal reference, metres. `at_border` is True for plates at the
+    border of the image (one value per plate; empty: no plate is). Their slopes are not used, but they get an estimate.
     """
     border = np.array(at_border, bool) if at_border else np.zeros(len(plates), bool)
     places_m = np.array([plate.centre_m for plate in plates], np.float64).reshape(-1, 2)
@@ -134,7 +144,7 @@ def estimate_common_change(
         noise = np.array([part(plate.slope_std) for plate in plates], np.float64).reshape(-1, 2).T
         noises.append(np.maximum(noise, LEAST_SLOPE_STD))
         parts.append(smooth_fields.explain(slopes, noises[-1] + BORDER_SLOPE_STD * border))
-    # Fringes, and slopes that all plates have alike, are as large in amplitude as in phase.
+    # The cases of `shared` apply to amplitude and phase together, so both evidences count.
     log_weight = parts[0].log_evidence + parts[1].log_evidence + smooth_fields.log_prior
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
@@ -152,12 +162,13 @@ def estimate_common_change(
 
 
 def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], border: npt.NDArray[np.bool_]) -> Real:
-    """Return the root mean square of each plate's own slopes beyond their errors, [plate], per metre.
+    """Return the root mean square of each plate's own slopes beyond their measurement errors, [plate], per metre.
 
-    `remaining` and `noises` are those of the real part and of the imaginary part, [2, plate] each, along x and y. What
-    disturbs a plate does so alike both ways and in both parts. Unevenness changes the brightness of H and V along y
-    alone, in which direction they see different places; it is antisymmetric about the middle and no error of the
-    median: these slopes are left out.
+    `remaining` are the slopes without those by common causes, and `noises` their standard deviations: each a pair (real
+    part, imaginary part) of arrays [2, plate] along x and y. A disturbance is taken as equally strong in both
+    directions and both parts, so that their squares are averaged.
+    The slope of the real part along y is left out. H and V see different places along y, so an uneven plate changes
+    their brightness ratio there. This change is antisymmetric about the plate's middle and no error of the median.
     """
     (real_x, _), (imag_x, imag_y) = remaining
     (noise_real_x, _), (noise_imag_x, noise_imag_y) = noises
@@ -172,29 +183,32 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
 
 
 def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
-    """Return the variance of slopes [plate] about zero beyond their errors; 0 with fewer than three plates.
+    """Return the variance of `slopes` [plate] about zero minus that of their `errors`; 0 with fewer than three plates.
 
-    It is robust: one plate that hardly reflects V, whose slopes are large, is no ripple.
+    It is computed from medians, so that the large slopes of one plate that hardly reflects V do not count as ripple.
     """
     if slopes.size < 3:
         return 0.0
     scatter = 1.4826 * float(np.median(np.abs(slopes)))
-    # Larger by the freedom that what all plates share has taken: it was fitted to the same slopes (two, chosen).
+    # The common causes were fitted to the same slopes: n / (n - 2) makes up for the freedom that took (2 is chosen).
     return max(0.0, scatter**2 - float(np.median(errors)) ** 2) * slopes.size / (slopes.size - 2)
 
 
 @dataclass(frozen=True)
 class _Field:
-    """Covariances of a smooth field of unit variance on the plane, relative to its value at the origin.
+    """Covariances of a smooth field of unit variance on the plane, at the plates.
+
+    A value is the field at a plate minus the field at the origin. A slope is as the plate's image shows it, smaller
+    than the field's by `SLOPE_SEEN`; slopes along x stand before those along y.
 
     Attributes
     ----------
     of_slopes
-        [2 plate, 2 plate]: of its slopes as the plates' images show them, those along x before those along y.
+        [2 plate, 2 plate]: covariance of the slopes, 1 / m^2.
     with_slopes
-        [plate, 2 plate]: of its values with its slopes.
+        [plate, 2 plate]: covariance of the values with the slopes, 1 / m.
     of_itself
-        [plate]: variances of its values.
+        [plate]: variance of the values.
     """
 
     of_slopes: Real
@@ -203,16 +217,16 @@ class _Field:
 
     @classmethod
     def along(cls, axes: tuple[int, int], length_m: float, places_m: Real, origin_m: Real) -> _Field:
-        """Return a field with a Gaussian covariance of length `length_m`, at places [plate, 2].
+        """Return a field whose covariance is Gaussian with the standard deviation `length_m`, at places [plate, 2].
 
-        `axes` has 1 for each of x and y along which the field changes, and 0 for one along which it is constant.
+        `axes` (x, y) has 1 for an axis along which the field changes, and 0 for one along which it is constant.
         """
         count = len(places_m)
         distance = (places_m[:, None] - places_m[None]) * np.array(axes)
         from_origin = (places_m - origin_m) * np.array(axes)
         covariance = np.exp(-0.5 * np.sum(distance**2, axis=-1) / length_m**2)
         with_origin = np.exp(-0.5 * np.sum(from_origin**2, axis=-1) / length_m**2)
-        # Derivatives of the Gaussian covariance by one place and by both.
+        # Derivatives of the Gaussian covariance with respect to both places, and to one place.
         product = distance[..., :, None] * distance[..., None, :] / length_m**2
         of_slopes = covariance[..., None, None] * (np.diag(axes) - product) / length_m**2
         with_slopes = (covariance[..., None] * distance + (with_origin[:, None] * from_origin)[None]) / length_m**2
@@ -225,19 +239,19 @@ class _Field:
 
 @dataclass(frozen=True)
 class _Fields:
-    """Drift and fringes at the places of the plates, and the prior of what both parts of ln(V / H) share.
+    """Fields of drift and fringes at the plates, and the cases that are weighed against each other.
 
     Attributes
     ----------
     drifts
-        Fields of unit variance along y, one for each of `DRIFT_LENGTHS_M`.
+        Fields of unit variance that change along y, one for each of `DRIFT_LENGTHS_M`.
     fringes
-        Length in metres to the field of unit variance over the plane.
+        Correlation length in metres to the field of unit variance that changes along x and y.
     shared
-        Size and length of the fringes, the size of the slopes that all plates have alike, and whether the rig is
-        stable.
+        Cases that both parts of ln(V / H) share: standard deviation and correlation length (metres) of the fringes,
+        standard deviation of the slope that all plates share (per metre), and True if the rig is stable.
     log_prior
-        Logarithm of the prior probability of each of `shared`.
+        ln of the prior probability of each case of `shared`, but for a common constant.
     """
 
     drifts: Sequence[_Field]
@@ -262,16 +276,20 @@ class _Fields:
         )
 
     def explain(self, slopes: Real, noise: Real) -> _Explained:
-        """Return what the slopes [2, plate] of one part and their errors tell, for each of `shared`."""
+        """Explain the slopes [2, plate] of one part of ln(V / H), once for each case of `shared`.
+
+        `noise` [2, plate] is the standard deviation of the slopes.
+        """
         parts = [_list_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
         return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _explain(
         self, slopes: Real, noise: Real, fringe: float, fringe_m: float, common: float, stable: bool
     ) -> _Explained:
-        """Return the same for one of `shared`, averaged over drifts and the plates' own slopes by their evidence.
+        """Explain the slopes by one case of `shared`, averaged over drifts and the plates' own slopes by their
+        evidence.
 
-        `fringe` and `fringe_m` are size and length of the fringes, `common` that of the slopes that all plates have.
+        The case is given by `fringe`, `fringe_m`, `common` and `stable`, in the order of `shared`.
         """
         count = slopes.shape[1]
         measured = slopes.ravel()
@@ -282,7 +300,7 @@ class _Fields:
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = of_common_causes + drift**2 * field.of_slopes
             total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
-            # Gaussian process: `answer` weighs the slopes, its products with covariances are the expected values.
+            # Gaussian process: the expected value of any quantity is its covariance with the slopes times `answer`.
             inverse = np.asarray(np.linalg.inv(total), np.float64)
             answer = inverse @ measured
             of_drift = drift**2 * field.with_slopes
@@ -303,7 +321,10 @@ class _Fields:
 
 
 def _estimate_own_variances(count: int) -> tuple[Real, Real]:
-    """Return variances of the plates' own slopes along x and y, [case, 2 plate], and the probability of each case."""
+    """Return variances of the plates' own slopes, [case, 2 plate] (x before y), and the prior probability of each case.
+
+    A case is a pair of `OWN_SLOPES`, one along x and one along y.
+    """
     variances = []
     shares = []
     for along_x, along_y in itertools.product(OWN_SLOPES, OWN_SLOPES):
@@ -316,25 +337,29 @@ def _estimate_own_variances(count: int) -> tuple[Real, Real]:
 
 
 def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
-    """Return the mean square of a field at each plate, [case, plate], from its covariance with the slopes."""
+    """Return the expected square of a field at each plate given the slopes, [case, plate].
+
+    `answer` is as in `_Fields._explain`, `inverse` that of the slopes' covariance, `with_slopes` and `of_itself` as in
+    `_Field`.
+    """
     explained_variance = np.sum(with_slopes @ inverse * with_slopes, axis=-1)
     return np.maximum(of_itself - explained_variance, 0.0) + (answer @ with_slopes.T) ** 2
 
 
 @dataclass(frozen=True)
 class _Explained:
-    """Drift and fringes expected from the slopes of one part (real or imaginary), for some cases.
+    """Drift and fringes expected from the slopes of one part of ln(V / H) (real or imaginary), for some cases.
 
     Attributes
     ----------
     log_evidence
-        [case]: logarithm of the probability density of the slopes, but for a constant factor.
+        [case]: logarithm of the probability density of the slopes, but for a constant.
     mean, square
         [case, plate]: mean and mean square of drift and fringes at each plate.
     drift, drift_square
         [case, plate]: mean and mean square of the drift alone.
     remaining
-        [case, 2, plate]: slopes along x and y that are left.
+        [case, 2, plate]: measured slopes along x and y minus those expected from drift, fringes and the common slope.
     """
 
     log_evidence: Real
@@ -346,7 +371,7 @@ class _Explained:
 
     @classmethod
     def average_over(cls, parts: Sequence[_Explained]) -> _Explained:
-        """Return one case for all cases of `parts`, weighed by their evidence."""
+        """Return one case: the average over all cases of `parts`, weighted by their evidence."""
         together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_list_arrays, parts), strict=True)))
         largest = float(together.log_evidence.max())
         weight = np.exp(together.log_evidence - largest)
@@ -354,7 +379,7 @@ class _Explained:
         return replace(average, log_evidence=np.array([largest + np.log(weight.sum())]))
 
     def average(self, weight: Real) -> _Explained:
-        """Return one case, the average with weights [case]."""
+        """Return one case: the average over the cases with weights [case] that sum to 1."""
         return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _list_arrays(self)))
 
     @property

@@ -1,9 +1,9 @@
 """Kinds of materials that a plate may be of, as densities over t = 1 / P: a library's, the literature's, and others.
 
-P = H / V is relative to metal. A kind is a half space whose ln eps' and eps'' are normal about its value (two specimens
-of a material differ); to first order its t is normal, too. Patches are of the library's kinds, of the literature's, or
-any half space, thin plate or stack. The density of a measured ratio under all of them is the prior of the joint
-inversion, and its parts are the probabilities of names. Eq. 2 and 3 of the POLySIGHT paper convert eps to P and back.
+P = H / V is relative to metal; eps = eps' - j eps''. A kind is metal, or a half space whose ln eps' and eps'' are
+normal, as specimens differ; to first order its t is normal, too. A patch is of a kind of the library or of the
+literature, or any other half space, thin plate or stack. The density of t under all of them is the prior of the joint
+inversion; its parts give the probabilities of names. Eq. 2 and 3 of the POLySIGHT paper convert eps to P and back.
 """
 
 from __future__ import annotations
@@ -28,68 +28,68 @@ Source = Literal["library", "literature"]
 REAL_RANGE = (1.2, 30.0)
 LOSS_RANGE = (0.0, 30.0)
 SOFT_LOSS = 0.05
-"""Ranges of eps' and eps'' of any half space, from nearly air to beyond water. Its coordinates are ln eps' and
-asinh(eps'' / SOFT_LOSS), which is logarithmic above `SOFT_LOSS` and linear below."""
+"""Ranges of eps' and eps'' of any half space, from nearly air to beyond water. Densities are over the coordinates
+ln eps' and asinh(eps'' / SOFT_LOSS); the second is logarithmic above `SOFT_LOSS` and linear below."""
 NEAR_LITERATURE = 0.8
-"""Share of the other half spaces that lie near the literature's: materials that no table has are mostly like those that
-one has. The rest is uniform in both coordinates."""
+"""Share of the half spaces of no kind that lie near a kind of the literature: materials that are in no table are mostly
+like those that are. The others are uniform in both coordinates."""
 NEAR_LITERATURE_STD = (0.12, 0.6)
-"""Distance of these from the literature's in both coordinates, standard deviations. Share and distance are chosen."""
+"""Standard deviations of their distance from that kind in both coordinates. Share and distance are chosen."""
 USUAL_LIBRARY_SHARE = 0.5
 """Expected share of a library's materials in a scan that was processed without it; chosen."""
 LITERATURE_SHARE = 0.4
-"""Share of the literature in thick plates that are none of the library's materials; the others are metal or any half
-space. Chosen, as are the shares of metal and of thin plates: larger ones draw uncertain names to these."""
+"""Share of the literature's kinds in thick plates that are of no kind of the library. The others are metal or any half
+space. Chosen, as are the shares of metal and of thin plates: a larger share draws uncertain names to it."""
 METAL_SHARE = 0.1
-"""Share of metal in these patches; chosen."""
+"""Share of metal in these thick plates; chosen."""
 SHEET_SHARE = 0.25
-"""Share of thin plates, which reflect at both faces, in what is none of the library's materials. Chosen: with 0.15 thin
-wood of the published picture was named after laminates, with 0.3 a lossy half space became a possible layer."""
+"""Share of thin plates, which reflect at both faces, in patches of no kind of the library. Chosen: with 0.15 thin wood
+of the published picture was named as a laminate; with 0.3 a lossy half space counted as possibly thin."""
 SHEET_REAL = (1.5, 8.0)
 SHEET_LOSS_TANGENT = (1e-3, 0.2)
 SHEET_MM = (0.2, 6.0)
-"""Permittivities and thicknesses of thin plates; all uniform on logarithmic scales; chosen."""
+"""Ranges of eps', loss tangent and thickness of thin plates, each uniform on a logarithmic scale; chosen."""
 HOLDER_REAL = (1.0, 2.5)
-"""Permittivity behind a thin plate: air, foam, wood. Half of the plates have air."""
+"""Range of the permittivity behind half of the thin plates, uniform: foam, wood. Behind the other half is air."""
 SHEET_HZ = 78e9
-"""Frequency at which thin plates are drawn, about the middle of the sweep."""
+"""Frequency at which t of the drawn thin plates is computed, about the middle of the sweep."""
 SHEET_KERNEL = 0.02
-"""Smoothing of the distribution of thin plates, in t; chosen."""
+"""Standard deviation by which the distribution of the drawn plates' t is smoothed; chosen."""
 STACK_SHARE = 0.05
-"""Share of plates that are neither half space nor thin plate in the patches that are none of the library's materials: a
-liquid behind glass may reflect as no passive half space does. Their t is uniform on the unit disk. Without them three
-cups of sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
+"""Share of stacks, neither half space nor thin plate, in patches of no kind of the library: a liquid behind glass may
+reflect as no passive half space does. Their t is uniform on the unit disk. Without them three cups of sugar water moved
+the estimated leakage by three standard deviations, and their own t by a fifth."""
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
-"""Share of patches whose brightness is that of nothing known (shadows, edges), and its logarithm's spread; chosen."""
+"""Share of patches whose |H| fits no half space (shadows, edges), and the standard deviation of ln |H| then; chosen."""
 # Cells of a map of densities along each side of its rectangle; chosen.
 _MAP_CELLS = 96
 DISPERSION_KERNEL = 0.05
 DISPERSION_MODEL = 0.2
-"""Errors of a thin plate's change over the sweep: smoothing of the drawn plates, and a share of each change (edges, and
-second echoes from beside). Chosen."""
+"""Standard deviations of a thin plate's change over the sweep: absolute, to smooth the drawn plates; and relative to
+the change, for edges and for second echoes from the neighbourhood. Chosen."""
 ODD_DISPERSION = 0.02
 ODD_DISPERSION_STD = 0.05
-"""Share of half spaces whose change over the sweep is that of their surroundings, and its usual size then; chosen."""
+"""Share of half spaces whose surroundings change over the sweep, and the standard deviation of that change; chosen."""
 LEAST_LOSS_SPREAD = 0.02
-"""Standard deviation of eps'' between specimens of low-loss materials; chosen."""
+"""Standard deviation of eps'' between specimens, in addition to that in proportion to eps''; chosen."""
 POSSIBLY_THIN = 0.2
-"""Probability of layers from which on a patch gets no permittivity: as that of a half space it would be wrong with this
+"""Probability of layers (thin plate or stack) above which a patch gets no permittivity, which would be wrong with this
 probability. Chosen: of 383 half spaces of an independent generator none has more, of the published picture's plates
 none more than 0.08."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat. Chosen."""
 LEAST_STD_OF_T = 1e-6
 MOST_STD_BEYOND = 30.0
-"""Least standard deviation of t in which a distance is counted, and its largest: there the density is nearly 0."""
-# Cells of the table of other half spaces along each coordinate: a fifth of `NEAR_LITERATURE_STD` and less.
+"""Smallest standard deviation of t by which a distance is divided, and the largest quotient that is distinguished."""
+# Cells of the table of half spaces along each coordinate: a fifth of `NEAR_LITERATURE_STD` and less.
 _COORDINATE_CELLS = 256
 _CELL_NUMBERS = np.arange(float(_COORDINATE_CELLS))
 # Smallest standard deviation of a ratio: below it a covariance has no inverse in double precision.
 LEAST_RATIO_STD = 1e-6
-# Step of numerical derivatives by ln of the real part, and by the loss; chosen.
+# Step of numerical derivatives with respect to ln eps' and to eps''; chosen.
 _STEP = 1e-4
-# Numbers of thin plates that are drawn, and of half spaces for several angles; chosen.
+# Numbers of thin plates that are drawn, and of half spaces that are drawn to join scans at several angles; chosen.
 _SHEETS = 6000
 _HALF_SPACES = 4000
 # Frequencies of the sweep at which a thin plate is computed; chosen.
@@ -100,9 +100,9 @@ _MOST_LOG_ODDS = 200.0
 
 @dataclass(frozen=True)
 class Kind:
-    """One material: its name, permittivity (None: metal), and where both are from.
+    """One material: its name, its mean permittivity (None: metal), and the source of both.
 
-    `spread`: standard deviations of ln eps' and of eps'' over its value between specimens.
+    `spread`: standard deviations between specimens of ln eps', and of eps'' relative to its mean.
     """
 
     name: str
@@ -110,7 +110,7 @@ class Kind:
     spread: tuple[float, float] = PUBLISHED_SPREAD
     source: Source = "library"
     family: str = ""
-    """Class of a material of the literature: "polymer", "wood"."""
+    """Class of a material of the literature, for example "polymer" or "wood"; "" for the library's."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +120,9 @@ class PatchDispersion:
     Attributes
     ----------
     change, std
-        float64 [3]: of ln |H|, ln |V / H| and the phase of V / H, and their standard deviations.
+        float64 [3]: change of ln |H|, of ln |V / H| and of the phase of V / H (radians); their standard deviations.
     band_hz
-        First and last frequency.
+        First and last frequency of the sweep.
     """
 
     change: Real
@@ -139,17 +139,17 @@ class PatchMeasurement:
     inverse_ratio
         V / H.
     std
-        Standard deviation of its real part and of its imaginary part: noise, sidelobes.
+        Standard deviation of the real part, and of the imaginary part, of V / H by noise and sidelobes.
     theta_rad
         Nominal incidence angle.
     brightness
         |H|; None if it is not used.
     relative_std
-        Standard deviations of ln|V / H| and of its phase by what scatters over the plate: edges, ripple, tilt.
+        Standard deviations of ln |V / H| and of the phase of V / H (radians) by edges, ripple and tilt of the plate.
     rise
         Rise of the plate along the plane of incidence and across it, radians.
     dispersion
-        Change over the sweep; None if it is not known.
+        Change of the patch over the sweep; None if it was not measured.
     """
 
     inverse_ratio: complex
@@ -174,16 +174,16 @@ class RatioEvidence:
     Attributes
     ----------
     theta_rad
-        Angle of incidence that the ratio is for.
+        Angle of incidence at which the patch has this t.
     inverse_ratio, covariance
-        t, corrected for all estimated errors; float64 [2, 2] of its real and imaginary part.
+        t, corrected for all estimated errors; covariance float64 [2, 2] of its real and imaginary part.
     library_share
         Expected share of the library's materials in this scan.
     brightness_off, brightness_std
-        ln |H| over that of the half space of this ratio, relative to the scene's, and its usual size in this scene; NaN
-        if |H| says nothing. Thin plates are brighter or darker than half spaces of the same ratio.
+        ln of |H| over that of a half space with this t, and its standard deviation over the scene's patches; the first
+        is NaN if |H| is not used. Thin plates are brighter or darker than half spaces of the same t.
     dispersion
-        Change over the sweep; None if it is not known.
+        Change of the patch over the sweep; None if it was not measured.
     """
 
     theta_rad: float
@@ -222,10 +222,10 @@ class HalfSpaces:
             return np.asarray(0.5 * np.log(difference2 / sum2), np.float64)
 
     def move_to_angle(self, other_rad: float) -> Complex:
-        """Return t of the same half spaces at another angle, complex128, broadcast."""
+        """Return t of the same half spaces at another angle, complex128, broadcast; metal's t is not changed."""
         other2 = np.sin(other_rad) ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
-            # Of both roots that in the direction of q: a loss stays a loss. Then u at the other angle, and t of it.
+            # q at the other angle: the root on the side of q, so that a loss stays a loss. Then its u, and its t.
             root = np.sqrt(np.square(self._q) + (self._sine2 - other2))
             along_q = root.real * self._q.real + root.imag * self._q.imag
             root = root * np.copysign(np.cos(other_rad) / other2, along_q)
@@ -234,7 +234,7 @@ class HalfSpaces:
 
 
 def brightness_density(difference: Real | float, size: Real | float) -> Real:
-    """Return the density of `difference` (ln |H| less its expectation), not normalised: error of `size`, or odd."""
+    """Return the density, but for a factor, of `difference`, ln |H| minus the expected: of std `size`, or odd."""
     usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (difference / size) ** 2)
     odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
     return np.asarray(usual + odd, np.float64)
@@ -247,9 +247,9 @@ def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
 
 
 def move_to_angle_of_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEvidence:
-    """Return what a scan says of a patch, with its ratio at the angle of the kinds.
+    """Return the evidence with its t converted to the incidence angle of the kinds.
 
-    The covariance stays as it is: angles of a library differ from the scan's by a degree at most.
+    The covariance is not converted: angles of a library differ from the scan's by a degree at most.
     """
     t = HalfSpaces(evidence.inverse_ratio, evidence.theta_rad).move_to_angle(kinds.theta_rad)
     return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=complex(t))
@@ -274,18 +274,18 @@ class Kinds:
     Attributes
     ----------
     kinds
-        The library's and the literature's.
+        The library's, the literature's, and metal.
     in_library
         bool [kind]: True for materials of the library.
     t, effects, covariance, share
-        complex [kind], float64 [kind, 2, 2] twice, float64 [kind]: each kind's mean of t, the effect of the specimens'
-        two deviations on real and imaginary part, the covariance by them, and its share in the library, or in what is
-        none of the library's.
+        complex [kind]: mean t. float64 [kind, 2, 2]: effect of one standard deviation of ln eps' and of eps'' on the
+        real and imaginary part of t; covariance of t by both. float64 [kind]: share of the kind in the library, or in
+        patches of no kind of the library.
     other
-        Share of any other half space in what is none of the library's.
+        Share of any other half space in patches of no kind of the library.
     sheet_share, sheets, sheet_brightness_off
-        Share of thin plates in what is none of the library's (0: plates are thick), and [draw]: their t, and ln |r_s|
-        over that of the half space of the same t.
+        Share of thin plates in these patches (0: plates are thick). complex [draw]: t of the drawn thin plates. float64
+        [draw]: ln of their |r_s| over that of the half space with the same t.
     """
 
     def __init__(self, kinds: Sequence[Kind], theta_rad: float, sheets: bool = False) -> None:
@@ -306,9 +306,9 @@ class Kinds:
         return tuple(kind.name for kind in self.kinds)
 
     def density_map(self, low: complex, high: complex, covariance: Real) -> DensityMap:
-        """Tabulate the density of each kind on the rectangle of t from `low` to `high`, for patches of one covariance.
+        """Tabulate the densities of `DensityMap` on the rectangle of t from `low` to `high`.
 
-        `covariance`, float64 [2, 2], is of the real and the imaginary part of a patch's t.
+        `covariance`, float64 [2, 2], is that of the real and the imaginary part of a measured t.
         """
         real = np.linspace(low.real, high.real, _MAP_CELLS)
         imag = np.linspace(low.imag, high.imag, _MAP_CELLS)
@@ -322,7 +322,7 @@ class Kinds:
         reach = 4.5 * np.sqrt(summed[:, (0, 1), (0, 1)])
         columns = np.searchsorted(real, self.t.real + np.array([-1, 1])[:, None] * reach[:, 0])
         rows = np.searchsorted(imag, self.t.imag + np.array([-1, 1])[:, None] * reach[:, 1])
-        # The exponent of a normal density is split in parts along x, along y, and a product of both: only the latter is
+        # The exponent of a normal density is a term of x, plus a term of y, plus a product of both. Only the product is
         # computed for every cell.
         inverse = np.linalg.inv(summed)
         scale = self.share * np.sqrt(np.linalg.det(inverse)) / (2 * np.pi)
@@ -344,11 +344,11 @@ class Kinds:
         return DensityMap(low, high, np.log(density + 1e-12))
 
     def compute_half_space_density(self, t: Complex, covariance: Real) -> Real:
-        """Return the density of t of any half space, as `REAL_RANGE`, `LOSS_RANGE` and `SOFT_LOSS` say, shape of `t`.
+        """Return the density of t of half spaces of no kind, shape of `t`; see `REAL_RANGE` and `NEAR_LITERATURE`.
 
         `covariance` [2, 2] is that of the real and imaginary part of a measured t. Errors of the measurement soften the
-        border of the passive half spaces: the density beyond is that at the border, times exp(-x^2 / 2) with x the
-        distance from it in standard deviations.
+        border of the allowed half spaces: the density beyond it is that at the border times exp(-x^2 / 2), with x the
+        distance of t from the border in standard deviations.
         """
         std = float(np.sqrt(np.trace(covariance) / 2))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -370,9 +370,9 @@ class Kinds:
 
 @dataclass(frozen=True)
 class DensityMap:
-    """Logarithms of densities on a rectangle from `low` to `high`: the library's, other half spaces, and layers.
+    """Logarithms of densities over t on a rectangle from `low` to `high`, `log_density` float64 [3, imaginary, real].
 
-    `log_density` float64 [3, imaginary, real].
+    They are of the library's kinds, of all other half spaces (literature and metal included), and of layers.
     """
 
     low: complex
@@ -382,12 +382,12 @@ class DensityMap:
 
 @dataclass(frozen=True)
 class DensityMaps:
-    """The maps of all patches, which have equally many cells.
+    """The density maps of all patches, which have equal numbers of cells.
 
     Attributes
     ----------
     low, cells_per_unit
-        complex128 [patch]: corner of each rectangle, and cells per unit of t along both axes.
+        complex128 [patch]: lower corner of each rectangle; cells per unit of t along the real and the imaginary axis.
     log_density
         float64 [3, patch, imaginary, real].
     """
@@ -398,7 +398,7 @@ class DensityMaps:
 
     @classmethod
     def collect(cls, maps: Sequence[DensityMap]) -> DensityMaps:
-        """Return the maps together."""
+        """Return the maps of patches, one each, as arrays."""
         low = np.array([density_map.low for density_map in maps], np.complex128)
         size = np.array([density_map.high for density_map in maps], np.complex128) - low
         log_density = np.stack([density_map.log_density for density_map in maps], axis=1)
@@ -406,9 +406,9 @@ class DensityMaps:
         return cls(low, (columns - 1) / size.real + 1j * (rows - 1) / size.imag, log_density)
 
     def log_densities(self, t: Complex) -> Real:
-        """Return the logarithms of the densities at each patch's t [..., patch], [3, ..., patch].
+        """Return the logarithms of the three densities at each patch's t [..., patch], [3, ..., patch].
 
-        They are interpolated linearly; beyond the rectangle they are those of its border.
+        They are interpolated linearly. Beyond its rectangle a patch has the values of the border.
         """
         _, patches, rows, columns = self.log_density.shape
         x = np.fmin(np.fmax((t.real - self.low.real) * self.cells_per_unit.real, 0.0), columns - 1)
@@ -427,7 +427,7 @@ class DensityMaps:
 
 
 def literature(library: Collection[str] = ()) -> list[Kind]:
-    """Return the materials of the catalogue, but for those that a library of these names has measured itself."""
+    """Return the materials of the catalogue without those whose names are in `library`, which has measured them."""
     return [
         Kind(material.name, material.permittivity, material.spread, "literature", material.kind)
         for material in load_catalogue()
@@ -436,14 +436,14 @@ def literature(library: Collection[str] = ()) -> list[Kind]:
 
 
 def _nominal_ratio(kind: Kind, theta_rad: float) -> complex:
-    """Return t of a kind's own permittivity, that of the mean specimen; 1 for metal."""
+    """Return t of a kind's mean permittivity; 1 for metal."""
     if kind.permittivity is None:
         return 1.0 + 0j
     return complex(inverse_ratio(kind.permittivity, theta_rad))
 
 
 def _compute_effects(kind: Kind, theta_rad: float) -> Real:
-    """Return the effect on t of one standard deviation of ln eps' and of eps'' between specimens, [part, deviation]."""
+    """Return the change of t (real, imaginary) by one standard deviation of ln eps' and of eps'', [part, deviation]."""
     if kind.permittivity is None:
         return METAL_SPREAD * np.eye(2)
     eps = kind.permittivity
@@ -454,9 +454,9 @@ def _compute_effects(kind: Kind, theta_rad: float) -> Real:
 
 
 def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
-    """Return the share of each kind in the library or in the rest, and that of any other half space in the rest.
+    """Return the share of each kind in the library or in the rest, and the share of half spaces of no kind in the rest.
 
-    `sheets` is the share of thin plates in the rest.
+    The rest are patches of no kind of the library. `sheets` is the share of thin plates in it.
     """
     ours = np.array([kind.source == "library" for kind in kinds])
     metal = np.array([kind.permittivity is None for kind in kinds]) & ~ours
@@ -477,10 +477,10 @@ def _half_space_coordinates(real: npt.ArrayLike, loss: npt.ArrayLike) -> Real:
 
 @cache
 def _tabulate_coordinate_density() -> tuple[Real, Real, Real]:
-    """Return the density of other half spaces over both coordinates, float64 [eps', eps''], and its two axes.
+    """Return the density of half spaces of no kind over both coordinates, float64 [eps', eps''], and its two axes.
 
-    Near the literature's each kind of material counts the same, as laminates and tissues are no more common on a table
-    than others. What would lie beyond the ranges is reflected at their ends.
+    All families of the catalogue have the same weight: those with many entries (laminates, tissues) are no more common
+    on a table than others. Density that would lie beyond the ranges is reflected at their ends.
     """
     ends = _half_space_coordinates(REAL_RANGE, LOSS_RANGE)
     axes = [np.linspace(low, high, _COORDINATE_CELLS) for low, high in ends]
@@ -500,7 +500,7 @@ def _tabulate_coordinate_density() -> tuple[Real, Real, Real]:
 
 
 def _tabulated_coordinate_density(real: Real, loss: Real) -> Real:
-    """Return the density of other half spaces over their two coordinates, interpolated linearly, shape of `real`."""
+    """Interpolate the table of `_tabulate_coordinate_density` at eps' and eps'' linearly; shape of `real`."""
     table, real_axis, loss_axis = _tabulate_coordinate_density()
     x, y = _half_space_coordinates(real, loss)
     cells = np.stack([np.interp(x, real_axis, _CELL_NUMBERS), np.interp(y, loss_axis, _CELL_NUMBERS)])
@@ -511,9 +511,9 @@ def _tabulated_coordinate_density(real: Real, loss: Real) -> Real:
 
 @cache
 def draw_sheets(theta_rad: float) -> tuple[Complex, Real]:
-    """Return t of thin plates before air or a holder, complex128 [draw], and ln |r_s| over that of half spaces, [draw].
+    """Return t of drawn thin plates before air or a holder, complex128 [draw], and a brightness, float64 [draw].
 
-    The half spaces have the same t. The plates are the same at every angle.
+    The brightness is ln of |r_s| over that of a half space with the same t. The plates are the same at every angle.
     """
     eps, holder, thickness_m = _draw_sheet_properties()
     r_s, r_p = multilayer([eps, holder], [thickness_m, np.inf], SHEET_HZ, theta_rad)
@@ -529,7 +529,7 @@ def draw_sheets(theta_rad: float) -> tuple[Complex, Real]:
 def draw_sheet_dispersions(theta_rad: float, band_hz: tuple[float, float]) -> Real:
     """Return the change of the thin plates of :func:`draw_sheets` over a sweep, float64 [draw, 3].
 
-    Of ln |r_s|, ln |t| and the phase of t: the slope over frequency, weighted as the range gate weighs the sweep.
+    It is that of ln |r_s|, ln |t| and the phase of t: a line fitted with the range gate's weights over the sweep.
     """
     eps, holder, thickness_m = _draw_sheet_properties()
     place = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES - 0.5
@@ -551,7 +551,7 @@ def draw_sheet_dispersions(theta_rad: float, band_hz: tuple[float, float]) -> Re
 
 
 def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
-    """Return how much likelier a change over the sweep is for each drawn thin plate than for a half space, [draw]."""
+    """Return the likelihood of a change over the sweep for each drawn thin plate over that for a half space, [draw]."""
     of_sheets = draw_sheet_dispersions(theta_rad, dispersion.band_hz)
     width = np.sqrt(dispersion.std**2 + DISPERSION_KERNEL**2 + (DISPERSION_MODEL * of_sheets) ** 2)
     layers = _log_normal(dispersion.change - of_sheets, width)
@@ -562,20 +562,20 @@ def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
 
 
 def log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> float:
-    """Return ln of how much likelier a change over the sweep is for layers than for half spaces; 0 if it is unknown."""
+    """Return ln of the mean of `layer_odds` over the thin plates; 0 if the change over the sweep is not known."""
     if dispersion is None or kinds is None:
         return 0.0
     return float(np.log(np.mean(layer_odds(dispersion, kinds.theta_rad))))
 
 
 def _log_normal(difference: Real, std: Real) -> Real:
-    """Return the logarithm of the product of normal densities over the last axis, but for a constant factor."""
+    """Return the sum over the last axis of the logarithms of normal densities, but for a constant."""
     return np.sum(-0.5 * (difference / std) ** 2 - np.log(std), axis=-1)
 
 
 @cache
 def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
-    """Return permittivity, permittivity behind, and thickness in metres of thin plates, [draw] each."""
+    """Return the drawn thin plates: permittivity, permittivity behind them, and thickness in metres, [draw] each."""
     unit = np.random.default_rng(0).random((_SHEETS, 5))
     real, tangent, size_mm = (
         low * (high / low) ** part
@@ -586,7 +586,7 @@ def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
 
 
 def _compute_histogram(draws: Complex, real: Real, imag: Real, covariance: Real) -> Real:
-    """Return the density of draws on a grid [imaginary, real], smoothed by the errors."""
+    """Return the density of `draws` of t on a grid [imaginary, real], smoothed by `SHEET_KERNEL` and errors of t."""
     step = np.array([imag[1] - imag[0], real[1] - real[0]])
     edges = [np.append(axis - d / 2, axis[-1] + d / 2) for axis, d in zip((imag, real), step, strict=True)]
     count = np.histogram2d(draws.imag, draws.real, edges)[0] / (draws.size * step.prod())
@@ -596,10 +596,10 @@ def _compute_histogram(draws: Complex, real: Real, imag: Real, covariance: Real)
 
 @dataclass(frozen=True)
 class Odds:
-    """Probabilities of what a patch may be; they sum to 1.
+    """Probabilities that a patch is of each kind, `kinds` [kind], of layers, `sheet`, or of no kind, `other`; sum 1.
 
-    `kinds` float64 [kind]: of each kind; `sheet`: of layers (thin plates and stacks); `other`: of any other half space.
-    `distance` [kind] is that of the measurement over the 99 % region of each kind; beyond 1 the probability is 0.
+    `distance` [kind]: distance of t from the kind over the radius of its 99 % region. Beyond 1 the kind has probability
+    0, and what it would have is in `other`.
     """
 
     kinds: Real
@@ -609,9 +609,9 @@ class Odds:
 
 
 def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Odds:
-    """Return the probabilities of what a patch may be, from one scan or from several under different angles.
+    """Return the probabilities of materials of a patch from one scan, or from several at different incidence angles.
 
-    The specimen is the same in all scans, the errors are each scan's own. `kinds` are the same at each scan's angle.
+    Errors of different scans are independent. `kinds` has the same materials for each scan, at the angle of that scan.
     """
     first = kinds[0]
     size = 2 * len(scan_evidence)
@@ -645,12 +645,12 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
 
 
 def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
-    """Return true if a patch is too probably a thin plate or a stack to be measured as a half space."""
+    """Return True if the probability of layers is above `POSSIBLY_THIN`: then the patch gets no permittivity."""
     return weigh_kinds((kinds,), (evidence,)).sheet > POSSIBLY_THIN
 
 
 def _weigh_dispersion(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
-    """Return how much likelier the change over the sweep is for each drawn thin plate than for a half space, [draw]."""
+    """Return the product of `layer_odds` over the scans in which the change over the sweep was measured, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
     for kind, evidence in zip(kinds, scan_evidence, strict=True):
         if evidence.dispersion is not None:
@@ -659,7 +659,7 @@ def _weigh_dispersion(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvide
 
 
 def _weigh_brightness(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
-    """Return how much likelier the brightness of a patch is for each drawn thin plate than for a half space, [draw]."""
+    """Return the likelihood of |H| for each drawn thin plate over that for a half space, product of scans, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
     for kind, evidence in zip(kinds, scan_evidence, strict=True):
         if np.isfinite(evidence.brightness_off):
@@ -678,9 +678,9 @@ def _evaluate_normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
 
 
 def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> float:
-    """Return the density of the measured ratios as any half space.
+    """Return the density of the measured t, one per scan, as a half space of no kind.
 
-    With several angles it is averaged over half spaces drawn from the most exact measurement.
+    With several scans it is averaged over half spaces drawn from the most exact measurement.
     """
     best = min(range(len(scan_evidence)), key=lambda i: float(np.linalg.det(scan_evidence[i].covariance)))
     mean = scan_evidence[best].inverse_ratio

@@ -1,17 +1,22 @@
-"""The metal reference: the region that everything is divided by, and the evidence that it is metal.
+"""The metal reference: the region by which both images are divided, and the evidence that it is metal.
 
-It is given as a box or a patch, or it is the patch that is brightest in both channels. Evidence is its own: V / H
-against the direct path, which reaches both boards with equal strength. Metal reflects both polarisations fully, a
-dielectric loses most of p at these angles (Eq. 2 of the POLySIGHT paper: Fresnel's r_s and r_p). Nothing else
-contradicts a declared metal; other patches that do not fit it only make it uncertain.
+The region is given as a box or as a patch. Otherwise it is chosen among the patches that are brightest in both channels
+(`find_metals`).
 
-The other patches give evidence, too: beside metal their ratios are those of materials. Beside a dielectric of inverse
-ratio t0 they are those of materials divided by t0, too large by far, and their |H| is too large by 1 / |r_s|. The score
-is the logarithm of the ratio of both evidences, each integrated over all errors of the rig by the joint inversion, and
-over every permittivity that the reference may have.
+First evidence: the region's own V / H relative to the direct path, which reaches both boards with equal strength. Metal
+reflects both polarisations fully; a dielectric loses most of p at these angles (Eq. 2 of the POLySIGHT paper: Fresnel's
+r_s and r_p).
 
-Metal is the strongest echo of V by far, in H it is one of many. An overdriven receiver (clipping) loses part of it and
-spreads the rest around the metal, in V more than in H (`find_halo`).
+Second evidence: the other patches. If the reference is metal, their inverse ratios V / H are those of materials. If it
+is a dielectric with the inverse ratio t0 = r_p / r_s, they are those of materials divided by t0, far too large, and
+their |H| is too large by 1 / |r_s|. The *score* is ln of the evidence for metal over that for a dielectric. Each is
+integrated over all errors of the rig by the joint inversion, and the second over every permittivity of the reference.
+
+A declared metal is contradicted only by its own V / H: by a very weak one alone, or by a weak one together with a very
+low score. A low score alone makes it uncertain.
+
+Metal is the strongest echo in V by far, in H it is one of many. An overdriven receiver (clipping) loses part of the
+metal's echo and spreads the rest around the metal, in V more than in H (`find_halo`).
 """
 
 from __future__ import annotations
@@ -38,50 +43,53 @@ Complex = npt.NDArray[np.complex128]
 
 DOUBTFUL_V_DB = -2.5
 WEAK_V_DB = -7.0
-"""V / H relative to the direct path below which a patch that nobody declared is no metal, and below which even a
-declared one is none: at 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water -4 dB, metal
-0 dB, but for the patterns of the antennas (-4 dB with those of an independent generator)."""
+"""V / H relative to the direct path. Below the first value a patch that nobody declared is no metal; below the second
+even a declared one is none. At 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water has
+-4 dB, and metal 0 dB. The patterns of the antennas are added: -4 dB with those of an independent generator."""
 LEAST_SCORE = 1.7
 SURE_MARGIN = 1.5
-"""Score from which on a patch that nobody declared counts as metal beside one other patch, and how much more makes it
-certain. The first grows with the root of their number, for each may be an odd one. Of 125 drawn scenes without metal
-none counts as metal with the direct path (open water comes closest, and is doubtful by its V / H), of 75 with metal all
-do (tests/materials/test_metal_evidence.py)."""
+"""Score from which a patch that nobody declared counts as metal beside one other patch, and how much more makes it
+certain. The first is multiplied by the square root of the number of other patches, for each may be an odd one. With the
+direct path, the reference counts as metal in none of 125 drawn scenes without metal (open water comes closest, and is
+doubtful by its V / H), and in all of 75 with metal (tests/materials/test_metal_evidence.py)."""
 REFERENCE_REAL = (1.5, 30.0)
 REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
-"""Permittivities of a reference that is no metal, uniform on logarithmic scales: all half spaces, water among them."""
+"""Ranges of eps' and of the loss tangent of a reference that is no metal, uniform on logarithmic scales; they hold all
+half spaces, water among them."""
 CHANNEL_RATIO_STD_DB = 2.5
-"""Standard deviation of metal's V / H relative to the direct path's: the boards' patterns differ off their axis.
-Chosen."""
+"""Standard deviation of metal's V / H relative to the direct path, because the boards' patterns differ off their axes;
+chosen."""
 CONFLICT_SCORE = 0.0
-"""Score below which a declared metal is reported as doubtful, with the patch that fits it least: a dielectric fits the
-others better. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this estimator, dielectrics
-declared as metal -0.3 to -8 in eleven."""
+"""Score below which a declared metal is reported as doubtful, with the patch that fits it least: below 0 the other
+patches fit better to a dielectric. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this
+estimator; dielectrics declared as metal have -0.3 to -8 in eleven."""
 CONTRADICTING_SCORE = -5.0
-"""Score below which the other patches and a weak V / H of its own (`DOUBTFUL_V_DB`) together contradict a declared
-metal. Chosen: nine half spaces declared as metal have -7 to -27 and -3 to -8 dB, metal 7 to 31 and -0.8 to 0.7 dB
-(scenes of another author's generator)."""
+"""Score below which a declared metal is contradicted if its own V / H is below `DOUBTFUL_V_DB`, too. Chosen: nine half
+spaces declared as metal have scores of -7 to -27 and V / H of -3 to -8 dB; metal has scores of 7 to 31 and V / H of
+-0.8 to 0.7 dB (scenes of another author's generator)."""
 PAINT_SCORE = 7.0
-"""Cost of paint: a reference that counts as metal only if it is painted needs so much more score. Chosen."""
+"""Extra score that a reference needs if it counts as metal only with paint on it; chosen."""
 ALIKE_DB = 2.5
 LEAST_METAL_LEVEL = 0.15
 MOST_METALS = 3
-"""V / H and |H||V| relative to the brightest patch's from which on another patch may be the metal instead, and how many
-patches are compared: coated metal (sheets, boards with copper behind) may be the brighter one. Dielectrics reflect p by
-8 dB less; all nuisances together have made bare metal darker than a coated one by a factor of four."""
+"""Another patch may be the metal instead of the brightest one if its |V / H| is at most so many dB below that of the
+brightest patch, and its |H||V| at least this share. So many patches are compared, the brightest included. Coated metal
+(sheets, boards with copper behind) may be the brighter one: all disturbances together have made bare metal darker than
+a coated one by a factor of four. Dielectrics reflect p by 8 dB less."""
 HALO_MM = (6.0, 36.0)
-"""Distances from the metal's edge at which its halo is measured; chosen."""
+"""Smallest and largest distance from the metal's edge at which its halo is measured; chosen."""
 AROUND_MM = (4.0, 14.0)
-"""The same for the other plates; chosen."""
+"""Smallest and largest distance from another plate's edge at which the halo around that plate is measured; chosen."""
 HALO_EXCESS = 1.26
-"""Median of |V| over |H| beside the metal, each relative to metal, above which it is a halo: 2 dB. Undisturbed scenes
-of an independent generator have -4 to 1.1 dB, clipped ones -0.3 to 8.7 dB (seven of eight above 2.4 dB)."""
+"""Smallest median of |V| / |H| beside a plate that is a halo, both relative to metal: 2 dB. Beside the metal
+undisturbed scenes of an independent generator have -4 to 1.1 dB, clipped ones -0.3 to 8.7 dB (seven of eight above 2.4
+dB)."""
 OVERDRIVING = 2.0
-"""Least |V| of the metal over that of any other plate: only such an echo overdrives the receiver of V. Beside a
-dielectric that is declared as metal the sidelobes of its neighbours would count as its halo."""
+"""Smallest |V| of the metal over that of any other plate for a halo: only such an echo overdrives the receiver of V.
+Without this limit, sidelobes of the neighbours of a dielectric that is declared as metal would count as its halo."""
 USUAL_POWER = 0.56
-"""Usual power of V there without a halo, relative to H's: dielectrics, whose sidelobes it is, reflect H better.
-Median of the same undisturbed scenes, -2.5 dB."""
+"""Usual power of V over that of H beside plates without a halo: -2.5 dB, the median of these undisturbed scenes. The
+power there is sidelobes of dielectrics, which reflect s (H) better than p (V)."""
 
 
 @dataclass(frozen=True)
@@ -91,16 +99,16 @@ class MetalEvidence:
     Attributes
     ----------
     score
-        Logarithm of the ratio of the evidences of metal and of a dielectric; positive values support metal.
+        ln of the evidence for metal, bare or painted, over that for a dielectric; positive values support metal.
     bare
-        The same for metal without any paint; of several patches like metal the one with the largest is the reference.
+        The score for bare metal. Of several patches like metal the one with the largest is the reference.
     others
-        Number of other patches that differ from the judged one. Similar patches give no evidence: metal beside metal
-        looks like water beside water.
+        How many other patches differ from the judged one. Without any the scores are 0: metal beside metal looks like
+        water beside water.
     channel_ratio_db
-        V / H of the patch relative to the direct path; None if not known.
+        V / H of the judged patch relative to the direct path, dB; None if not known.
     culprit
-        Number of the other patch that fits metal least, if the score speaks against metal; None otherwise.
+        Label of the other patch that fits metal least, if the score is below `CONFLICT_SCORE`; None otherwise.
     """
 
     score: float
@@ -111,24 +119,27 @@ class MetalEvidence:
 
     @property
     def needed(self) -> float:
-        """Least score to count as metal that nobody declared."""
+        """Smallest `metal` with which a patch that nobody declared counts as metal; infinite without other patches."""
         if self.others == 0:
             return np.inf
         return LEAST_SCORE * float(np.sqrt(self.others))
 
     @property
     def metal(self) -> float:
-        """Score of metal that may be painted, which costs `PAINT_SCORE` at most."""
+        """Score to compare with `needed`: for bare metal, or for metal that may be painted minus `PAINT_SCORE`."""
         return max(self.bare, self.score - PAINT_SCORE)
 
     @property
     def sure(self) -> bool:
-        """True if it is certainly metal: very lossy dielectrics (wet, conducting) come close to metal."""
+        """True if the patch is certainly metal. The margin is for very lossy dielectrics (wet, conducting)."""
         return self.enough and self.metal >= self.needed + SURE_MARGIN
 
     @property
     def against(self) -> bool:
-        """True if its own V / H contradicts metal, even if the user declares it; a doubtful one beside odd patches."""
+        """True if V / H of the patch contradicts metal, even one that the user declared.
+
+        It does so below `WEAK_V_DB`, or below `DOUBTFUL_V_DB` if the score is below `CONTRADICTING_SCORE`.
+        """
         if self.channel_ratio_db is None:
             return False
         is_odd = self.score < CONTRADICTING_SCORE
@@ -136,7 +147,7 @@ class MetalEvidence:
 
     @property
     def enough(self) -> bool:
-        """True if the patch is shown to be metal."""
+        """True if a patch that nobody declared counts as metal: enough score, and V / H not below `DOUBTFUL_V_DB`."""
         doubtful = self.channel_ratio_db is not None and self.channel_ratio_db < DOUBTFUL_V_DB
         return self.metal >= self.needed and not doubtful
 
@@ -144,7 +155,7 @@ class MetalEvidence:
 def log_evidence_of_dielectric(
     measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None = None
 ) -> float:
-    """Return the log evidence of the same measurements if the reference is a dielectric, as `Inversion.log_evidence`.
+    """Return ln of the evidence if the reference is a dielectric, to compare with `Inversion.log_evidence` for metal.
 
     `channel_ratio_db` is V / H of the reference relative to the direct path; None if it is not known.
     """
@@ -154,9 +165,10 @@ def log_evidence_of_dielectric(
 
 
 class _DielectricReference(SceneLikelihood):
-    """The same scene if the reference is a dielectric of unknown permittivity instead of metal.
+    """Likelihood of a scene whose reference is a dielectric of unknown permittivity instead of metal.
 
-    A particle has two more columns, normal like the others: for the real part and the loss tangent of the reference.
+    A particle has two more columns than in the base class, standard normal, too: for eps' and for the loss tangent of
+    the reference.
     """
 
     width = WIDTH + 2
@@ -172,7 +184,7 @@ class _DielectricReference(SceneLikelihood):
         return 0.0
 
     def reference_permittivity(self, z: Real) -> Complex:
-        """Return the permittivity of the reference, [..., 1]: any half space."""
+        """Return the permittivity of the reference, eps' - j eps'', [..., 1], within the ranges of `REFERENCE_REAL`."""
         real, tangent = (
             low * (high / low) ** scipy.special.ndtr(z[..., WIDTH + i, None])
             for i, (low, high) in enumerate((REFERENCE_REAL, REFERENCE_LOSS_TANGENT))
@@ -180,7 +192,7 @@ class _DielectricReference(SceneLikelihood):
         return real * (1 - 1j * tangent)
 
     def reference_ratio(self, z: Real) -> Complex:
-        """Return t of the reference, [..., 1]."""
+        """Return the inverse ratio t0 of the reference, [..., 1]."""
         return inverse_ratio(self.reference_permittivity(z), self._find_middle_angle())
 
     def log_reference_brightness(self, z: Real) -> Real:
@@ -192,14 +204,15 @@ class _DielectricReference(SceneLikelihood):
     def _log_likelihoods(self, z: Real, half_spaces: HalfSpaces) -> Real:
         """Return log likelihoods [..., 1 + patch] as the base class does, of ratios measured relative to a dielectric.
 
-        What was measured is t of the patch over that of the reference.
+        The measured ratio is t of the patch over t0 of the reference. The first element also holds the likelihood of
+        the reference's V / H relative to the direct path, if that is known.
         """
         parts = super()._log_likelihoods(z, half_spaces)
         reference = self.reference_ratio(z)
         size = np.abs(reference)
         measured = half_spaces.t / reference
-        # With t0 of the reference the density of a measured ratio is |t0|^2 that of t. Two plates may be of the same
-        # material, as metal is beside metal.
+        # The measured ratio is t / t0, so its density is |t0|^2 that of t. A plate may also be of the material of the
+        # reference, with the prior probability of metal beside metal.
         variance = METAL_SPREAD**2 + self.own_variance
         of_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
         of_some_kind = parts[..., 1:] + 2 * np.log(size)
@@ -222,11 +235,11 @@ def metal_evidence(
     kinds: Kinds,
     inversion: Inversion | None = None,
 ) -> MetalEvidence:
-    """Weigh the explanations of a patch as metal and as a dielectric.
+    """Weigh the evidence that a patch, the judged one, is metal against that for a dielectric.
 
-    `patches` are the other patches by their number, relative to the judged one; `channel_ratio` is V / H of the patch
-    itself in images referenced to the direct path, None for others; `kinds` are the materials that patches may be;
-    `inversion` is the joint inversion of these patches, if it was done before.
+    `patches`: label to measurement of each other patch, relative to the judged one. `channel_ratio`: V / H of the
+    judged patch; None if the images are not referenced to the direct path. `kinds`: materials of which patches may be.
+    `inversion`: joint inversion of `patches` with the judged one as metal; None: it is computed.
     """
     level_db = None
     if channel_ratio is not None and abs(channel_ratio) > 0:
@@ -257,13 +270,13 @@ class MetalReference:
     mask
         bool [ny, nx], interior of the region.
     label
-        Patch number; None for a given box outside all patches.
+        Label of the patch; None for a given box outside all patches, and in a scene without patches.
     how
-        One sentence for the report.
+        How the region was found, for the report.
     given
-        True if the user or a calibration declares it metal.
+        True if the user or a calibration declares the region metal.
     evidence
-        Evidence of the rest of the scene; None if it was not computed.
+        Evidence for and against metal; None if it was not computed.
     """
 
     mask: Mask
@@ -274,7 +287,7 @@ class MetalReference:
 
     @property
     def certain(self) -> bool:
-        """True if the rest of the scene makes it certainly metal, or it is given and nothing speaks against it."""
+        """True if the evidence is sure, or if the metal was declared and no evidence speaks against it."""
         if self.evidence is None:
             return self.given
         declared = self.given and not self.evidence.against and self.evidence.culprit is None
@@ -286,8 +299,9 @@ def metal_in_box(
 ) -> MetalReference:
     """Take the metal reference from a box (x0, y0, x1, y1), millimetres from the image centre.
 
-    If the box overlaps a found patch, only that patch's interior inside the box is used, so that the box may be too
-    large. Raises DataError if the box has no valid pixel.
+    If the box holds 9 or more pixels of the interior of a patch, only these are used, so that the box may be too large.
+    Of several such patches the one with the most pixels counts. `x_m`, `y_m` are the pixel centres, `valid` [ny, nx]
+    the pixels that may be used; None: all. Raises DataError if the box has no such pixel.
     """
     mask = box_mask(box_mm, x_m, y_m)
     if valid is not None:
@@ -295,7 +309,7 @@ def metal_in_box(
     overlaps = [(int((p.interior & mask).sum()), p) for p in segmentation.patches]
     count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
     label = None
-    # Fewer pixels (chosen: 3 by 3) are only the patch's edge; the box is then taken as it is.
+    # Fewer pixels than 3 by 3 (chosen) are only the edge of a patch: then the box is taken as it is.
     if patch is not None and count >= 9:
         mask = mask & patch.interior
         label = patch.label
@@ -313,7 +327,7 @@ def metal_in_box(
 
 
 def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
-    """Take this patch as the metal reference. Raises DataError if there is no such patch."""
+    """Take the patch `label` as the metal reference. Raises DataError if there is no such patch."""
     for p in segmentation.patches:
         if p.label == label:
             return MetalReference(p.interior, label, f"given as patch {label}", given=True)
@@ -326,15 +340,16 @@ def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
 
 
 def no_metal(usable: Mask) -> MetalReference:
-    """Return the reference of a scene without patches: images are scaled as if all of them were metal."""
+    """Return the reference of a scene without patches: all `usable` pixels, as if all were metal."""
     return MetalReference(usable, None, "none: no patch was found")
 
 
 def gains_as_plates(images: Images, metal_mask: Mask) -> tuple[complex, complex]:
-    """Return the gains of H and V over metal, relative to which the median of its V / H is 1.
+    """Return the gains of H and V: after division by them the median ratio of H and V over the metal is 1.
 
-    Plates are measured by their median, too. Where the end of the scan lights metal unevenly the root mean squares of
-    the paper (:func:`metal_gains`) are up to 7 % away from it. Raises DataError as :func:`metal_gains`.
+    Plates are measured by their median, too. The paper uses root mean squares over the metal (:func:`metal_gains`);
+    where the end of the scan lights the metal unevenly, their ratio differs from the median by up to 7 %. They are
+    returned if the median is zero or not finite. Raises DataError as :func:`metal_gains`.
     """
     gain_h, gain_v = metal_gains(images.h, images.v, metal_mask)
     metal_p = median_ratio(images.h[metal_mask] / gain_h, images.v[metal_mask] / gain_v)
@@ -344,9 +359,10 @@ def gains_as_plates(images: Images, metal_mask: Mask) -> tuple[complex, complex]
 
 
 def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
-    """Divide both channels by metal, in the scene or scanned separately; leakage is not removed.
+    """Divide both channels by metal; leakage is not removed.
 
-    Without any signal of metal to divide by, the images are returned unchanged; DataError if the metal was given.
+    The metal is `reference`, which was scanned separately, or without that the region `metal` of these images. If the
+    region has no signal, the images are divided by 1; but DataError is raised if the metal was declared.
     """
     if reference is not None:
         return reference.apply(images)
@@ -359,7 +375,7 @@ def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | 
 
 
 def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
-    """Return V / H of the metal reference in the images, by least squares over its pixels; None without signal."""
+    """Return V / H of the region `metal` in the images, by least squares over its pixels; None if H is zero there."""
     h = images.h[metal.mask]
     v = images.v[metal.mask]
     power = float(np.sum(np.abs(h.astype(np.complex128)) ** 2))
@@ -369,7 +385,10 @@ def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
 
 
 def metal_unevenness(images: Images, metal_mask: Mask) -> float:
-    """Return |ln(V / H)| of the root mean squares over the metal, of images in which the median of its V / H is 1."""
+    """Return |ln(V / H)| of the root mean squares of H and V over the metal: 0 if it is lit evenly.
+
+    The images are divided by `gains_as_plates`, so that the median of V / H is 1 there.
+    """
     rms_h, rms_v = metal_gains(images.h, images.v, metal_mask)
     return float(abs(np.log(rms_v / rms_h)))
 
@@ -377,10 +396,10 @@ def metal_unevenness(images: Images, metal_mask: Mask) -> float:
 def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalReference, ...]:
     """Return the patch that is brightest in both channels, then others that may be the metal; empty without patches.
 
-    The measure is the median of |H| times that of |V|. Metal reflects both polarisations fully (|r_s| = |r_p| = 1),
-    every dielectric loses most of p at these angles; the product does not depend on the unknown gains of H and V. The
-    brightest patch of a scene without metal is a dielectric: whether it is metal is another question
-    (:func:`metal_evidence`), as is which of several is bare.
+    The brightness is the median of |H| times that of |V|. Metal reflects both polarisations fully (|r_s| = |r_p| = 1);
+    every dielectric loses most of p at these angles. The unknown gains of H and V do not change the order of the
+    products. In a scene without metal the brightest patch is a dielectric: :func:`metal_evidence` tells whether it is
+    metal, and which of several metals is bare.
     """
     patches = [p for p in segmentation.patches if p.interior.any()]
     size_h = np.array([np.median(np.abs(h[p.interior])) for p in patches])
@@ -408,14 +427,15 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
 
 @dataclass(frozen=True)
 class Halo:
-    """Halo of V around the metal.
+    """Halo around the metal in V.
 
     Attributes
     ----------
     level
-        Its amplitude relative to the metal; 0 without one.
+        Amplitude of the halo beside the metal, relative to |V| of the metal; 0 if there is none.
     around
-        Patch number to its amplitude around that patch, relative to the metal; empty without one.
+        Label of each patch to the amplitude of the halo around it, relative to |V| of the metal; empty if there is
+        none.
     """
 
     level: float = 0.0
@@ -427,7 +447,7 @@ NO_HALO = Halo()
 
 
 def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
-    """Find a halo of V around the metal, bool [ny, nx], which is given by its interior; `NO_HALO` if there is none."""
+    """Find a halo in V around the metal, whose interior is `metal`, bool [ny, nx]; `NO_HALO` if there is none."""
     pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
     levels = [float(np.median(np.abs(channel[metal]))) if metal.any() else 0.0 for channel in (images.h, images.v)]
     if min(levels) <= 0:
@@ -447,7 +467,7 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     around = {}
     for patch in patches:
         around[patch.label] = _measure_excess(relative, free, patch.mask, AROUND_MM, pixel_mm)
-        # The halo reaches under a plate beside the metal, where nothing is free to measure it.
+        # A plate near the metal lies in the halo, even if no pixel beside it is free to measure that.
         if patch.mask.any() and float(from_metal_mm[patch.mask].min()) <= HALO_MM[1]:
             around[patch.label] = max(around[patch.label], level)
     return Halo(level, around)
@@ -456,10 +476,11 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
 def _measure_excess(
     relative: Sequence[np.ndarray], free: Mask, plate: Mask, reach_mm: tuple[float, float], pixel_mm: float
 ) -> float:
-    """Return the amplitude of V beside a plate beyond its usual one; 0 if it is no halo, or nothing is free.
+    """Return the amplitude of the halo in V beside a plate; 0 if there is none, or no pixel beside the plate is free.
 
-    `relative` are |H| and |V| over those of metal, float [ny, nx]; `free` the pixels away from all plates; `reach_mm`
-    the least and the largest distance from the plate.
+    Its power is the median power of V minus `USUAL_POWER` times that of H. `relative` are |H| and |V| over those of
+    metal, float [ny, nx]; `free` [ny, nx] are the pixels away from all plates; `reach_mm` is the smallest and the
+    largest distance from the plate.
     """
     distance = _measure_distance_mm(plate, pixel_mm)
     ring = free & (distance > reach_mm[0]) & (distance <= reach_mm[1])
@@ -474,5 +495,5 @@ def _measure_excess(
 
 
 def _measure_distance_mm(mask: Mask, pixel_mm: float) -> np.ndarray:
-    """Return the distance of each pixel from a mask, float [ny, nx]; 0 inside."""
+    """Return the distance of each pixel from a mask, millimetres, float [ny, nx]; 0 inside."""
     return np.asarray(scipy.ndimage.distance_transform_edt(~mask)) * pixel_mm

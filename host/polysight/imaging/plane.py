@@ -9,13 +9,15 @@ would be the sharpest. Points and edges determine the focus, the inside of a pla
 phase error that grows with the square of the aperture's length: a wide scan resolves a tenth of a millimetre, a narrow
 one does not.
 
-Echoes of flat plates (`move_to_plane`). A plate's echo gives its range in two ways: coarse but unambiguous from the
-change of the image's amplitude with range (bandwidth of the sweep), and fine but ambiguous by half a wavelength of
-height from its phase. The first gives the plane within about a millimetre and resolves the second. Both are compared
-with a mirror on the rig file's plane, seen from the same positions, so that aperture, taper (weights of the positions)
-and masked positions have no influence. The image of that mirror is the footprint.
+Echoes of flat plates (`move_to_plane`). A plate's echo gives its *height*, the distance behind the rig file's plane, in
+two ways:
+* by range: from the change of the image's amplitude with range (bandwidth of the sweep); coarse but unambiguous, within
+  about a millimetre;
+* by phase: fine but ambiguous, by half a wavelength / cos(incidence angle); the height by range resolves that.
+Both ways compare the echo with that of a mirror on the rig file's plane, seen from the same positions. So aperture,
+taper (weights of the positions) and masked positions have no influence. The image of that mirror is the *footprint*.
 
-One plane is fitted to all plates; the height of each plate is returned too.
+One plane is fitted to all plates; the height of each plate is returned, too.
 """
 
 from __future__ import annotations
@@ -35,37 +37,44 @@ from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
 
-# Largest tilt of the plates that `focus_sweep` searches; a plane near this limit is not believed; chosen.
+# Largest tilt of the plane along x and along y that `focus_sweep` searches; a result near this limit is not certain;
+# chosen.
 _MAX_TILT_DEG = 3.0
 
 PLANE_REACH_M = 0.015
-"""Search range to either side of the rig file's plane; chosen."""
-MOUNT_STD_M = 1e-3
-"""Standard deviation of the antennas' positions in the rig file, in addition to that of the plane's distance; chosen.
+"""Largest offset of the plates' plane from the rig file's to which images are moved, and for which echoes are kept;
+chosen.
 """
+MOUNT_STD_M = 1e-3
+"""Standard deviation of the antennas' distance by errors of the rig file, added to that of a plane that was found;
+chosen."""
 PRIOR_STD_M = 5.8e-3
-"""Standard deviation of the plane's distance if the scene does not determine it: uniform within +-10 mm (chosen)."""
+"""Standard deviation of the plane's distance if the scene does not determine it: that of a uniform error within +-10 mm
+(chosen)."""
 _WORTH_M = 5e-4
-"""Smallest offset for which images are formed again: a nearer plane changes the angle by less than MOUNT_STD_M does."""
+"""Smallest offset of the plane for which images are formed again. A smaller one changes the incidence angle by less
+than an error of MOUNT_STD_M does."""
 _STEP_M = 2e-4
-"""Height step to find the change of range and phase with height; chosen."""
+"""Step of height for the numerical derivatives of range and phase; chosen."""
 _COHERENT = 0.7
-"""Smallest coherence of the pixels of a plate whose phase is used (1: all equal; chosen)."""
+"""Smallest coherence of a plate's pixels, |sum| / sum of magnitudes, if its phase is used (1: equal phases); chosen."""
 _TILT_PRIOR_RAD = 0.02
-"""Prior standard deviation of the tilt: about one degree (chosen)."""
+"""Prior standard deviation of the tilt along x and along y: about one degree (chosen)."""
 _MIN_STD_M = 3e-4
-"""Smallest standard deviation of a plate's range, due to sidelobes of its neighbours; chosen."""
+"""Smallest standard deviation of a height by range, due to sidelobes of the plate's neighbours; chosen."""
 _MAX_RISE_BY_PHASE = 0.035
-"""Largest tilt that phases may show, rise per metre: two degrees; chosen."""
+"""Largest tilt of a plane by phase that is accepted, rise per metre: two degrees; chosen."""
 _TILT_TOLERANCE = 3e-3
-"""Difference of the tilts by phase and by range that is accepted beside their errors, rise per metre (chosen)."""
+"""Accepted difference between the tilts by phase and by range, in addition to three standard deviations of the latter,
+rise per metre (chosen)."""
 _MAX_RANGE_STD_M = 0.05
 """Largest standard deviation of a height by range that is used (chosen)."""
 _PHASE_FITS_RAD = 0.5
-"""Largest RMS phase error of plates on one plane (chosen); random phases have 1.8."""
+"""Largest root mean square of the phases' deviations from the fitted plane, radians (chosen); random phases have
+1.8."""
 _PHASE_STD_M = 5e-5
-"""Standard deviation of a height by phase: phase of the reflection (some degrees for lossy plates), roughness; chosen.
-"""
+"""Standard deviation of a height by phase, due to roughness and to the phase of the reflection (some degrees for lossy
+plates); chosen."""
 
 
 @dataclass(frozen=True)
@@ -75,15 +84,15 @@ class Focus:
     Attributes
     ----------
     depths_mm
-        float64 [n]: planes of the sweep, relative to the rig file's.
+        float64 [n]: distances of the planes of the sweep minus that of the rig file's plane.
     sharpness
-        float64 [n]: sharpness on the parallel plane at each depth, relative to the largest.
+        float64 [n]: sharpness on the plane without tilt at each depth, over the largest of them.
     depth_mm
-        Distance of the object plane minus that in the rig file, at the centre of the image.
+        Distance of the sharpest plane minus that of the rig file's plane, at the centre of the image.
     tilt_deg
-        Rise of the plane in z along x and along y, as angles.
+        Tilt of the sharpest plane along x and along y, degrees; positive where z grows.
     gain
-        Sharpness on the found plane relative to the rig file's plane.
+        Sharpness on the sharpest plane over that on the rig file's plane.
     """
 
     depths_mm: NDArray[np.float64]
@@ -94,7 +103,8 @@ class Focus:
 
     @property
     def certain(self) -> bool:
-        """True if the plane is not near the limits of the search, and the sharpness falls by 2 % towards both ends.
+        """True if depth and tilt are below 95 % of the search's limits, and the sharpness falls by 2 % towards both
+        ends.
 
         Both margins are chosen.
         """
@@ -120,7 +130,7 @@ class Focus:
 
 
 def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) -> Focus:
-    """Find the plane on which the sum of both channels is sharpest.
+    """Find the plane on which the sum of both channels' intensities is sharpest.
 
     Parameters
     ----------
@@ -129,7 +139,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     depth_m
         Search range to either side of the rig file's plane.
     planes
-        Number of planes.
+        Number of planes, evenly spaced over the search range.
     """
     grid = builder.grid
     depths = np.linspace(-depth_m, depth_m, planes)
@@ -143,7 +153,7 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
     y = grid.y_m - grid.y_m.mean()
 
     def sharpness(plane: NDArray[np.float64]) -> float:
-        """Return the sharpness on a plane: depth in mm at the centre, rise along x and y in mm per 100 mm."""
+        """Return the sharpness on a plane [3]: depth at the centre, mm; rise along x and along y, mm per 100 mm."""
         depth, along_x, along_y = plane * [1e-3, 1e-2, 1e-2]
         z = np.clip(depth + along_x * x[None, :] + along_y * y[:, None], depths[0], depths[-1])
         weight = 1 / _interpolate_stack(cells, depths, z)
@@ -167,9 +177,9 @@ def focus_sweep(builder: ImageBuilder, depth_m: float = 8e-3, planes: int = 17) 
 
 
 def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the relative area of a resolution cell at every pixel of every plane, [plane, ny, nx].
+    """Return the area of a resolution cell at every pixel of every plane, [plane, ny, nx], m^2.
 
-    Interpolated from nine points per plane, for it varies slowly.
+    It varies slowly: it is computed at nine pixels of the nearest and of the farthest plane, and interpolated between.
     """
     aperture = next(iter(builder.boards.values())).aperture
     grid = builder.grid
@@ -187,7 +197,10 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
 def _interpolate_stack(
     stack: NDArray[np.float64], depths: NDArray[np.float64], z: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the intensity [ny, nx] on a surface z through a stack [plane, ny, nx] by cubic convolution (Keys 1981)."""
+    """Return the values [ny, nx] of a stack [plane, ny, nx] at the depths z [ny, nx], metres, one for each pixel.
+
+    Interpolated along the depth by cubic convolution (Keys 1981).
+    """
     place = (z - depths[0]) / (depths[1] - depths[0])
     base = np.clip(np.floor(place).astype(np.intp), 0, len(depths) - 2)
     t = place - base
@@ -211,16 +224,16 @@ class PlaneEstimate:
     Attributes
     ----------
     offset_m, offset_std_m
-        Distance of the plane behind the rig file's plane at the middle of the image, and its standard deviation.
+        Height of the plane, its distance behind the rig file's plane at the middle of the image, and its standard
+        deviation.
     tilt_rad, tilt_std_rad
-        Rise of the plane's z along x and along y, radians, and their standard deviations.
+        Tilt of the plane along x and along y, radians (positive where z grows), and their standard deviations.
     heights_m
-        float64 [patch]: distance of each patch behind the rig file's plane, from its range (from its phase if
-        `by_phase`); NaN if undetermined.
+        float64 [patch]: height of each patch, by phase if `by_phase`, otherwise by range; NaN if undetermined.
     by_phase
-        The plates' phases lie on one plane and determine it.
+        True if the plates' phases fit one plane that agrees with the ranges: then it is the estimate.
     plates
-        Number of patches with a height.
+        Number of patches with a height by range; 0 if the plane is not known.
     """
 
     offset_m: float
@@ -238,24 +251,25 @@ class PlaneEstimate:
 
     @property
     def worth_moving(self) -> bool:
-        """True if the offset from the rig file's plane is large enough to form images again, and within reach."""
+        """True if the offset is large enough to form images again (0.5 mm), and below `PLANE_REACH_M`."""
         return self.known and abs(self.offset_m) > _WORTH_M and abs(self.offset_m) < PLANE_REACH_M
 
     @property
     def moved_m(self) -> float:
-        """Distance from the rig file's plane to that of the images: 0 if moving them is not worth it."""
+        """Distance of the images' plane behind the rig file's plane: `offset_m`, or 0 if not `worth_moving`."""
         return self.offset_m if self.worth_moving else 0.0
 
     def apply_to_rig(self, rig: Instrument) -> Instrument:
-        """Return a rig with its object plane at the plates; the same rig if moving it is not worth it."""
+        """Return the rig with its object plane moved by `offset_m`; the rig itself if not `worth_moving`."""
         if not self.worth_moving:
             return rig
         distance = rig.geometry.object_distance_mm + 1e3 * self.offset_m
         return msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=distance))
 
     def incidence_std_rad(self, rig: Instrument) -> float:
-        """Return the standard deviation of the incidence angle due to plane distance and antenna positions, radians.
+        """Return the standard deviation of the incidence angle theta, radians.
 
+        It is that of the plane's distance z (with the antennas' positions if the plane is known) times
         d theta / d z = sin theta cos theta / z.
         """
         theta = np.radians(incidence_deg(rig, rig.receivers[0]))
@@ -292,11 +306,11 @@ UNKNOWN_PLANE = PlaneEstimate(
     by_phase=False,
     plates=0,
 )
-"""Plane undetermined: use the rig file's plane."""
+"""Estimate of a scene that does not determine the plane: the rig file's plane is used."""
 
 
 def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> PlaneEstimate:
-    """Estimate the plane from the insides of flat patches.
+    """Estimate the plane from the insides of flat patches; without any height the result is not `known`.
 
     Parameters
     ----------
@@ -317,7 +331,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     determined = np.isfinite(heights)
     if not determined.any():
         return replace(UNKNOWN_PLANE, heights_m=np.full(len(masks), np.nan))
-    # Middle of each patch (x, y), from the middle of the image.
+    # Middle of each patch (x, y), relative to the middle of the image.
     places = np.zeros((len(masks), 2))
     for place, mask in zip(places, masks, strict=True):
         if mask.any():
@@ -333,7 +347,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds)
         residual = phase_heights[with_phase] - _evaluate_plane(phase_plane, places[with_phase])
         on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
-        # Thin sheets change the phase themselves: accept the plane only if the ranges agree.
+        # Thin sheets have a phase of reflection of their own: the plane is accepted only if it agrees with the ranges.
         tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]
         agrees_with_ranges = bool((np.abs(phase_plane - plane) < tolerance).all())
         if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_RISE_BY_PHASE:
@@ -356,9 +370,10 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
 def move_to_plane(
     builder: ImageBuilder, images: Images, masks: Sequence[NDArray[np.bool_]], transposed: bool, move: bool
 ) -> tuple[PlaneEstimate, Images]:
-    """Estimate the plane of patches; return it and the images on it with their dispersion.
+    """Estimate the plane of patches; return it, and the images on it.
 
-    Images are formed again if the plane differs enough from the rig file's (`PlaneEstimate.worth_moving`).
+    Images are formed again if the plane differs enough from the rig file's (`PlaneEstimate.worth_moving`). With `move`
+    they get their dispersion, too.
 
     Parameters
     ----------
@@ -367,9 +382,9 @@ def move_to_plane(
     masks
         bool [ny, nx] insides of the patches, on the images' grid.
     transposed
-        The images are the builder's with x and y swapped.
+        True if `images` and `masks` are the builder's with x and y swapped. The plane is that of the builder's axes.
     move
-        False: return the images unchanged.
+        False: return the images unchanged, without dispersion.
     """
     plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
     if not move:
@@ -387,9 +402,9 @@ def move_to_plane(
 def _estimate_heights_by_range(
     board: BoardSamples, masks: Sequence[NDArray[np.bool_]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the height of each patch from the range of its echo, and its standard deviation, metres, [patch].
+    """Return the height by range of each patch, and its standard deviation, metres, [patch].
 
-    NaN and infinite where the range does not determine it.
+    Where the range does not determine the height, it is NaN and its standard deviation infinite.
     """
     image, footprint, _ = board.image()
     slope, mirror_slope = board.range_slope()
@@ -402,7 +417,7 @@ def _estimate_heights_by_range(
         if not power.sum() > 0:
             continue
         weight = power / power.sum()
-        # The change of the amplitude with range, beyond that of a mirror; and how much of it a mirror has per metre of
+        # Relative change of the amplitude with range minus that of a mirror; and the same of a mirror per metre of its
         # height.
         with np.errstate(invalid="ignore", divide="ignore"):
             path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
@@ -427,13 +442,17 @@ def _estimate_heights_by_phase(
     places: NDArray[np.float64],
     plane: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Return heights [patch] by phase (NaN: not coherent), unwrapped with a plane near `plane`; radians per metre."""
+    """Return the heights by phase [patch], metres, NaN where pixels are not coherent; and the radians per metre.
+
+    The multiple of the ambiguity of each height is the one with which all heights fit a plane best, near `plane` [3]
+    (height and rise along x and y, by range). `places` [patch, 2] are the middles of the patches, metres.
+    """
     image, footprint, _ = board.image()
     moved_image = board.mirror_image(_STEP_M)
     phases = np.full(len(masks), np.nan)
     rates = []
     for i, mask in enumerate(masks):
-        # The reflection r_s of a plate is nearly real and negative: minus makes it a phase near zero.
+        # The reflection r_s of a plate is nearly real and negative: the minus turns its phase to about zero.
         flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
         coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
         if mask.any() and coherent > _COHERENT:
@@ -445,8 +464,8 @@ def _estimate_heights_by_phase(
     ambiguity_m = 2 * np.pi / abs(rad_per_m)
     with_phase = np.flatnonzero(np.isfinite(phases))
     design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
-    # The range leaves an ambiguity of some turns, common to all plates except for the tilt: try 17 tilts
-    # along each axis, within one standard deviation of the prior.
+    # Ranges leave an ambiguity of some turns. It is common to all plates if the tilt is right: 17 tilts along each axis
+    # are tried, within one standard deviation of the prior.
     tilts = np.linspace(-1, 1, 17) * _TILT_PRIOR_RAD
     trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
     guesses = trial_planes @ design.T
@@ -455,7 +474,7 @@ def _estimate_heights_by_phase(
     common_height = np.angle(np.mean(phasors, axis=1)) / (2 * np.pi) * ambiguity_m
     lifted = heights + ambiguity_m * np.round((guesses + common_height[:, None] - heights) / ambiguity_m)
     lifted += ambiguity_m * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / ambiguity_m)[:, None]
-    # All tilts have the same places, so one inverse fits them all.
+    # The matrix depends on the places alone, so one solution serves all trial tilts.
     prior = np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
     weighted = design / _PHASE_STD_M**2
     planes = np.linalg.solve(design.T @ weighted + prior, (lifted @ weighted).T).T
@@ -469,9 +488,10 @@ def _estimate_heights_by_phase(
 def _fit_plane(
     places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a plane [3] (height, rise along x, along y) with a prior on its tilt; return it and its covariance [3, 3].
+    """Fit a plane [3] (height at the middle, rise along x, along y); return it and its covariance [3, 3].
 
-    The covariance is scaled up if the scatter around the plane exceeds the standard deviations of the heights.
+    `heights` and `stds` [patch] are in metres. The tilt has a prior (`_TILT_PRIOR_RAD`). The covariance is scaled up if
+    the scatter around the plane is larger than by the standard deviations of the heights.
     """
     rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
     information = rows.T @ rows + np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
@@ -483,5 +503,5 @@ def _fit_plane(
 
 
 def _evaluate_plane(plane: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the heights of a plane at places [patch, 2]."""
+    """Return the heights of a plane [3] at places [patch, 2], metres, [patch]."""
     return plane[0] + places @ plane[1:]

@@ -14,19 +14,8 @@ import msgspec
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.raster import check_burst_fits
-from polysight_simulators.process import command_line, run_program
+from polysight_simulators.process import command_line, count_from_zero, run_program
 from polysight_simulators.scene import apply_scene, load_scene, simulate
-
-
-def _count_from_zero(text: str) -> int:
-    """Parse a whole number of at least 0, of 63 bits. Raises ArgumentTypeError."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if not 0 <= value < 1 << 63:
-        raise argparse.ArgumentTypeError(f"{text} is not a whole number, 0 or more")
-    return value
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,11 +25,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     layouts = ("own", "authors")
     parser.add_argument("--layout", choices=layouts, default="own", help="scan folder, or the published data set's")
-    parser.add_argument("--seed", type=_count_from_zero, default=None, help="instead of the scene's seed")
+    parser.add_argument("--seed", type=count_from_zero, default=None, help="of gains and noise, instead of the scene's")
     parser.add_argument("--columns", action="store_true", help="authors' layout: scanned column by column")
     parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
     text = "use another set of specimens, number N (scene seed + 1000 N)"
-    parser.add_argument("--specimens", type=_count_from_zero, default=0, metavar="N", help=text)
+    parser.add_argument("--specimens", type=count_from_zero, default=0, metavar="N", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -82,7 +71,7 @@ def _simulate(args: argparse.Namespace) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Run `check`. Raises PolysightError."""
+    """Run `check`: load each scene and apply it to the rig. Raises PolysightError for the first scene with an error."""
     rig = load_instrument(args.config)
     for path in args.scenes:
         scanned = apply_scene(rig, load_scene(path))
@@ -104,7 +93,7 @@ def main(argv: list[str] | None = None) -> int:
 
     sub = add_command("simulate", _simulate, "raw data of a scene, without sockets", parser.epilog)
     _add_arguments(sub)
-    text = "check scene files alone and with the rig file; print only errors"
+    text = "check scene files alone and with the rig file; print only the first error"
     example = "example:\n  python -m polysight_simulators check examples/metal-plate.toml"
     sub = add_command("check", _check, text, example)
     sub.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="scene files")

@@ -25,9 +25,10 @@ _RADAR_PORT = 5700
 
 
 def move_to_subnet(rig: Instrument, subnet: str) -> Instrument:
-    """Return the rig with its cards, host and Pi on `subnet` ("127.x.y"), with the last bytes of their addresses kept.
+    """Return the rig with its cards, host and Pi on `subnet` ("127.x.y"); the Pi gets .10, the others keep their byte.
 
-    A board's control server, or its native connection, gets its card's address.
+    A board's control server keeps its port, and its native connection gets port 5700; both get its card's address.
+    The simulated boards replace those that the rig file identifies by serial number, plug or die.
     """
     table: dict[str, Any] = to_builtins(rig)
     for board in table["boards"]:
@@ -37,7 +38,10 @@ def move_to_subnet(rig: Instrument, subnet: str) -> Instrument:
     servers = {name: f"{cards[name]}:{port.rpartition(':')[2]}" for name, port in rig.radar.servers.items()}
     native = table["radar"].get("native", {})
     for name, board in native.items():
-        board["usb_serial"] = f"tcp://{cards[name]}:{_RADAR_PORT}"
+        place = f"tcp://{cards[name]}:{_RADAR_PORT}"
+        if board["usb_serial"] and board["ldo_bypass_acknowledged"] == board["usb_serial"]:
+            board["ldo_bypass_acknowledged"] = place
+        board |= {"usb_serial": place, "usb_path": "", "die_id": ""}
     table["radar"] = {**table["radar"], "servers": servers, "native": native}
     pi = f"tcp://{subnet}.{_PI_HOST_PART}"
     table["pi"] |= {"command_address": f"{pi}:{_COMMAND_PORT}", "event_address": f"{pi}:{_EVENT_PORT}"}
@@ -45,7 +49,7 @@ def move_to_subnet(rig: Instrument, subnet: str) -> Instrument:
 
 
 def is_free(rig: Instrument) -> bool:
-    """Return True if every address of the rig is free."""
+    """Return True if every address of the rig is free; the rig is one of `move_to_subnet`."""
     udp = {(b.card_address, port) for b in rig.boards for port in (SOURCE_PORT, b.command_port)}
     udp |= {(b.host_address, port) for b in rig.boards for port in (b.command_port, b.data_port)}
     radars = (*rig.radar.servers.values(), *(b.usb_serial for b in rig.radar.native.values()))
@@ -68,7 +72,7 @@ def is_free(rig: Instrument) -> bool:
 def move_to_free_subnet(rig: Instrument) -> Instrument:
     """Return the rig on a random loopback subnet with free addresses.
 
-    Raises DeviceError if 50 attempts find none: this machine's loopback is not 127.0.0.0/8, or many rigs run.
+    Raises DeviceError if no attempt finds one: this machine's loopback is not 127.0.0.0/8, or many rigs run.
     """
     generator = random.Random()
     for _ in range(_TRIES):

@@ -1,4 +1,4 @@
-"""Life of a simulator process: print `ready`, end on SIGTERM or SIGINT, and end with the parent process."""
+"""Options and life of a simulator process: print `ready`, end on SIGTERM or SIGINT, and end with the parent process."""
 
 from __future__ import annotations
 
@@ -20,6 +20,17 @@ def command_line(module: str, description: str, example: str) -> argparse.Argume
         epilog=f"example:\n  python -m {module} {example}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def count_from_zero(text: str) -> int:
+    """Parse a whole number of at least 0, of 63 bits. Raises ArgumentTypeError."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value < 1 << 63:
+        raise argparse.ArgumentTypeError(f"{text} is not a whole number, 0 or more")
+    return value
 
 
 def announce_ready(text: str = "") -> None:

@@ -2,9 +2,10 @@
 
     python -m polysight_simulators.rig --config instrument.toml --scene SCENE.toml --dir DIR --time-scale 30 --with-pi
 
-Writes DIR/instrument.toml, the rig file with the addresses of these processes, DIR/truth.json, the truth of the scene,
-and DIR/logs. Prints `ready DIR/instrument.toml` when all processes are ready. SIGTERM, SIGINT or the end of a process
-ends all of them. *Wire time* is the clock of the simulated signals: wall time times the time scale.
+Writes into DIR instrument.toml, the rig file with the addresses of these processes, truth.json, the truth of the scene
+(not with --pattern), reports of the cards, and logs. Prints `ready DIR/instrument.toml` when all processes are ready.
+SIGTERM, SIGINT or the end of a process ends all of them; SIGUSR1 switches all cards off and on. *Wire time* is the
+clock of the simulated signals: wall time times the time scale.
 """
 
 from __future__ import annotations
@@ -28,12 +29,13 @@ from polysight_shared.program import die_with_parent
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.faults import read_faults
 from polysight_simulators.loopback import move_to_free_subnet
-from polysight_simulators.process import announce_ready, command_line, run_until_stopped
+from polysight_simulators.process import announce_ready, command_line, count_from_zero, run_until_stopped
 from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
 
-# Shortest heartbeat timeout of stage and Pi: the processes share the cores of a busy machine, and may be late; chosen.
+# Shortest heartbeat timeout, `stage.heartbeat_ms` of the stage and four times `pi.host_heartbeat_ms` of the Pi: the
+# processes share the cores of a busy machine, and may be late; chosen.
 MIN_HEARTBEAT_MS = 2000
 # Firmware image of the radars in the folder of the rig.
 IMAGE_FILE = "firmware.bin"
@@ -49,7 +51,7 @@ _NATIVE_OFFSET_HZ = 790e3
 # Last lines of a log that an error shows; chosen.
 _LOG_LINES = 15
 # One thread for linear algebra, unless the environment says otherwise: several processes with more threads on few cores
-# are ten times slower.
+# are ten times slower. Unbuffered: `ready` is read from the log.
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
 
 
@@ -75,8 +77,9 @@ def _apply_if_offset(table: dict[str, Any], if_offset_hz: float) -> None:
 def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
     """Derive the rig file of a simulated rig in `folder`: the scene's overrides, free addresses, paths.
 
-    `native` overrides the radar control of the rig file. Raises ConfigError if an override breaks a rule, DeviceError
-    if no loopback subnet is free.
+    `native` overrides the radar control of the rig file; the scene's IF offset is then that of receivers without a
+    start offset of their own. It is left out if the rig file itself has native control. Raises ConfigError if an
+    override breaks a rule, DeviceError if no loopback subnet is free.
     """
     disturbed_rig = rig
     offset_hz = _NATIVE_OFFSET_HZ
@@ -159,7 +162,8 @@ class RigOptions(NamedTuple):
 
     `time_scale`: wire time over wall time; `with_pi`: run the Pi's program; `seed`: None for the scene's; `pattern`:
     counting pattern instead of the scene's signals; `faults`: file with a `[faults]` table; `cache`: folder of the
-    scene's object fields; `uno`: emulated board instead of the compiled sketch; `native`: the host controls the radars.
+    scene's object fields (computed echoes); `uno`: emulated board instead of the compiled sketch; `native`: the host
+    controls the radars.
     """
 
     time_scale: float = 1.0
@@ -175,9 +179,10 @@ class RigOptions(NamedTuple):
 
 
 class RigProcesses:
-    """The processes of a simulated rig in `folder`, which contains its rig file.
+    """The processes of a simulated rig in `folder`, which contains its rig file; started by the constructor.
 
-    Raises DeviceError if one of them ends, or is not ready before the timeout.
+    Raises DeviceError if one of them ends, or is not ready before the timeout, ConfigError if the Pi's program is
+    missing.
     """
 
     def __init__(self, rig: Instrument, scene: Path | None, folder: Path, options: RigOptions, stop: Event) -> None:
@@ -264,7 +269,7 @@ def _list_card_options(scene: Path | None, options: RigOptions) -> list[str]:
     """Return the options of the process of the cards that follow from those of the rig."""
     words = []
     if scene is not None:
-        # The rig file has the scene's IF offset already, see `derive`.
+        # `derive` has put the scene's IF offset into the rig file, or left it out.
         words += ["--scene", str(scene), "--offset-in-rig"]
     if options.pattern:
         words.append("--pattern")
@@ -348,7 +353,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a simulated rig until SIGTERM or SIGINT."""
+    """Run a simulated rig until SIGTERM, SIGINT or the end of a process; return the exit status."""
     parser = command_line(
         "polysight_simulators.rig",
         "Start a simulated rig; print `ready FILE` with its rig file, and run until Ctrl-C.",
@@ -359,7 +364,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--dir", type=Path, required=True, help="folder of this rig: its rig file, logs, serial port")
     parser.add_argument("--time-scale", type=float, default=1.0, help="speed: wire time relative to wall time")
     parser.add_argument("--with-pi", action="store_true", help="run the Pi's program too")
-    parser.add_argument("--seed", type=int, help="default: the scene's")
+    parser.add_argument("--seed", type=count_from_zero, help="default: the scene's")
     parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene's signals")
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table for the cards")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")

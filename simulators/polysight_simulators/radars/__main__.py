@@ -15,8 +15,8 @@ from pathlib import Path
 from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
-# Where the traced board raised its interrupt the simulated clock goes on in these steps until the simulated board does,
-# too, at most so long; chosen, longer than a board starts.
+# Where the traced board raised its interrupt, the simulated clock advances in these steps until the simulated board
+# raises its own, at most for this timeout. Chosen; the timeout is longer than the start of a board.
 _STEP_S = 1e-4
 _TIMEOUT_S = 15.0
 
@@ -32,7 +32,11 @@ class _Time:
 
 
 def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> list[str]:
-    """Return a line for each different answer of the board. Raises OSError, ValueError."""
+    """Return a line for each read of the trace that the board answers differently; what else it sends is not compared.
+
+    `make` creates the board from its clock. Raises OSError, ValueError if the file is not a trace; a damaged line may
+    also raise KeyError, TypeError, AttributeError or RecursionError.
+    """
     time = _Time()
     board = make(time.now)
     differences = []
@@ -48,7 +52,7 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
         record = json.loads(line)
         time.s = max(time.s, record.get("t", 0.0))
         if record.get("line") == "NRST":
-            # At the release of the reset the board reads its mode from the sense-on-power pins.
+            # Set before the release of the reset, at which the board reads its mode from the sense-on-power pins.
             board.sense(FUNCTIONAL)
             board.reset(held=not record["level"])
         elif record.get("line") == "HOST_INTR" and record["level"]:
@@ -74,7 +78,7 @@ def _list_words(text: str) -> list[int]:
 
 
 def main() -> int:
-    """Return 0 if the simulated board answers the same."""
+    """Return 0 if the simulated board answers the same, 1 if not, 2 if the trace cannot be read."""
     parser = argparse.ArgumentParser(
         prog="python -m polysight_simulators.radars",
         description=__doc__,

@@ -1,0 +1,49 @@
+"""Seeds and addresses that a simulated rig cannot use are refused or replaced before a process starts."""
+
+import msgspec
+import pytest
+from tests.support.rigs import published_rig
+
+from polysight_shared.config import NativeRadar
+from polysight_simulators import __main__ as simulate, rig as simulated_rig
+from polysight_simulators.cards import __main__ as cards
+from polysight_simulators.loopback import move_to_subnet
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments"),
+    [
+        (simulate.main, ["simulate", "scene.toml", "--out", "out"]),
+        (simulated_rig.main, ["--config", "rig.toml", "--dir", "rig"]),
+        (cards.main, ["--config", "rig.toml", "--wires", "wires"]),
+    ],
+)
+@pytest.mark.parametrize("seed", ["-1", "1.5", str(1 << 63)])
+def test_a_seed_is_a_whole_number_from_zero(main, arguments, seed, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main([*arguments, "--seed", seed])
+    assert caught.value.code == 2
+    assert f"--seed: {seed} is not a whole number" in capsys.readouterr().err
+
+
+def move_native(boards):
+    """Rig with native control of these boards, one a board of the published rig, on a subnet."""
+    rig = published_rig()
+    native = {board.name: identity for board, identity in zip(rig.boards, boards, strict=True)}
+    radar = msgspec.structs.replace(rig.radar, control="native", native=native)
+    return move_to_subnet(msgspec.structs.replace(rig, radar=radar), "127.3.4")
+
+
+def test_simulated_boards_replace_those_identified_by_plug_and_die():
+    die = "00000001-00000002-00000003-00000004"
+    moved = move_native([NativeRadar(usb_path=f"1-4.{n}", die_id=die, ldo_bypass=True) for n in range(3)])
+    for board in moved.boards:
+        place = f"tcp://{board.card_address}:5700"
+        assert moved.radar.native[board.name] == NativeRadar(usb_serial=place, ldo_bypass=True)
+
+
+def test_simulated_boards_have_the_acknowledgement_of_those_that_they_replace():
+    serials = ["FT0", "FT1", "FT2"]
+    moved = move_native([NativeRadar(s, ldo_bypass=True, ldo_bypass_acknowledged="FT1") for s in serials])
+    acknowledged = [n.ldo_bypass_acknowledged == n.usb_serial for n in moved.radar.native.values()]
+    assert acknowledged == [False, True, False]

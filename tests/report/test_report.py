@@ -15,7 +15,7 @@ from polysight.materials import TruthPlate
 from polysight.process.quality import find_masked_runs
 from polysight.report import write_report
 from polysight.report.figures import coverage_figure, find_masked_positions
-from polysight.report.report import format_value, imaging_table, render
+from polysight.report.report import format_value, imaging_table, quality_tables, render
 from polysight.report.style import png
 from polysight.results import RxGain, ScanFacts, ScanMaterials, ScanQuality
 from polysight_shared.raster import RasterPlan
@@ -331,3 +331,10 @@ def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
     words = re.findall(r"[\w.]+", Page(html).words.lower())
     assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]
     assert format_value(value) == "–"
+
+
+def test_a_standard_deviation_is_not_shown_as_the_value():
+    boards = {"RH": {"stage_backlash_mm": {"shift": 0.12, "std": 0.01}}}
+    (table,) = quality_tables({"boards": boards})
+    shown = [row["cells"] for row in table["rows"]]
+    assert shown == [["stage backlash shift (mm)", "0.12"], ["stage backlash std (mm)", "0.01"]]

@@ -1,7 +1,7 @@
 """Write `report.html`, one self-contained page with inline images, and the same figures as files.
 
 Tables are plain dicts (caption, head, rows) for the page's template. The columns of the patches' figures are those that
-`polysight.results.PatchFigures` declares with a title.
+the type of the scan's patches (`polysight.results.PatchFigures` or a subclass) declares with a title.
 """
 
 from __future__ import annotations
@@ -150,6 +150,7 @@ def _list_notes(scan: ProcessedScan) -> list[str]:
     notes = [NOT_ON_HARDWARE]
     if scan.quality.coverage and scan.quality.coverage.damage:
         notes.insert(0, scan.quality.coverage.damage)
+    # Without a model of the materials, `library` is the sentence that says why.
     if scan.materials is not None and scan.materials.model is None and scan.materials.library:
         notes.append(scan.materials.library)
     return notes
@@ -230,7 +231,12 @@ def _write_lead(scan: ProcessedScan) -> str:
 
 
 def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str, Any]:
-    """Format one line of the materials table."""
+    """Format one line of the materials table: key of the template to text.
+
+    `truth`, `true_real`, `true_loss` and `error` are of the true plate there; `right`: the name is the true one;
+    `strange`: called unknown, and truly not in the library. `votes` is the confidence, `drawn_as` the name of the box
+    that the operator drew, `do` the measurement that would shrink the error most.
+    """
     truth = patch.truth
     e = patch.permittivity
     name = patch.name or f"patch {patch.label}"
@@ -283,7 +289,7 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
 
 
 def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
-    """Format a permittivity with its errors and their main source."""
+    """Format a permittivity with its errors, the 30th and 70th percentile of its pixels, and the main error source."""
     row = {"real": f"{e.real:.2f}", "loss": f"{e.loss:.2f}"}
     if e.spread is not None:
         row["real_error"] = f"± {e.spread.real_std:.2f}"
@@ -301,7 +307,7 @@ def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
 
 
 def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
-    """Say how many positions of each board are masked, bool [row, column]; "" if that is not known."""
+    """Say how many positions of each board are masked; `masks`: board to bool [row, column]. "" if it is empty."""
     if not masks:
         return ""
     if not any(m.any() for m in masks.values()):
@@ -381,8 +387,7 @@ def format_heading(key: str) -> str:
     unit = ""
     if len(words) > 1 and words[-1] in UNITS:
         unit = f" ({UNITS[words.pop()]})"
-    # The table's caption says that the figures are standard deviations.
-    words = ["IF" if word == "if" else word for word in words if word != "std"]
+    words = ["IF" if word == "if" else word for word in words]
     return " ".join(words) + unit
 
 
@@ -437,7 +442,7 @@ def _compute_received_shares(quality: ScanQuality) -> list[tuple[str, str]]:
 
 
 def quality_tables(quality: dict[str, Any]) -> list[Table]:
-    """Return tables of the known parts of quality.json, then one of all other keys."""
+    """Return tables of boards, synchronisation, imaging and times of quality.json, then one of all other keys."""
     shown_elsewhere = {"boards", "seconds_per_stage", "imaging", "verdict", "error_budget"}
     boards = quality.get("boards")
     parts = (
@@ -563,7 +568,7 @@ def _flatten_board(board: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tabulate_residuals(boards: Any) -> Table | None:
-    """Return a table of `synchronisation` of all boards, a line a stage and a column a quantity; None without any."""
+    """Return a table of `synchronisation`: a line for each stage, a column for each board's quantity; None without."""
     if not isinstance(boards, dict):
         return None
     flat: dict[str, dict[str, Any]] = {}
@@ -574,7 +579,8 @@ def _tabulate_residuals(boards: Any) -> Table | None:
         return None
     keys = list(dict.fromkeys(k for v in flat.values() for k in v))
     rows = [_format_cells(format_heading(stage), *(format_value(v.get(k)) for k in keys)) for stage, v in flat.items()]
-    head = ["After stage", *map(format_heading, keys)]
+    # The caption says that the figures are standard deviations.
+    head = ["After stage", *(format_heading(key.replace("_std", "")) for key in keys)]
     caption = (
         "Residual (standard deviation) after each stage of synchronisation: of one chirp as received and aligned, of"
         " the direct path in a position's average, and of the object referenced to it; amplitude relative to its mean."

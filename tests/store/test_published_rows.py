@@ -170,8 +170,9 @@ def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
         assert scan.recording_facts()["recording"].boards[board]["rows_not_placed"] == 1
 
 
+@pytest.mark.parametrize("first_sequence", [0, 1])
 @pytest.mark.parametrize("zero_filling", [True, False])
-def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling):
+def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling, first_sequence):
     folder, sent = record(tmp_path, zero_filling=zero_filling)
     short = 4
     file = folder / "RH" / "0_0.bin"
@@ -189,7 +190,7 @@ def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling):
         pulse_time = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
         # The card holds what is left, not a whole packet, back
         pulse_time += late_s if end + 1 == raw.size else 0.0
-        lines.append(f"{k + 1},{end + 1 - start},{pulse_time:.6f}")
+        lines.append(f"{k + first_sequence},{end + 1 - start},{pulse_time:.6f}")
     log.write_text("\n".join(lines))
     scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 0), sent["RH", 0])

@@ -67,7 +67,7 @@ class Stream:
 
     # uint8 [n]: the payload, zero where bytes were lost.
     data: NDArray[np.uint8]
-    # Byte ranges that never arrived, and the number of packets that they make.
+    # Byte ranges that never arrived, and the number of packets in them.
     lost: Gaps
     packets_lost: int
     # Offset of each packet that arrived, bytes; empty without a log.
@@ -86,7 +86,7 @@ class Bursts(NamedTuple):
 
 
 def read_log(path: Path) -> PacketLog | None:
-    """Read a row's packet log; None if there is none. A header line is skipped.
+    """Read a row's packet log; None if there is none, or none with a packet. A header line is skipped.
 
     The first three columns are sequence number, bytes of payload, and time of arrival.
     A last packet that is not full gets the arrival time of the one before it: the card delays it by 2 s, and it would
@@ -131,7 +131,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     Raises
     ------
     DataError
-        if file and log are not of one recording.
+        if file and log are not of one recording, or the log's sequence numbers jump.
     """
     raw = np.fromfile(file, np.uint8)
     no_packets = np.zeros(0, np.int64)
@@ -213,7 +213,8 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled
 
     With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
     counted back from a short last packet if no position is missing, otherwise the first packet that arrived. If the
-    result is neither 0 nor 1 but the numbers fit a record from 1, return 1: cards count from 1, a log may from 0.
+    result is neither 0 nor 1 but the numbers fit a record from 1, as in a row that lacks a frame, it is 1, or 0 if
+    that packet arrived: cards count from 1, a log may from 0.
     """
     expected = -(-shape.bytes // full)
     first = int(log.sequence[0])
@@ -225,7 +226,7 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled
         begin = min(first, last - expected + 1)
     fits_from_1 = last <= expected
     if begin not in (0, 1) and fits_from_1:
-        return 1
+        return min(first, 1)
     return begin
 
 
@@ -243,7 +244,7 @@ def _find_pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
 
 
 def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
-    """Find the bursts of a stream; None without a log."""
+    """Find the bursts of a stream; None if there are no arrival times: without a log, or if no packet arrived."""
     if not stream.at_s.size:
         return None
     frame = shape.frame_bytes
@@ -252,7 +253,8 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
     ends = np.zeros(first_packets.size, np.int64)
     before_end = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
     for i, (low, high) in enumerate(zip(before_end, stream.start[first_packets] + stream.packet_bytes, strict=True)):
-        # The burst ends in the packet that straddles the pause: a whole number of bursts if one fits, else of frames.
+        # The burst ends in the packet that straddles the pause: after a whole number of bursts from its beginning, if
+        # such an end lies in that packet, otherwise after a whole number of frames.
         begun = 0
         if i:
             begun = ends[i - 1]
@@ -266,9 +268,12 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
 
 
 def period_s(bursts: Bursts) -> float | None:
-    """Return the time between positions, seconds (most must follow one another); None for fewer than two bursts."""
+    """Return the time between neighbouring positions, seconds; None for fewer than two bursts.
+
+    At least a quarter of the bursts must be followed by that of the next position.
+    """
     if bursts.at_s.size > 1:
-        # A quartile, not the median: missing positions and row ends make gaps longer, nothing makes them shorter.
+        # A quartile, not the median: missing positions make gaps longer, and nothing makes them shorter.
         return float(np.quantile(np.diff(bursts.at_s), 0.25))
     return None
 
@@ -317,7 +322,8 @@ class RowLosses:
     positions_missing: int = 0
     # Positions with another number of frames than pulses: they are masked, because the missed pulse is unknown.
     positions_short: int = 0
-    # 1 if positions are missing and it is not known which: the whole row is masked.
+    # 1 if the row is too short and it is not known which positions are missing (no log, or no times that fit): the
+    # whole row is masked.
     rows_not_placed: int = 0
 
 
@@ -345,7 +351,7 @@ class _Published:
 
     @property
     def plan(self) -> RasterPlan:
-        """The plan of positions; the rows of a scan by columns are its columns."""
+        """The plan of positions; a row of the plan is a column of the stage if the scan was recorded by columns."""
         return self._plan
 
     @property
@@ -370,7 +376,10 @@ class PublishedScan(_Published):
         self._files: dict[str, dict[int, Path]] = {b.name: self._list_row_files(b.name) for b in base.boards}
 
     def _list_row_files(self, board_name: str) -> dict[int, Path]:
-        """Return the files of a board by row. Raises DataError if one starts at another column than the plan."""
+        """Return the files of a board by row; files with other names and rows outside the plan are left out.
+
+        Raises DataError if one starts at another column than the plan.
+        """
         files = {}
         for file in (self.path / board_name).glob("*.bin"):
             match = _ROW_FILE.fullmatch(file.name)
@@ -473,7 +482,7 @@ class PublishedScan(_Published):
 
     def recording_facts(self) -> dict[str, Any]:
         """Return the losses of the rows read so far and the number of missing rows, by board."""
-        # A scan that is only recorded loads nothing of the results.
+        # Imported here: a program that only records scans does not load the results.
         from polysight.results import Recording
 
         boards = {}
@@ -522,7 +531,10 @@ class PublishedCubes(_Published):
         yield from range(self._plan.rows)
 
     def read_row(self, board_name: str, row: int) -> CubeRow:
-        """Read one board's row with the authors' reference. Raises DataError if it is missing or of a wrong shape."""
+        """Read one board's row as the authors synchronised it, complex64 [rx, position, sample], in order of recording.
+
+        Raises DataError if the cube is missing or of a wrong shape.
+        """
         file = self.path / f"{board_name}{SYNCED}"
         try:
             with HEADER_LOCK:
@@ -537,7 +549,7 @@ class PublishedCubes(_Published):
         if cube.shape != shape:
             problem = f"{file}: shape {cube.shape}, {shape} in its settings"
             raise DataError(problem, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)
-        # Positions in the order of ascending x (or y).
+        # Ascending x (y of a scan by columns); the order of recording follows.
         if self.mirrored:
             ascending = cube[:, :, row]
         else:

@@ -37,12 +37,12 @@ class ChirpConfig(msgspec.Struct, frozen=True):
 
 
 class Collection(msgspec.Struct, frozen=True):
-    """The keys of the JSON files that are used. Lengths in mm, times in ms, angles in degrees, `board_dist` in m.
+    """Keys of the JSON files. Lengths in mm, times in ms, angles in degrees, `board_dist` in m.
 
     `total_x`, `total_y` are positions `dx`, `dy` apart; `num_trigger` the pulses of a position, `period_frame` apart;
     `num_chirp` the chirps of a pulse. `moving_direction` is "row" (along x) or "col". With `packet_zero_filling` the
     file of a row has zeros where packets were lost, otherwise nothing. Angles and offsets that are None stay those of
-    the base rig.
+    the base rig. `num_adc` is required, but the samples of a chirp are those of `chirp_configs`.
     """
 
     dx: float
@@ -72,14 +72,14 @@ class Collection(msgspec.Struct, frozen=True):
 
 
 class Rig(NamedTuple):
-    """The rig of a scan, x from TX to RX, and notices on how the settings were read."""
+    """The rig of a scan, with x from TX to RX, and notices on settings that were read otherwise than written."""
 
     instrument: Instrument
     notices: tuple[str, ...]
 
 
 def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
-    """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError."""
+    """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError if it is none."""
     if missing_ok and not path.exists():
         return {}
     cause = "the download is not complete"
@@ -112,7 +112,7 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     """Return the base rig with the scan's settings; values missing in the JSON stay the base's. Raises ConfigError."""
     chirp = settings.chirp_configs[0]
     grid = {"columns": settings.total_x, "rows": settings.total_y, "step_x_mm": settings.dx, "step_y_mm": settings.dy}
-    # The grid was within their stage's travel.
+    # The authors' stage had room for the grid.
     travel = (
         max(base.stage.travel_x_mm, settings.total_x * settings.dx + 2 * base.stage.run_up_mm(settings.dx)),
         max(base.stage.travel_y_mm, settings.total_y * settings.dy + 2 * base.stage.run_up_mm(settings.dy)),
@@ -139,9 +139,10 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
 
 
 def _scale_if_below(value: float, least: float, factor: float) -> float:
-    """Return a value in the wanted unit: their files have some in SI, some in the units of TI's tools.
+    """Return a value in the wanted unit: the authors' files have some in SI, some in the units of TI's tools.
 
-    No chirp has a value below `least` in the wanted unit; such a value is in the other one and is multiplied.
+    No chirp has a value below `least` in the wanted unit, but for 0; such a value is in the other unit and is
+    multiplied.
     """
     if value < least:
         return value * factor
@@ -151,9 +152,9 @@ def _scale_if_below(value: float, least: float, factor: float) -> float:
 def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tuple[MountStep, ...]:
     """Return the base rig's mount with the angles and offsets of the scan; append to `notices` what was read otherwise.
 
-    The last turn about y points the board at the object, the last about z tilts the receivers, and the shift between
-    them is the tilt's offset; the V board has another turn about y before. The last shift is half the distance between
-    the board origins.
+    The last turn about y points the board at the object, and the last about z tilts the receivers; the V board has
+    another turn about y before. The last shift but one is the offset of the tilt, and the last step, if it is a shift,
+    half the distance between the board origins.
     """
     steps = list(board.mount)
     transmits = board.role == "transmit"

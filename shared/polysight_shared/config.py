@@ -1,7 +1,7 @@
 """Declaration of the rig file `instrument.toml`: every setting of the instrument with its type, limits and rules.
 
 `load_instrument` reads it. An unknown key, a wrong type or a broken rule is refused with file, key, value and rule.
-The comments of `instrument.toml` at the top of the repository explain each key.
+The comments of `instrument.toml` at the top of the repository explain the keys that it has; others are explained here.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
 DEBOUNCE_TICKS_US = 5_000
 # 2000 x 2000: imaging holds some 200 bytes a pixel, and an image of 9999 x 9999 took all memory of a PC.
 MAX_PIXELS = 4_000_000
-# The wavelength is 4 mm; the memory of the imager (by FFTs over a lattice of pixels) grows as one over the size. Both
+# The wavelength is 4 mm; the imager's FFTs over a lattice of pixels take more memory the smaller a pixel is. Both
 # limits are chosen.
 MIN_PIXEL_MM = 0.05
 MAX_PIXEL_MM = 100.0
@@ -60,7 +60,8 @@ class Chirp(Section, frozen=True):
     # Corners of the two high-pass filters of the receivers; 0 for none.
     hpf1_khz: float = 175.0
     hpf2_khz: float = 350.0
-    # Samples that are used, first and end: the published rig's chirp bends in its last 20 us.
+    # Samples that are used, from the first up to, but without, the second: the published rig's chirp bends in its last
+    # 20 us.
     linear_samples: tuple[int, int] = (0, 192)
 
     def __post_init__(self) -> None:
@@ -118,6 +119,7 @@ class Pi(Section, frozen=True):
     one_shot: bool = False
     # Return wire of SYNC_IN, MISO with "spi"; None: pulses are sent, not seen.
     pulses_in: GpioLine | None = None
+    # Where the Pi answers commands, and where it publishes events (ZeroMQ).
     command_address: str = "tcp://127.0.0.1:5601"
     event_address: str = "tcp://127.0.0.1:5602"
     journal_dir: str = "journal"
@@ -182,7 +184,7 @@ class MountStep(Section, frozen=True):
 
     def __post_init__(self) -> None:
         require(
-            (self.shift_mm is not None) != (self.turn_deg is not None and self.about is not None),
+            (self.turn_deg is None) == (self.about is None) == (self.shift_mm is not None),
             "a mount step is either { shift_mm = [x, y, z] } or { turn_deg = a, about = axis }",
         )
 
@@ -204,7 +206,8 @@ class Board(Section, frozen=True):
     # IP addresses of the card, and of the host's interface to it.
     card_address: str
     host_address: str
-    # UDP ports, the same on card and host: commands with their replies, and samples.
+    # UDP ports: of commands on the card and of their replies on the host; of samples on the host (a card sends them
+    # from its port 1024).
     command_port: Port
     data_port: Port
     # From the board's frame (RX1 is zero) to the rig's, in order.
@@ -339,7 +342,7 @@ class Polarimetry(Section, frozen=True):
 
 
 class CalibrationFiles(Section, frozen=True):
-    """Files of `polysight calibrate`; "" for none. Paths are relative to the rig file's folder."""
+    """Files of `polysight calibrate`, by its subcommands; "" for none. Paths are relative to the rig file's folder."""
 
     direct_path: str = ""
     hpf: str = ""
@@ -350,8 +353,8 @@ class CalibrationFiles(Section, frozen=True):
 class CheckPlate(Section, frozen=True):
     """A plate of known permittivity that lies at the same place in every scan; `name` "" for none.
 
-    `permittivity` is [eps', loss], `std` how well both are known, `place_mm` a place on the plate from the image's
-    centre.
+    `permittivity` is [eps', eps''], `std` the standard deviation of each, `place_mm` a place on the plate (x, y) from
+    the image's centre.
     """
 
     name: str = ""
@@ -365,7 +368,7 @@ class Limits(Section, frozen=True):
 
     # Further attempts at a row with faults.
     row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
-    # Longest wait for a reply of Pi or card.
+    # Longest wait for a reply of the Pi, a card or a board's control server.
     command_timeout_s: Positive = 5.0
     # Silence of a card after which its record of a row counts as ended.
     end_of_record_s: Positive = 3.0
@@ -376,7 +379,7 @@ class Limits(Section, frozen=True):
 
 
 class Notify(Section, frozen=True):
-    """Who is told when a scan ends: a command that gets the text, a web address that gets JSON. Never recorded."""
+    """Who is told when a scan ends: a command that gets the text, a web address that gets JSON. Not stored in scans."""
 
     command: str = ""
     url: Annotated[str, msgspec.Meta(pattern=r"^(https?://\S+)?$")] = ""
@@ -462,7 +465,7 @@ class Instrument(Section, frozen=True):
         return tuple(b for b in self.boards if b.record)
 
     def by_role(self, role: str) -> Board:
-        """Return the board with this role."""
+        """Return the board with this role, one of `Board.role`."""
         return next(b for b in self.boards if b.role == role)
 
     def by_name(self, name: str) -> Board:
@@ -474,7 +477,7 @@ class Instrument(Section, frozen=True):
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of one frame: chirps x samples x 4 RX x (I, Q) x int16."""
+        """Bytes of one frame: chirps x samples x RX x (I, Q) x int16."""
         return self.burst.chirps * self.chirp.samples * len(self.antennas.rx_mm) * 2 * 2
 
     @property

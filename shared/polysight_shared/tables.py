@@ -18,7 +18,7 @@ from polysight_shared.files import read_bounded
 
 # Chosen: far above any table written by hand.
 _MAX_BYTES = 64 << 20
-_RIG_KEYS = "instrument.toml in the repository explains every key"
+_RIG_KEYS = "instrument.toml in the repository and shared/polysight_shared/config.py explain every key"
 T = TypeVar("T")
 # The upper limits only refuse infinities and typing errors.
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e15)]

@@ -11,7 +11,7 @@ from tests.support.refusals import refused
 from polysight_shared import geometry
 from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Section, load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import no_such
+from polysight_shared.errors import ConfigError, no_such
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 
@@ -53,6 +53,23 @@ def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
     assert geometry.rx_positions_m(rig, v)[0] == pytest.approx((0.6836, 0.1337, 0.0104), abs=6e-5)
     assert geometry.direct_path_m(rig, h)[0] == pytest.approx(1.390, abs=5e-4)
     assert geometry.incidence_deg(rig, h) == pytest.approx(55.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        {},
+        {"turn_deg": 3.0},
+        {"about": "x"},
+        {"shift_mm": [0.0, 0.0, 1.0], "turn_deg": 3.0},
+        {"shift_mm": [0.0, 0.0, 1.0], "about": "x"},
+        {"shift_mm": [0.0, 0.0, 1.0], "turn_deg": 3.0, "about": "x"},
+    ],
+    ids=str,
+)
+def test_a_mount_step_is_a_whole_shift_or_a_whole_turn(step):
+    with pytest.raises(ConfigError, match="mount step"):
+        decode(step, MountStep, "a mount")
 
 
 @pytest.mark.parametrize(("axis", "first", "second"), [("x", 1, 2), ("y", 2, 0), ("z", 0, 1)])

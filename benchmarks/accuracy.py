@@ -43,7 +43,7 @@ def _draw_noise(rng: np.random.Generator, shape: tuple[int, ...], snr_db: float)
 def _simulate_paths(rig: Instrument, board: Board, cycles_away: float = 0.0) -> tuple[Complex, Complex]:
     """Return direct path and echo of the specular midpoint, each of amplitude one: complex [rx, sample].
 
-    `cycles_away` turns the echo's phase.
+    The echo's phase is turned by `cycles_away`, cycles.
     """
     tx = np.array(tx_position_m(rig))
     rx = np.array(rx_positions_m(rig, board))
@@ -101,6 +101,7 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
         bursts[p] = signal * turn[:, None] + _draw_noise(rng, bursts.shape[1:], snr_db)
     aligned = align_row(_quantise_bursts(bursts), np.ones(truth.shape, bool), chirp.linear_samples)
     method = Synchroniser(rig, board)
+    # The method's frequency offsets, cycles a sample [position, chirp].
     divided = np.array([method.offsets(np.swapaxes(burst, 0, 1))[0] for burst in bursts])
     half_bin = 0.5 / (b - a)
 
@@ -135,7 +136,10 @@ def one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
 
 
 def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
-    """Return the rig with its object plane moved so that the mirror point's echo is `bins` linear samples away."""
+    """Return the rig with its object plane moved so that echo and direct path are `bins` FFT bins apart.
+
+    The echo is that of the specular midpoint at the board's first RX, the FFT one of the linear samples.
+    """
     samples = rig.chirp.linear_samples[1] - rig.chirp.linear_samples[0]
 
     def move_plane(z_mm: float) -> Instrument:
@@ -158,7 +162,8 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     """Return the direct path's rms phase error beside an equal echo: in rad, and over its Cramer-Rao bound.
 
     The bound is of the joint estimate from all RX: the direct path's amplitude, phase and frequency, and the echo's
-    complex amplitude and frequency, with the directions of both known, from the geometry.
+    complex amplitude and frequency, with the directions of both known, from the geometry. Trials in which the direct
+    path was not found are left out.
     """
     rng = np.random.default_rng([SEED, 2, round(10 * snr_db), round(100 * bins)])
     rig = at_bins(rig, board, bins)
@@ -208,11 +213,12 @@ PIXELS = 60
 
 
 def image_error(rig: Instrument, board: Board) -> float:
-    """Return the largest difference between our image and the matched filter at some pixels, as a share of the peak.
+    """Return the largest difference between the instrument's image and the matched filter, as a share of the peak.
 
-    Points lie anywhere in the image, positions anywhere in the grid (2000 of them, the others masked), and each holds
-    its direct path. The matched filter takes all linear samples with the imager's window, after the
-    direct path is taken out of every position as the range gate does (`Reduction.direct`).
+    Compared are the peak and `PIXELS` - 1 drawn pixels. Points lie anywhere in the image, positions anywhere in the
+    grid (about 2000, the others masked), and each holds its direct path. The matched filter takes all linear samples
+    with the imager's window (Hann), after the direct path is taken out of every position as the range gate does
+    (`Reduction.direct`).
     """
     rng = np.random.default_rng(IMAGE_SEED)
     builder = ImageBuilder(rig)
@@ -290,8 +296,8 @@ def _match_filter(
 
 
 __all__ = ["add_arguments", "run"]
-# Signal-to-noise ratios and the distance of the two tones in FFT bins; chosen to span what a rig has (7.2 dB: the
-# POLySIGHT paper's figures, see static_chirps).
+# Signal-to-noise ratios and the distance of the two tones in FFT bins; chosen. Alignment is measured below what a rig
+# has (7.2 dB: the POLySIGHT paper's figures, see static_chirps), tones from there on.
 ALIGN_SNR_DB = (0.0, 2.5, 5.0)
 TONE_SNR_DB = (7.0, 16.0, 22.0, 30.0)
 BINS = 2.5
@@ -301,6 +307,7 @@ TWO_TONE_SNR_DB = 16.0
 def run(args: argparse.Namespace) -> int:
     """Measure all parts on one core and print the table; return 0."""
     rig, _ = published_scene(args.quick)
+    # Trials are divided by this number.
     few = 1
     if args.quick:
         few = 20
@@ -330,7 +337,7 @@ def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
             1 / 2,
             1 / 3,
             higher_is_better=False,
-            note=f"at {ALIGN_SNR_DB} dB a channel, two equal paths; the worst ratio; division's gross errors left out",
+            note=f"at {ALIGN_SNR_DB} dB a channel, two equal paths; the worst ratio; gross errors of both left out",
         ),
         Line(
             "gross errors of alignment at 0-5 dB",
@@ -381,5 +388,5 @@ def _image_line(images: Mapping[str, float]) -> Line:
         1e-5,
         1e-6,
         higher_is_better=False,
-        note="nine points, 2,000 positions of the full grid, all linear samples, 60 pixels and the peak",
+        note="nine points, 2,000 positions of the full grid, all linear samples, 60 pixels with the peak",
     )

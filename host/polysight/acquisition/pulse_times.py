@@ -10,8 +10,8 @@ a frame less behind a spurious edge.
   the train came at the time of a pulse and is of a single frame: what was held back comes in one go.
 
 In a whole row every train must allow a shift of 0. In a row that is some frames short, the shift only grows, from 0 to
-what is missing at the end; a frame is kept where its bounds meet at a whole number of frames. Of both, only frames are
-kept that were seen at their pulses.
+what is missing at the end; a frame is kept where its bounds meet at a whole number of frames. In both cases, only
+frames that came at the times of their pulses are kept.
 
 A *burst* is the pulses of one position of the stage. Pulses are numbered through the row; a frame's *slot* is the
 number of its pulse.
@@ -70,7 +70,8 @@ _BLURRED = 0.1
 _DISPLACED = 3
 # A card drops whole samples of its four antennas (inferred).
 _SAMPLE_BYTES = 16
-# A train that follows the previous one sooner than this share of the pulse period catches up a delay (chosen).
+# A train that the next one follows sooner than this share of the pulse period was delayed itself: the next catches up
+# (chosen).
 _CATCHING_UP = 0.8
 # Least number of bursts whose delays from pulse to data must agree, and how closely: within the share of a pulse
 # period, but no more than the time in ns (chosen).
@@ -94,8 +95,8 @@ _NO_BOUND = 1 << 60
 class PlacedFrames:
     """Pulse numbers of the frames of a row."""
 
-    # int64 [frame]: the pulse number of each received frame; -1 if it was not seen at its pulse. Empty if the row's
-    # capture events are missing
+    # int64 [frame]: the pulse number of each received frame; -1 if it was not seen at its pulse. Empty if no frame
+    # came, or the row's capture events are missing
     slots: Times
     # Numbers of the pulses that were certainly missed
     missed: list[int]
@@ -103,7 +104,8 @@ class PlacedFrames:
     pulses: int
     # The times contradict the row's length or each other: no frame is certain
     contradicted: bool = False
-    # Why the times say nothing, or how they contradict each other; "" otherwise
+    # Why the times say nothing. If `contradicted`: how, or "" if single trains contradict the row's length or each
+    # other
     reason: str = ""
 
     @property
@@ -149,6 +151,7 @@ def place_frames(
     pulses = pulses_ns.size
     received = 0
     if len(arrivals):
+        # The last frame may be cut.
         received = -(-int(arrivals[-1, 1]) // frame_bytes)
     try:
         if received == 0:
@@ -187,8 +190,8 @@ class _Trains(NamedTuple):
     high: Times
     # True for trains of one frame at the time of a pulse.
     punctual: Flags
-    # True for trains of one frame that came at no pulse's time, or so soon after the last that they caught up a delay;
-    # of a whole row also for those at another pulse's time. Trains of several frames are neither.
+    # True for trains of one frame that came at no pulse's time, or that the next one follows so soon that they were
+    # delayed; of a whole row also for those at another pulse's time. Trains of several frames are neither.
     astray: Flags
 
 
@@ -196,7 +199,7 @@ def _find_trains(
     pulses_ns: Times, received_ns: Times, arrivals: Times, frame_bytes: int, payload_bytes: int, frame_ns: int
 ) -> _Trains:
     """Divide the packets into trains, and bound the shift of each; parameters as of :func:`place_frames`."""
-    # The short last packet waits for the end of the record.
+    # Arrivals of full packets that added bytes: the short last packet waits for the end of the record.
     new_bytes = np.diff(arrivals[:, 1], prepend=0) > 0
     entries = arrivals[new_bytes & (arrivals[:, 1] % payload_bytes == 0)]
     came_ns = entries[:, 0]
@@ -211,7 +214,7 @@ def _find_trains(
     tails = np.append(heads[1:], came_ns.size) - 1
     first_stop = stop[heads]
 
-    # Number of the latest pulse that had been sent when a train began and when it ended; -1 before the first.
+    # Number of the latest pulse whose data was due when a train began and when it ended; -1 before the first.
     early_ns = min(_EARLY * period_ns, _EARLY_NS)
     pulse_of_head = np.searchsorted(expected, came_ns[heads] + early_ns, "right") - 1
     pulse_of_tail = np.searchsorted(expected, came_ns[tails] + early_ns, "right") - 1
@@ -246,13 +249,15 @@ def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFr
     is_early = (trains.high < 0) & trains.punctual
     is_displaced = is_early | (trains.low > 0)
     is_in_place = trains.punctual & ~is_displaced
-    # A train or two at later pulses were delayed: packets came out of order there, or the machine stalled.
     max_early = 0 if is_sharp else _DISPLACED - 1
+    # One or two trains in sequence at later pulses contradict nothing: their packets came out of order, or the machine
+    # stalled.
     contradicted = is_early.sum() > max_early or _measure_longest_run(is_displaced) >= _DISPLACED
     trains = trains._replace(punctual=is_in_place, astray=trains.astray | is_displaced)
     slots = np.where(_select_seen(trains, frame_bytes, pulses), np.arange(pulses), -1)
     reason = ""
-    # No frame came at its pulse, and none contradicts the row's length: that no delay is as long as a pause is wrong.
+    # No frame came at its pulse, though the row's length is right: delays are as long as a pause, which
+    # `_find_trains` excludes.
     if not contradicted and (slots < 0).all():
         reason = "the delays in this row are as long as the pauses between its bursts"
     if contradicted or reason:
@@ -273,6 +278,7 @@ def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: i
     low = np.maximum.accumulate(np.append(0, trains.low))
     high = np.minimum.accumulate(np.append(trains.high, at_the_end)[::-1])[::-1]
     slots = np.full(received, -1, dtype=np.int64)
+    # A lower bound above an upper one.
     if (low[1:] > high[:-1]).any():
         return PlacedFrames(slots, [], pulses, contradicted=True)
     # Bounds of each frame: the lower one of the last train whose first packet lies before it, the upper one of the
@@ -353,8 +359,11 @@ def _predict_arrivals(
     others and is left out. Of a row with missed pulses only bursts with all of their frames count, as a radar may miss
     the first pulse of many.
 
-    If no frame came in another burst than its number says, frames are counted from the row's first: the first frames of
-    many bursts may have come out of order. Otherwise they are counted from the first of their burst.
+    If the row is whole and every frame came in the burst that its number says, frames are counted from the row's first:
+    the first frames of many bursts may have come out of order. Otherwise they are counted from the first of their
+    burst.
+
+    Raises _DisturbedError if too few bursts agree, _UndeterminedError if the clocks cannot be compared.
     """
     bursts, count = pulses_ns.shape
     pauses = _find_pauses(pulses_ns, received_ns)
@@ -389,6 +398,7 @@ def _predict_arrivals(
     narrowest = int(np.argmin(widths))
     if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
         raise _DisturbedError("the delays of the bursts differ too much to tell their pulses apart")
+    # Of the bursts that agree, the quickest: what is slower was held back.
     pulses = pulses_ns.reshape(-1)
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]
 
@@ -447,9 +457,9 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
 
 
 def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
-    """Return a time in the pause before the row's first burst, before which none of its frames was sent.
+    """Return a time shortly before the row's first pulse, in the pause before its first burst.
 
-    It is in the host's monotonic clock, from the row's capture events; None if undetermined.
+    None of its frames was sent before. Host's monotonic clock, from the row's capture events; None if undetermined.
     """
     events = sorted((e for e in events if e.event.pulses), key=lambda e: e.event.point)
     if not events or events[0].event.point != 0:
@@ -461,7 +471,10 @@ def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
 
 
 def _collect_pulse_times(events: list[ReceivedCapture]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the time of each pulse (Pi's clock), int64 [burst, pulse], and of each event's receipt, int64 [burst]."""
+    """Return the time of each pulse (Pi's clock), int64 [burst, pulse], and of each event's receipt, int64 [burst].
+
+    Between the first and the last pulse of a burst, whose times its event has, pulses are taken as evenly spaced.
+    """
     first = [e.event.first_pulse_ns for e in events]
     last = [e.event.last_pulse_ns for e in events]
     sent_ns = np.linspace(first, last, events[0].event.pulses, axis=1, dtype=np.int64)
@@ -525,9 +538,10 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
 def move_frames(
     received: NDArray[np.uint8], holes: list[Gap], extent: int, slots: Times, frame_bytes: int
 ) -> tuple[NDArray[np.uint8], list[Gap]]:
-    """Return the row with each frame at its slot, uint8 [expected], and the ranges that are masked.
+    """Return the row with each frame at its slot, uint8 [byte], and the ranges that are masked.
 
-    `received` has `extent` bytes in the card's order, without those in `holes`.
+    `received` has the size of a complete row; its first `extent` bytes are the record in the card's order, in which
+    those in `holes` never came.
     """
     moved = np.zeros_like(received)
     present: list[Gap] = []
@@ -547,7 +561,7 @@ def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) ->
     """Return the frames with which a row is rewritten; None if it stays as its packets' counters say.
 
     Only frames are kept that were seen at their pulses. Without times a row stays as it is, and the manifest says so.
-    A row has slipped if nothing but missing whole frames keeps its packets from being located.
+    A row has slipped if its packets cannot be located only because whole frames are missing.
     """
     if frames is None or not frames.is_timed:
         return None

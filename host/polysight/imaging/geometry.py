@@ -1,8 +1,8 @@
 """Geometry of an aperture: positions of pixels, antennas and stage, and the `Aperture` that imagers take.
 
-`StageWindow` says what the scan sees of the ends of a plate: where it ends within one Fresnel zone of a plate, more
-positions see the plate from one side than from the other, and the phase of its image rises although it is level, by up
-to 0.8 degrees on a narrow scan.
+`StageWindow` corrects the slope of a plate for the ends of the scan: if the scan ends within one Fresnel zone of the
+plate, more positions see the plate from one side than from the other, and the phase of its image rises although the
+plate is level, as if it were tilted by up to 0.8 degrees on a narrow scan.
 
 With it: checks of regularity, windows, and functions of the array API (namespace, transforms, device), so that imagers
 run on NumPy, PyTorch and CuPy.
@@ -28,12 +28,13 @@ from polysight_shared.raster import Row, mean_burst_travel_mm, plan_raster
 
 ROUNDS = 2
 END_STEP = 0.7
-"""`ROUNDS` in which the rise of a plate and its ends are found, and the share of the ends' error taken off in each
-(`END_STEP`): with more of either, plates half in the dark run away (78 drawn plates, apertures of 25 to 45 columns)."""
+"""`ROUNDS` of the iteration that finds slope and ends of a plate, and the share of the ends' error corrected in each
+(`END_STEP`). With more of either, it diverges for plates that lie half outside the illuminated part (78 drawn plates,
+apertures of 25 to 45 columns)."""
 
 SAME_END_PX = 5.0
 """Distance up to which a plate's end by |H| and by its segmentation are the same one: about a resolution cell."""
-# Tolerance of positions: 2e-3 rad at one position, far below the noise.
+# Tolerance of positions: at a wavelength of 4 mm a path longer by this has 2e-3 rad more phase, far below the noise.
 _SAME_M = 1e-6
 # The lattice in y (of rows and pixels, `pitch_y_m`) may be finer than the pixels by this factor at most (chosen).
 _FINER = 4
@@ -58,7 +59,7 @@ def excess_path_m(xp: Any, x: Any, y: Any, z: Any, tx_m: Any, rx_m: Any, referen
     tx_m, rx_m
         Positions of antennas [..., 3], metres.
     reference_m
-        Path already removed from the phase (here the direct path).
+        Path that is already removed from the phase: in this instrument the direct path.
     """
     return distance_m(xp, x, y, z, tx_m) + distance_m(xp, x, y, z, rx_m) - reference_m
 
@@ -127,7 +128,7 @@ class Antennas:
     def excess_m(
         self, dx: NDArray[np.float64], dy: NDArray[np.float64], z: float | NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the excess path of points at `(dx, dy, z)` relative to the stage offset, metres, [rx, ...]."""
+        """Return the excess path of points `(dx, dy)` from the stage offset in the plane `z`, metres, [rx, ...]."""
         pairs = zip(self.rx_m, self.direct_m, strict=True)
         return np.stack(
             [excess_path_m(xp=np, x=dx, y=dy, z=z, tx_m=self.tx_m, rx_m=rx, reference_m=direct) for rx, direct in pairs]
@@ -232,7 +233,7 @@ def pitch_y_m(aperture: Aperture) -> float | None:
 
 
 def window_weights(name: Window, n: int) -> NDArray[np.float64]:
-    """Return a symmetric window of n points without the zeros at its ends, float64 [n]."""
+    """Return a symmetric window, float64 [n]: one of n + 2 points without its end points (zero for some windows)."""
     # Common ones in NumPy: scipy.signal loads scipy.stats, which takes a second.
     match name:
         case "boxcar":
@@ -276,7 +277,7 @@ def fft_module(xp: Any) -> ModuleType | Any:
 
 
 def get_device(array: Any) -> Any:
-    """Return the device of an array."""
+    """Return the device of an array; None if its library has none."""
     return getattr(array, "device", None)
 
 
@@ -284,8 +285,9 @@ def get_device(array: Any) -> Any:
 class StageWindow:
     """The scan along one axis: specular points of the stage's positions, and their weights.
 
-    `places_px` [position] are in pixels from the first pixel, `weights` [position] those of the window.
-    `bend_px` is the growth of the phase by the square of the distance from the specular point, radians per pixel^2.
+    `places_px` [position] are in pixels from the first pixel, `weights` [position] those of the window over the
+    aperture. `bend_px` is the growth of the phase by the square of the distance from the specular point, radians per
+    pixel^2.
     """
 
     places_px: NDArray[np.float64]
@@ -295,8 +297,8 @@ class StageWindow:
     def level_image(self, ends_px: NDArray[np.float64], columns_px: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the image of a level plate between `ends_px` [2] over that of a mirror, [column].
 
-        The part of a plate's spectrum that the scan sees is not symmetric unless the plate is in its middle, so that
-        its phase rises (Fresnel integrals over the plate).
+        Unless the plate is in the middle of the scan, the part of its spectrum that the scan sees is not symmetric, so
+        that its phase rises (Fresnel integrals over the plate).
         """
         from_specular = (ends_px[:, None] - self.places_px) * np.sqrt(2 * self.bend_px / np.pi)
         sine, cosine = scipy.special.fresnel(from_specular)
@@ -317,18 +319,19 @@ class StageWindow:
         mask_ends_px: NDArray[np.float64],
         moved_px: float,
     ) -> float:
-        """Return the rise of a plate without what a level one seems to have.
+        """Return the rise of a plate, radians, without the rise that a level plate at its place seems to have.
 
         Parameters
         ----------
         slope
             Rise by the phase step between pixels alone, radians.
         inside_px
-            Pixels along this axis inside the plate.
+            Pixels along this axis inside the plate, ascending.
         slope_per_rad
             Rise for a phase step of one radian.
         profile, lit
-            |H| along this axis, mean over the plate's lines, [pixel], and where the scan illuminates it enough.
+            |H| along this axis, mean over the plate's lines, [pixel], and where the scan illuminates it enough (at
+            least at one pixel).
         mask_ends_px
             Where the plate ends along this axis by its segmentation, [2].
         moved_px
@@ -337,8 +340,8 @@ class StageWindow:
         step_rad = slope / slope_per_rad
         columns_px = np.arange(profile.size, dtype=np.float64)
         seen_px = find_ends(profile, lit, inside_px)
-        # Where plates touch, |H| does not fall to half between them: there the end is that of the segmentation. A plate
-        # that goes on into the dark has no end.
+        # Where plates touch, |H| does not fall to half between them, or does so elsewhere: there the end is that of the
+        # segmentation. A plate that is segmented up to the end of the illuminated part goes on: it has no end.
         touching = np.abs(seen_px - mask_ends_px) > SAME_END_PX
         light_ends_px = np.flatnonzero(lit)[[0, -1]]
         in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX
@@ -358,7 +361,10 @@ class StageWindow:
 
 
 def find_ends(profile: NDArray[np.float64], lit: NDArray[np.bool_], inside_px: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return where a plate's |H| falls to half of that inside, [2] pixels; infinite if it does not within `lit`."""
+    """Return where a plate's |H| falls to half of its median inside, [2] pixels.
+
+    -inf or inf if it does not within `lit`, or is below half at the outermost pixel inside already.
+    """
     half = float(np.median(profile[inside_px])) / 2
     ends = []
     for outwards, start in ((-1, int(inside_px[0])), (1, int(inside_px[-1]))):

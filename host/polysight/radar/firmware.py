@@ -82,7 +82,17 @@ def describe_patch(major: int, minor: int, build: int, debug: int) -> str:
 
 
 def read_image(path: Path) -> Image:
-    """Read and check an image file. Raises ConfigError, OSError."""
+    """Read and check an image file.
+
+    Raises
+    ------
+    OSError
+        if it cannot be read.
+    DataError
+        if it is larger than `MAX_BYTES`, or not a regular file.
+    ConfigError
+        if it is not a complete, undamaged image for an AWR2243.
+    """
     return check_image(read_bounded(path, MAX_BYTES), path.name)
 
 
@@ -155,7 +165,7 @@ def _format_rom(rom: tuple[int, ...]) -> str:
 def require_family(board_name: str, core: str, answer: bytes) -> None:
     """Raise ConfigError if a core's answer to a version request is not that of an AWR2243.
 
-    `core` is "main" or "RF". The settings would not apply to another device.
+    `core` is "main" or "RF", `answer` the body of the answer. The settings would not apply to another device.
     """
     rom = _read_version(answer, _ROM_IN_ANSWER)
     generation = rom[0]
@@ -194,7 +204,8 @@ def require_rom(board_name: str, answer: bytes, image: Image) -> None:
 def split_into_chunks(image: bytes, file_type: int = TO_FLASH) -> list[tuple[FileChunk, int]]:
     """Return the commands that download an image, each with the number of commands after it.
 
-    Raises ValueError if the image is empty.
+    `file_type` is `TO_RAM` or `TO_FLASH`; it and the image's length precede the image. Raises ValueError if the image
+    is empty.
     """
     if not image:
         raise ValueError("the firmware image is empty")
@@ -212,7 +223,8 @@ def send_image(
 ) -> None:
     """Download an image to the RAM or the flash; call `progress` with the chunks sent and their total.
 
-    Raises DeviceError for the chunk that failed. The flash is then incomplete; the board still accepts a download.
+    Raises DeviceError for the chunk that failed. The destination is then incomplete; the board still accepts a
+    download.
     """
     chunks = split_into_chunks(image.data, file_type)
     progress(0, len(chunks))

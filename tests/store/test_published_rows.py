@@ -170,7 +170,7 @@ def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
         assert scan.recording_facts()["recording"].boards[board]["rows_not_placed"] == 1
 
 
-@pytest.mark.parametrize("first_sequence", [0, 1])
+@pytest.mark.parametrize("first_sequence", [0, 1, 5000])
 @pytest.mark.parametrize("zero_filling", [True, False])
 def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling, first_sequence):
     folder, sent = record(tmp_path, zero_filling=zero_filling)

@@ -212,17 +212,18 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled
     """Return the sequence number of the row's first packet, which may be lost; `full`: payload of a full packet, bytes.
 
     With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
-    counted back from a short last packet if no position is missing, otherwise the first packet that arrived. If the
-    result is neither 0 nor 1 but the numbers fit a record from 1, as in a row that lacks a frame, it is 1, or 0 if
-    that packet arrived: cards count from 1, a log may from 0.
+    counted back from a short last packet if no position is missing and the packet is as short as that of a complete row
+    (a row that lacks a frame ends elsewhere), otherwise the first packet that arrived. If the result is neither 0 nor 1
+    but the numbers fit a record from 1, it is 1, or 0 if that packet arrived: cards count from 1, a log may from 0.
     """
     expected = -(-shape.bytes // full)
     first = int(log.sequence[0])
     last = int(log.sequence[-1])
     begin = first
+    ends_complete = full > log.size[-1] == shape.bytes - (expected - 1) * full
     if zero_filled is not None:
         begin -= int(np.argmin(np.append(_find_silent(zero_filled, full), False)))
-    elif log.size[-1] < full and _find_pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
+    elif ends_complete and _find_pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
         begin = min(first, last - expected + 1)
     fits_from_1 = last <= expected
     if begin not in (0, 1) and fits_from_1:

@@ -4,17 +4,16 @@
 parts of the sweep that overlap by half. `Images` is what every later step reads and returns: imaging forms it,
 polarimetry adds metal reference and ratio.
 
-Tilt: a flat plate is visible where it reflects TX into RX: from the stage position whose specular point on the object
-plane is the pixel. A plate that rises by s (radians, along x and y) is visible from other positions, like the object
-plane at a distance
+Tilt. A level plate is seen at a pixel from the stage position whose specular point on the object plane is that pixel. A
+plate with the rise s (dz/dx, dz/dy) is seen there from another position: the one whose specular point is away by
 
-    d = H^-1 C s        H = d2 (r1 + r2) / dx dy,   C = cos of TX's leg + cos of RX's leg to the plane's normal
+    d = H^-1 C s        H = second derivatives of r1 + r2 by x and y [2, 2],   C = (e1 + e2)_z
 
-away: with the directions e1, e2 of both legs, specular reflection requires (e1 + e2)_xy + s (e1 + e2)_z = 0, and
-(e1 + e2)_xy grows with H from the specular point. There the aperture has another weight, which differs between H and V
-because their specular points differ: 2.5 % of V / H per degree on the published rig (simulated). So a pixel of a
-tilted plate is divided by the mirror's footprint `d` away. The tilt follows from the image: its phase grows by k C s
-per metre.
+with r1, r2 the lengths of TX's and RX's legs (metres) and e1, e2 their unit vectors: specular reflection requires
+(e1 + e2)_xy + s (e1 + e2)_z = 0, and (e1 + e2)_xy grows with H from the specular point. There the aperture has another
+weight, which differs between H and V, as their specular points differ: 2.5 % of V / H per degree on the published rig
+(simulated). So a pixel of a tilted plate is divided by the mirror's footprint `d` away (`Illumination.to_level`). The
+rise follows from the image, whose phase grows by k C s, radians per metre, k the wave number (`Illumination.rise`).
 
 `ImagedWith` has the settings that the gains of an image depend on; a metal reference is used only for images with the
 same settings. Samples are referenced to the direct path, and images are divided by the footprint of an ideal mirror.
@@ -53,30 +52,30 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 Image = NDArray[np.complexfloating]
 Mask = NDArray[np.bool_]
 Rise = tuple[float, float]
-"""Growth of a plate's z, which points away from the antennas, along x and along y."""
+"""Slope of a plate, dz/dx and dz/dy (about radians); z points away from the antennas."""
 MAX_RISE = 0.06
-"""Largest tilt of a plate (3.4 degrees); a steeper phase has another cause; chosen."""
+"""Largest rise that is taken for a tilt (3.4 degrees); a steeper phase has another cause; chosen."""
 MIN_RISE = 2e-3
-"""Smallest tilt that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours; chosen."""
+"""Smallest rise that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours; chosen."""
 _FEEBLE = 0.12
-"""Level of V relative to H below which its phase is not used: permittivities below 2.8 at 55 degrees."""
+"""|V| over |H| of a patch below which V's phase is not used: permittivities below 2.8 at 55 degrees."""
 _LEAST_LINES = 6
 """Columns or rows of pixels in a patch from which a curvature is estimated; chosen."""
 _COHERENT = 0.5
 """Smallest coherence of the phase steps between pixels (1: all equal); chosen."""
 _MAX_CHANGE = 2.0
-"""Largest change of the footprint over the distance `d`; chosen: larger ones occur only at the aperture's edge."""
+"""Largest factor of the footprint over the distance `d` that is used; chosen: larger ones occur at the edge alone."""
 
 SAME_MM = 1e-3
-"""Tolerance of positions: 2e-3 rad of an echo's phase."""
+"""Tolerance of positions, mm: 2e-3 rad of an echo's phase."""
 SAME_HZ = 1e3
 """Tolerance of transmit frequencies; chosen."""
 SAME_CORNER_KHZ = 10.0
 """Tolerance of filter corners: less than 0.1 dB and 0.1 degrees between direct path and echo, in both channels."""
 ARM_MM = 100.0
-"""Points at this distance along a board's x and y show its rotation, which antennas in one line do not."""
+"""Distance of two points, along a board's x and y, that are compared to see its rotation; antennas are in one line."""
 
-# Smallest footprint relative to the strongest; weaker pixels are mostly noise; chosen.
+# Smallest footprint of a valid pixel, relative to the strongest; chosen: weaker pixels are mostly noise.
 _VISIBLE = 0.15
 # Width of the majority filter, pixels; chosen.
 _NEIGHBOURS = 15
@@ -95,13 +94,13 @@ class Illumination:
     footprints
         complex64 [2, ny, nx]: the image of a uniform mirror, H and V.
     moved_m
-        float64 [2, 2, 2]: `d` of each channel (x, y) for a rise of 1 along x and along y, metres.
+        float64 [channel, (x, y) of `d`, rise along x or y]: H^-1 C, `d` in metres for a rise of 1.
     steepness_rad_m
-        float64 [2]: growth of the phase, radians a metre, for a rise of 1.
+        float64 [2]: k C of each channel, growth of the phase for a rise of 1, radians per metre.
     pixel_m
-        Pitch of the pixels along x and y.
+        Pitch of the pixels along x and y, metres.
     windows
-        The scan along x and along y; None if it is not known.
+        Positions and weights of the scan along x and along y; None if they are not known.
     """
 
     footprints: NDArray[np.complex64]
@@ -112,7 +111,7 @@ class Illumination:
 
     @property
     def across(self) -> int:
-        """Axis across the plane of incidence, 0 (x) or 1 (y), where a rise moves the specular point least."""
+        """Axis across the plane of incidence, 0 (x) or 1 (y): that along which a rise moves the point least."""
         return int(np.argmin(np.abs(np.diagonal(self.moved_m.mean(axis=0)))))
 
     def transpose(self) -> Illumination:
@@ -127,12 +126,12 @@ class Illumination:
         )
 
     def rise(self, h: Image, v: Image, mask: Mask, plate: Mask | None = None) -> Rise:
-        """Estimate the rise of a patch along x and y from its phase, radians; zero if undetermined.
+        """Estimate the rise of a patch along x and y from its phase; 0 along an axis where it is undetermined.
 
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
-        the patch. A channel that nearly vanishes there (V of a low permittivity) is left out: its phase is that of the
-        neighbours' sidelobes. `plate` [ny, nx] is the whole patch: with it the rise that a level plate seems to have is
-        taken off (:mod:`polysight.imaging.geometry`).
+        the patch. V is left out where it nearly vanishes (`_FEEBLE`), for its phase is of neighbours' sidelobes.
+        `plate` [ny, nx] is the whole patch. With it, the rise that a level plate seems to have is subtracted
+        (`StageWindow` in :mod:`polysight.imaging.geometry`); None: it is not.
         """
         if not mask.any():
             return 0.0, 0.0
@@ -148,7 +147,7 @@ class Illumination:
         return slopes[0], slopes[1]
 
     def _estimate_slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
-        """Return the rise of a plate along x (0) or y (1) from its phase step."""
+        """Return the rise of a plate along x (`along` 0) or y (1) from its mean phase step per pixel, radians."""
         slope_per_rad = 1 / (self.pixel_m[along] * float(self.steepness_rad_m.mean()))
         slope = slope_per_rad * step_rad
         inside_px = np.flatnonzero(mask.any(axis=along))
@@ -195,15 +194,15 @@ class Illumination:
 
     @property
     def known(self) -> bool:
-        """True if the footprints are those of a recorded scan, not taken as even."""
+        """True if the footprints are those of a recorded scan; False if they are the same at all pixels."""
         return bool(np.ptp(np.abs(self.footprints)) > 0)
 
     def to_level(self, mask: Mask, rise: Rise) -> NDArray[np.float64]:
-        """Return factors [2, n] that convert H and V of a patch's pixels to those of a level plate.
+        """Return factors [2, n] that convert H and V of a patch's n pixels to those of a level plate.
 
-        They use only the magnitude of the footprint, for its phase ripples with the rows of the grid; and only the rise
-        across the plane of incidence. Along it, H and V are illuminated equally (|H| changes by 7 % per degree), and
-        the phase is less reliable.
+        Only the magnitude of the footprint is used, for its phase ripples with the rows of the grid. Only the rise
+        across the plane of incidence is used, and from `MIN_RISE`. A rise along the plane changes H and V equally (|H|
+        by 7 % per degree), and its estimate is less reliable.
         """
         slope = rise[self.across]
         if abs(slope) < MIN_RISE:
@@ -211,7 +210,7 @@ class Illumination:
         return np.stack([self._change(k, mask, self.moved_m[k][:, self.across] * slope) for k in (0, 1)])
 
     def _change(self, channel: int, mask: Mask, moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the footprint at a patch's pixels divided by that `moved_m` away, [n]; 1 beyond the aperture."""
+        """Return |footprint| at a patch's pixels over that `moved_m` away, [n]; 1 where beyond `_MAX_CHANGE`."""
         rows, columns = np.nonzero(mask)
         level = np.abs(self.footprints[channel])
         coordinates = np.stack([rows + moved_m[1] / self.pixel_m[1], columns + moved_m[0] / self.pixel_m[0]])
@@ -222,10 +221,10 @@ class Illumination:
 
 @dataclass(frozen=True)
 class Dispersion:
-    """Change of the reflectivity over the sweep: none of a half space; a thin plate's ripples.
+    """Change of the reflectivity over the sweep: 0 for a half space; not for a thin plate, whose faces interfere.
 
-    `h`, `v` complex [ny, nx]: change of ln h and ln v from the first to the last frequency, `band_hz`, relative to a
-    mirror on the plane; NaN where nothing is seen. Each channel has a constant of its own until metal's is subtracted.
+    `h`, `v` complex [ny, nx]: change of ln h and of ln v from the first to the last frequency of `band_hz`, relative to
+    a mirror on the plane; NaN where nothing is seen. Each has a constant of its own until that of metal is subtracted.
     """
 
     h: Image
@@ -233,13 +232,13 @@ class Dispersion:
     band_hz: tuple[float, float]
 
     def transpose(self) -> Dispersion:
-        """Return the same with x and y swapped."""
+        """Return the dispersion with x and y swapped."""
         return replace(self, h=np.ascontiguousarray(self.h.T), v=np.ascontiguousarray(self.v.T))
 
 
 @dataclass(frozen=True)
 class Images:
-    """Both channels on one grid; what is added on the way is None before. Row 0 is the smallest y.
+    """Both channels on one grid; row 0 is the smallest y. Fields that a later step adds are None before it.
 
     Attributes
     ----------
@@ -249,13 +248,13 @@ class Images:
         needed because samples have the phase +2 pi f tau, while a delayed wave has exp(-j 2 pi f tau). Each channel
         contains a constant gain until it is divided by metal.
     x_m, y_m
-        float64 [nx], [ny]: pixel centres in the rig frame.
+        float64 [nx], [ny]: pixel centres in the rig frame, metres.
     valid
         bool [ny, nx]: pixels illuminated in both channels (and where the metal reference is valid).
     p
         complex [ny, nx]: h / v; NaN where v is zero.
     p_sigma
-        float32 [ny, nx]: standard deviation of the complex p; NaN where unknown.
+        float32 [ny, nx]: standard deviation of p as a complex number; NaN where unknown.
     metal_h, metal_v
         Metal by which h and v were divided: complex numbers, or images [ny, nx] of a reference over the whole plane.
         Then |h| = |v| = 1 on metal, and their phase difference is zero there.
@@ -266,7 +265,7 @@ class Images:
     dispersion
         Change over the sweep; None where it was not formed.
     rx_gains
-        Board name to complex128 [rx]: gain of each RX, from the direct path, which was divided out.
+        Board name to complex128 [rx]: gain of each RX, measured by the direct path. It was divided out.
     notices
         Notices for the user, for example of slow imaging.
     """
@@ -318,7 +317,7 @@ class Images:
 
 
 def specular_point_m(antennas: Antennas, z_m: float) -> NDArray[np.float64]:
-    """Return where a board's TX is reflected into its RX on the plane at `z_m`: x, y [2], metres, stage offset zero."""
+    """Return the point of the plane at `z_m` that reflects TX into a board's RX: x, y [2], metres, stage at zero."""
     tx = antennas.tx_m
     rx = antennas.rx_m.mean(axis=0)
     z_tx = z_m - tx[2]
@@ -370,7 +369,7 @@ def _step(image: Image, mask: Mask, axis: int) -> complex:
 
 @dataclass(frozen=True)
 class View:
-    """Plane and pixels other than the rig file's (None: as there); the plane lies `depth_mm` farther."""
+    """Plane and pixels of an image: those of the rig file where None; the plane is `depth_mm` farther away."""
 
     depth_mm: float = 0.0
     columns: int | None = None
@@ -399,7 +398,7 @@ def find_needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, fl
 class ImageBuilder:
     """Collects rows in any order and forms images of the rows so far.
 
-    A row added again replaces the earlier one. Only reduced samples are kept: 10 frequencies instead of 192.
+    A row added again replaces the earlier one. Only reduced samples are kept: about 10 frequencies instead of 192.
 
     Parameters
     ----------
@@ -476,7 +475,7 @@ class ImageBuilder:
         return self._make_channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
 
     def disperse(self, offset_m: float = 0.0) -> Dispersion:
-        """Form the change of both images over the sweep; `offset_m` as of :meth:`finish`."""
+        """Form the dispersion from the rows so far; `offset_m` as of :meth:`finish`."""
         grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
         h, v = (board.dispersion(grid).conj() for board in self.boards.values())
         return Dispersion(h, v, self._band_hz)
@@ -514,7 +513,7 @@ class ImageBuilder:
         pitch = self.grid.pixel_m
         moved_m = np.stack(shifts)
         steepness_rad_m = np.array(steep)
-        # Half of the second derivative of the phase by the distance from the specular point.
+        # Half of the second derivative of the phase with respect to the distance from the specular point, rad / m^2.
         bend_rad_m2 = steepness_rad_m.mean() * np.diagonal(np.linalg.inv(moved_m.mean(axis=0))) / 2
         specular_m = np.mean([specular_point_m(a, z_m) for a in self._antennas], axis=0)
         offsets_m = scan_offsets_m(self.rig)
@@ -651,7 +650,7 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
         )
 
     def differences(self, now: ImagedWith) -> list[str]:
-        """Return the differences to `now`, in a few words each; empty if the gains apply."""
+        """Return the differences from these settings to `now`, a few words each; empty if the gains apply."""
         return list(self._list_differences(now))
 
     def _list_differences(self, now: ImagedWith) -> Iterator[str]:

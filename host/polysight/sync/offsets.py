@@ -1,34 +1,33 @@
 """Estimate and remove offsets of frequency and phase: of each chirp in its burst, then of each position.
 
-Burst alignment (`align_row`). A board samples SYNC_IN with its own clock, so each chirp is the same signal times
-`exp(j(2 pi df t + dphi))` (POLySIGHT paper, Eq. 4). The conjugate product with a reference chirp, summed over the RX,
-is a tone with the positive envelope `|s(t)|^2`; the maximum of its spectrum is the maximum-likelihood offset for any
-signal `s`. The paper divides by the reference chirp instead, which amplifies noise where direct path and object cancel.
+Burst alignment (`align_row`). A board samples SYNC_IN with its own clock. So each chirp of a burst is the same signal
+s(t) times `exp(j(2 pi df t + dphi))`, with its own df and dphi (POLySIGHT paper, Eq. 4). Its product with the conjugate
+of a reference chirp, summed over the RX, is a tone of frequency df with the positive envelope `|s(t)|^2`. The maximum
+of this tone's spectrum is the maximum-likelihood df for any s. The paper divides by the reference chirp instead, which
+amplifies noise where direct path and object cancel. Each chirp is then mixed to zero frequency. Its signal fills only a
+few range bins there, so one sample in four is kept (`decimate.py`). Filter compensation, a second estimate (each chirp
+against the sum of all others) and all later steps use these decimated samples.
 
-After mixing each chirp to zero frequency, its signal fills only a few range bins, so one sample in four is enough
-(`decimate.py`). Filter compensation, a second estimate (each chirp against the sum of all others) and everything after
-it use the decimated samples.
+Disturbed chirps are left out. The part of a chirp that is not in the sum of the others is compared among the chirps of
+the burst, in eight parts of the chirp: another radar is heard while its chirp crosses the receiver's band. A burst with
+disturbed chirps is aligned again without them, as if they had not been received.
 
-Disturbed chirps are left out. What a chirp has in common with the sum of the others is explained; the rest is compared
-among the chirps of a burst, in eight parts of the chirp: another radar is heard while its chirp crosses the receiver's
-band. A burst with disturbed chirps is aligned again without them, as if they had not been received.
-
-Direct path from TX to RX (`reference`): found in the average of every position, its frequency and phase are removed.
-The object's echo is as strong as the direct path and lies only 3.5 IF bins above it, so the estimate of the direct path
-must suppress the object. Both are known from the geometry: the direct path has fixed delays along the RX array, and the
-object lies on the object plane. With the object as coloured noise of covariance R, the best linear unbiased estimate of
-a direct path `A exp(j w t)` near `w = 0`, with the model `x = A g + A w (jt g)`, is
+Direct path from TX to RX (`reference`). It is estimated in the average of the burst of every position, and its
+frequency and phase are removed. The object's echo is as strong and lies only 3.5 IF bins above it, so the estimate must
+suppress the object. The geometry gives both: the direct path's delays along the RX array, and the object plane. The
+samples x of all RX are modelled as `x = A g + A w (j t g)`: a direct path `A exp(j w t)` with complex amplitude A and a
+small frequency w (radians per sample), g its phases at the RX (1 after steering), t the time in samples from the
+middle. With the object as coloured noise of covariance R, the best linear unbiased estimate is
 
     [A, A w] = (G^H R^-1 G)^-1 G^H R^-1 x,   G = [g, j t g]
 
-(generalised least squares; Kay 1993, section 6.4). This is a fixed 2 x (4 RX x samples) matrix: a beamformer in space
-and frequency with nulls at the object. R also holds weak clutter behind the object (walls, a table) from any direction;
-otherwise the sidelobes there would be those of a rectangular window. Gauss-Newton steps `w += Re(A w / A)` converge.
-Its input is the average after burst alignment: mixed to zero frequency and decimated to one sample in four.
+(generalised least squares; Kay 1993, section 6.4). This is a fixed matrix, 2 x (RX * decimated samples): a beamformer
+in space and frequency with nulls at the object. R also holds weak clutter behind the object (walls, a table); otherwise
+the sidelobes there would be those of a rectangular window. Gauss-Newton steps `w += Re(A w / A)` converge.
 
-The crystals of the boards differ by some ppm, and with them the chirp slopes, so the IF drifts by some kilohertz within
-a chirp, equally for all paths and positions. A third column `jt^2/2 g` estimates this drift; its median over the row is
-removed first.
+The crystals of the boards differ by some ppm, and with them the chirp slopes. So the IF drifts by some kilohertz within
+a chirp, equally for all paths and positions. A third column `j t^2 / 2 g` estimates this drift; its median over the row
+is removed before the second, final estimate.
 
 The amplitude of the direct path is constant during a scan. If a position's amplitude is an outlier in its row, the
 second of the two strongest peaks is tried. Nothing is smoothed.
@@ -54,14 +53,14 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _REFERENCES = 4
 # A good chirp has at least this part of the coherence of the position's median chirp; chosen.
 _GOOD = 0.5
-# A chirp is disturbed if the others leave this many times the usual energy of a part of it unexplained (chosen); noise
-# leaves twice as much.
+# A chirp is disturbed if, in one of its parts, the energy that the sum of the others does not explain is this many
+# times the usual (chosen); noise reaches twice the usual.
 _UNEXPLAINED = 8.0
-# Share of a part's energy that is no disturbance: -30 dB, above the effect of frequencies wrong by 0.1 bins.
+# Unexplained share of a part's energy that is never a disturbance: -30 dB, above the effect of 0.1 bins of frequency.
 _NEGLIGIBLE = 1e-3
 # Times that a burst is aligned, each without the chirps found disturbed before; chosen.
 _ROUNDS = 4
-# Clipping below full scale: least count, and one in so many words at the limit.
+# Clipping below full scale: smallest magnitude of the limit, and one in so many words of a chirp at the limit.
 _LEAST_LIMIT = 1024
 _AT_LIMIT = 32
 
@@ -73,13 +72,14 @@ _SPREAD_M = 0.1
 _GAIN_SPREAD = 0.3
 # Noise power of a sample relative to an echo as strong as the direct path; chosen.
 _NOISE = 1e-2
-# Clutter behind the object: largest excess path, and power of all of it relative to the direct path. At this power the
-# estimate holds a sixth of the clutter's power that it holds without, and 0.5 % more noise.
+# Clutter behind the object: largest excess path, and its total power relative to the direct path. With this power in R
+# the estimate holds a sixth of the clutter's power that it holds without it, and 0.5 % more noise.
 _CLUTTER_M = 1.5
 _CLUTTER_POWER = 4e-3
-# Gauss-Newton steps to its frequency. In noise the last one stays large, so that no direct path is found.
+# Gauss-Newton steps to the direct path's frequency. In noise the last one stays large: no direct path is found.
 _STEPS = 3
-# A second peak this strong (chosen), one object distance (10 % less to 10 % more) below the first, is the direct path.
+# If the strongest peak has a second one of this relative amplitude (chosen) below it, nearer by the object's distance
+# from the direct path (10 % less to 10 % more), then the second is the direct path.
 _COMPARABLE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median; chosen.
 _LOST = 0.3
@@ -98,8 +98,8 @@ class AlignedRow(NamedTuple):
     Attributes
     ----------
     halves
-        complex64 [position, 2, rx, block]: contributions of alternate good chirps to the average, in the frame of each
-        position's reference chirp; one sample for every `FOLD` linear ones (`decimate.py`).
+        complex64 [position, 2, rx, block]: contributions of the first, third, ... and of the second, fourth, ... good
+        chirp to the average, their sum, in the frame of the reference chirp; one sample per `FOLD` (`decimate.py`).
     centre
         float64 [position]: middle of the signal's band in the reference chirp, cycles per sample.
     good
@@ -108,7 +108,7 @@ class AlignedRow(NamedTuple):
         float64 [position, chirp]: offset of each chirp from the average, cycles per sample, and radians at the
         centre of the linear samples.
     amplitude
-        float64 [position, chirp]: amplitude relative to the average, after compensation.
+        float64 [position, chirp]: amplitude relative to the average, after filter compensation.
     gain
         float64 [position, chirp]: gain of the filter compensation at the chirp's centre.
     error
@@ -137,7 +137,8 @@ class AlignedRow(NamedTuple):
 
 
 Align = Callable[[NDArray[np.int16], NDArray[np.bool_], tuple[int, int], hpf.Equaliser | None, int, AlignedRow], None]
-"""Aligns positions: words, valid, linear samples in whole blocks, filter compensation, full scale; into a row."""
+"""Function that aligns positions. Arguments: words, valid, linear samples in whole blocks, equaliser, full scale (as of
+`align_row`), and the part of the row that it fills."""
 
 
 def align_row(
@@ -331,9 +332,9 @@ def _find_disturbed(
 ) -> NDArray[np.bool_]:
     """Return the chirps [position, chirp] with a part that the others explain badly, as with interference.
 
-    `left` [position, chirp, part] is energy that the others' sum does not explain, `level` [position, part] the energy
-    of the average. It is compared with the median, and with the least of the two chirps on either side: the stage's
-    motion leaves more in some chirps, but equally much in those beside.
+    `left` [position, chirp, part] is the energy that the others' sum does not explain, `level` [position, part] that of
+    the average. `left` is compared with its median over the chirps, and with the smallest of the two chirps on either
+    side, for the stage's motion raises it in neighbouring chirps alike. With fewer than four chirps none is disturbed.
     """
     median = _take_lower_median(left, usable[..., None])[:, None]
     padded = np.pad(np.where(usable[..., None], left, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
@@ -363,8 +364,8 @@ def _refer_to_one(
 ) -> tuple[Tone, NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Estimate offsets relative to one usable chirp per position; try another one if it matches few others.
 
-    Return the offsets, the middle of the signal's band [position], and [position, chirp]: coherence with the reference
-    chirp, and usable chirps (whole, not silent).
+    Return the offsets, the middle of the signal's band [position] (cycles per sample), and [position, chirp]: coherence
+    with the reference chirp, and True for usable chirps (whole, not silent).
     """
     positions, chirps = is_complete.shape
     # Threshold for two records of noise: four times the RMS of a sum of random phases.
@@ -435,7 +436,7 @@ class DirectPath(NamedTuple):
     folded_steering
         complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
     estimator
-        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered, demodulated samples.
+        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered samples at w near 0.
     drift_estimator
         complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
     half_estimators
@@ -445,7 +446,7 @@ class DirectPath(NamedTuple):
     search_weights
         complex64 [rx, block]: beam, steering and window of the search.
     object_bins
-        IF distance of the nearest and farthest echo from the direct path, in bins of the search FFT.
+        IF of the nearest and of the farthest echo minus that of the direct path, in bins of the search FFT.
     sweep_hz
         float64 [block]: transmit frequency at the middle of each block.
     """
@@ -478,9 +479,9 @@ class Referenced(NamedTuple):
     drift
         IF drift of the row, radians per sample squared.
     noise
-        float64 [position]: noise power of a sample of one channel of one chirp, NaN with fewer than two good chirps.
+        float64 [position]: noise power of a sample of one RX in one chirp; NaN with fewer than two good chirps.
     steering
-        complex64 [rx, block]: what aligned averages were multiplied by, beside their turn; without the drift.
+        complex64 [rx, block]: factors that steer the aligned averages to the direct path and remove the drift.
     """
 
     samples: NDArray[np.complex64]
@@ -562,7 +563,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
 
 
 def _make_window(blocks: int) -> NDArray[np.float32]:
-    """Return the search's window [sample]: a Hann window without zeros at its ends."""
+    """Return the search's window [block]: a Hann window without zeros at its ends."""
     return np.hanning(blocks + 2)[1:-1].astype(np.float32)
 
 
@@ -650,7 +651,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
 
 
 def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:
-    """Return the factors that make each half an average of its own chirps, float32 [position, 2]."""
+    """Return the factors that make each of `AlignedRow.halves` the average of its chirps, float32 [position, 2]."""
     chirps = good_chirps[:, None]
     chirps_of_half = (chirps + np.array([1, 0])) // 2
     return (chirps / np.maximum(chirps_of_half, 1)).astype(np.float32)
@@ -662,10 +663,10 @@ def _try_second_peaks(
     usable: NDArray[np.bool_],
     remove: Callable[[NDArray[np.intp], NDArray[np.float64]], Removed],
 ) -> None:
-    """Use the second peak where the amplitude is an outlier in its row; changes `removed` in place.
+    """Use the second peak where ln of the amplitude is an outlier in its row; changes `removed` in place.
 
-    `remove` tries again from other frequencies. An outlier is beyond `_OUTLIER` standard deviations, estimated from the
-    median absolute deviation of the row.
+    `remove` repeats the estimate of given positions from given frequencies. An outlier is beyond `_OUTLIER` standard
+    deviations, estimated from the median absolute deviation of the row. The second peak has to be nearer and within.
     """
     level = np.log(np.maximum(np.abs(removed.estimate[:, 0]), 1e-30))
     if not usable.any():
@@ -687,13 +688,13 @@ def _try_second_peaks(
 
 
 def _find_middle(values: NDArray[np.floating]) -> float:
-    """Return the median of some hundred values, one at least; `np.median` takes four times as long for so few."""
+    """Return the median of at least one value; for some hundred values `np.median` takes four times as long."""
     rising = np.sort(values)
     return float(rising[(rising.size - 1) // 2] + rising[rising.size // 2]) / 2
 
 
 def _divide(moment: NDArray[np.complex128], amplitude: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return the real parts of the ratios; 0 where the amplitude is 0."""
+    """Return Re(moment / amplitude); 0 where the amplitude is 0."""
     ratio = np.zeros(amplitude.shape, complex)
     np.divide(moment, amplitude, out=ratio, where=amplitude != 0)
     return np.real(ratio)

@@ -64,9 +64,9 @@ CONFLICT_SCORE = 0.0
 patches fit better to a dielectric. Metal has 1.3 or more in 52 scenes of a generator that knows nothing of this
 estimator; dielectrics declared as metal have -0.3 to -8 in eleven."""
 CONTRADICTING_SCORE = -5.0
-"""Score below which a declared metal is contradicted if its own V / H is below `DOUBTFUL_V_DB`, too. Chosen: nine half
-spaces declared as metal have scores of -7 to -27 and V / H of -3 to -8 dB; metal has scores of 7 to 31 and V / H of
--0.8 to 0.7 dB (scenes of another author's generator)."""
+"""Score below which a declared metal is contradicted if its own V / H is below `DOUBTFUL_V_DB`, too. Chosen: eight half
+spaces and a wafer declared as metal have scores of -7 to -27 and V / H of -3 to -8 dB; metal has scores of 7 to 31 and
+V / H of -0.8 to 0.7 dB (scenes of another author's generator)."""
 PAINT_SCORE = 7.0
 """Extra score that a reference needs if it counts as metal only with paint on it; chosen."""
 ALIKE_DB = 2.5

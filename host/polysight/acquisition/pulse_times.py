@@ -1,17 +1,18 @@
 """At which pulse each frame of a row was taken, by the times at which its packets came (docs/spec/row.md).
 
 A record says how many frames a radar sent, not at which pulses: a missed SYNC_IN pulse, a spurious edge and bytes that
-the card dropped unnoticed leave no other trace. Arrival times do. The packets of one frame come as one *train*, and a
-train bounds the *shift*: the bytes that are missing before it, 0 in a perfect row, a frame more behind a missed pulse,
-a frame less behind a spurious edge.
+the card dropped unnoticed leave no other trace. Arrival times do. The packets of one frame come together, as a *train*
+between two silences. The *shift* of a train is the number of bytes that are missing before it: 0 in a perfect row, a
+frame more behind a missed pulse, a frame less behind a spurious edge. Arrival times bound it:
 
-* The last byte of a train existed when it came, so its pulse had been sent: an upper bound, whatever was delayed.
-* The first packet of a train came when it was full, unless something held it back: a lower bound. It is used only if
-  the train came at the time of a pulse and is of a single frame: what was held back comes in one go.
+* Upper bound: when the last byte of a train came, the pulse of its frame had been sent. It holds whatever was delayed.
+* Lower bound: the first packet of a train came as soon as it was full, unless something held it back. This bound is
+  used only for a train of a single frame, as frames that were held back come together. If the train came at no pulse's
+  time, the first pulse of its burst counts.
 
-In a whole row every train must allow a shift of 0. In a row that is some frames short, the shift only grows, from 0 to
-what is missing at the end; a frame is kept where its bounds meet at a whole number of frames. In both cases, only
-frames that came at the times of their pulses are kept.
+In a row with as many frames as pulses every train must allow a shift of 0. In a row with fewer frames the shift only
+grows, from 0 to the number of bytes missing at the end; a frame is kept if its bounds are equal, and a whole number of
+frames. In both kinds of rows only frames that came at the times of their pulses are kept.
 
 A *burst* is the pulses of one position of the stage. Pulses are numbered through the row; a frame's *slot* is the
 number of its pulse.
@@ -55,31 +56,31 @@ Gap = tuple[int, int]
 # Silence between packets that begins a new train (chosen). A radar needs 150 us between two frames (AWR2243, hardware
 # trigger), and the first packet of a frame comes only when it is full.
 SILENCE_NS = 200_000
-# A train is at the time of a pulse if it comes at most so much before its predicted arrival, and at most so much more
-# than the duration of a frame after it: the share of the pulse period, but no longer than the time in ns. Chosen: wide
-# enough for the jitter of network and machine, far less than half a period.
+# A train is at the time of a pulse if it comes at most _EARLY before the predicted arrival of that pulse's data, and at
+# most the duration of a frame plus _LATE after it. Both are shares of the pulse period, but at most the times in ns.
+# Chosen: wide enough for the jitter of network and machine, far less than half a period.
 _EARLY = 0.1
 _EARLY_NS = 200_000
 _LATE = 0.15
 _LATE_NS = 200_000
 # If more than this share of the trains is not of a single frame at the time of a pulse, the machine or the network is
-# slow, and the expected times are not sharp; chosen.
+# slow, and the arrival times of the row are not *sharp*; chosen.
 _BLURRED = 0.1
-# A whole row is contradicted by so many trains one after another that came at other pulses than theirs, or by so many
-# that came before their pulses; if times are sharp, by a single one of these. Chosen.
+# A whole row is contradicted by so many trains one after another that came at other pulses than theirs. It is also
+# contradicted by so many trains in all that came before their pulses; if times are sharp, by a single one. Chosen.
 _DISPLACED = 3
-# A card drops whole samples of its four antennas (inferred).
+# Bytes of one sample of all four antennas: a card drops whole ones of these (inferred).
 _SAMPLE_BYTES = 16
-# A train that the next one follows sooner than this share of the pulse period was delayed itself: the next catches up
+# If the next train follows sooner than this share of the pulse period, a train was delayed, and the next one catches up
 # (chosen).
 _CATCHING_UP = 0.8
-# Least number of bursts whose delays from pulse to data must agree, and how closely: within the share of a pulse
-# period, but no more than the time in ns (chosen).
+# Smallest number of bursts whose delays from pulse to data must agree, and the largest difference between these delays:
+# a share of the pulse period, but at most the time in ns (chosen).
 _AGREEING = 3
 _AGREE = 0.3
 _AGREE_NS = 500_000
-# Drift between the clocks of Pi and host: at most that of a clock which NTP slews, usually that of two crystals of 50
-# ppm. With fewer bursts than these it cannot be estimated, and must be negligible (chosen).
+# Relative drift between the clocks of Pi and host: at most that of a clock which NTP slews, usually that of two
+# crystals of 50 ppm. From fewer bursts than _DRIFT_BURSTS (chosen) it is not estimated, and must be negligible.
 _MAX_DRIFT = 500e-6
 _USUAL_DRIFT = 100e-6
 _DRIFT_BURSTS = 8
@@ -102,20 +103,20 @@ class PlacedFrames:
     missed: list[int]
     # Number of pulses in the row.
     pulses: int
-    # The times contradict the row's length or each other: no frame is certain
+    # True if the times contradict the row's length or each other: the pulse of no frame is certain
     contradicted: bool = False
-    # Why the times say nothing. If `contradicted`: how, or "" if single trains contradict the row's length or each
-    # other
+    # Why the times cannot be used; "" if they can. If `contradicted`: how they contradict each other, or "" if single
+    # trains contradict the row's length or each other
     reason: str = ""
 
     @property
     def is_timed(self) -> bool:
-        """False if there are no times to compare the frames with: their pulses follow from their number alone."""
+        """True if there are times to compare the frames with; False: pulses follow from the frames' numbers alone."""
         return self.contradicted or not self.reason
 
     @property
     def uncertain(self) -> int:
-        """Number of received frames that cannot be placed."""
+        """Number of received frames whose pulse is not certain."""
         return int((self.slots < 0).sum())
 
 
@@ -141,12 +142,13 @@ def place_frames(
     frame_bytes, payload_bytes
         Bytes of one frame and of the payload of a full packet.
     frame_ns
-        Duration of a frame.
+        Duration of a frame, from the start of its first chirp to the end of its last.
 
     Returns
     -------
     PlacedFrames
-        with strictly increasing slots; -1 where the evidence allows more than one pulse, or says nothing.
+        Slots of placed frames increase along the row. A slot is -1 where the bounds allow more than one pulse, or the
+        frame was not seen at its pulse.
     """
     pulses = pulses_ns.size
     received = 0
@@ -190,8 +192,8 @@ class _Trains(NamedTuple):
     high: Times
     # True for trains of one frame at the time of a pulse.
     punctual: Flags
-    # True for trains of one frame that came at no pulse's time, or that the next one follows so soon that they were
-    # delayed; of a whole row also for those at another pulse's time. Trains of several frames are neither.
+    # True for trains of one frame that came at no pulse's time, or that were delayed, as the next one follows too soon.
+    # In a whole row also for those at another pulse's time. Trains of several frames are neither punctual nor astray.
     astray: Flags
 
 
@@ -221,12 +223,12 @@ def _find_trains(
     late_ns = came_ns[heads] - expected[np.maximum(pulse_of_head, 0)]
     is_single = stop[tails] - first_stop < frame_bytes
     in_time = (pulse_of_head >= 0) & (late_ns <= frame_ns + min(_LATE * period_ns, _LATE_NS))
-    # A train that is late within its burst is at least not of an earlier burst, as long as no delay is as long as a
-    # pause.
+    # A train that is late for every pulse of its burst is not of an earlier burst: no delay is as long as a pause. So
+    # the first pulse of the burst is its bound.
     count = pulses_ns.shape[1]
     first_pulse = np.where(in_time, pulse_of_head, pulse_of_head // count * count)
-    # When its first packet was full, all frames before that pulse's and at least one sample of it had been sent: what
-    # `first_stop` is short of these bytes is missing.
+    # When the first packet was full, the radar had sent all frames before that pulse's, and at least one sample of that
+    # frame. The bytes of these that are beyond `first_stop` are missing.
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
     # Frames that come faster than pulses are sent catch up with a delay, however long it was.
     to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
@@ -278,7 +280,7 @@ def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: i
     low = np.maximum.accumulate(np.append(0, trains.low))
     high = np.minimum.accumulate(np.append(trains.high, at_the_end)[::-1])[::-1]
     slots = np.full(received, -1, dtype=np.int64)
-    # A lower bound above an upper one.
+    # A lower bound above the upper bound of a later train.
     if (low[1:] > high[:-1]).any():
         return PlacedFrames(slots, [], pulses, contradicted=True)
     # Bounds of each frame: the lower one of the last train whose first packet lies before it, the upper one of the
@@ -306,7 +308,7 @@ def _select_frames(trains: _Trains, selected: Flags, frame_bytes: int, frames: i
 
 
 def _find_missed(slots: Times, pulses: int) -> list[int]:
-    """Return the numbers of the pulses that lie between those of two neighbouring frames whose pulses are certain."""
+    """Return the numbers of the pulses between those of two successive frames whose pulses are certain."""
     # The row's begin and end count as frames with certain pulses.
     number = np.concatenate([[-1], np.arange(slots.size), [slots.size]])
     slot = np.concatenate([[-1], slots, [pulses]])
@@ -354,10 +356,10 @@ def _predict_arrivals(
 ) -> NDArray[np.float64]:
     """Return the expected arrival of each pulse's first packet: host's clock, float64 [pulse].
 
-    Estimated from the full packets in `entries`, as `arrivals` of :func:`place_frames`: the shortest time from pulse to
-    data of each burst, and its drift along the row. A burst with a missed pulse or a spurious edge differs from the
-    others and is left out. Of a row with missed pulses only bursts with all of their frames count, as a radar may miss
-    the first pulse of many.
+    `entries` are the full packets, as `arrivals` of :func:`place_frames`. The delay of a burst is its shortest time
+    from a pulse to the data of that pulse. The estimate is the delay that half of the bursts share, with its drift
+    along the row. A burst with a missed pulse or a spurious edge differs from the others and is left out. In a row with
+    missed pulses only bursts with all of their frames count, because a radar may miss the first pulse of many bursts.
 
     If the row is whole and every frame came in the burst that its number says, frames are counted from the row's first:
     the first frames of many bursts may have come out of order. Otherwise they are counted from the first of their
@@ -404,9 +406,10 @@ def _predict_arrivals(
 
 
 def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], pulses_ns: Times) -> float:
-    """Return the least relative drift of the clocks that fits the delays (ns) of bursts at these times (ns).
+    """Return the relative drift of the clocks by the delays (ns) of bursts at `times` (ns).
 
-    Raises _UndeterminedError if there are too few bursts and the row is too long to neglect it.
+    It is the smallest magnitude within the 95 % interval of the slope; 0 with fewer bursts than `_DRIFT_BURSTS`. Raises
+    _UndeterminedError if there are so few and the row is too long to neglect the drift.
     """
     if times.size >= _DRIFT_BURSTS:
         # The ends of the 95 % interval.
@@ -418,7 +421,7 @@ def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], puls
 
 
 def check_frame_fills_packet(rig: Instrument) -> None:
-    """Raise ConfigError if a packet of the card holds several frames: of these, only one has an arrival time."""
+    """Raise ConfigError if a frame is smaller than a packet: of the frames in a packet only one has an arrival time."""
     if rig.frame_bytes < rig.card.payload_bytes:
         raise ConfigError(
             f"a frame of {rig.frame_bytes} bytes is smaller than a packet of {rig.card.payload_bytes}",
@@ -560,7 +563,8 @@ def move_frames(
 def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) -> PlacedFrames | None:
     """Return the frames with which a row is rewritten; None if it stays as its packets' counters say.
 
-    Only frames are kept that were seen at their pulses. Without times a row stays as it is, and the manifest says so.
+    Without times a row stays as it is, and the manifest says so. If the times contradict the row, no frame is kept.
+    Otherwise the row is rewritten if it has slipped, or if the pulse of some frame is uncertain.
     A row has slipped if its packets cannot be located only because whole frames are missing.
     """
     if frames is None or not frames.is_timed:

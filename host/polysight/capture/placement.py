@@ -1,12 +1,16 @@
 """Which packets are a row, and where each byte belongs: the whole decision (docs/spec/placement.md).
 
-A card numbers every byte that it sends. If the counters of the row's first byte are known, each packet says by itself
-where it belongs; packets behind them are left over, packets elsewhere are another record's. So one thing has to be
-known, the start, and one has to be seen, the end: a card that drops bytes before numbering them, or a radar that misses
-or adds a frame, shows it only in the length of the record. A row is *located* if it starts where it must and ends where
-it must. Everything else is masked as a whole; data is original or masked, never guessed.
+A *record* is one recording of a card, normally that of one row of the scan. A card numbers every byte that it sends:
+each packet has a byte count and a sequence number, its *counters*. If the counters of the row's first byte, the
+*start*, are known, each packet's place follows from its counters alone. Packets with earlier counters are left over
+from an earlier record, packets elsewhere are of another record.
 
-The start is known behind such a row, or behind a reset by the host, which follows all others (`Past`).
+A card may drop bytes before it numbers them, and a radar may miss or add a frame. Only the length of the record shows
+that. So a row is *located* if its start is known and its record ends where it must. A row that is not located is masked
+as a whole; data is original or masked, never guessed.
+
+The start of a record is known after one whose start and end are certain, and after a reset by the host (`Past`). After
+any other record the host has to reset the card.
 """
 
 from __future__ import annotations
@@ -28,18 +32,18 @@ Gap = tuple[int, int]
 
 SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
-# Fewer packets of another record, or of a second card, are damaged ones. Chosen: two of these need not disturb a row.
+# Fewer packets that seem to be of another record, or of a second card, are taken for damaged ones; chosen.
 MIN_PACKETS_OF_A_RECORD = 3
-# A packet that comes so many packets late was not delayed by a network: the card has counted its bytes twice. Chosen,
-# far more than a switch or the kernel reorders.
+# A packet that comes behind one so many packets further on was not delayed by the network: the card restarted, and gave
+# the same counters twice. Chosen: far more than a switch or the kernel reorders.
 _FAR_BEHIND = 64
-# A packet size seen in fewer packets may be that of last packets, which are short.
+# A size seen in fewer packets is not taken for that of full packets: the last packet of a record is short.
 _MIN_PACKETS_OF_A_SIZE = 3
 
 
 @dataclass(frozen=True)
 class Past:
-    """Where the next record begins, from the records before it."""
+    """Start of the next record, known from the records before it."""
 
     # Counters of the next record's first byte. None: they are unknown, and the card has to be reset.
     start: Counters | None = None
@@ -51,30 +55,33 @@ class Past:
 
     @staticmethod
     def after_reset() -> Past:
-        """Return the knowledge after the host has reset the card: its memory is empty and it counts anew."""
+        """Return the start after a reset by the host: the card's memory is empty, and its counters begin anew."""
         return Past(start=SWITCHED_ON)
 
 
 @dataclass
 class PacketCounts:
-    """Packets of one row by result: every packet is in exactly one of the first eight; the others are subsets."""
+    """Packets of one row by result: every packet is in exactly one of the first eight counts, `placed` to `malformed`.
+
+    Of the others, `late` and `short` count packets of `placed`, and `before_pulses` packets of `leftover`.
+    """
 
     placed: int = 0
-    # Every byte of them was there already, with the same value.
+    # Packets whose bytes had all come before, with the same values.
     duplicates: int = 0
-    # Their bytes differ from those of a packet with equal counters; their place in the row is masked.
+    # Packets whose bytes differ from those of another packet with equal counters; their place in the row is masked.
     conflicting: int = 0
     # Number of packets that belong to an earlier record.
     leftover: int = 0
-    # They came after the card restarted within the row and reset its counters.
+    # Packets with the counters of a card that restarted within the row.
     restarted: int = 0
     # Packets behind the record's last expected byte, or not kept for lack of memory.
     outside: int = 0
-    # All others: their byte count and sequence contradict each other, or lie far from the row's.
+    # All others: their byte count and sequence number contradict each other, or are far from the row's.
     disagreeing: int = 0
     # Packets without payload, or longer than the card's.
     malformed: int = 0
-    # Placed packets that came after one that follows them.
+    # Placed packets that came after a packet of a later place.
     late: int = 0
     # Largest delay of late packets, bytes.
     late_by_bytes: int = 0
@@ -105,7 +112,7 @@ class Placed:
     missing: list[Gap]
     # True if the place of every byte is certain; otherwise `missing` is the whole record.
     located: bool
-    # Reason why it is not located.
+    # Why the row is not located; "" if it is.
     reason: str
     counts: PacketCounts
     # Missing bytes by kind; for a record that is not located, by its counters only.
@@ -114,16 +121,16 @@ class Placed:
     past: Past
     # int64 [packet]: offset of the packet's payload in the row, -1 outside the row.
     offsets: Counts
-    # int64 [n, 2]: time (monotonic, ns), bytes received by then.
+    # int64 [n, 2]: time (host's monotonic clock, ns), and end of the furthest packet that had come by then, bytes.
     arrivals: Counts
-    # Missing or uncertain ranges before the furthest byte that came; sorted, also of a record that is not located.
+    # Missing or uncertain ranges before the furthest byte that came, sorted; those by counters if it is not located.
     holes: list[Gap] = field(default_factory=list)
     # True if nothing but missing whole frames (missed triggers) keeps the row from being located.
     slipped: bool = False
 
     @property
     def complete(self) -> bool:
-        """True if every byte is there and nothing more came."""
+        """True if the row is located and no byte is missing or uncertain."""
         return self.located and not self.missing
 
     def facts(self) -> dict[str, Any]:
@@ -153,7 +160,7 @@ class Preview:
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """Inputs for placing a row, beside its packets (see :func:`place_record`); without `past` the start is unknown."""
+    """Inputs for placing a row, beside its packets (see :func:`place_record`). By default the start is unknown."""
 
     # Bytes of the whole row.
     expected: int
@@ -177,7 +184,8 @@ def place_record(
     past
         Knowledge from earlier records; default: the card was reset.
     not_before_ns
-        Time before the first pulse of the row (clock of the arrivals); 0 if unknown.
+        A time before the first pulse of the row, in ns of the arrivals' clock. Packets that came before it are not of
+        the row. 0: it is unknown, and no packet is too early.
     dropped_by_card
         Names of the status bits by which the card reported data dropped before the packets were numbered: bytes are
         missing without a gap in the counters, so that no byte's place is certain.
@@ -236,13 +244,13 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
 
 @dataclass(frozen=True)
 class _Record:
-    """The row's record among the packets; arrays are [packet]."""
+    """The record that is expected for the row, and how each packet relates to it; arrays are [packet]."""
 
     # Counters of the first byte of the record.
     start: Counters
-    # int64: bytes from the start to each packet.
+    # int64: byte count of each packet minus that of the start.
     offsets: Counts
-    # int64: packets from the start to each packet.
+    # int64: sequence number of each packet minus that of the start.
     steps: Counts
     # Packets with counters within the row that came after the first pulse.
     of_row: Flags
@@ -252,7 +260,7 @@ class _Record:
     later: Flags
     # True for packets that came before the row's first pulse.
     early: Flags
-    # The early packets with counters of the row.
+    # Early packets with counters within the row: frames that no pulse of the row triggered.
     too_early: Flags
     # Packets with counters of a card that restarted within the row.
     after_restart: Flags
@@ -260,14 +268,15 @@ class _Record:
     full: int
     # Bytes from the start to the end of the furthest packet.
     length: int = 0
-    # The furthest packet is short, as only a record's last one is.
+    # True if the furthest packet is short, as only a record's last one is.
     ended: bool = False
-    # The record ends at the row's last byte, with a short packet if it must, and nothing follows.
+    # True if the record ends at the row's last byte (with a short packet, unless full ones fill the row), and no
+    # packet continues it.
     ends_as_planned: bool = False
 
 
 def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
-    """Select the packets with counters of the record that was predicted."""
+    """Select the packets of the record that begins at `past.start`; unknown: as after a reset."""
     full_payload = find_full_payload(log)
     is_early = log.arrivals_ns < not_before_ns
     start = past.start or SWITCHED_ON
@@ -275,7 +284,7 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     expected = log.expected
     offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
     steps = counter_differences(log.sequences, start.sequence, SEQUENCE_BITS)
-    # All packets before it were full, as they are up to the last one of a record.
+    # All packets of a record but the last are full: so byte count and sequence number of a packet determine each other.
     counters_agree = (offsets == full_payload * steps) & (offsets >= 0)
     is_of_row = counters_agree & (offsets < expected) & ~is_early
     length = 0
@@ -294,8 +303,8 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     is_beyond = is_near & counters_agree & (offsets >= expected)
     later = is_near & ~counters_agree & (offsets >= max(length, full_payload))
     ends_in_short = expected % full_payload > 0
-    # A card that restarts counts from byte 0, packet 1 on. Such packets are told from the row's own only if the row
-    # began far from there, and they follow its first packet.
+    # A card that restarts counts again from byte 0 and packet 1. Its packets can be told from the row's own only if the
+    # row began far from there. They come after the row's first packet.
     after_restart = np.zeros_like(is_of_row)
     if start.byte_count > 2 * expected and is_of_row.any():
         counts_anew = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
@@ -329,7 +338,8 @@ def counter_differences(counters: Counts, origin: int, bits: int) -> Counts:
 def find_full_payload(log: PacketLog) -> int:
     """Return the payload of a full packet in bytes, as seen in the packets of a row.
 
-    The card's default if a packet has it or the row fits into one; otherwise the most frequent size of three or more.
+    It is the card's default if a packet has that size, if the row fits into one packet, or if no size was seen in three
+    or more packets. Otherwise it is the most frequent size, the largest of several.
     """
     row_fits_one_packet = log.expected < MAX_PAYLOAD_BYTES
     default_is_seen = bool((log.sizes == MAX_PAYLOAD_BYTES).any())
@@ -349,7 +359,7 @@ def find_full_payload(log: PacketLog) -> int:
 
 @dataclass(frozen=True)
 class _Doubt:
-    """Why a record is not located; "" if it is. `frames_missing`: only because whole frames are missing."""
+    """Why a record is not located, `text`; "" if it is. `frames_missing`: missing whole frames are the only cause."""
 
     text: str = ""
     frames_missing: bool = False
@@ -364,11 +374,12 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
         return _Doubt("no packet came")
     if not record.of_row.any():
         return _Doubt("every packet is of another record, of a second card, or came before the first pulse")
-    # A card that restarts within the row counts from its first counters on: again, if the row began with them.
+    # A card that restarts within the row begins with its first counters again. If the row began with them, too, the
+    # same counters come twice.
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
     if row.counts.restarted or (record.start == SWITCHED_ON and counted_twice):
         return _Doubt("the card restarted within it")
-    # A second card may send what is missing of this one, so packets that are alone at their place are in doubt, too.
+    # A second card may also send packets at places that are missing of the first, so no packet is certain.
     if row.counts.conflicting >= MIN_PACKETS_OF_A_RECORD:
         return _Doubt(
             f"{row.counts.conflicting} packets have other bytes than packets with equal counters: a second card has"
@@ -397,7 +408,7 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
 
 
 def _continue_past(record: _Record, doubt: _Doubt) -> Past:
-    """Return where the next record begins: known behind a record whose start and end are certain."""
+    """Return the start of the next record; unknown if start or end of this one are not certain."""
     is_certain = not doubt.text or doubt.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
         return Past()
@@ -407,7 +418,7 @@ def _continue_past(record: _Record, doubt: _Doubt) -> Past:
 def _count_packets(
     log: PacketLog, record: _Record, placed: Flags, duplicate: Flags, conflicting: Flags
 ) -> PacketCounts:
-    """Count a row's packets. `placed`, `duplicate`, `conflicting`: bool [packet], disjoint."""
+    """Count a row's packets, except `late` and `short`. The other arguments are bool [packet], disjoint."""
     is_unplaced = ~(placed | duplicate | conflicting)
     leftover = is_unplaced & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.after_restart))
     restarted = is_unplaced & record.after_restart & ~leftover
@@ -431,7 +442,7 @@ def _count_packets(
 
 
 class _Row:
-    """Puts the packets of a record in place."""
+    """The packets of a record, put in place in the row."""
 
     def __init__(self, log: PacketLog, record: _Record) -> None:
         self._log = log
@@ -443,12 +454,12 @@ class _Row:
         self.offsets: Counts = np.full(log.count, -1, dtype=np.int64)
         # Byte ranges that are covered by packets: sorted and joined.
         self.covered: list[Gap] = []
-        # Byte ranges in which packets of one place differ.
+        # Byte ranges in which packets at the same place have different bytes.
         self.conflicts: list[Gap] = []
         # Bytes covered, and the end of the furthest packet in place.
         self.received = 0
         self.extent = 0
-        # End of each packet in the row; what lies behind the row's last byte is cut off.
+        # End of each packet in the row, at most the row's last byte.
         self._stops = np.minimum(record.offsets + self._sizes, log.expected)
         self._placed, self._duplicate, self._conflicting = np.zeros((3, log.count), dtype=np.bool_)
         self._place()
@@ -456,7 +467,7 @@ class _Row:
         self._measure()
 
     def _measure(self) -> None:
-        """Set what is covered and received, and count the packets that came late or are short."""
+        """Set `covered`, `received` and `extent`, and count the packets that came late or are short."""
         placed = np.flatnonzero(self._placed)
         if not placed.size:
             return
@@ -481,7 +492,7 @@ class _Row:
         self.counts.short = int((self._sizes[placed] < self._record.full).sum())
 
     def _place(self) -> None:
-        """Mark the packets that are put in place: of those at one place, the first one and any with more bytes."""
+        """Mark the packets that are put in place: of several at one place, the first, and any that adds bytes to it."""
         packets = np.flatnonzero(self._of_row)
         offsets = self._record.offsets[packets]
         order = np.argsort(offsets, kind="stable")
@@ -528,9 +539,9 @@ class _Row:
         return np.column_stack([self._log.arrivals_ns[is_new], reached[is_new]])
 
     def bytes(self, holes: list[Gap]) -> Bytes:
-        """Return the row: the log's own memory if it came whole and in order, otherwise a copy. Zero at the holes.
+        """Return the row, zero at the `holes`: a view of the log if it came whole and in order, otherwise a copy.
 
-        The log's payload stays as it came: it is stored as the evidence.
+        In a copy the holes are zeroed, never in the log's payload, which is stored as evidence.
         """
         log = self._log
         placed = np.flatnonzero(self._placed)

@@ -1,11 +1,11 @@
 """Fit of several echoes of a window together.
 
-Echoes of two objects 150 mm apart in x are one resolution cell apart in slope (the derivative of the path by the stage
-offset). Fits of one after the other, each to what the others leave, were 6 mm and 3 dB off after as many rounds as time
-allowed; all together they are exact.
+Echoes of two objects 150 mm apart in x are one resolution cell apart in slope (the derivative of the path with respect
+to the stage offset). Fits of one echo after the other, each to the residual of the others, had errors of 6 mm and 3 dB
+after as many rounds as time allowed. A fit of all echoes together is exact.
 
-Echoes that a window hardly resolves make each other uncertain: their widening is the standard error of a value in the
-joint fit over that in a fit of the echo alone.
+Echoes that a window hardly resolves make each other uncertain. The *widening* of a value is its standard error in the
+joint fit over that in a fit of its echo alone; 1 at least.
 """
 
 from __future__ import annotations
@@ -28,39 +28,40 @@ from polysight.surfaces.window import (
 )
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# The curvature Q of a convex body's path is between 0 (plane) and 2.3 / m (point).
+# Curvature Q at which fits start, 1 / m. That of a convex body's path is between 0 (plane) and 2.3 / m (point).
 START_BEND = 0.8
-# Steps of the fit, the share of the rest below which a step's gain ends it, and the damping at which it gives up;
-# chosen.
+# Largest number of steps of the fit; the fit ends if a step reduces the residual's energy by less than the share
+# JOINT_GAIN, or if the damping reaches MOST_DAMPING; all chosen.
 JOINT_ITERATIONS = 14
 JOINT_GAIN = 3e-3
 MOST_DAMPING = 10
-# How often the RX are added up anew at most (each turned by its phase for the paths found, `steering`), and the share
-# of the last energy that a round must leave at most for another one to be worth it; chosen.
+# The RX are added with phases for the current paths (`steering`). Largest number of rounds with new phases; another
+# round follows only if the last one left less than the share STEERING_GAIN of the residual's energy; chosen.
 STEERINGS = 4
 STEERING_GAIN = 0.9
-# Two echoes that make each other's amplitude so much less certain have run into one another, or are two halves of a
-# wave that an edge cuts. Echoes 150 mm apart in x have 1.4, 50 mm apart in range 2.8. With 3 a plate of 200 mm keeps
-# 488 points and with 12 it keeps 120, for 524 with 2 (simulated).
+# Widening of the amplitude above which two fitted echoes are one and the same, or two halves of a wave that an edge
+# cuts. Echoes 150 mm apart in x have 1.4, 50 mm apart in range 2.8. A plate of 200 mm keeps 524 points with a limit of
+# 2, 488 with 3, and 120 with 12 (simulated).
 MERGED_WIDENING = 2
 # Pairs of the six values of a path, each once.
 PAIRS = np.triu_indices(6)
-# Square of the widening that stands for no information at all.
+# Square of the widening of a value that the samples do not determine.
 NO_INFORMATION = 1e12
 
 
 class JointFit:
     """Paths and amplitudes of all echoes of some windows, by Levenberg's and Marquardt's method.
 
-    Unknown for each echo: two parts of the amplitude and the six values of its path, L, g_x, g_y, Q_xx, Q_xy, Q_yy
-    (`find_basis`). A step of a path leaves the mean phase as it is.
+    Each echo has 8 unknowns: real and imaginary part of the amplitude, and the six values of its path: length L (m),
+    slopes g_x and g_y, curvatures Q_xx, Q_xy and Q_yy (1 / m), see `find_basis`. A step of the path turns the amplitude
+    so that the mean phase stays.
 
     Attributes
     ----------
     values, amplitude
-        Float64 [window, echo, 6] and complex [window, echo].
+        float64 [window, echo, 6]: the six values of each path; complex [window, echo]: the amplitudes.
     rest
-        Complex64 [window, rx, frequency, position]: what the echoes leave of the samples.
+        complex64 [window, rx, frequency, position]: samples minus all echoes.
     """
 
     def __init__(self, fit: BoardFit, windows: Windows, values: Array, amplitude: NDArray) -> None:
@@ -71,7 +72,7 @@ class JointFit:
         self.basis = find_basis(windows.offsets)
         count = np.maximum(windows.valid.sum(axis=1), 1)
         mean_basis = np.einsum("wn,wnp->wp", windows.valid, self.basis) / count[:, None]
-        # Rate of an echo's mean phase by its parameters.
+        # Derivative of an echo's mean phase with respect to the six values of its path.
         self.mean_rate = fit.middle * mean_basis
         # An echo's wave and its derivatives are j (steady + nu changing) times the wave, nu the frequency's distance
         # from the middle; both are given as [window, 7, 6] and [7, 6]: the wave and its six derivatives in the basis.
@@ -91,7 +92,7 @@ class JointFit:
         self.rest = windows.samples.copy()
 
     def run(self) -> None:
-        """Fit until the rest no longer shrinks; the RX are added up anew for the paths found."""
+        """Fit in up to `STEERINGS` rounds, each with the RX added for the paths of the round before."""
         members = np.arange(len(self.values))
         energy = np.full(len(self.values), np.inf)
         for _ in range(STEERINGS):
@@ -104,7 +105,7 @@ class JointFit:
                 break
 
     def subtract(self, members: NDArray) -> None:
-        """Add up the RX of windows (indices) for the paths as they are, and subtract the echoes from the samples."""
+        """Set the phases of the RX of windows `members` for the current paths, and subtract the echoes from samples."""
         for index in range(self.values.shape[1]):
             path, slope, _ = unpack_values(self.values[members, index])
             self.steering[members, index] = self.fit.steer(self.windows.at_m[members], path, slope)
@@ -123,12 +124,12 @@ class JointFit:
         return waves, self.windows.samples[members] - echoes
 
     def _descend(self, members: NDArray) -> None:
-        """Improve values and amplitudes of windows (indices), with the RX added up as they are, by damped steps."""
+        """Improve values and amplitudes of windows `members` by damped steps; the phases of the RX stay."""
         echoes = self.amplitude.shape[1]
         energy = np.zeros(len(self.rest))
         energy[members] = find_energy(self.rest[members])
-        # Levenberg and Marquardt's damping. Its start and factors (0.2 after a step that helps, 8 after another) are
-        # chosen.
+        # Levenberg-Marquardt damping. Its start and its factors are chosen: 0.2 after a step that reduces the energy, 8
+        # after one that does not.
         damping = np.full(len(self.rest), 1e-3)
         running = members
         for _ in range(JOINT_ITERATIONS):
@@ -157,10 +158,10 @@ class JointFit:
                 break
 
     def part_merged_echoes(self) -> None:
-        """Fit again where two echoes have run into one another: they are large then, and of opposite sign.
+        """Fit windows again in which two echoes have the same path: they are large then, and of opposite sign.
 
-        The two most uncertain echoes start from half a resolution cell on either side of their mean, in path, in g_x
-        and in g_y. Of all fits the one that leaves the least energy is kept.
+        The two echoes with the largest widening start half a resolution cell to either side of their mean: one fit
+        apart in path, one in g_x, one in g_y. The fit that leaves the least energy is kept, the first one included.
         """
         widening = self.find_widening()[..., 0]
         merged = np.flatnonzero(widening.max(axis=1) > MERGED_WIDENING)
@@ -208,7 +209,7 @@ class JointFit:
         return normal.reshape(count, 8 * echoes, 8 * echoes), gradient.reshape(count, 8 * echoes)
 
     def _find_directions(self, members: NDArray, index: int) -> NDArray[np.complex128]:
-        """Change of an echo by its 8 unknowns, in terms of the wave and its 6 derivatives: [window, 8, 7]."""
+        """Return an echo's derivatives by its 8 unknowns, as factors of its wave and 6 derivatives: [window, 8, 7]."""
         directions = np.zeros((len(members), 8, 7), complex)
         directions[:, 0, 0] = 1
         directions[:, 1, 0] = 1j
@@ -216,7 +217,7 @@ class JointFit:
         return directions
 
     def _project(self, members: NDArray, index: int) -> NDArray[np.complex128]:
-        """Products of an echo's wave and its derivatives with the rest, [window, 7]."""
+        """Return the products of an echo's wave, and of its 6 derivatives, with the residual `rest`, [window, 7]."""
         added = add_rx(self.steering[members, index] / len(self.fit.lever), self.rest[members])
         turned = self.waves[members, index].conj() * added
         by_power = np.stack([np.ones_like(self.nu), self.nu]).astype(np.complex64) @ turned
@@ -224,7 +225,7 @@ class JointFit:
         return np.einsum("wpb,wb->wp", self.steady[members], sums[:, 0]) + sums[:, 1] @ self.changing.T
 
     def _multiply(self, members: NDArray, first: int, second: int) -> NDArray[np.complex128]:
-        """Products of the waves of two echoes, and of their derivatives: [window, 7, 7]."""
+        """Return the products of wave and 6 derivatives of one echo with those of another: [window, 7, 7]."""
         # Sums over the frequencies with the powers 0, 1 and 2 of nu, and over the positions with the products of the
         # basis, give all products of the waves' derivatives: each is linear in nu and in the basis.
         fit = self.fit
@@ -246,7 +247,7 @@ class JointFit:
         return (products + mixed + np.swapaxes(mixed, 1, 2)).astype(complex)
 
     def fit_amplitudes(self) -> Array:
-        """Fit the amplitudes alone; return the widening of the first echo's, [window]."""
+        """Fit the amplitudes for given paths; return the widening of the first echo's amplitude, [window]."""
         members = np.arange(len(self.values))
         echoes = self.amplitude.shape[1]
         self.subtract(members)
@@ -256,7 +257,7 @@ class JointFit:
                 gram[:, first, second] = self._multiply(members, first, second)[:, 0, 0]
         # A small diagonal, so that the amplitudes of echoes that coincide can be solved.
         gram += 1e-6 * np.einsum("wii->w", gram).real[:, None, None] * np.eye(echoes)
-        # Twice, as the range gate's effect on an echo is taken by its weights alone.
+        # Two rounds, as the matrix holds the range gate's effect on an echo only approximately, by its weights.
         for _ in range(2):
             right = np.stack([self._project(members, index)[:, 0] for index in range(echoes)], axis=1)
             self.amplitude = self.amplitude + np.linalg.solve(gram, right[..., None])[..., 0]
@@ -264,7 +265,7 @@ class JointFit:
         return np.sqrt(np.maximum(1, (np.linalg.inv(gram)[:, 0, 0] * gram[:, 0, 0]).real))
 
     def find_widening(self) -> Array:
-        """Standard errors of amplitude and path parameters over those without the other echoes: [window, echo, 7]."""
+        """Return the widening of the amplitude and of the six values of the path, [window, echo, 7]."""
         count, echoes = self.amplitude.shape
         normal, _ = self._find_normal_equations(np.arange(count))
         scale = np.sqrt(np.einsum("wii->wi", normal) + 1e-30)
@@ -275,7 +276,7 @@ class JointFit:
             unknowns = slice(8 * index, 8 * index + 8)
             alone = np.einsum("wii->wi", np.linalg.inv(scaled[:, unknowns, unknowns]))
             ratio = together[:, index] / alone
-            # Rounding makes the inverse of a matrix that is nearly singular negative: that is no information.
+            # Rounding can make the inverse of a nearly singular matrix negative: the value is then not determined.
             ratio = np.where((together[:, index] > 0) & (alone > 0), ratio, NO_INFORMATION)
             widening[:, index, 0] = np.sqrt(ratio[:, :2].max(axis=1))
             widening[:, index, 1:] = np.sqrt(ratio[:, 2:])

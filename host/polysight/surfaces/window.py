@@ -78,13 +78,25 @@ class Samples:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Echoes [n]: stage offset `at_m` [n, 3], metres, and there the path, its derivatives `slope` [n, 2] and `bend`.
+    """Echoes of n points.
 
-    `bend` [n, 2, 2] is the curvature of the path over the stage offset, 1 / m, not that of the surface.
-    `amplitude`: complex, with the path's phase exp(-j k path) at the middle of the band in it. `amplitude_std`: of its
-    real and of its imaginary part. `path_std_m`, `slope_std` [n, 2]: by the residual of the fit. `share`: of a window's
-    power, less that of its other echoes, that the echo explains. `band_rise`: ln of the amplitude in the upper half of
-    the band over that in the lower half.
+    Attributes
+    ----------
+    at_m
+        Stage offset for which the next four are given, [n, 3], metres.
+    path_m, slope, bend
+        Path from TX over the point to the middle of the RX, [n], metres; its first derivatives with respect to the
+        stage offset, [n, 2]; its second derivatives, [n, 2, 2], 1 / m (not the curvature of the surface).
+    amplitude
+        complex [n], with the phase of the path, exp(-j k path), k the wave number at the middle of the band.
+    amplitude_std
+        Standard deviation of the real part, and of the imaginary part, of `amplitude`, [n].
+    path_std_m, slope_std
+        Standard deviations of `path_m` [n] and `slope` [n, 2] by the residual of the fit.
+    share
+        Share of a window's power, without that of its other echoes, that the echo explains, [n].
+    band_rise
+        ln of the amplitude in the upper half of the band over that in the lower half, [n].
     """
 
     at_m: Array
@@ -149,10 +161,10 @@ class BoardFit:
     lever
         float64 [rx, 3]: places of the RX relative to their mean, metres.
     model, gain, weights
-        Effect of the range gate [frequency, frequency] (1 on the diagonal without one); what it leaves of an echo,
-        added up over the frequencies; and the share of each frequency in that, [frequency].
+        Effect of the range gate on an echo, [frequency, frequency] (identity without a gate); the sum over the
+        frequencies of the factors that it leaves of an echo; the share of each frequency in this sum, [frequency].
     middle, mean_square
-        Mean of `omega` and of its square with these weights.
+        Means of `omega` and of its square, weighted by `weights`.
     upper_half, band_rise
         bool [frequency]: the upper half of the band; ln of the gain there over that of the lower half.
     """
@@ -180,9 +192,9 @@ class BoardFit:
         self.model = model
 
     def steer(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
-        """Phase factors [window, rx, frequency] that add up the RX for echoes of given path and slope.
+        """Return the phase factors [window, rx, frequency] with which the RX add in phase for given echoes.
 
-        `offsets`: stage offsets of the echoes, [window, 3].
+        One echo per window: its stage offset, `offsets` [window, 3], path [window] and slope [window, 2], metres.
         """
         board = self.board
         points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)
@@ -207,7 +219,10 @@ def find_mirror_path(board: Samples, z_m: float) -> float:
 
 
 def find_basis(offsets: Array) -> Array:
-    """Derivatives of the path by (L, g_x, g_y, Q_xx, Q_xy, Q_yy): [window, position, 6]."""
+    """Return the path's derivatives by its six values, [window, position, 6], at `offsets` [window, position, 2].
+
+    The values are the path L (metres), its slopes g_x, g_y and curvatures Q_xx, Q_xy, Q_yy (1 / m) at the offset zero.
+    """
     x = offsets[..., 0]
     y = offsets[..., 1]
     return np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=-1)
@@ -226,11 +241,11 @@ def unpack_values(values: Array) -> tuple[Array, Array, Array]:
 
 @dataclass
 class Maximum:
-    """Result of :func:`maximise` for each window.
+    """Result of :func:`maximise`, one echo per window.
 
-    The six values of the path [window, 6], the amplitude with the phase of the matched filter, standard deviations of
-    either part of the amplitude (`rest`) and of the values (`std`, [window, 6]), share of the power explained, and rise
-    over the band as of :class:`Echoes`.
+    `values` [window, 6]: the path (`find_basis`); `std` [window, 6]: their standard deviations. `amplitude` [window]:
+    in the phase of the matched filter, without that of the path; `rest` [window]: standard deviation of either part of
+    it. `share` and `band_rise` [window] are as of :class:`Echoes`.
     """
 
     values: Array
@@ -261,7 +276,7 @@ def maximise(
     scale = np.sqrt(np.einsum("wpp->wp", curvature) + 1e-12)
     scaled = curvature / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(6)
     values = values.copy()
-    # Sums over the frequencies: as they are, times the distance from the middle, and over the upper half of the band.
+    # Three sums over the frequencies: of all, weighted by the distance from the middle, and of the band's upper half.
     rows = np.stack([np.ones_like(fit.omega), fit.omega - fit.middle, fit.upper_half]).astype(np.complex64)
     sums = np.zeros(basis.shape[:2], complex)
     upper = np.zeros(basis.shape[:2], complex)

@@ -194,7 +194,7 @@ class BoardFit:
     def steer(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
         """Return the phase factors [window, rx, frequency] with which the RX add in phase for given echoes.
 
-        One echo per window: its stage offset, `offsets` [window, 3], path [window] and slope [window, 2], metres.
+        One echo per window: its stage offset, `offsets` [window, 3], path [window], both in metres; slope [window, 2].
         """
         board = self.board
         points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)

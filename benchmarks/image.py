@@ -224,7 +224,19 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         # How many images at once all updates of an image row by row cost.
         name = f"all row updates in batch images, both from {placement}"
         note = f"{1e3 * ours / len(starts):.2f} ms a row"
-        lines.append(Line(name, f"{ours:.3f} s", f"{theirs:.3f} s", ours / theirs, *limits, False, note))
+        at_least, aim = limits
+        lines.append(
+            Line(
+                quantity=name,
+                ours=f"{ours:.3f} s",
+                theirs=f"{theirs:.3f} s",
+                value=ours / theirs,
+                at_least=at_least,
+                aim=aim,
+                higher_is_better=False,
+                note=note,
+            )
+        )
     difference = max(worst(images["rows"], images["batch"]), worst(images["live"], images["whole"]))
     lines.append(
         Line(

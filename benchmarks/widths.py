@@ -3,11 +3,13 @@
 The narrowest honest error bar of a plate follows from all nuisances, marginalised over the prior that they are drawn
 from. That bound has no closed form here. The rival comes near it from above: it is told which nuisance a scene has, and
 learns the error of the plain estimate (Eq. 3 of the mean images, relative to copper, the measured leakage removed) from
-other scenes of the same generator: a linear model of the means, slopes and scatter of all plates, and gradient boosted
-quantiles of what is left (scikit-learn), widened or narrowed until they hold 95 % in each row. It does not know which
-materials there are; the program does, but neither the nuisance nor its size. For each nuisance: median relative half
-widths of 95 % regions of both, and their ratio. The rival is above the bound, far above it where only the inversion of
-a whole scene finds an error (leakage, turned boards): ratios below 1 say nothing of the bound. All is simulated.
+other scenes of the same generator, as gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of
+all plates, widened or narrowed until they hold 95 % in each row. It does not know which materials there are; the
+program does, but neither the nuisance nor its size. For each nuisance: median relative half widths of 95 % regions of
+both, and their ratio. The rival is above the bound, by how much is not known, and far above it where only the inversion
+of a whole scene finds an error (leakage, turned boards): ratios below 1 say nothing of the bound. With a linear model
+learnt first, of all rows together, it is worse in mild rows; without it, its intervals about a slope of 20 times the noise
+are three times too wide (tests/benchmarks/test_widths.py). All is simulated.
 """
 
 from __future__ import annotations
@@ -107,18 +109,12 @@ def learn_half_widths(features: Real, deviation: Real, row: Integers, scene: Int
     """Return half widths [plate] of intervals that hold 95 % of `deviation` [plate] in each row.
 
     `features` are [plate, feature]; `row` and `scene` [plate] are numbers. A scene's intervals are learnt from scenes
-    of other folds: what is linear in the features first, then quantiles of what is left.
+    of other folds.
     """
     # They take a second to load.
     from sklearn.ensemble import HistGradientBoostingRegressor
-    from sklearn.linear_model import RidgeCV
     from sklearn.model_selection import GroupKFold, cross_val_predict
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
 
-    folds = GroupKFold(FOLDS)
-    linear = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-2, 4, 13)))
-    rest = deviation - cross_val_predict(linear, features, deviation, groups=scene, cv=folds)
     ends = []
     for quantile in (0.025, 0.975):
         boosted = HistGradientBoostingRegressor(
@@ -129,10 +125,10 @@ def learn_half_widths(features: Real, deviation: Real, row: Integers, scene: Int
             min_samples_leaf=15,
             l2_regularization=1.0,
         )
-        ends.append(cross_val_predict(boosted, features, rest, groups=scene, cv=folds))
+        ends.append(cross_val_predict(boosted, features, deviation, groups=scene, cv=GroupKFold(FOLDS)))
     low, high = ends
     half_width = np.maximum(high - low, 1e-4) / 2
-    distance = np.abs(rest - (low + high) / 2) / half_width
+    distance = np.abs(deviation - (low + high) / 2) / half_width
     for number in np.unique(row):
         half_width[row == number] *= np.quantile(distance[row == number], 0.95)
     return half_width

@@ -1,16 +1,16 @@
 """Are the error bars as narrow as the data allow? Beside a rival that learnt from the nuisances' own generator.
 
 The narrowest honest error bar of a plate follows from all nuisances, marginalised over the prior that they are drawn
-from. That bound has no closed form here, so a rival stands for it: it is told which nuisance a scene has, and learns the
-error of the plain estimate (Eq. 3 of the mean images, relative to copper, the measured leakage removed) from other
-scenes of the same generator, as gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of all
-plates, widened or narrowed until they hold 95 % in each row. It does not know which materials there are; the program
-does, but neither the nuisance nor its size. For each nuisance: median relative half widths of 95 % regions of both, and
-their ratio. All is simulated.
+from. That bound has no closed form here, so a rival stands for it: it is told which nuisance a scene has, and learns
+the error of the plain estimate (Eq. 3 of the mean images, relative to copper, the measured leakage removed) from
+other scenes of the same generator, as gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of
+all plates, widened or narrowed until they hold 95 % in each row. It does not know which materials there are; the
+program does, but neither the nuisance nor its size. For each nuisance: median relative half widths of 95 % regions of
+both, and their ratio. All is simulated.
 
-The rival is above the bound, by how much is not known: about a slope of 20 times the noise its intervals are three times
-too wide (tests/benchmarks/test_widths.py), and errors that only the inversion of a whole scene finds (leakage, turned
-boards) it hardly learns. A linear model learnt first, of all rows together, is worse in mild rows.
+The rival is above the bound, by how much is not known: about a slope of 20 times the noise its intervals are three
+times too wide (tests/benchmarks/test_widths.py), and errors that only the inversion of a whole scene finds (leakage,
+turned boards) it hardly learns. A linear model learnt first, of all rows together, is worse in mild rows.
 """
 
 from __future__ import annotations

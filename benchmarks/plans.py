@@ -63,7 +63,8 @@ def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilde
         setup = BoardSetup.from_rig(rig, board)
         for row in plan:
             x, y = row_offsets_mm(radar, row)
-            payload = radar.chirps(board.name, x, y, row.index * len(x)).view(np.uint8).ravel()
+            payload = radar.chirps(board.name, x, y, first_pulse=row.index * len(x)).view(np.uint8).ravel()
+            # All bytes are there: no gaps.
             frames, valid = row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
             synced = synchronise_row(frames, valid, setup)
             true.add_row(board.name, row.index, synced)
@@ -80,8 +81,12 @@ def tell(text: str) -> None:
 
 
 def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
-    """Image every n-th row, by matched filter or (`rebuilt`) by reconstruction; the builder is not changed."""
+    """Image every n-th row, by matched filter or (`rebuilt`) by reconstruction; the builder is not changed.
+
+    A reconstruction predicts the image of all rows, so it is divided by the footprints of all rows.
+    """
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
+    # Weights and images of all rows, before some are left out.
     weights = {name: board.weights for name, board in builder.boards.items()}
     all_images = builder.finish()
     raw = []
@@ -96,11 +101,12 @@ def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
         board.valid[:] = valid[name]
     if not rebuilt:
         return images
-    flat = [
-        np.divide(r, w, out=np.zeros_like(r), where=all_images.valid).conj()
-        for r, w in zip(raw, all_images.illumination.footprints, strict=True)
-    ]
-    return replace(all_images, h=flat[0], v=flat[1], h_raw=raw[0], v_raw=raw[1])
+    # As `ImageBuilder` makes h and v of the raw images.
+    h, v = (
+        np.divide(image, footprint, out=np.zeros_like(image), where=all_images.valid).conj()
+        for image, footprint in zip(raw, all_images.illumination.footprints, strict=True)
+    )
+    return replace(all_images, h=h, v=v, h_raw=raw[0], v_raw=raw[1])
 
 
 def image_error(images: Images, ideal: Images) -> float:
@@ -211,8 +217,8 @@ def main() -> int:
     rig = load_instrument(RIG)
     x, y = args.coarser
     rig = Changes(step_x_mm=x * rig.grid.step_x_mm, step_y_mm=y * rig.grid.step_y_mm).apply(rig)
-    leakage = scene.disturbances
-    still = scene.with_disturbances(ideal=True, leakage_h=leakage.leakage_h, leakage_v=leakage.leakage_v)
+    disturbances = scene.disturbances
+    still = scene.with_disturbances(ideal=True, leakage_h=disturbances.leakage_h, leakage_v=disturbances.leakage_v)
     # Without noise and motion a burst of two pulses is as good as a long one.
     ideal = as_scanned(Changes(pulses=2).apply(rig), still)[0].finish()
     plates = truth_plates(truth(rig, scene, scene.seed))

@@ -127,7 +127,10 @@ class _Leg(NamedTuple):
 
     @staticmethod
     def plan(distance: int, motion: RowMotion) -> _Leg:
-        """Return the leg over `distance` steps with speed and acceleration of `motion`; a short one has half a ramp."""
+        """Return the leg over `distance` steps with speed and acceleration of `motion`.
+
+        One that is too short for full speed speeds up over half of its distance, and slows down over the other.
+        """
         ramp = min(motion.ramp, distance // 2)
         slowest = slowest_feed(motion.accel)
         speed = slowest

@@ -29,7 +29,7 @@ def test_cups_behind_glass_keep_their_ratio_and_the_measured_leakage():
         for (ratio, brightness), scatter in zip(MEASURED, SCATTER, strict=True)
     ]
     prior = RigPrior(0.003, leakage=LEAKAGE, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
-    inversion = invert(seen, prior, Kinds(literature(), THETA_RAD, sheets=True))
+    inversion = invert(seen, prior, Kinds(literature(), THETA_RAD, with_sheets=True))
     assert np.abs(np.array(inversion.leakage) - LEAKAGE).max() < 0.02
     for t, patch in zip(true, inversion.patches, strict=True):
         assert abs(patch.inverse_ratio - t) < 0.12 * abs(t)

@@ -42,7 +42,7 @@ PAIRS = ((0, 0), (1, 1), (0, 1), (1, 0))
 
 @dataclass(frozen=True)
 class BendTerms:
-    """Additions to the reflection coefficients over the cosine of incidence, at `FREQUENCY_HZ`.
+    """Additions to the reflection coefficients, as functions of the angle of incidence, at `FREQUENCY_HZ`.
 
     `spline` gives them over the angle in degrees, real [4 rows, 4 coefficients, 2 parts]. The rows are for a plane, a
     curvature along, one across, and a twist (the last three times metres), the coefficients s to s, p to p, s to p and
@@ -110,11 +110,14 @@ def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) ->
             arguments = (shape, tx, rx, np.array([FREQUENCY_HZ]), np.zeros((1, 3)), specular)
             optics.append(sum_window(*arguments)[0, 0])
             spreads.append(spread_of_ray(patch, path, tx_m, rx_m)[0])
-            place = -np.asarray(shape.place_m)
-            columns.append((tx.position + place, rx.position + place, tx.polarisation, rx.polarisation))
+            centre_m = np.asarray(shape.place_m)
+            columns.append((tx.position - centre_m, rx.position - centre_m, tx.polarisation, rx.polarisation))
+    # In the cylinder's own coordinates: x is along it.
     pair = Pair(*(np.array(part).T for part in zip(*columns, strict=True))).rotate(shape.axes)
+    # The specular path in the cross-section: the whole path without its part along the cylinder.
     path_m = np.sqrt((2 * DISTANCE_M) ** 2 - (pair.rx_m[0] - pair.tx_m[0]) ** 2)
     medium = None if stack.is_metal else stack.below
     series = scatter_cylinder(pair, radius_m, medium, FREQUENCY_HZ, path_m)
+    # Remove the phase of the specular path, which `sum_window` leaves out.
     series = series * np.exp(2j * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S * 2 * DISTANCE_M)
     return ((series - np.array(optics)) / np.array(spreads)).reshape(len(ANGLES_DEG), len(PAIRS))

@@ -257,17 +257,17 @@ def write_calibration(file: CalibrationFile, out: Path) -> Path:
     )
 
 
-def read_calibration(path: Path, kind: type[F], name: str) -> F:
-    """Read a calibration file of the kind `name`.
+def read_calibration(path: Path, file_type: type[F], kind: str) -> F:
+    """Read a calibration file of this kind, whose class is `file_type`.
 
     Raises ConfigError if it is missing, of another kind, or of a later format.
     """
     table = read_toml(path)
-    if table.get("kind") != name:
+    if table.get("kind") != kind:
         raise ConfigError(
-            f"{path}: kind {table.get('kind')!r}, not {name!r}",
+            f"{path}: kind {table.get('kind')!r}, not {kind!r}",
             "the file belongs to another key of [calibration]",
-            f"give a file that `polysight calibrate {name.replace('_', '-')}` wrote",
+            f"give a file that `polysight calibrate {kind.replace('_', '-')}` wrote",
             code=ErrorCode.FILE_FOREIGN,
         )
     if table.get("format", FORMAT) > FORMAT:
@@ -277,7 +277,7 @@ def read_calibration(path: Path, kind: type[F], name: str) -> F:
             "install that release, or calibrate again",
             code=ErrorCode.VERSION_UNSUPPORTED,
         )
-    return decode(table, kind, str(path))
+    return decode(table, file_type, str(path))
 
 
 def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path, bands: Sequence[SubBand] = ()) -> Path:
@@ -496,8 +496,8 @@ class Calibration:
 def load_calibration(paths: dict[str, Path]) -> Calibration:
     """Load calibration files, kind to path. Raises ConfigError or DataError for an invalid file."""
 
-    def load(name: str, kind: type[F]) -> F | None:
-        return read_calibration(paths[name], kind, name) if name in paths else None
+    def load(kind: str, file_type: type[F]) -> F | None:
+        return read_calibration(paths[kind], file_type, kind) if kind in paths else None
 
     metal = load("metal", MetalFile)
     if metal is not None and Path(metal.images).name != metal.images:

@@ -450,9 +450,9 @@ def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: f
     try:
         with CardClient(board, instrument.limits.command_timeout_s) as card:
             findings.append(_ok("host", f"{board.host_address}:{board.command_port} is free to listen at"))
-            findings += _reach(survey, card)
+            findings += _check_way(survey, card)
             if survey.ok and board.record:
-                findings += _receive(card, instrument, core, listen_s)
+                findings += _check_reception(card, instrument, core, listen_s)
     except DeviceError as e:
         findings.append(_wrong("host", e))
     hops = {hop.where for hop in findings}
@@ -470,7 +470,7 @@ def _wrong(hop: str, e: DeviceError) -> Finding:
     return Finding.of_error(e, where=hop)
 
 
-def _reach(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
+def _check_way(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
     """Check route, link and card. If the card replies, the hops before it are ok."""
     address = card.board.card_address
     error = None
@@ -496,7 +496,7 @@ def _reach(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
         yield _ok(hop, text)
 
 
-def _receive(card: CardClient, instrument: Instrument, core: Core | None, listen_s: float) -> Iterator[Finding]:
+def _check_reception(card: CardClient, instrument: Instrument, core: Core | None, listen_s: float) -> Iterator[Finding]:
     """Check the receiver process as a scan starts it, its buffer, and the radar's data."""
     board = card.board
     requested = instrument.card.receive_buffer_bytes

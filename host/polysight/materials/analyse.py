@@ -564,7 +564,7 @@ def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
 def _list_kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
     if classifier is None or len(classifier.kinds) != 1:
-        return Kinds(literature(), theta_rad, sheets=True)
+        return Kinds(literature(), theta_rad, with_sheets=True)
     return classifier.kinds[0]
 
 

@@ -395,7 +395,7 @@ class Classifier:
         self.names = library.names
         self.permittivities: dict[str, complex] = self.distributions.permittivities
         kinds = (*self._make_library_kinds(), *literature(library.names))
-        self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), sheets=True) for angle in self.angles_deg)
+        self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), with_sheets=True) for angle in self.angles_deg)
 
     def _make_library_kinds(self) -> tuple[Kind, ...]:
         """Return the library's materials as half spaces, with the spread of their specimens and the mean's error."""

@@ -57,8 +57,8 @@ SHEET_KERNEL = 0.02
 """Standard deviation by which the distribution of the drawn plates' t is smoothed; chosen."""
 STACK_SHARE = 0.05
 """Share of stacks, neither half space nor thin plate, in patches of no kind of the library: a liquid behind glass may
-reflect as no passive half space does. Their t is uniform on the unit disk. Without them three cups of sugar water moved
-the estimated leakage by three standard deviations, and their own t by a fifth."""
+reflect as no passive half space does. Their density over t is 1 / pi, as on the unit disk. Without them three cups of
+sugar water moved the estimated leakage by three standard deviations, and their own t by a fifth."""
 ODD_BRIGHTNESS = 0.1
 ODD_BRIGHTNESS_STD = 1.2
 """Share of patches whose |H| fits no half space (shadows, edges), and the standard deviation of ln |H| then; chosen."""
@@ -233,9 +233,9 @@ class HalfSpaces:
         return np.where(np.isfinite(moved), moved, self.t)
 
 
-def brightness_density(difference: Real | float, size: Real | float) -> Real:
-    """Return the density, but for a factor, of `difference`, ln |H| minus the expected: of std `size`, or odd."""
-    usual = (1 - ODD_BRIGHTNESS) / size * np.exp(-0.5 * (difference / size) ** 2)
+def brightness_density(difference: Real | float, std: Real | float) -> Real:
+    """Return the density, but for a factor, of ln |H| minus the expected: usual (`std`) or odd (`ODD_BRIGHTNESS`)."""
+    usual = (1 - ODD_BRIGHTNESS) / std * np.exp(-0.5 * (difference / std) ** 2)
     odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
     return np.asarray(usual + odd, np.float64)
 
@@ -269,7 +269,7 @@ def turn_covariance(factor: npt.ArrayLike, covariance: npt.ArrayLike) -> Real:
 
 
 class Kinds:
-    """All kinds at one angle of incidence.
+    """All kinds at one angle of incidence, with or without thin plates (`with_sheets`).
 
     Attributes
     ----------
@@ -288,7 +288,7 @@ class Kinds:
         [draw]: ln of their |r_s| over that of the half space with the same t.
     """
 
-    def __init__(self, kinds: Sequence[Kind], theta_rad: float, sheets: bool = False) -> None:
+    def __init__(self, kinds: Sequence[Kind], theta_rad: float, with_sheets: bool = False) -> None:
         self.kinds = (*kinds, Kind("metal", None, source="literature", family="metal"))
         self.theta_rad = theta_rad
         self.in_library = np.array([kind.source == "library" for kind in self.kinds])
@@ -296,7 +296,7 @@ class Kinds:
         self.effects = np.stack([_compute_effects(kind, theta_rad) for kind in self.kinds])
         # The added variance, far below any real one, keeps the matrix invertible where a kind has one effect.
         self.covariance = self.effects @ self.effects.mT + 1e-10 * np.eye(2)
-        self.sheet_share = SHEET_SHARE if sheets else 0.0
+        self.sheet_share = SHEET_SHARE if with_sheets else 0.0
         self.share, self.other = _compute_shares(self.kinds, self.sheet_share)
         self.sheets, self.sheet_brightness_off = draw_sheets(theta_rad)
 
@@ -362,8 +362,10 @@ class Kinds:
         at_border[is_outside] = inverse_ratio(real[is_outside] - 1j * loss[is_outside], self.theta_rad)
         # At the border and not at t: near t = 1, which is metal, the slope has no bound.
         slope = np.abs(permittivity_slope(at_border, self.theta_rad))
+        # The density over both coordinates, times their derivatives by eps' and eps'', times that of eps by t, squared
+        # for an area. An error of eps'' widens the linear part of its coordinate.
         floor = np.hypot(SOFT_LOSS, slope * std)
-        density = slope**2 * _tabulated_coordinate_density(real, loss) / (real * np.hypot(loss, floor))
+        density = slope**2 * _interpolate_coordinate_density(real, loss) / (real * np.hypot(loss, floor))
         beyond = np.abs(t - at_border) / max(std, LEAST_STD_OF_T)
         return np.asarray(density * np.exp(-0.5 * np.minimum(beyond, MOST_STD_BEYOND) ** 2), np.float64)
 
@@ -486,20 +488,18 @@ def _tabulate_coordinate_density() -> tuple[Real, Real, Real]:
     axes = [np.linspace(low, high, _COORDINATE_CELLS) for low, high in ends]
     step = np.array([axis[1] - axis[0] for axis in axes])
     materials = load_catalogue()
-    families, family_index, family_size = np.unique(
-        [material.kind for material in materials], return_inverse=True, return_counts=True
-    )
+    _, family_index, family_size = np.unique([m.kind for m in materials], return_inverse=True, return_counts=True)
     eps = np.array([material.permittivity for material in materials], np.complex128)
     places = _half_space_coordinates(np.clip(eps.real, *REAL_RANGE), np.clip(-eps.imag, *LOSS_RANGE))
     edges = [np.append(axis - d / 2, axis[-1] + d / 2) for axis, d in zip(axes, step, strict=True)]
-    weights = 1 / (families.size * family_size[family_index])
+    weights = 1 / (family_size.size * family_size[family_index])
     count = np.histogram2d(places[0], places[1], edges, weights=weights)[0]
     near = scipy.ndimage.gaussian_filter(count, np.array(NEAR_LITERATURE_STD) / step, mode="reflect") / step.prod()
     even = 1 / np.prod(ends[:, 1] - ends[:, 0])
     return NEAR_LITERATURE * near + (1 - NEAR_LITERATURE) * even, axes[0], axes[1]
 
 
-def _tabulated_coordinate_density(real: Real, loss: Real) -> Real:
+def _interpolate_coordinate_density(real: Real, loss: Real) -> Real:
     """Interpolate the table of `_tabulate_coordinate_density` at eps' and eps'' linearly; shape of `real`."""
     table, real_axis, loss_axis = _tabulate_coordinate_density()
     x, y = _half_space_coordinates(real, loss)
@@ -562,7 +562,7 @@ def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
 
 
 def log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> float:
-    """Return ln of the mean of `layer_odds` over the thin plates; 0 if the change over the sweep is not known."""
+    """Return ln of the mean of `layer_odds` over the thin plates; 0 without dispersion or without kinds."""
     if dispersion is None or kinds is None:
         return 0.0
     return float(np.log(np.mean(layer_odds(dispersion, kinds.theta_rad))))
@@ -622,9 +622,8 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
     difference = split_complex(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
     distance2 = np.einsum("ki,kij,kj->k", difference, inverse, difference)
     weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
-    library_share = (
-        float(np.mean([evidence.library_share for evidence in scan_evidence])) if first.in_library.any() else 0.0
-    )
+    library_shares = [evidence.library_share for evidence in scan_evidence]
+    library_share = float(np.mean(library_shares)) if first.in_library.any() else 0.0
     weight = weight * np.where(first.in_library, library_share, 1 - library_share)
     drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
     by_dispersion = _weigh_dispersion(kinds, scan_evidence)
@@ -689,6 +688,7 @@ def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[Rati
         return float(kinds[best].compute_half_space_density(np.array(mean), covariance))
     noise = np.random.default_rng(0).multivariate_normal(np.zeros(2), covariance, _HALF_SPACES, method="cholesky")
     t = mean + noise[:, 0] + 1j * noise[:, 1]
+    # The draws have the errors already: hardly any is added.
     density = kinds[best].compute_half_space_density(t, 1e-8 * np.eye(2))
     eps = permittivity_from_ratio(t, kinds[best].theta_rad)
     for i, evidence in enumerate(scan_evidence):

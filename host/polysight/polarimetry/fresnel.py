@@ -216,7 +216,7 @@ def multilayer(
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
     # Normal wavenumbers over k0, and the same over the permittivity: ratios of the tangential fields for s and for p,
-    # whose differences at an interface reflect.
+    # whose differences at an interface reflect. Those for p are taken the other way round: the signs of Eq. 2.
     q = [np.cos(theta).astype(np.complex128), *(_compute_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
@@ -288,17 +288,17 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         angle, path = _compute_half_bistatic(rig, i, points)
         specular, shortest = _compute_half_bistatic(rig, i, middle)
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
-        deviation = _convolve(visited, weight * (angle - specular))
-        mass = _convolve(visited, weight)
+        deviation_sum = _convolve(visited, weight * (angle - specular))
+        weight_sum = _convolve(visited, weight)
         # An index of the full convolution is that of the offset (0 mm at (count - 1) / 2) plus that of the displacement
         # (0 at reach); both together lead from the midpoint to the pixel.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
         grid = np.meshgrid(row, column, indexing="ij")
-        num = scipy.ndimage.map_coordinates(deviation, grid, order=1, mode="constant")
-        den = scipy.ndimage.map_coordinates(mass, grid, order=1, mode="constant")
-        is_lit = den > 1e-3 * float(weight.sum())
-        total += float(specular) + np.where(is_lit, num / np.where(is_lit, den, 1.0), 0.0)
+        deviation_px = scipy.ndimage.map_coordinates(deviation_sum, grid, order=1, mode="constant")
+        weight_px = scipy.ndimage.map_coordinates(weight_sum, grid, order=1, mode="constant")
+        is_lit = weight_px > 1e-3 * float(weight.sum())
+        total += float(specular) + np.where(is_lit, deviation_px / np.where(is_lit, weight_px, 1.0), 0.0)
     return total / len(rig.receivers)
 
 

@@ -251,7 +251,7 @@ def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
     estimated_v = _join_parts(leakage.v)
     if removed_h is None or removed_v is None or estimated_h is None or estimated_v is None:
         return inverse
-    # The channels as received, see `correct_leakage`.
+    # The channels as received, see `correct_leakage`: those of H = 1 and V = `inverse` with leakage, over metal's.
     h = (1 + removed_h * inverse) / (1 + removed_h)
     v = (inverse + removed_v) / (1 + removed_v)
     h, v = correct_leakage(h, v, estimated_h, estimated_v)

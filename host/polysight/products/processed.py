@@ -337,7 +337,7 @@ class ProcessedScan:
 
     @property
     def segments(self) -> list[PatchFigures]:
-        """Patches; empty if only images were made."""
+        """Figures of the patches (their pixels: `patches`), from materials.json; empty if only images were made."""
         if self.materials is None:
             return []
         return self.materials.segments

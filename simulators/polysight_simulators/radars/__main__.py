@@ -34,8 +34,10 @@ class _Time:
 def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> list[str]:
     """Return a line for each read of the trace that the board answers differently; what else it sends is not compared.
 
-    `make` creates the board from its clock. Raises OSError, ValueError if the file is not a trace; a damaged line may
-    also raise KeyError, TypeError, AttributeError or RecursionError.
+    `make` creates the board from its clock. In a trace, "out" is what the host wrote to the board, "in" what it read.
+
+    Raises OSError, ValueError if the file is not a trace; a damaged line may also raise KeyError, TypeError,
+    AttributeError or RecursionError.
     """
     time = _Time()
     board = make(time.now)

@@ -78,6 +78,7 @@ def backproject(
     xp = scene.xp
     s = xp.asarray(samples, dtype=xp.complex128)
     image = xp.zeros(scene.voxels.shape[0], dtype=xp.complex128, device=scene.device)
+    # `turn` is exp(-2j pi x).
     for part, delay in scene.delays():
         if scene.step is None:
             for k, f in enumerate(scene.frequencies):

@@ -84,7 +84,8 @@ def find_scene_warnings(scene: Path, config: Path) -> list[Finding]:
     image_mm = rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm
     smaller = [plate for plate in plates if plate.size_mm[0] < image_mm[0] or plate.size_mm[1] < image_mm[1]]
     if smaller:
-        # Ghosts lie on other plates, or make patches of their own: the scene reaches as far as its plates.
+        # Ghosts lie on other plates, or make patches of their own: the scene reaches as far as its plates. No noise
+        # changes them, so any will do.
         scene_mm = _measure_reach(smaller, axis=0), _measure_reach(smaller, axis=1)
         notes += [note for note in find_warnings(rig, Noise(), scene_mm) if note.where == "aliasing"]
     return notes

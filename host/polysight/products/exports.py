@@ -267,7 +267,10 @@ def patch_coordinates(scan: ProcessedScan) -> dict[str, Any]:
 
 
 def _make_figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
-    """Return a variable on dimension `patch` for each declared figure, and angles in radians too."""
+    """Return a variable on dimension `patch` for each figure declared as one, and angles in radians too.
+
+    Optional figures that no patch has are left out.
+    """
     variables = {}
     for figure in _patch_figures(patches):
         values = figure.values(patches)
@@ -361,15 +364,16 @@ def join_complex(dataset: xarray.Dataset) -> xarray.Dataset:
     variables: dict[str, Any] = {}
     for full_name, variable in dataset.data_vars.items():
         name, _, suffix = str(full_name).rpartition("_")
-        if variable.attrs.get(_PART) == "real" and f"{name}_imag" in dataset:
+        part = variable.attrs.get(_PART)
+        if part == "real" and f"{name}_imag" in dataset:
             joined = np.empty(variable.shape, np.result_type(variable.dtype, np.complex64))
             joined.real = variable.values
             joined.imag = dataset[f"{name}_imag"].values
             attrs = {key: text for key, text in variable.attrs.items() if key != _PART}
             attrs["long_name"] = str(attrs.get("long_name", name)).removesuffix(", real part")
             variables[name] = (variable.dims, joined, attrs)
-        elif variable.attrs.get(_PART) != suffix or suffix != "imag":
-            # Imaginary parts are left out here: they were joined with their real parts.
+        elif not (part == "imag" and suffix == "imag"):
+            # Imaginary parts are left out: they are joined with their real parts.
             variables[str(full_name)] = variable
     return dataset.drop_vars(list(dataset.data_vars)).assign(variables)
 
@@ -561,7 +565,10 @@ def _convert_column(figure: Figure, scan: ProcessedScan) -> Any:
 
 
 def _convert_struct(node: Any) -> Any:
-    """Convert nested dicts to structs with MATLAB's names; lists other than of numbers become cell arrays."""
+    """Convert nested dicts to structs with MATLAB's names; lists other than of numbers become cell arrays.
+
+    Keys without a value (None) are left out. A dict without keys becomes an empty matrix.
+    """
     if isinstance(node, dict):
         return {_make_matlab_name(k): _convert_struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
     if isinstance(node, list | tuple):

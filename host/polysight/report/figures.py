@@ -205,10 +205,10 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[sty
         _, y0, _, y1 = patch.box_mm
         if patch.refused is not None:
             ax.add_patch(
-                style.draw_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
+                style.make_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
             )
         if patch.outline_mm or patch.refused is not None:
-            ax.add_patch(style.draw_outline(patch, fill=False, edgecolor=style.INK, linewidth=0.9))
+            ax.add_patch(style.make_outline(patch, fill=False, edgecolor=style.INK, linewidth=0.9))
         name = style.patch_label(patch)
         second_line = ""
         if patch.refused is not None:
@@ -347,11 +347,11 @@ def _fill_patches(
         fill: Any = style.METAL_COLOUR if patch.metal_reference else "#e4e7ec"
         if patch.label in values:
             fill = colours.to_rgba(np.array([values[patch.label]]))[0]
-        ax.add_patch(style.draw_outline(patch, facecolor=fill, edgecolor=style.INK, linewidth=0.9))
+        ax.add_patch(style.make_outline(patch, facecolor=fill, edgecolor=style.INK, linewidth=0.9))
         text = "–"
         if patch.refused is not None:
             ax.add_patch(
-                style.draw_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
+                style.make_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
             )
             text = "not\njudged"
         if patch.metal_reference or patch.metal_like:

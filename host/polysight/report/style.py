@@ -112,7 +112,6 @@ def figure_label(name: str, number: str) -> str:
 def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     """Return the colour of each material in the results or the truth, the same in all figures."""
     names = {patch.name for patch in scan.segments if patch.name} | {plate.name for plate in scan.plates}
-    # Names of pixels, and their distances.
     for names_of_pixels, _ in scan.pixel_names.values():
         names |= set(np.unique(names_of_pixels).tolist())
     names.discard("unknown")
@@ -218,7 +217,7 @@ def plate_label(plate: TruthPlate, number: int) -> str:
     return figure_label(plate.name, f"plate {number}")
 
 
-def draw_outline(patch: PatchFigures, **style: Any) -> Polygon | Rectangle:
+def make_outline(patch: PatchFigures, **style: Any) -> Polygon | Rectangle:
     """Return a patch's outline, or its box if it has none; `style` are options of matplotlib's patches."""
     if patch.outline_mm:
         return Polygon(patch.outline_mm, closed=True, **style)

@@ -65,8 +65,8 @@ class Antenna:
 
 def _carry(start: Array, ends: Array, vector: NDArray) -> NDArray:
     """Turn `vector`, across the unit vector `start`, as `start` is turned to `ends` [n, 3] on the shortest arc."""
-    across = ends @ vector
-    return vector - (start + ends) * (across / np.maximum(1 + ends @ start, 1e-6))[:, None]
+    along_ends = ends @ vector
+    return vector - (start + ends) * (along_ends / np.maximum(1 + ends @ start, 1e-6))[:, None]
 
 
 @dataclass(frozen=True)
@@ -228,25 +228,24 @@ def reflect_curved(
     """
     bends = (bend_inside, bend_across)
     single_wave = _reflect_local(eps, theta, bends, wave_number)
-    # Metal's flat coefficients do not depend on the angle, so its own first order does: V of a sphere of 50 mm by 2 %.
-    # For dielectrics the next order of all other terms is missing, and the flat derivatives are closer to the series.
+    # Derivatives by the angle are those of the flat coefficients. Metal's are -1 at every angle: there those with the
+    # bends count (2 % of V of a sphere of 50 mm). For dielectrics the next order of all other terms is missing anyway,
+    # and derivatives without bends are closer to the series.
     is_metal = bool(np.any(np.isinf(eps)))
     bends_of_slopes = bends
     if not is_metal:
         bends_of_slopes = (0 * bend_inside, 0 * bend_across)
-    flat = _reflect_local(eps, theta, bends_of_slopes, wave_number)
-    reflection_above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_slopes, wave_number)
-    reflection_below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_slopes, wave_number)
+    middle = _reflect_local(eps, theta, bends_of_slopes, wave_number)
+    above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_slopes, wave_number)
+    below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_slopes, wave_number)
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
-    for local, r, other_flat, up, down in zip(
-        single_wave, flat, flat[::-1], reflection_above, reflection_below, strict=True
-    ):
+    for local, r, other, up, down in zip(single_wave, middle, middle[::-1], above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
         inside = 1j * bend_inside / (4 * wave_number * cos) * second
-        beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other_flat - r) / sin**2)
+        beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
         coefficients.append(local + inside + beside)
     return coefficients[0], coefficients[1]
 
@@ -284,14 +283,16 @@ def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number:
     first = ((above_s - above_p) - (below_s - below_p)) / (2 * ANGLE_STEP)
     # The sum over directions: with the angle of incidence its plane turns.
     directions = first / (2 * sin * cos) - (r_s - r_p) / (2 * sin**2)
-    # The wave of a cylinder: its logarithmic derivative differs from a plane wave's, inside and outside.
+    # The wave of a cylinder: its logarithmic derivative differs from a plane wave's, in air and in the medium. The
+    # tangential electric fields at the surface are 1 + r of the incident ones, the magnetic ones 1 - r.
     if np.any(np.isinf(eps)):
         electric = 0.0
         magnetic = 1 / cos**2
     else:
-        inside2 = np.asarray(eps) - sin**2
-        electric = 1 / cos**2 - eps / inside2
-        magnetic = 1 / cos**2 - 1 / inside2
+        # Square of the normal wave number in the medium over k.
+        normal2 = np.asarray(eps) - sin**2
+        electric = 1 / cos**2 - eps / normal2
+        magnetic = 1 / cos**2 - 1 / normal2
     local = (electric * (1 + r_s) * (1 + r_p) + magnetic * (1 - r_s) * (1 - r_p)) / 4
     return np.asarray(1j * twist / wave_number * (directions + local))
 
@@ -314,21 +315,21 @@ def _reflect_local(
         return -np.exp(1j * turn_s), -np.exp(1j * turn_p)
     eps = np.asarray(eps, complex)
     root = np.sqrt(eps)
-    cos_inside = np.sqrt(1 - sin**2 / eps)
+    cos_medium = np.sqrt(1 - sin**2 / eps)
     r_s, r_p = reflect_flat(eps, theta)
 
     # Cylinder across the plane of incidence. Logarithmic derivatives along the normal, over k: of the waves towards the
-    # surface and away from it outside (`into`, `out`), and of the wave inside (`behind`).
+    # surface and away from it in air (`into`, `out`), and of the wave in the medium (`behind`).
     outer = bend_inside / (2 * wave_number * cos**2)
-    inner = bend_inside / (2 * wave_number * cos_inside**2)
+    inner = bend_inside / (2 * wave_number * cos_medium**2)
     into = 1j * cos - outer
     out = -1j * cos - outer
-    behind = 1j * root * cos_inside - inner
+    behind = 1j * root * cos_medium - inner
     local_s = -(into - behind) / (out - behind)
     local_p = (into - behind / eps) / (out - behind / eps)
     # Cylinder along the plane of incidence.
     k_out = cos
-    k_in = root * cos_inside
+    k_in = root * cos_medium
     outer = bend_across / (2 * wave_number * k_out)
     inner = bend_across / (2 * wave_number * k_in)
     into = (1j - outer) / k_out

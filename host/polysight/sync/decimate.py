@@ -92,8 +92,8 @@ def decimator() -> Decimator:
 
 def _design_low_pass() -> NDArray[np.float64]:
     """Return symmetric taps of sum 1 with the least response where decimation would move echoes into the passband."""
-    images = [np.linspace(0.25 - _PASS, 0.25 + _PASS, 61), np.linspace(0.5 - _PASS, 0.5, 31)]
-    cycles = np.concatenate(images)
+    aliases = [np.linspace(0.25 - _PASS, 0.25 + _PASS, 61), np.linspace(0.5 - _PASS, 0.5, 31)]
+    cycles = np.concatenate(aliases)
     off_middle = np.minimum(np.abs(cycles - 0.25), np.abs(cycles - 0.5))
     weight = np.where(off_middle < _SCENE, 1.0, 0.05)
     pairs = 2 * np.cos(2 * np.pi * np.outer(cycles, np.arange(TAPS // 2) + 0.5))

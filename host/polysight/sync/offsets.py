@@ -269,8 +269,8 @@ def _align(
 def find_clipped(words: NDArray[np.int16], valid: NDArray[np.bool_], full_scale: int) -> NDArray[np.bool_]:
     """Return which of the received chirps [position, chirp] were clipped by the receiver.
 
-    They reach full scale, or one in `_AT_LIMIT` of their words lies within 1/2048 of the burst's largest magnitude, as
-    behind an amplifier that saturates earlier. A tone has two in a hundred words there, fewer with noise or an echo.
+    They reach full scale, or one in `_AT_LIMIT` of their words lies within 1/2048 of the burst's largest magnitude
+    below full scale: an amplifier saturates earlier. A tone has 2 % of its words there, fewer with noise or an echo.
     """
     magnitude: NDArray[np.int32] = np.abs(words.reshape(*words.shape[:2], -1).astype(np.int32))
     peak = magnitude.max(axis=-1)
@@ -288,25 +288,25 @@ def _align_round(
     equaliser: hpf.Equaliser | None,
 ) -> tuple[AlignedRow, NDArray[np.bool_]]:
     """Align and average the whole chirps of a few positions; return which of them are disturbed, too."""
+    # First pass: each chirp against a reference chirp; its frequency and, after the filter, its phase are removed.
     first, centre, coherence, usable = _refer_to_one(words, is_complete, linear)
     good = _find_coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
     taps = _find_taps(equaliser, frequency)
     start = np.angle(first.amplitude * taps.sum(axis=-1))
-
-    # Second pass: each chirp against the sum of the others.
     reduced = loops.reduce_chirps(words, frequency, complex64(taps * cis(-start)[..., None]), linear)
-    tone, own_energy, levels, half_difference, residual_energy = loops.against_others(reduced, good)
+    # Second pass: each chirp against the sum of the others. Energies of parts of a chirp are [position, part].
+    tone, own_energy, sum_energy, half_difference, residual_energy = loops.against_others(reduced, good)
     n = good.sum(axis=1)
-    disturbed = is_complete & _find_disturbed(residual_energy, levels / np.maximum(n, 1)[:, None] ** 2, usable)
-    level = np.maximum(levels.sum(axis=1) / np.maximum(n, 1) ** 2, 1e-30)[:, None]
+    disturbed = is_complete & _find_disturbed(residual_energy, sum_energy / np.maximum(n, 1)[:, None] ** 2, usable)
+    level = np.maximum(sum_energy.sum(axis=1) / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     other_chirps = n[:, None] - good
-    # A single chirp is the mean itself.
+    # Relative to the mean of the others; a single chirp is the mean itself.
     amplitude = np.where(other_chirps > 0, np.abs(tone.amplitude) / np.maximum(other_chirps, 1) / level, 1.0)
     # The difference from the mean of all chirps is smaller than that from the mean of the others.
-    part = other_chirps / np.maximum(n, 1)[:, None]
-    correction = part * tone.frequency
-    shift = part * np.angle(tone.amplitude)
+    share = other_chirps / np.maximum(n, 1)[:, None]
+    correction = share * tone.frequency
+    shift = share * np.angle(tone.amplitude)
     coherence = amplitude * np.sqrt(level / np.maximum(own_energy, 1e-30))
     good = _find_coherent(coherence, usable)
     second_half = np.cumsum(good, axis=1) % 2 == 0
@@ -346,7 +346,7 @@ def _find_disturbed(
 
 
 def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the lower median [position] of the usable values [position, chirp]; 0 without any."""
+    """Return the lower median [position, ...] of the usable values [position, chirp, ...]; 0 without any."""
     rising = np.sort(np.where(usable, values, np.inf), axis=1)
     middle = np.maximum(usable.sum(axis=1, keepdims=True) - 1, 0) // 2
     median = np.take_along_axis(rising, np.broadcast_to(middle, (*middle.shape[:2], *values.shape[2:])), axis=1)
@@ -521,7 +521,6 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     middles = block_frequencies_hz(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
-
     # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
     grid = np.linspace(-3, 3, 25) * _SPREAD_M
     dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
@@ -532,17 +531,17 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     echoes *= (weight / np.linalg.norm(weight))[:, None, None]
     n_rx = len(rx)
     n = middles.size
-    flat = echoes.reshape(len(points), n_rx * n)
+    all_rx = echoes.reshape(len(points), n_rx * n)
+    # A gain error is that of an RX: it adds echo power between samples of the same RX, none between two.
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
     mirror_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
     clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(mirror_m, _CLUTTER_M, 8 * n), middles))
     clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
-    covariance = (flat.T @ flat.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)
+    covariance = (all_rx.T @ all_rx.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)
     covariance = (covariance + _NOISE / FOLD * np.eye(n_rx * n)).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
     channels_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
-
     centre = echoes[:, :, n // 2]
     spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
     beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
@@ -634,7 +633,8 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         is_found &= strength > _LOST * _find_middle(strength[is_found])
 
     samples[:, ~is_found] = 0
-    # A half of k of the K good chirps was scaled by K / k, so its noise is that of a chirp divided by k.
+    # The averages of the halves, of k and l of the K good chirps, differ by 1 / k + 1 / l of a chirp's noise power, the
+    # sum of `scale` over K. `half_difference` is the difference's energy in all RX and blocks, after decimation.
     two = good_chirps > 1
     noise_power = np.full(len(two), np.nan)
     chirp_noise = half_difference * chirps / (len(path.beam) * n) / decimator().noise

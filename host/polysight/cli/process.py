@@ -25,8 +25,6 @@ from polysight_shared.config import MAX_IMAGE_MM, MAX_PIXEL_MM, MAX_PIXELS, MIN_
 _shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <= 1000)
 _search_range = number(float, "a length of 0.5 to 100 mm", lambda value: 0.5 <= value <= 100)
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
-
-
 _radius = number(float, "a radius of 50 to 500 mm", lambda value: 50 <= value <= 500)
 _turn = number(float, "angles of at most 360 degrees, as 0,30,60", lambda value: abs(value) <= 360)
 _degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
@@ -81,6 +79,7 @@ def _process(args: argparse.Namespace) -> int:
     scans = find_scans(args.data)
     if len(args.data) == 1 and scans == args.data and args.dask is None:
         return process(args.data[0], args.out, process_settings(args, args.data[0]))
+    # The processes of a batch may have another working folder.
     several = [(data, process_settings(args, data.absolute())) for data in scans]
     return process_several(several, args.out, args.jobs, args.dask, args.again)
 
@@ -160,7 +159,7 @@ def _add_surface(add: Add) -> None:
 
 
 def add_commands(add: Add) -> None:
-    """Register the commands."""
+    """Register the commands. The last argument of `add` names the options that the help shows first."""
     sub = add(
         "process",
         _process,
@@ -293,8 +292,8 @@ def _add_calibrate(add: Add) -> None:
         "calibrate the rig from recorded scans; each action writes one dated file",
         "polysight calibrate direct-path scans/points --target points.toml",
     )
+    # One of these is required, and each replaces the function given above.
     actions = sub.add_subparsers(dest="action", required=True, metavar="ACTION")
-
     _add_direct_path(actions)
     sub = add_action(
         actions,

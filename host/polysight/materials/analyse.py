@@ -390,6 +390,7 @@ class SceneScatter:
         evenly = images.illumination is not None and images.illumination.known
         lit = images.usable if plane is None else images.usable & plane.valid
         border = {p.label: border_errors(p, lit, images.x_m) for p in segmentation.patches}
+        # In the order of `scatters`; the metal, the last one, never counts as at the end: it is the origin.
         border_flags = [*(border[label][0] > UNEVEN_AT_END for label in scatter), False]
         change = None if metal is None else estimate_common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, segmentation.patches, images)
@@ -582,8 +583,8 @@ def _name_patches(
         interior = patch.interior
         if classifier.model == PAPER:
             # The paper's classifier compares pixels, which get the corrections of their patch.
-            corrected = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
-            pixels_p = p[interior].astype(np.complex128) / corrected
+            error = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
+            pixels_p = p[interior].astype(np.complex128) / error
             pixels = pixel_features(np.abs(h[interior]), np.abs(v[interior]), pixels_p)
             (name,) = classifier.scan([pixels])
         else:

@@ -253,6 +253,7 @@ def metal_evidence(
     score = inversion.log_evidence - log_evidence_of_dielectric(measurements, prior, kinds, level_db)
     if level_db is not None:
         score -= 0.5 * (level_db / CHANNEL_RATIO_STD_DB) ** 2
+    # The evidence for bare metal is that for metal, times the probability of bare after over that before.
     bare = score + inversion.log_bare - float(np.log1p(-prior.painted))
     culprit = None
     if score < CONFLICT_SCORE:

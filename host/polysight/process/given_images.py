@@ -116,7 +116,7 @@ class GivenPair:
 
 
 def is_given_images(path: Path) -> bool:
-    """Return true for an `.npz` file, and for a folder with the published `sar_h.npy` and `sar_v.npy`."""
+    """Return true for an `.npz` file, and for a folder with the published `sar_h.npy` or `sar_v.npy`."""
     if path.suffix == NPZ and not path.is_dir():
         return True
     return path.is_dir() and any((path / name).exists() for name in SAR_FILES)

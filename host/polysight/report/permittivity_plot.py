@@ -184,6 +184,7 @@ def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour
     elif e.real_p30_p70 and e.imag_p30_p70:
         real_p30, real_p70 = e.real_p30_p70
         imag_p30, imag_p70 = e.imag_p30_p70
+        # The loss is minus the imaginary part: its lower end is at -imag_p70.
         ax.errorbar(
             *centre, color=colour, linewidth=1.2, zorder=3,
             xerr=[[max(e.real - real_p30, 0)], [max(real_p70 - e.real, 0)]],

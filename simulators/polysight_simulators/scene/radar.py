@@ -326,7 +326,7 @@ class SimulatedRig:
         for start in range(0, len(x_mm), _BATCH):
             batch = slice(start, min(start + _BATCH, len(x_mm)))
             pulses = np.arange(first + batch.start, first + batch.stop, dtype=np.int64)
-            self._add_noise(board, pulses, out[batch])
+            self._fill_with_noise(board, pulses, out[batch])
             if board.role == "transmit":
                 out[batch] += self._simulate_own_leakage()
             else:
@@ -368,7 +368,7 @@ class SimulatedRig:
         `x_m`, `y_m` are stage offsets from the middle of the grid, `pulses` chirp numbers since power-up; [chirp].
         """
         d = self.scene.disturbances
-        receiver = self._make_receiving_board(board.name)
+        simulated = self._make_receiving_board(board.name)
         chirp = self.rig.chirp
         # All chirps of a frame start with one pulse.
         frames = pulses // self.rig.burst.chirps
@@ -377,27 +377,27 @@ class SimulatedRig:
             turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses)
         else:
             turns = 0.0 * delay
-        factor, shift = compute_chirp_factors(receiver.receiver, delay, 2 * np.pi * turns, d.hpf)
-        inside = receiver.field.covers(x_m, y_m)
+        factor, shift = compute_chirp_factors(simulated.receiver, delay, 2 * np.pi * turns, d.hpf)
+        inside = simulated.field.covers(x_m, y_m)
         self.outside[board.name] += int(np.sum(~inside))
-        nodes = np.zeros((len(x_m), *receiver.direct.shape[1:2], receiver.expand.shape[1]), dtype=np.complex64)
+        nodes = np.zeros((len(x_m), *simulated.direct.shape[1:2], simulated.expand.shape[1]), dtype=np.complex64)
         if inside.any():
-            gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * receiver.receiver.gains
-            nodes[inside] = receiver.field.interpolate(x_m[inside], y_m[inside]) * gains[:, :, None]
+            gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * simulated.receiver.gains
+            nodes[inside] = simulated.field.interpolate(x_m[inside], y_m[inside]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
         # [chirp, 2, rx, sample]
-        ideal = np.matmul(nodes[:, None], receiver.expand)
-        ideal += receiver.direct
+        ideal = np.matmul(nodes[:, None], simulated.expand)
+        ideal += simulated.direct
         if not d.hpf:
             out += factor[:, None] * ideal[:, 0]
             return
-        h, slope = high_pass(receiver.middle_hz + shift, chirp)
+        h, slope = high_pass(simulated.middle_hz + shift, chirp)
         ideal[:, 0] *= (factor * h).astype(np.complex64)[:, None]
         ideal[:, 1] *= (factor * slope).astype(np.complex64)[:, None]
         out += ideal[:, 0]
         out += ideal[:, 1]
 
-    def _add_noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
+    def _fill_with_noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
         """Fill `out` with receiver noise: each channel has the same signal-to-noise ratio for any gain."""
         snr_db = self.scene.disturbances.direct_snr_db
         if snr_db is None:

@@ -50,10 +50,10 @@ def scan_minutes(rig: Instrument) -> float:
     """Return the time of the whole scan: rows at constant speed, with run-up, run-out and the step to the next row."""
     stage = rig.stage
     grid = rig.grid
-    length = (grid.columns - 1) * grid.step_x_mm
-    ramp = stage.speed_mm_s / stage.accel_mm_s2
-    row = length / stage.speed_mm_s + 2 * ramp + grid.step_y_mm / stage.travel_speed_mm_s
-    return grid.rows * row / 60
+    length_mm = (grid.columns - 1) * grid.step_x_mm
+    ramp_s = stage.speed_mm_s / stage.accel_mm_s2
+    row_s = length_mm / stage.speed_mm_s + 2 * ramp_s + grid.step_y_mm / stage.travel_speed_mm_s
+    return grid.rows * row_s / 60
 
 
 def predict_image(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -63,7 +63,9 @@ def predict_image(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -
     """
     imager, _ = choose_imager(board.aperture)
     samples = imager.samples(image)
+    # Recorded samples have passed the range gate: `model` is what it does to an echo.
     gated = (board.model.astype(np.complex64) @ samples.reshape(*samples.shape[:2], -1)).reshape(samples.shape)
+    # The mean over RX and weighted positions, as `BoardSamples.image`.
     return imager.image((gated * weights).astype(np.complex64)) / (weights.sum() * len(samples))
 
 

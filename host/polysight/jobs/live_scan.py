@@ -289,10 +289,10 @@ def notify(settings: Notify, folder: Path, state: str, text: str) -> None:
     """
     message = f"{folder.name}: {text}"
     if settings.command:
-        _report_failure(lambda: _run_command([*shlex.split(settings.command), message]), "notify.command")
+        _send_or_note(lambda: _run_command([*shlex.split(settings.command), message]), "notify.command")
     if settings.url:
         content = json.dumps({"scan": folder.name, "state": state, "text": message}).encode()
-        _report_failure(lambda: _post(settings.url, content), "notify.url")
+        _send_or_note(lambda: _post(settings.url, content), "notify.url")
 
 
 def _run_command(words: list[str]) -> None:
@@ -306,7 +306,7 @@ def _post(url: str, content: bytes) -> None:
         pass
 
 
-def _report_failure(send: Callable[[], None], name: str) -> None:
+def _send_or_note(send: Callable[[], None], name: str) -> None:
     """Call `send`; write a note with `name` to stderr if it fails."""
     try:
         send()

@@ -312,7 +312,7 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
     background = float(np.median(level[~bright]))
     # Plates over a noisy background: the classes overlap, but noise is rarely as bright over a plate's width.
     plate_mask = _open_mask((image > background + PLAIN_DB) & usable, cfg.smallest_mm / pixel_mm / 2)
-    if not plate_mask.any() and not _separate(level, bright, cfg.least_contrast_db):
+    if not plate_mask.any() and not _are_separate(level, bright, cfg.least_contrast_db):
         return float("inf")
     # Here and below 1.4826 turns the median of normal deviations into their standard deviation.
     scatter = min(1.4826 * float(np.median(np.abs(level[~bright] - background))), MOST_SCATTER_DB)
@@ -361,7 +361,7 @@ def _remove_speckle(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: f
     return reduce_variation(level, min(cfg.speckle_db, max(speckle, _LEAST_WEIGHT)))
 
 
-def _separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
+def _are_separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
     """Return true if bright and dark are two classes, far enough apart, and not one class cut in two.
 
     Otsu also splits a single normal distribution, with 2/pi = 0.64 of the variance between the halves, so that 0.70 is

@@ -128,12 +128,15 @@ def band_rows(
             pixels = r.patch.interior & band_images.valid
             full_band = (result.h[pixels], result.v[pixels])
             parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
-    std_by_label = {r.patch.label: _estimate_own_std(result, r.patch.interior) for r in result.patches}
+    std_by_label = {r.patch.label: _estimate_common_std(result, r.patch.interior) for r in result.patches}
     return {label: _add_covariance(rows, result, std_by_label[label]) for label, rows in parts.items()}
 
 
-def _estimate_own_std(result: MaterialsResult, interior: Mask) -> float:
-    """Return the standard error of a patch's V / H, each part, by what scatters over the plate; NaN if not known."""
+def _estimate_common_std(result: MaterialsResult, interior: Mask) -> float:
+    """Return the standard error of a patch's V / H, each part, in all its sub-bands alike; NaN if not known.
+
+    It is that of what scatters over the plate.
+    """
     images = result.calibrated
     scatter = measure_scatter(interior, result.h, result.v, images.x_m, images.y_m)
     if scatter is None:
@@ -148,10 +151,12 @@ def _add_covariance(rows: list[BandFigures], result: MaterialsResult, common: fl
     ratios = [row.ratio.value for row in rows if row.ratio is not None]
     if len(ratios) < len(rows) or not math.isfinite(common):
         return rows
+    # Effects on real and imaginary part of each band's V / H: of six independent errors of leakage and metal reference,
+    # and of the plate's common error.
     slopes = ratio_slopes(result.inversion, result.prior, 1 / np.array(ratios, np.complex128)).reshape(2 * len(rows), 6)
-    place = common * np.tile(np.eye(2), (len(rows), 1))
+    of_plate = common * np.tile(np.eye(2), (len(rows), 1))
     variances = np.repeat([(row.own_std or 0.0) ** 2 for row in rows], 2)
-    covariance = slopes @ slopes.T + place @ place.T + np.diag(variances)
+    covariance = slopes @ slopes.T + of_plate @ of_plate.T + np.diag(variances)
     std = np.sqrt(np.diag(covariance).reshape(-1, 2).mean(axis=1))
     return [
         structs.replace(row, inverse_ratio_std=float(std[k]), covariance=covariance[2 * k : 2 * k + 2].tolist())
@@ -264,7 +269,7 @@ def bands_of_row(
     inverse = 1 / np.array(ratios, np.complex128)
     sigma = np.array(errors)
     spectrum = Spectrum.from_chirp(chirp, count)
-    level = [part.amplitude_h for part in parts]
+    amplitudes = [part.amplitude_h for part in parts]
     shared = [part.covariance for part in row.bands or () if part.covariance]
     covariance = None
     if count > 1 and len(shared) == count:
@@ -280,9 +285,9 @@ def bands_of_row(
     bands = Bands(
         spectrum, inverse, sigma, covariance=covariance, theta_std_rad=theta_std, phase_per_angle=phase_per_angle
     )
-    if not amplitude_error or any(a is None for a in level):
+    if not amplitude_error or any(a is None for a in amplitudes):
         return bands
-    h = np.array(level, np.float64)
+    h = np.array(amplitudes, np.float64)
     if covariance is None:
         return replace(bands, amplitude_h=h, sigma_h=np.sqrt(count) * amplitude_error * h)
     # Products of earlier releases have only the least error.
@@ -311,7 +316,7 @@ def parse_layer(text: str) -> Layer:
     real, loss, *thickness = (float(part) for part in rest)
     if not (np.isfinite(real) and np.isfinite(loss)):
         raise ValueError(text)
-    return Layer(name, complex(real, -loss), _parse_metres(thickness[0]) if thickness else None)
+    return Layer(name, complex(real, -loss), _convert_to_metres(thickness[0]) if thickness else None)
 
 
 def _parse_unknown_layer(name: str, size: str = "") -> Layer:
@@ -324,14 +329,14 @@ def _parse_unknown_layer(name: str, size: str = "") -> Layer:
     if size == "?":
         return Layer(name, thickness_range_m=THICKNESS_RANGE_M)
     if between := _RANGE.fullmatch(size):
-        low, high = (_parse_metres(float(mm)) for mm in between.groups())
+        low, high = (_convert_to_metres(float(mm)) for mm in between.groups())
         if low >= high:
             raise ValueError(size)
         return Layer(name, thickness_range_m=(low, high))
-    return Layer(name, None, _parse_metres(float(size)))
+    return Layer(name, None, _convert_to_metres(float(size)))
 
 
-def _parse_metres(mm: float) -> float:
+def _convert_to_metres(mm: float) -> float:
     """Return a thickness in metres. Raises ValueError unless it is positive and finite."""
     if not 0 < mm < np.inf:
         raise ValueError(mm)

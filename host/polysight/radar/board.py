@@ -366,6 +366,7 @@ class BringUp:
 
     def _check_die(self) -> str:
         die = self._read_die()
+        # Fatal events since the last step raise here: the board counts as configured afterwards.
         for event in self._link.poll():
             self.note(event)
         return die

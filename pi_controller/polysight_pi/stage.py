@@ -269,6 +269,7 @@ class StageLink:
         Raises StageRefusedError if the stage refuses the line, StageLostError if it does not answer.
         """
         answer = self._exchange(verb, args)
+        # The stage has missed a line, or was reset: after HELLO it takes any number for the next one.
         if answer.number == StageError.SEQUENCE and verb != "HELLO":
             self._exchange("HELLO", ())
             answer = self._exchange(verb, args)

@@ -77,7 +77,7 @@ class Rows(RuleBasedStateMachine):
     def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[Sent, Placed]:
         sent = self.card.record(self.frames, troubles)
         log = log_packets(sent, self.size, batch)
-        placed, out = place_record(log, self.frame, self.past, sent.first_pulse_ns if pulses_known else 0)
+        placed, out = place_record(log, self.frame, self.past, sent.not_before_ns if pulses_known else 0)
         assert wrong_bytes(sent, placed, out) == 0, (troubles, placed.reason)
         c = placed.counts
         named = c.placed + c.duplicates + c.conflicting + c.leftover + c.restarted + c.outside + c.disagreeing
@@ -119,7 +119,7 @@ class Rows(RuleBasedStateMachine):
         """Nothing happens to this record; leftovers may still come among its packets."""
         sure = self.sure and self.past.start is not None and self.card.resets == 0
         sent, placed = self.take((), batch, pulses_known=True)
-        alone = all(a.record == sent.number or a.t_ns < sent.first_pulse_ns for a in sent.arrivals)
+        alone = all(a.record == sent.number or a.t_ns < sent.not_before_ns for a in sent.arrivals)
         if sure:
             assert placed.complete, placed.reason
         self.refused = 0 if placed.complete or not alone else self.refused + 1

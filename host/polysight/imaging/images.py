@@ -488,12 +488,12 @@ class ImageBuilder:
         """Divide the images by their footprints; `channels`: board name to image, footprint and notice (None: none)."""
         h, v = channels.values()
         visible = np.ones(self.grid.shape, bool)
-        for _, weight, _ in (h, v):
-            strong = np.abs(weight) >= _VISIBLE * np.abs(weight).max()
+        for _, footprint, _ in (h, v):
+            strong = np.abs(footprint) >= _VISIBLE * np.abs(footprint).max()
             # The rim of the footprint ripples with the row spacing; a majority filter avoids stripes.
             share = scipy.ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
-            visible &= (share > 0.5) & (weight != 0)
-        flat = [np.divide(raw, w, out=np.zeros_like(raw), where=visible).conj() for raw, w, _ in (h, v)]
+            visible &= (share > 0.5) & (footprint != 0)
+        flat = [np.divide(raw, foot, out=np.zeros_like(raw), where=visible).conj() for raw, foot, _ in (h, v)]
         return Images(
             h=flat[0],
             v=flat[1],

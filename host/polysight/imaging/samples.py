@@ -153,12 +153,12 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
     frequencies = np.linspace(sweep[0], sweep[-1], int(np.ceil(product)) + extra)
     # Dense (chosen), so that the fits hold between them. `rcond` drops combinations that only rounding tells apart.
-    d = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
-    target = np.exp(-2j * np.pi * np.outer(d, sweep)) * weight
-    basis = np.exp(-2j * np.pi * np.outer(d, frequencies))
+    delay_s = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
+    target = np.exp(-2j * np.pi * np.outer(delay_s, sweep)) * weight
+    basis = np.exp(-2j * np.pi * np.outer(delay_s, frequencies))
     m = np.linalg.lstsq(basis, target, rcond=1e-6)[0]
 
-    echoes = np.exp(2j * np.pi * np.outer(sweep, d)) / np.sqrt(d.size)
+    echoes = np.exp(2j * np.pi * np.outer(sweep, delay_s)) / np.sqrt(delay_s.size)
     covariance = echoes @ echoes.conj().T + _NOISE * np.eye(b - a)
     direct = np.linalg.solve(covariance, np.ones(b - a)).conj()
     direct /= direct.sum()
@@ -166,13 +166,13 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     # The direct path is a constant in x: the estimated one is subtracted before the projection `m`.
     matrix = np.zeros((frequencies.size, chirp.samples), complex)
     matrix[:, a:b] = m - np.outer(m.sum(axis=1), direct)
-    spectrum = np.zeros(chirp.samples, complex)
-    spectrum[a:b] = direct
+    direct_of_all = np.zeros(chirp.samples, complex)
+    direct_of_all[a:b] = direct
     # Echoes at the samples' frequencies are combinations of echoes at the few frequencies.
-    wave = np.exp(2j * np.pi * np.outer(d, frequencies))
-    from_few = np.linalg.lstsq(wave, np.exp(2j * np.pi * np.outer(d, sweep)), rcond=1e-9)[0].T
+    wave = np.exp(2j * np.pi * np.outer(delay_s, frequencies))
+    from_few = np.linalg.lstsq(wave, np.exp(2j * np.pi * np.outer(delay_s, sweep)), rcond=1e-9)[0].T
     model = (matrix[:, a:b] @ from_few).astype(np.complex128)
-    return Reduction(frequencies, matrix, spectrum, model, gate_m, sample_frequencies_hz(chirp))
+    return Reduction(frequencies, matrix, direct_of_all, model, gate_m, sample_frequencies_hz(chirp))
 
 
 def burst_filters(rig: Instrument) -> NDArray[np.float32]:
@@ -522,8 +522,8 @@ class BoardSamples:
         if self._live is None or not weights.any():
             return
         if self._final is not None and not self._moved:
-            white = self._final.spectra_of_row(weights.astype(np.complex64), index)
-            self._live.add_spectra(index, sign * self._compute_row_spectra(self._final, index), white)
+            spectra_of_weights = self._final.spectra_of_row(weights.astype(np.complex64), index)
+            self._live.add_spectra(index, sign * self._compute_row_spectra(self._final, index), spectra_of_weights)
         else:
             start = float(geometry.row_starts_m(self._offsets)[index])
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
@@ -632,6 +632,7 @@ class BoardSamples:
         sweep_per_m = -2j * np.pi * (f[-1] - f[0]) / SPEED_OF_LIGHT_M_S
         with np.errstate(divide="ignore", invalid="ignore"):
             of_mirror = mirror_slope / footprint
+            # Times (-j 2 pi / c)^2, as the slopes are times -j 2 pi / c.
             variance = mirror_bend / footprint - of_mirror**2
             change = (slope / image - of_mirror) / variance * sweep_per_m
         return np.where(np.isfinite(change), change, complex(np.nan, np.nan)).astype(np.complex64)

@@ -242,12 +242,14 @@ def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: f
         print_json(content)
         return 0
     line = result.line
+    # The slope is per radian; times pi / 180 it is per degree.
+    slope_per_degree = np.radians(line.slope)
     rows = [
         f"  {r.name:30s} {r.true_percent:6.2f} %   found {r.percent:6.2f} %   {r.low:6.2f} .. {r.high:6.2f} %\n"
         for r in result.left_out
     ]
     sys.stdout.write(
-        f"{source}: percent = {line.intercept:.2f} + ({np.radians(line.slope):.3f}) * angle in degrees,"
+        f"{source}: percent = {line.intercept:.2f} + ({slope_per_degree:.3f}) * angle in degrees,"
         f" {line.patches} patches\neach concentration predicted from the others:\n{''.join(rows)}"
         f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
         f" truth in {100 * result.covered:.0f} % of the patches\n"

@@ -1,6 +1,7 @@
 """POST requests of the reading process: plan, doctor, scans, labels, notes, processing; `front` has checked the token.
 
-Each is a command of `polysight` as well; what takes long runs as that command, in a process of its own.
+Each is a command of `polysight` as well; what takes long runs as that command, in a process of its own. `Site.rig` is a
+lock: it is held from the check that the rig is free until a program uses it.
 """
 
 from __future__ import annotations

@@ -90,7 +90,8 @@ class Sent:
     number: int
     # Data that the row should contain.
     data: bytes
-    first_pulse_ns: int
+    # Packets that arrive earlier are of an earlier record: a millisecond before the first frame.
+    not_before_ns: int
     # Packets in the order of their arrival.
     arrivals: list[Arrival] = field(default_factory=list)
     # The card sent the complete record, with consecutive counters.
@@ -185,16 +186,16 @@ class Adversary:
         if not data:
             draw = np.random.default_rng(chance.getrandbits(32))
             data = draw.integers(1, 256, frames * self._frame, np.uint8).tobytes()
-        pulse_ns = self._now_ns + 1_000_000
+        begin_ns = self._now_ns + 1_000_000
         if edges_ns is not None:
-            pulse_ns = edges_ns[0] - 1_000_000
-        sent = Sent(self._number, data, pulse_ns, troubles=troubles)
+            begin_ns = edges_ns[0] - 1_000_000
+        sent = Sent(self._number, data, begin_ns, troubles=troubles)
         packets, last_bytes = self._make_packets(sent, data)
-        made_ns = [pulse_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
+        made_ns = [begin_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
         if edges_ns is not None:
             made_ns = [self._find_time_made_ns(byte, edges_ns) for byte in last_bytes]
         # A card that was reset may send nothing.
-        made_ns = made_ns or [pulse_ns]
+        made_ns = made_ns or [begin_ns]
         packets_before = self.take_late(0.5)
         in_between = self.take_late(0.7)
         arriving = self._transmit(packets, made_ns, sent)
@@ -215,7 +216,7 @@ class Adversary:
             arriving.insert(place, Arrival(t_ns, late.packet, late.record))
         before = [Arrival(self._now_ns + k * 1000, a.packet, a.record) for k, a in enumerate(packets_before)]
         sent.arrivals = before + arriving
-        self._now_ns = max([pulse_ns, *(a.t_ns for a in arriving)]) + 10_000_000
+        self._now_ns = max([begin_ns, *(a.t_ns for a in arriving)]) + 10_000_000
         return sent
 
     def _make_packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:

@@ -135,8 +135,9 @@ def _transfer(shape: tuple[int, ...], cells_mm: NDArray[np.float64], tapered: bo
 
 def _draw_uneven_light(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.complex128]:
     """Return a complex random field [ny, nx] of unit scatter, correlated over about 30 mm."""
-    wavenumbers = [np.fft.fftfreq(count, PIXEL_MM) for count in shape]
-    passed = np.exp(-((wavenumbers[0][:, None] * 60) ** 2) - (wavenumbers[1][None, :] * 60) ** 2)
+    per_mm = [np.fft.fftfreq(count, PIXEL_MM) for count in shape]
+    # In space exp(-(pi r / 60 mm)^2): 1 / e at 19 mm; the field's own correlation is wider by sqrt(2), 27 mm.
+    passed = np.exp(-((per_mm[0][:, None] * 60) ** 2) - (per_mm[1][None, :] * 60) ** 2)
     white = rng.standard_normal((2, *shape))
     field = np.fft.ifft2(np.fft.fft2(white[0] + 1j * white[1]) * passed)
     return field / np.sqrt(np.mean(np.abs(field) ** 2))

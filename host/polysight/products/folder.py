@@ -249,6 +249,7 @@ def _replace(new: Path, place: Path, old: Path) -> None:
         old.rename(new)
     sync_folder(place.parent)
     for entry in new.iterdir():
+        # `write_atomically` left files `.part` if it was killed.
         if not _is_product(entry.name) and not entry.name.endswith(".part"):
             entry.rename(place / entry.name)
 

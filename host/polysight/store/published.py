@@ -162,21 +162,20 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
         )
     if zero_filled:
         end = max(end, raw.size)
-        if end == raw.size:
-            data = raw
-        else:
-            data = np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
+    if end == raw.size:
+        data = raw
+    elif zero_filled:
+        data = np.concatenate([raw, np.zeros(end - raw.size, np.uint8)])
     else:
-        if end == raw.size:
-            data = raw
-        else:
-            data = _spread(raw, start, log.size, end)
+        data = _spread(raw, start, log.size, end)
     count = -(-end // full_size)
     arrived_packets = np.zeros(count, bool)
     arrived_packets[start // full_size] = True
     if zero_filled:
         arrived_packets &= ~_find_silent(data, full_size)
-        arrived_packets[-(-raw.size // full_size) :] = False
+        # What the log has beyond the file's end is not there.
+        packets_in_file = -(-raw.size // full_size)
+        arrived_packets[packets_in_file:] = False
     arrived = arrived_packets[start // full_size]
     lost_ranges = _find_ranges(~arrived_packets, full_size, end)
     return Stream(data, lost_ranges, int(count - arrived_packets.sum()), start[arrived], log.at_s[arrived], full_size)
@@ -222,7 +221,9 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled
     begin = first
     ends_complete = full > log.size[-1] == shape.bytes - (expected - 1) * full
     if zero_filled is not None:
-        begin -= int(np.argmin(np.append(_find_silent(zero_filled, full), False)))
+        silent_packets = _find_silent(zero_filled, full)
+        # Index of the first packet that is not silent: so many are before it.
+        begin -= int(np.argmin(np.append(silent_packets, False)))
     elif ends_complete and _find_pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
         begin = min(first, last - expected + 1)
     fits_from_1 = last <= expected
@@ -252,10 +253,12 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
     end = stream.data.size
     first_packets = _find_pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
     ends = np.zeros(first_packets.size, np.int64)
-    before_end = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
-    for i, (low, high) in enumerate(zip(before_end, stream.start[first_packets] + stream.packet_bytes, strict=True)):
-        # The burst ends in the packet that straddles the pause: after a whole number of bursts from its beginning, if
-        # such an end lies in that packet, otherwise after a whole number of frames.
+    # A burst ends between the ends of the packets before and behind the pause, for the latter holds its last bytes.
+    ends_before = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
+    ends_behind = stream.start[first_packets] + stream.packet_bytes
+    for i, (low, high) in enumerate(zip(ends_before, ends_behind, strict=True)):
+        # It ends after a whole number of bursts from its beginning, if such an end lies there, otherwise after a whole
+        # number of frames.
         begun = 0
         if i:
             begun = ends[i - 1]

@@ -307,8 +307,8 @@ def field_exact(
 
 def _place_quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
     """Return quadrature points x, y relative to the centre of a rectangle, and their areas; each [y, x]."""
-    # The phase changes at most by 2 k per metre. Gauss-Legendre with n points is exact up to the degree 2 n - 1, which
-    # takes a quarter of a point per radian: 0.3, which is 0.6 per k and metre, and 16 more.
+    # The phase changes at most by 2 k per metre. Gauss-Legendre with n points is exact up to the degree 2 n - 1, so a
+    # quarter of a point per radian suffices. Taken are 0.3 (0.6 k per metre), and 16 points more.
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in size_m)
     x, y = np.meshgrid(nx * size_m[0] / 2, ny * size_m[1] / 2)

@@ -61,7 +61,7 @@ def _mirror_level(tx: Antenna, rx: Antenna, plane_m: float) -> float:
 
 
 def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape, ...]:
-    """Return the shapes of one [[shapes]] table, with optional keys filled in."""
+    """Return the shapes of one [[shapes]] table, which has its optional keys, too: no defaults are known here."""
     x, y, z = centre_m
     front_m = x + table["centre_mm"][0] / 1000, y + table["centre_mm"][1] / 1000, z + table["height_mm"] / 1000
     name = table["name"]

@@ -53,6 +53,7 @@ SHOWN_PAIRS = 3
 def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
     """Return lines on confidence: whether it is too large or too small, why, and how many specimens are needed.
 
+    Then follow the pairs of materials that lie closest together.
     `fit` is that of one angle (`train.fit_samples`), `angle` its key in the library's fit.
     """
     if fit.get("named") is None:

@@ -237,8 +237,8 @@ def _find_max_pulses(rig: Instrument) -> int:
 
 def _list_speeds(rig: Instrument, minutes: float) -> Iterator[float]:
     """Yield whole speeds, mm/s, ascending, from the slowest that can keep the time to the limit of stage and travel."""
-    length = (rig.grid.columns - 1) * rig.grid.step_x_mm
-    slowest = max(1, int(rig.grid.rows * length / (60 * minutes)))
+    row_mm = (rig.grid.columns - 1) * rig.grid.step_x_mm
+    slowest = max(1, int(rig.grid.rows * row_mm / (60 * minutes)))
     for speed in range(slowest, int(MAX_STEPS_PER_S / rig.stage.steps_per_mm) + 1):
         stage = msgspec.structs.replace(rig.stage, speed_mm_s=float(speed))
         if not stage.misfit(rig.grid):

@@ -108,7 +108,8 @@ def sync_scan(run: Run) -> SyncScan:
                 if carrier is None:
                     carrier = float(np.median(synced.direct_hz)) / chirp.sample_rate_hz
                 mixed = raw[:, :: rig.burst.pulses] * np.exp(-2j * np.pi * carrier * np.arange(chirp.samples))
-                # All samples of the chirp, where synchronised rows are decimated, and no turn that was estimated.
+                # All samples of the chirp, where synchronised rows are decimated; and no estimate of the phase's turn
+                # from position to position, so that motion in the bursts stays as it is.
                 unsynchronised = replace(
                     synced, samples=mixed.astype(np.complex64), sweep_hz=sample_frequencies_hz(chirp), turn=None
                 )
@@ -220,11 +221,14 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
 
     `summary`: by board, as of `SyncReport.summary`; two boards.
     """
+    # Circles and squares.
+    styles = (("o", PALETTE[0]), ("s", PALETTE[6]))
     for i, (board, content) in enumerate(summary.items()):
+        marker, colour = styles[i]
         stages = content["stages"]
         positions = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
         values = [s[f"{quantity}_std"] for s in stages.values()]
-        ax.plot(positions, values, "os"[i], ms=7, color=PALETTE[(0, 6)[i]], label=f"{board}, simulated")
+        ax.plot(positions, values, marker, ms=7, color=colour, label=f"{board}, simulated")
         key = f"{quantity}_bound"
         bound = [(x, s[key]) for x, s in zip(positions, stages.values(), strict=True) if key in s]
         ax.plot(*zip(*bound, strict=True), "_", ms=16, mew=1.6, color=INK, label=None if i else "Cramér-Rao bound")
@@ -309,8 +313,8 @@ def _draw_spectrogram(ax: Axes, samples: Complex, chirp: Chirp) -> None:
     f, t, power = scipy.signal.spectrogram(
         samples, chirp.sample_rate_hz, nperseg=48, noverlap=44, nfft=256, return_onesided=False
     )
-    f = np.fft.fftshift(f % chirp.sample_rate_hz)
-    power = np.fft.fftshift(power, axes=0)
+    # The IF is 0 to the sample rate, not -1/2 to 1/2 of it.
+    f = f % chirp.sample_rate_hz
     order = np.argsort(f)
     level = 10 * np.log10(power[order] / power.max())
     picture = ax.pcolormesh(t * 1e6, f[order] / 1e6, level, cmap="cividis", vmin=-35, vmax=0, rasterized=True)
@@ -325,10 +329,10 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
     smear = {}
     parts = {"whole chirp": ((0, chirp.samples), PALETTE[6]), "used part": (chirp.linear_samples, INK)}
     for part, ((first, last), colour) in parts.items():
-        distance_bins, level = skirt_db(chirps[..., first:last], chirp.sample_rate_hz)
-        near = (np.abs(distance_bins) > SKIRT_HZ[0]) & (np.abs(distance_bins) < SKIRT_HZ[1])
+        distance_hz, level = skirt_db(chirps[..., first:last], chirp.sample_rate_hz)
+        near = (np.abs(distance_hz) > SKIRT_HZ[0]) & (np.abs(distance_hz) < SKIRT_HZ[1])
         smear[part] = float(10 * np.log10(np.mean(10 ** (level[near] / 10))))
-        ax.plot(distance_bins / 1e6, level, color=colour, lw=1.2, label=part)
+        ax.plot(distance_hz / 1e6, level, color=colour, lw=1.2, label=part)
     style_axes(ax, "Spectrum about the tone", "IF from the tone (MHz)", "dB, 0 = peak")
     ax.set_xlim(-0.6, 0.6)
     ax.legend(fontsize=8, frameon=False, loc="upper right")

@@ -57,9 +57,10 @@ class Synchroniser:
         self._beam = np.exp(-2j * np.pi * middle / SPEED_OF_LIGHT_M_S * (path - path[0])).astype(np.complex64)
         self._n = np.arange(chirp.samples)
         self._n_single = self._n.astype(np.float32)
-        self._wide = scipy.signal.ZoomFFT(self._b - self._a, [0, RANGE_BINS], RANGE_BINS, fs=RANGE_BINS)
-        fine = (2 * np.arange(ZOOM) / ZOOM - 1) / RANGE_BINS
-        self._fine = np.exp(-2j * np.pi * np.outer(np.arange(self._b - self._a), fine)).astype(np.complex64)
+        # Spectrum of the linear samples at all range bins; and, as a matrix, at points within a bin of zero.
+        self._to_bins = scipy.signal.ZoomFFT(self._b - self._a, [0, RANGE_BINS], RANGE_BINS, fs=RANGE_BINS)
+        near_zero = (2 * np.arange(ZOOM) / ZOOM - 1) / RANGE_BINS
+        self._zoom = np.exp(-2j * np.pi * np.outer(np.arange(self._b - self._a), near_zero)).astype(np.complex64)
 
     def decode(self, payload: NDArray[np.uint8], chirps: int) -> Complex:
         """Convert one position's bytes to complex64 [rx, chirp, sample]: I of RX1..RX4, then Q, for every sample."""
@@ -83,10 +84,10 @@ class Synchroniser:
         """
         frequency, phase = (part[:, None] for part in self.offsets(chirps))
         if self._tuned:
-            turns = np.float32(2 * np.pi) * frequency.astype(np.float32) * self._n_single + phase.astype(np.float32)
-            turn = np.empty(turns.shape, np.complex64)
-            turn.real = np.cos(turns)
-            turn.imag = -np.sin(turns)
+            angle = np.float32(2 * np.pi) * frequency.astype(np.float32) * self._n_single + phase.astype(np.float32)
+            turn = np.empty(angle.shape, np.complex64)
+            turn.real = np.cos(angle)
+            turn.imag = -np.sin(angle)
             return (chirps * turn).mean(axis=1)
         out = np.empty_like(chirps)
         # As published: each RX makes the same factors again, in double precision.
@@ -135,7 +136,7 @@ class Synchroniser:
         if self._tuned:
             beam = self._beam @ linear
         if beam is None:
-            spectrum = self._beam @ self._wide(linear)
+            spectrum = self._beam @ self._to_bins(linear)
         else:
             spectrum = np.asarray(scipy.fft.fft(beam, RANGE_BINS))
         power = np.abs(spectrum)
@@ -143,11 +144,13 @@ class Synchroniser:
         peaks, _ = scipy.signal.find_peaks(power, height=power.max() / 2, distance=2)
         best = int(peaks[0] if len(peaks) else power.argmax())
         if beam is not None:
+            # Tuned: the sum, mixed down by the peak's bin, is looked at within a bin of zero.
             turned = beam * np.exp(np.float32(-2 * np.pi * best / RANGE_BINS) * 1j * self._n_single[: len(beam)])
-            frequency = (best + 2 * int(np.abs(turned @ self._fine).argmax()) / ZOOM - 1) / RANGE_BINS
+            frequency = (best + 2 * int(np.abs(turned @ self._zoom).argmax()) / ZOOM - 1) / RANGE_BINS
             turn = np.exp(np.float32(-2 * np.pi * frequency) * 1j * (self._n_single - self._a))
             phase = float(np.angle(beam @ turn[self._a : self._b]))
             return mean * turn * (self._beam * np.exp(-1j * phase)).astype(np.complex64)[:, None], phase
+        # As published: each RX within a bin of the peak, then once more the whole spectrum, of which bin 0 is read.
         near = scipy.signal.ZoomFFT(linear.shape[1], [best - 1, best + 1], ZOOM, fs=RANGE_BINS)
         frequency = (best + 2 * int(np.abs(self._beam @ near(linear)).argmax()) / ZOOM - 1) / RANGE_BINS
         moved = (mean * np.exp(-2j * np.pi * frequency * (self._n - self._a))).astype(np.complex64)
@@ -214,15 +217,15 @@ def form_image(
     for rx in range(n_rx):
         spectrum = np.asarray(scipy.fft.fft(cube[rx, :, :, a:b], points))
         bins = np.round(excess[rx] / SPEED_OF_LIGHT_M_S * chirp.hz_per_sample * points).astype(int)
-        turns = (-2 * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(np.float32)
+        angle = (-2 * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(np.float32)
         wave = None
         if tuned:
-            wave = np.exp(1j * turns)
+            wave = np.exp(1j * angle)
         for n in range(int(bins.min()), int(bins.max()) + 1):
             if wave is not None:
                 kernel = np.where(bins == n, wave, 0)
             else:
-                kernel = np.exp(1j * turns) * (bins == n)
+                kernel = np.exp(1j * angle) * (bins == n)
             kernel = np.asarray(scipy.fft.fft2(kernel, shape))
             total += kernel * np.asarray(scipy.fft.fft2(spectrum[:, :, n % points], shape))
         if not tuned:

@@ -58,7 +58,7 @@ _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBU
 def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
     """Set native radar control in the rig file's table: an entry for each board, and a start offset of the receivers.
 
-    A start offset in the rig file stays. The board's address follows in `move_to_subnet`.
+    A start offset in the rig file stays. The board's address follows in `move_to_free_subnet`.
     """
     names = [board["name"] for board in table["boards"]]
     table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}

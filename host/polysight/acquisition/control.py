@@ -173,6 +173,7 @@ def read_start_ticks(pid: int) -> int | None:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return None
+    # Fields of proc(5) after the name: the state ("Z": ended, but not yet reaped), and as the 20th the start time.
     fields = text.rpartition(")")[2].split()
     if fields[0] == "Z":
         return None

@@ -663,11 +663,9 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
 
 
 def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) -> dict[str, float]:
-    """Return the share of each source in the variance of a permittivity `value`, to first order.
-
-    They add up to 1; empty if the variance is zero or not finite.
-    """
-    # Effect of one source: its columns vary as in the particles, all others stay at their mean.
+    """Return the share of each source in a permittivity's variance, sum 1; empty if that is zero or not finite."""
+    # Effect of one source: its columns vary as in the particles, all others stay at their mean. Its part of the
+    # variance is its covariance with the whole error, so that correlated sources add up to the whole.
     mean = np.tile(z.mean(axis=0), (len(z), 1))
     of_all = model.permittivities(z)[:, i] - value
     slope_at_mean = permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])

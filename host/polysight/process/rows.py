@@ -207,13 +207,14 @@ class KeptSamples:
         self.filled = self.images
         self._builders = {"samples": self.images}
         self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}
+        # Rows without the sub-bands of those on disk are not added to them.
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
 
     def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
-        """Return the gate on disk (without samples: the usual one) if it covers the needed one, else the latter.
+        """Return the gate of the samples on disk if it covers the needed one, else the needed one.
 
-        In the latter case, and if the samples on disk are damaged, these are forgotten; rows of the needed gate are not
-        kept.
+        Without samples on disk, or if they are damaged, the usual gate stands for theirs. If the needed gate is
+        returned, samples on disk are not used, and no rows are kept.
         """
         gate_on_disk = tuple(self._head.get("gate_m", usual))
         if self._head and not _has_frequencies(self._head, rig, gate_on_disk, usual):

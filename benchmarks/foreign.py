@@ -61,7 +61,7 @@ class Piece:
 
 
 def draw_scene(rng: np.random.Generator, kind: str, first: int) -> World:
-    """Draw copper and eight pieces of a kind; plates take the materials from number `first` on, in turn."""
+    """Draw copper and eight pieces of a kind; plates are of eight of the nine materials from number `first` on."""
     centre = tuple(published_rig().centre_m)
     stacks: dict[str, complex | Stack]
     if kind == "plates":
@@ -156,7 +156,9 @@ def format_line(title: str, pieces: Sequence[Piece]) -> str:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of the benchmark."""
-    parser.add_argument("--scenes", type=int, default=4, help="scenes of each kind; four hold each material once")
+    parser.add_argument(
+        "--scenes", type=int, default=4, help="scenes of each kind; four hold most of the 30 materials of plates"
+    )
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--nuisances", default="none,all", help="separated by commas")
     parser.add_argument("--jobs", type=int, default=2, help="processes")

@@ -459,7 +459,7 @@ def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instru
     )
 
 
-def first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
+def time_before_first_pulse_ns(events: list[ReceivedCapture]) -> int | None:
     """Return a time shortly before the row's first pulse, in the pause before its first burst.
 
     None of its frames was sent before. Host's monotonic clock, from the row's capture events; None if undetermined.

@@ -625,7 +625,7 @@ class RowTaker:
         """Stop the records and make the rows durable; notify while a slow disk delays this."""
         started_s = time.monotonic()
         with ThreadPoolExecutor(1, thread_name_prefix="disk") as executor:
-            ending = executor.submit(self._rig.end_row, pulse_times.first_pulse_ns(take.events) or 0)
+            ending = executor.submit(self._rig.end_row, pulse_times.time_before_first_pulse_ns(take.events) or 0)
             while not wait([ending], _DISK_NOTICE_S).done:
                 waited_s = time.monotonic() - started_s
                 self._notify("wait", f"row {take.row.index} is not written after {waited_s:.0f} s: the disk is slow")

@@ -173,6 +173,7 @@ def fit_places(
     # In the order of `Prior.scale`: shift of each board, distance of the plane, x, y and rotation of the target.
     start = np.zeros(scale.size)
     start[-3:-1] = _find_target(boards, centre, points_mm)
+    # The misfit has real and imaginary part of each sample, then the terms of the prior.
     size = sum(b.samples.size for b in boards)
     sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
     fit: Any = None

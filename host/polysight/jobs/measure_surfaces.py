@@ -102,7 +102,8 @@ def load_sphere_points(file: SphereFile) -> surfaces.Seen:
     """Return the points of a metal sphere from its calibration file."""
     h = _parse_echoes(np.array(file.points["h"]))
     v = _parse_echoes(np.array(file.points["v"]))
-    return surfaces.Seen(h, v, np.zeros(len(h), int))
+    # All points are of one segment, the sphere.
+    return surfaces.Seen(h, v, segment=np.zeros(len(h), int))
 
 
 def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
@@ -138,16 +139,16 @@ def thin_out(metal: surfaces.Seen) -> surfaces.Seen:
 
 
 def analyse_points(
-    pipeline: Pipeline, optics: surfaces.Optics, seen_rows: surfaces.Seen, gains: surfaces.Reference | None = None
+    pipeline: Pipeline, optics: surfaces.Optics, seen_rows: surfaces.Seen, reference: surfaces.Reference | None = None
 ) -> surfaces.Surface:
-    """Return the surfaces of a scan's points, named; without `gains` those of the calibration's sphere count."""
+    """Return the surfaces of a scan's points, named; without a metal `reference` the calibration's sphere is it."""
     calibration = pipeline.calibration
-    if gains is None and calibration.sphere is not None:
-        gains = make_reference(load_sphere_points(calibration.sphere))
+    if reference is None and calibration.sphere is not None:
+        reference = make_reference(load_sphere_points(calibration.sphere))
     surface = surfaces.analyse_surface(
         seen_rows,
         optics,
-        gains,
+        reference,
         uncertainty=find_uncertainty(pipeline.rig, places_known=calibration.places is not None),
         scan_id=pipeline.source.scan_id,
         simulated=pipeline.source.simulated,

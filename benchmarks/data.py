@@ -72,7 +72,7 @@ def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[
     for row in itertools.islice(plan, first, first + count):
         x, y = row_offsets_mm(radar, row)
         for name, board_rows in rows.items():
-            board_rows.append(radar.chirps(name, x, y, row.index * len(x)))
+            board_rows.append(radar.chirps(name, x, y, first_pulse=row.index * len(x)))
     return rows
 
 
@@ -174,13 +174,14 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     nodes = np.linspace(sweep[0], sweep[-1], 24)
     low, high = scene_gate_m((antennas,), plan, grid)
-    turns = 2j * np.pi / SPEED_OF_LIGHT_M_S * np.linspace(low, high, 200)[:, None]
-    expand = np.linalg.lstsq(np.exp(turns * nodes), np.exp(turns * sweep), rcond=1e-9)[0].astype(np.complex64)
+    # An echo's phase per hertz, by path.
+    exponent = 2j * np.pi / SPEED_OF_LIGHT_M_S * np.linspace(low, high, 200)[:, None]
+    expand = np.linalg.lstsq(np.exp(exponent * nodes), np.exp(exponent * sweep), rcond=1e-9)[0].astype(np.complex64)
     shape = len(antennas.rx_m), plan.rows, plan.columns, chirp.samples
     cube = np.lib.format.open_memmap(path, "w+", np.complex64, shape)
     for row in plan:
-        met = point_row(rig, antennas, row, points, nodes).astype(np.complex64) @ expand
-        cube[:, row.index] = met[:, :: row.direction]
+        samples = point_row(rig, antennas, row, points, nodes).astype(np.complex64) @ expand
+        cube[:, row.index] = samples[:, :: row.direction]
     cube.flush()
 
 

@@ -76,7 +76,7 @@ class Network(NamedTuple):
 
     @staticmethod
     def decode(body: bytes) -> Network:
-        """Parse the 18 bytes of command 0x04. Raises ProtocolError if there are not 18."""
+        """Parse the 18 bytes of command 0x04, addresses from their last byte. Raises ProtocolError for other sizes."""
         if len(body) != 18:
             raise ProtocolError(f"EEPROM body of {len(body)} bytes, expected 18")
         host = body[3::-1]

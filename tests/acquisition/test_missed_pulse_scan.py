@@ -11,6 +11,7 @@ from tests.support.store.plain_scan import errors
 from polysight.acquisition import pulse_times
 from polysight.acquisition.pulse_times import ReceivedCapture
 from polysight.acquisition.scan import run_scan
+from polysight.capture.dca1000 import Code
 from polysight.capture.row_files import read_index
 
 POINTS = 8
@@ -77,3 +78,14 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(timed_rig, paylo
     for name, pulses in missed.items():
         assert check_unmasked(result, payload, name)[sorted(pulses)].all()
         assert facts_of(result.folder, "row_committed")[0]["boards"][name]["pulses_missed"] == len(pulses)
+
+
+def test_a_card_is_reset_behind_a_row_whose_frames_came_at_other_times(timed_rig, tmp_path):
+    """A spurious edge and as many lost packets at the end leave the length right: the next start is one frame off."""
+    timed_rig.cards["RH"].extra[0, 1] = 20
+    result = run_scan(timed_rig.instrument, tmp_path / "s")
+    assert (result.exit_status, result.retakes) == ("success", 1)
+    assert {name: card.codes_received.count(Code.RESET_FPGA) for name, card in timed_rig.cards.items()} == {
+        "RH": 2,
+        "RV": 1,
+    }

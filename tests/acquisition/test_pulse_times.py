@@ -74,6 +74,15 @@ def test_frames_are_kept_up_to_where_frames_and_packets_last_began_together(miss
     assert all("SYNC_IN" in describe(r, PULSES) for r in results)
 
 
+@pytest.mark.parametrize("bursts", [1, 2])
+def test_a_whole_row_of_too_few_bursts_is_not_contradicted(bursts):
+    pulses = pulse_times(bursts)
+    arrivals, answer = receive(pulses.reshape(-1), pulses, FRAME, np.random.default_rng(1))
+    placed = place(pulses, answer, arrivals)
+    assert (placed.is_timed, placed.contradicted) == (False, False)
+    assert "needs 3 bursts" in placed.reason
+
+
 def test_undetermined_frames_are_masked_each_for_its_own_reason():
     pulses = pulse_times(BURSTS)
     rng = np.random.default_rng(1)

@@ -289,6 +289,21 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
         client.require_alone()
 
 
+def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_card, monkeypatch):
+    """Cards were exchanged, or a second one with this address answers now; what the kernel forgot says nothing."""
+    client, _ = scripted_card(lambda code, _: [reply(code, 0)])
+    known = {"mac": "12:34:56:78:90:12"}
+    monkeypatch.setattr(card, "neighbour_mac", lambda _: known["mac"])
+    client.require_alone()
+    client.record_start()
+    for forgotten in (None, ""):
+        known["mac"] = forgotten
+        client.record_start()
+    known["mac"] = "12:34:56:78:90:13"
+    with refused(ErrorCode.VALUES_CONFLICT, "12:34:56:78:90:12 and 12:34:56:78:90:13"):
+        client.record_start()
+
+
 def test_second_cards_are_told_of_every_board(rig, cards, monkeypatch):
     names = [board.name for board in rig.boards]
     cards(*names, **dict.fromkeys(names, Faults(twin=True)))

@@ -118,6 +118,10 @@ class CaptureRig:
         for card in self.cards.values():
             card.record_start()
 
+    def reset_before_next_row(self, name: str) -> None:
+        """Reset this card before the next row: it is uncertain where its last record ended."""
+        self._start_lost.add(name)
+
     @property
     def complete(self) -> bool:
         """True if every expected byte of the row has arrived, on every board."""

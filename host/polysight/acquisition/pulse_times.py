@@ -368,6 +368,8 @@ def _predict_arrivals(
     Raises _DisturbedError if too few bursts agree, _UndeterminedError if the clocks cannot be compared.
     """
     bursts, count = pulses_ns.shape
+    if bursts < _AGREEING:
+        raise _UndeterminedError(f"the offset between the clocks needs {_AGREEING} bursts")
     pauses = _find_pauses(pulses_ns, received_ns)
     came_ns = entries[:, 0]
     frame = (entries[:, 1] - 1) // frame_bytes

@@ -637,6 +637,9 @@ class RowTaker:
             path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
             if capture.located or capture.slipped:
                 take.frames[name] = pulse_times.find_frames(path, take.row, take.events, self._instrument)
+                if take.frames[name].contradicted:
+                    # Another number of frames may have been sent than came: lost with the end of the record.
+                    self._rig.reset_before_next_row(name)
 
 
 class _SilenceCheck:

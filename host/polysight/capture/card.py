@@ -75,6 +75,8 @@ class CardClient:
         self._address = (board.card_address, board.command_port)
         self._socket = bind_udp(board.host_address, board.command_port, f"{board.name} commands")
         self._status = Status(0)
+        # MAC addresses that the kernel has had for the card's address.
+        self._macs: set[str] = set()
         # Datagrams that were neither replies nor status of this card.
         self.strangers = 0
 
@@ -95,7 +97,7 @@ class CardClient:
 
         Raises DeviceError if there are two, or no answer. A second card sends whole rows that look like this one's.
         """
-        macs = {neighbour_mac(self.board.card_address)}
+        self._note_mac()
         versions: list[Version] = []
         requests = 0
         while not versions:
@@ -111,20 +113,29 @@ class CardClient:
             reply = self._receive(remaining_s)
             if reply is not None and reply.code == Code.VERSION:
                 versions.append(dca1000.decode_version(reply.status))
-        macs.add(neighbour_mac(self.board.card_address))
-        macs = set(filter(None, macs))
-        if len(versions) > requests or len(macs) > 1:
-            asked = "one request" if requests == 1 else f"{requests} requests"
-            answers = f"{len(versions)} answers to {asked} (FPGA {', '.join(map(str, versions))})"
-            if len(macs) > 1:
-                answers += f", MAC addresses {' and '.join(sorted(macs))}"
-            raise DeviceError(
-                f"{self._name()}: {answers}",
-                "two cards have this address, or the network doubles packets: rows of either look like the other's",
-                "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
-                f" `arping {self.board.card_address}` shows who answers",
-                code=ErrorCode.VALUES_CONFLICT,
-            )
+        asked = "one request" if requests == 1 else f"{requests} requests"
+        answers = f"{len(versions)} answers to {asked} (FPGA {', '.join(map(str, versions))})"
+        self._note_mac(answers)
+        if len(versions) > requests:
+            raise self._twin_error(answers)
+
+    def _note_mac(self, *answers: str) -> None:
+        """Raise DeviceError, with the `answers`, if this address has had two MAC addresses since the first call."""
+        mac = neighbour_mac(self.board.card_address)
+        if mac:
+            self._macs.add(mac)
+        if len(self._macs) > 1:
+            raise self._twin_error(*answers, f"MAC addresses {' and '.join(sorted(self._macs))}")
+
+    def _twin_error(self, *seen: str) -> DeviceError:
+        return DeviceError(
+            f"{self._name()}: {', '.join(seen)}",
+            "two cards have this address or were exchanged, or the network doubles packets: rows of either look like"
+            " the other's",
+            "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
+            f" `arping {self.board.card_address}` shows who answers",
+            code=ErrorCode.VALUES_CONFLICT,
+        )
 
     def configure(self, card: Card, lanes: int = 4) -> None:
         """Configure raw 16-bit capture of `lanes` LVDS lanes to Ethernet, and the packet delay. Raises DeviceError."""
@@ -153,7 +164,10 @@ class CardClient:
         return self.take_status()
 
     def record_start(self) -> None:
-        """Start a record; before a retry it is stopped, because it may run already. Raises DeviceError."""
+        """Start a record; before a retry it is stopped, because it may run already.
+
+        Raises DeviceError, also if another card than before answers at this address.
+        """
         for attempt in range(ATTEMPTS):
             self.take_status()
             # Errors that the previous record left do not belong to this one.
@@ -163,6 +177,7 @@ class CardClient:
             self._status &= ~Status.RECORD_COMPLETED
             if reply is not None:
                 self._check(reply, Code.RECORD_START)
+                self._note_mac()
                 return
             if attempt < ATTEMPTS - 1:
                 self.record_stop()

@@ -556,6 +556,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
         phasors = mean / np.abs(mean)
+        # The phases of the RX agree once their lags behind the first (at the middle frequency) are removed, or as
+        # they are.
         if abs((phasors * lag[:, (a + b) // 2].conj()).sum()) > abs(phasors.sum()):
             turn = turn * lag.conj()
             form.append("all RX referenced to the direct path of one")

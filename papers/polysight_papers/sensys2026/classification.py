@@ -99,7 +99,7 @@ def noise_text(tasks: Iterable[str], quick: bool) -> str:
     )
 
 
-def _parse_angles(task: str) -> tuple[float, ...]:
+def _list_angles_deg(task: str) -> tuple[float, ...]:
     """Return the incidence angles of a task, degrees."""
     name, _, two = task.partition(", ")
     if two:
@@ -119,7 +119,7 @@ def accuracy_over_draws(quick: bool) -> Table:
         errors = calibrated_errors(name, count_draws(quick))
         # In the order of the kinds below.
         limits = [
-            pixel_bound(groups()[name].materials, _parse_angles(task), errors, reference, pixels)
+            pixel_bound(groups()[name].materials, _list_angles_deg(task), errors, reference, pixels)
             for reference, pixels in ((True, 1), (False, 1), (False, PIXELS))
         ]
         cells = []
@@ -221,7 +221,7 @@ class TaskScores:
             (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
             (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
         )
-        angle = " and ".join(f"{a:.0f}°" for a in _parse_angles(task))
+        angle = " and ".join(f"{a:.0f}°" for a in _list_angles_deg(task))
         return Picture(
             confusion_figure(groups()[task.partition(", ")[0]].materials, panels),
             f"{task[0].upper()}{task[1:]} at {angle}, whole scans left out. Rows are the truth and add up to 100 %; the"
@@ -423,7 +423,8 @@ def pixel_bound(
     columns = []
     std = []
     for angle in angles_deg:
-        # H is s, V is p; metal reflects -1 in both, which changes neither magnitudes nor their ratio.
+        # H is s, V is p; metal reflects -1 in both, which changes neither magnitudes nor their ratio. The phase of P is
+        # that of H minus that of V: two independent errors.
         r_s, r_p = fresnel(eps, np.radians(angle))
         p = r_s / r_p
         columns += [np.log(np.abs(r_s)), np.log(np.abs(r_p)), p / np.abs(p)]

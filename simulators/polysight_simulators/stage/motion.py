@@ -217,6 +217,7 @@ class StepEngine:
             clear_major = clear_y
             clear_minor = clear_x
         steps_before_braking = self.left - self.ramp - 1
+        # Step k after the next one is due (k TICK_HZ + carry) // rate ticks after it.
         steps_in_time = ((wait_ticks + 1) * rate - 1 - self.carry) // TICK_HZ + 1
         n = min(steps_before_braking, steps_in_time, clear_major)
         if self.points_left:

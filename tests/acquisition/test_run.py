@@ -23,6 +23,7 @@ from polysight.acquisition import capture_rig
 from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.scan import resume_scan, run_scan, takes_so_far
+from polysight.capture import card
 from polysight.capture.dca1000 import Code
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
@@ -332,6 +333,25 @@ def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path)
     result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert (card.codes_received.count(CONFIGURE), rig.cards["RV"].codes_received.count(CONFIGURE)) == (4, 2)
+
+
+def test_a_scan_is_not_resumed_with_the_cards_of_two_boards_exchanged(rig, tmp_path, monkeypatch):
+    """Nothing in a packet says whose it is: the manifest has the MAC address of each row's card, from the kernel."""
+    macs = {rig.cards[name].board.card_address: f"12:34:56:78:90:{name}" for name in ("RH", "RV")}
+    monkeypatch.setattr(card, "neighbour_mac", macs.get)
+    stop = StopRequest()
+    run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
+    row = facts_of(tmp_path / "s", "row_committed")[0]
+    assert {name: board["card_mac"] for name, board in row["boards"].items()} == {
+        "RH": "12:34:56:78:90:RH",
+        "RV": "12:34:56:78:90:RV",
+    }
+    addresses = list(macs)
+    macs.update(zip(addresses, [macs[address] for address in reversed(addresses)], strict=True))
+    with refused(ErrorCode.MISMATCH, "RH", "RV", "12:34:56:78:90:RV"):
+        resume_scan(tmp_path / "s")
+    macs.update(zip(addresses, ["12:34:56:78:90:RH", "12:34:56:78:90:new"], strict=True))
+    assert resume_scan(tmp_path / "s").exit_status == "success"
 
 
 @pytest.mark.parametrize(("limit_s", "warned"), [(0.25, True), (3.0, False)])

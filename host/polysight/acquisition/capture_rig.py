@@ -10,6 +10,8 @@ from collections.abc import Collection
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from polysight.capture import (
     CardClient,
     Progress,
@@ -154,7 +156,10 @@ class CaptureRig:
             if not receiver.poll().complete:
                 self.cards[name].wait_completed(max(0.0, deadline - time.monotonic()))
         statuses = self.statuses()
-        rows = {name: receiver.end_row(statuses[name], not_before_ns) for name, receiver in self.receivers.items()}
+        rows = {
+            name: replace(receiver.end_row(statuses[name], not_before_ns), card_mac=self.cards[name].mac)
+            for name, receiver in self.receivers.items()
+        }
         self._start_lost = {name for name, row in rows.items() if row.start_lost}
         return rows
 

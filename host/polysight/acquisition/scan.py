@@ -568,6 +568,7 @@ def resume_scan(
         scan.reload()
         withdrawn = _withdraw_damaged(scan, writer, progress)
         pi, rig, hello = _connect(stack, rig_now or scan.instrument, progress)
+        _check_cards(scan, rig)
         if is_simulated(hello.backend) != scan.simulated:
             kind = "simulated" if scan.simulated else "of the real rig"
             raise ScanError(
@@ -625,6 +626,24 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
         writer.append(RowWithdrawn(row=row, take=rows[row].take, reasons=faults, withdrawn_utc=utc_now()))
     scan.reload()
     return [f"row {row} is taken again: {'; '.join(faults)}" for row, faults in damaged.items()]
+
+
+def _check_cards(scan: ScanFolder, rig: CaptureRig) -> None:
+    """Raise ScanError if a card sent another board's rows so far, by its MAC address: boards would be exchanged."""
+    sent: dict[str, set[str]] = {name: set() for name in rig.cards}
+    for row in scan.committed_rows().values():
+        for name, board in row.boards.items():
+            sent[name].add(board.card_mac)
+    for name, card in rig.cards.items():
+        others = [other for other, macs in sent.items() if card.mac in macs]
+        if card.mac and others and name not in others:
+            raise ScanError(
+                f"the card of {name} at {card.board.card_address} sent the rows of {others[0]} so far"
+                f" (MAC address {card.mac})",
+                "cards or their addresses were exchanged: later rows would be another board's",
+                "exchange them back, or begin another scan",
+                code=ErrorCode.MISMATCH,
+            )
 
 
 def _copy_calibration(instrument: Instrument, folder: Path, simulated: bool) -> dict[str, Any]:

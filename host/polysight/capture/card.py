@@ -84,6 +84,11 @@ class CardClient:
         """Return the descriptor that becomes readable when the card reports a status."""
         return self._socket.fileno()
 
+    @property
+    def mac(self) -> str:
+        """MAC address of the card; "" if the kernel does not know it."""
+        return next(iter(self._macs), "")
+
     def alive(self) -> None:
         """Check that the card replies; otherwise raise DeviceError with the first hop that does not work."""
         self._send_command(Code.ALIVE)

@@ -237,6 +237,8 @@ class RowCapture(_Message, frozen=True):
     packets_crc32: int = 0
     # It is unknown where the card's next record begins: the card must be reset.
     start_lost: bool = False
+    # MAC address of the card; "" if unknown.
+    card_mac: str = ""
 
     @property
     def missing_bytes(self) -> int:

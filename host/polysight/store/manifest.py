@@ -107,6 +107,7 @@ class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     gap_bytes: int | None = None
     tail_bytes: int | None = None
     card_status: int | None = None
+    card_mac: str = ""
     located: bool | None = None
     received_bytes: int | None = None
     pulses_missed: int | None = None

@@ -63,7 +63,10 @@ class Cards:
         return max(sender.hear()["seconds"] for sender in self.senders)
 
     def queues(self) -> list[int]:
-        """Bytes of kernel memory that wait at each board's port."""
+        """Bytes of kernel memory that wait at each board's port.
+
+        In /proc/net/udp word 1 is the local `address:port`, word 4 the `sent:received` bytes that wait, hexadecimal.
+        """
         ports = [b.data_port for b in self.boards]
         byte_counts = [0] * len(ports)
         for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]:
@@ -159,9 +162,10 @@ class Receivers:
         `rate`: packets/s of all cards; `beside`: process whose progress meanwhile is noted.
         """
         cards = self._cards
-        in_all = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
-        rows = -(-in_all // ROW_BLOCKS)
-        blocks = round(in_all / rows)
+        blocks_of_card = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
+        rows = -(-blocks_of_card // ROW_BLOCKS)
+        # Of one card in one row; so many packets.
+        blocks = round(blocks_of_card / rows)
         packets = blocks * PACKETS
         state_before = ask(beside)
         cpu = [cpu_s(r.pid) for r in self._receivers]

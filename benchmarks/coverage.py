@@ -76,8 +76,9 @@ KINDS = ("full", "no metal", "no direct path", "noise", "empty", "named", "sheet
 metal. "no direct path": without the path from TX to RX that synchronisation needs; "noise": the same without plates.
 "empty": nothing there. "named": plates of `KNOWN`. "sheet" is "full" with one thin sheet in air that is not declared,
 "wide" is "full" with permittivities and apertures drawn from the ranges below."""
-# Kinds with a metal reference and plates that can be judged.
+# Kinds with a metal reference and plates that can be judged, and kinds that must give no result.
 WHOLE = ("full", "sheet", "wide")
+NOTHING = ("no metal", "no direct path", "noise", "empty")
 # Of "wide" scenes: ranges of the real part and of the loss tangent; chosen.
 WIDE_REAL = (2.0, 12.0)
 WIDE_LOSS_TANGENT = (0.003, 0.4)
@@ -442,8 +443,8 @@ def run(args: argparse.Namespace) -> int:
         ]
         wide_jobs = [(args.first + i, "wide", False) for i in range(args.wide)]
         wide = [r for result in pool.map(_measure_scene, wide_jobs) for r in result]
-        kinds = [(args.first + i, KINDS[1 + i % 4]) for i in range(args.without)]
-        without = list(pool.map(_judge_without_result, kinds))
+        nothing_jobs = [(args.first + i, NOTHING[i % len(NOTHING)]) for i in range(args.without)]
+        without = list(pool.map(_judge_without_result, nothing_jobs))
         named = [
             pair for result in pool.map(_read_names, range(args.first, args.first + args.named)) for pair in result
         ]
@@ -468,6 +469,7 @@ def run(args: argparse.Namespace) -> int:
     if differences:
         median_percent = 100 * float(np.median(differences))
         print(f"raw beside samples: errors of the same patches differ by {median_percent:.2f} % (median)")
+    # A verdict that allows names is printed too, but only a name or a permittivity fails.
     said = [scene for scene in without if scene.said or scene.level != "none"]
     print(f"scenes with nothing to name: {len(without)}; given a name or permittivity: {len(said)}")
     for scene in said:

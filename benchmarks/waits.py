@@ -173,6 +173,7 @@ def small_products(folder: Path) -> Path:
 
 def _report_seconds(name: str, value: float, limit: float, aim: float, note: str = "") -> Line:
     """Return a line for seconds that must not exceed the limit, and should not exceed the aim."""
+    # `at_least` holds the most that is allowed where lower is better.
     return Line(
         name, f"{value:.3f} s", theirs="", value=value, at_least=limit, aim=aim, higher_is_better=False, note=note
     )

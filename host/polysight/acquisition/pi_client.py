@@ -345,6 +345,7 @@ class PiClient:
             if isinstance(event, m.JOURNALLED) and event.seq == self._last_seq + 1:
                 self._take(event)
             elif event.seq > self._last_seq:
+                # Some were lost: an event that is not journalled has the number of the last one that is.
                 self._catch_up(event.seq)
         if time.monotonic() - self._last_heard_s > self._silence_s:
             # Heartbeats are missing: check that the Pi answers commands.

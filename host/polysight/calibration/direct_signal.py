@@ -146,6 +146,7 @@ def find_direct(
     has_direct_path = aligned.good & referenced.found[:, None]
     cycles = (referenced.frequency[:, None] + aligned.frequency)[has_direct_path]
     power = _measure_power(words[has_direct_path.ravel()], cycles, setup, drift + referenced.drift)
+    # The amplitude is a weighted sum of means of `FOLD` samples: so much of a sample's noise remains in it.
     noise = (
         _estimate_recorded_noise(aligned, referenced.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / sync.FOLD
     )

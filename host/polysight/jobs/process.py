@@ -348,6 +348,7 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     lines = (*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}")
     print_lines(lines)
     sys.stdout.flush()
+    # The images are there; quality.json is written again with the point response, which is found only now.
     pipeline.quality.note_imaging(pipeline.images, images)
     write_json(out / QUALITY, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality).quality)
     if not images.valid.any():

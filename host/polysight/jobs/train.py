@@ -154,6 +154,7 @@ def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
         raise _no_metal_error(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
     materials = analyse(pair, _read_optics(saved), KnownScene(segmentation, metal))
+    # Where it is not known, the scan counts as simulated.
     return _add_labels(saved.scan_id, materials, saved.simulated is not False, checked)
 
 

@@ -427,6 +427,7 @@ def _apply_switches(table: Any, source: str) -> Any:
                 )
             result[key] = OFF.get(key, value)
         elif value == "on" or value is True:
+            # Its default. An unknown key stays: the caller's `decode` refuses it.
             result.pop(key, None)
             if key not in Disturbances.__struct_fields__:
                 result[key] = value

@@ -155,11 +155,16 @@ class Stage(Section, frozen=True):
         ):
             half = (points - 1) / 2 * step + margin
             if half > centre or centre + half > travel:
+                remedy = "plan fewer or closer points"
+                speed_keys = ""
+                if axis == "x":
+                    remedy += ", or a lower speed"
+                    speed_keys = ", stage.speed_mm_s, stage.accel_mm_s2"
                 return (
-                    f"grid.{key} = {points} of grid.step_{axis}_mm = {step}"
-                    f" with {margin:g} mm of run-up on either side do not fit stage.travel_{axis}_mm = {travel} around"
-                    f" stage.centre_{axis}_mm = {centre}: narrow the grid, lower stage.speed_mm_s, or raise"
-                    " stage.accel_mm_s2"
+                    f"the grid does not fit the stage: {points} points {step:g} mm apart with {margin:g} mm of run-up"
+                    f" reach {half:g} mm to either side of {axis} = {centre:g} mm, and the stage has {travel:g} mm:"
+                    f" {remedy}"
+                    f" (grid.{key}, grid.step_{axis}_mm{speed_keys}, stage.centre_{axis}_mm, stage.travel_{axis}_mm)"
                 )
         return ""
 

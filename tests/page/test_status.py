@@ -61,6 +61,35 @@ def test_a_dead_program_outranks_everything_but_the_end(history):
     assert status(history, killed_signs).headline == "Stopped on request"
 
 
+def test_a_started_program_hangs_once_its_run_has_begun(history):
+    """Before it has written anything, the signs of life are those of the run before."""
+    lifeless = replace(LIVELY, alive=False)
+    started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
+    assert status(history, lifeless, program=started).key == "frozen"
+    resumed = replace_struct(started, started_utc="2100-01-01T00:00:00+00:00")
+    assert status(history, lifeless, program=resumed).key == "resuming"
+    add_fact(history, {"fact": "scan_resumed", "resumed_utc": "2100-01-01T00:00:01+00:00"})
+    s = status(history, lifeless, program=resumed)
+    assert (s.key, s.press) == ("frozen", ("abort", "resume"))
+
+
+def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
+    """It writes its first sign of life when it does."""
+    started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
+    facts = facts_of(finished)
+    history = begin_history(facts[0])
+    quiet = replace(LIVELY, life=None)
+    between_rows = replace(RUNNING, row=-1)
+    s = status(history, quiet, between_rows, program=started)
+    assert (s.key, s.press) == ("starting", ())
+    add_fact(history, next(f for f in facts if f["fact"] == "row_committed"))
+    assert status(history, quiet, between_rows, program=started).key == "rows"
+    add_fact(history, {"fact": "scan_resumed", "resumed_utc": "2090-01-01T00:00:01+00:00"})
+    assert status(history, quiet, between_rows, program=started).key == "resuming"
+    assert status(history, quiet, program=started).key == "rows"
+    assert status(history, LIVELY, between_rows, program=started).key == "rows"
+
+
 @pytest.mark.parametrize(
     ("signs", "heard", "word"),
     [
@@ -137,6 +166,10 @@ def test_an_abort_is_no_fault(history):
     s = status(history, replace(LIVELY, alive=False, life=None))
     assert (s.key, s.press) == ("aborted", ("resume", "repeat"))
     assert "the page" in s.detail
+    # The program's own words on leaving, which are those of an error.
+    failure = Finding("error", "scans/one: stopped on request, 2 of 3 rows are missing")
+    told = make_snapshot(Inputs(FOLDER, history, replace(LIVELY, alive=False, life=None), failure=failure))
+    assert [notice.level for notice in told.notices] == ["note", "note"]
 
 
 def test_there_is_no_result_before_materials(history):

@@ -154,6 +154,18 @@ def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watchin
     assert answer(watch)["status"]["level"] == "done"
 
 
+def test_a_new_scan_of_an_old_name_has_nothing_of_the_old_one(growing, watching):
+    growing.grow_until("row_committed")
+    watch = watching(growing.path, lapse_s=1e6)
+    watch.wait_for(shows(1))
+    shutil.rmtree(growing.path)
+    watch.wait_for(lambda s: s["status"]["key"] == "folder_gone")
+    # Its program has not written a manifest yet.
+    growing.path.mkdir()
+    watch.wait_for(lambda s: s["status"]["key"] == "empty")
+    assert answer(watch)["scan"] is None
+
+
 def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(finished, folder)

@@ -440,8 +440,28 @@ def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
     assert "Positions in a row" in said
     assert "columns" not in said
     assert page.browser.value("document.getElementById('start').disabled")
-    # The refused request
+    page.browser.fill("#columns", "900")
+    page.browser.wait("document.getElementById('plan-wrong')?.innerText.includes('900')", "the refusal")
+    said = page.browser.text("plan-wrong")
+    assert "does not fit the stage" in said
+    assert not re.search(r"\w_\w|stage\.|grid\.|changed|rule of its format", said), said
+    wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map((field) => field.id).join()"
+    assert page.browser.value(wrong) == "columns,step_x_mm,speed_mm_s"
+    # The refused requests
     page.browser.errors.clear()
+
+
+def test_a_scan_that_was_stopped_on_request_has_not_failed(page, scans):
+    """Its program leaves with the exit status of a scan that is not complete."""
+    record = ProgramRecord(pid=1, ticks=0, words=["polysight", "scan"], started_utc="2026-01-01T00:00:00+00:00")
+    folder = scans / "one" / PROGRAM
+    folder.mkdir()
+    (folder / "scan.json").write_bytes(msgspec.json.encode(record))
+    (folder / "scan.status").write_text("6\n", encoding="utf-8")
+    for end, said in (("stopped on request, 2 of 3 rows are missing", "was stopped on request"), ("", "has failed")):
+        (folder / "scan.log").write_text(f"1 of 3 rows, 0:40 left\nend: {end}\n", encoding="utf-8")
+        page.open("/scan?scan=one")
+        page.browser.wait(f"document.getElementById('program-title').innerText.includes('{said}')", said)
 
 
 def test_metal_is_drawn_for_processing_again(page):

@@ -15,7 +15,7 @@ import msgspec
 
 from polysight.acquisition import STATES, Button, Life, StateLevel, time_left
 from polysight.catalogue import Picture, Program
-from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, sentence
+from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, seconds, sentence
 from polysight.results import Verdict
 from polysight.store import ScanEnded
 from polysight_shared.errors import quote
@@ -330,7 +330,8 @@ def _collect_notices(inputs: Inputs) -> list[Finding]:
         cause = "It was written by another release, or is damaged"
         notices.append(Finding("warning", inputs.problem, cause, f"`polysight validate {quote(inputs.folder)}`"))
     history = inputs.history
-    if inputs.failure is not None:
+    stopped_on_request = history is not None and history.ended is not None and history.ended.exit_status == "abort"
+    if inputs.failure is not None and not stopped_on_request:
         notices.append(inputs.failure)
     if history is not None:
         if inputs.pi.deaf is not None and history.ended is None:
@@ -491,9 +492,8 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
     signs = inputs.signs
     folder = str(inputs.folder)
     safe = _describe_safe_rows(history)
-    program = inputs.program
-    if not signs.alive and program is not None and program.kind == "scan" and program.running:
-        return say("resuming", safe=safe)
+    if _connects(inputs, history):
+        return say("resuming" if history.takes else "starting", safe=safe)
     if signs.killed or (not signs.alive and signs.life is None):
         return say("killed", safe=safe, folder=folder)
     if not signs.alive:
@@ -501,6 +501,19 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
     if signs.pi_silent_s is not None and signs.pi_silent_s > signs.pi_limit_s:
         return say_since("pi_silent", inputs.pi.heard_utc_s)
     return _judge_request(signs.life or Life(), history, folder)
+
+
+def _connects(inputs: Inputs, history: ScanHistory) -> bool:
+    """True if the program that a page started does not take commands yet: it has given no sign of life of its own."""
+    signs = inputs.signs
+    program = inputs.program
+    if program is None or program.kind != "scan" or not program.running:
+        return False
+    if signs.alive:
+        has_begun_a_row = inputs.pi.row >= 0 or history.last_commit_s > history.run_started_s
+        return signs.life is None and not has_begun_a_row
+    # The signs of life are those of an earlier run until the manifest says that this one has begun.
+    return seconds(program.started_utc) > history.run_started_s
 
 
 def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | None:

@@ -193,8 +193,9 @@ export const STATES = {};
 export const VERDICTS = { good: ["good", "good"], care: ["usable with care", "warn"], none: ["no result", "bad"], damaged: ["products damaged", "bad"] };
 
 /** How a program of `polysight` stands: 7 is the exit status of a scan that supports no result. */
-export function ending({ running, status }) {
+export function ending({ running, status, log }) {
   if (running) return "runs";
+  if (/^end: stopped on request/m.test(log)) return "was stopped on request";
   if (status === 0) return "has ended";
   if (status === 7) return "has ended without a result";
   return `has failed${status === null ? ": it was killed" : ` (exit status ${status})`}`;
@@ -234,6 +235,8 @@ async function watchRunning(told) {
     for (const scan of runs ?? []) if (!now.some((s) => s.name === scan.name)) tellEnd(scan.name);
     for (const scan of now) if (scan.state !== "running" && runs?.some((s) => s.name === scan.name && s.state === "running")) tellEnd(scan.name);
     if (JSON.stringify(now) !== JSON.stringify(runs)) showRunning(now, told);
+    const asks = by("confirm")?.dataset.scan;
+    if (asks && runs?.some((s) => s.name === asks) && !now.some((s) => s.name === asks && s.doing === "rows")) by("confirm").close("ended");
     runs = now;
   } catch (error) { if (!(error instanceof Refused)) throw error; }
   setTimeout(() => watchRunning(told), RUNNING_MS);
@@ -275,6 +278,7 @@ async function tellEnd(name) {
 export function confirmAbort(scan, told = alertError) {
   by("confirm")?.remove();
   const dialog = make("dialog", null, null, { id: "confirm", "aria-label": "Abort" });
+  dialog.dataset.scan = scan;
   const form = make("form", null, null, { method: "dialog" });
   form.append(make("button", "Keep scanning", null, { value: "no" }), make("button", "Abort now", "danger", { value: "yes" }));
   dialog.append(nest(make("p"), make("strong", "Stop the stage now?")),

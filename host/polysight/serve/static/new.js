@@ -47,7 +47,7 @@ async function plan() {
 
 /** The same error with fields called as the page calls them, not as the rig file does. */
 function inWords(error) {
-  const ofField = /^the request: /; // which field, and what it must be, is all that helps here
+  const ofField = /^(the request|.*, changed): /; // which field, and what it must be, is all that helps here
   if (ofField.test(error.what)) Object.assign(error, { what: error.what.replace(ofField, ""), why: "", do: "" });
   for (const id of NUMBERS) {
     const label = by(id).parentNode.firstChild.textContent.trim();
@@ -55,6 +55,7 @@ function inWords(error) {
     by(id).setAttribute("aria-invalid", String(isMeant));
     for (const part of ["what", "why", "do"]) error[part] = error[part]?.replace(new RegExp(`(plan\\.|grid\\.)?\\b${id}\\b( =)?`, "g"), label);
   }
+  error.what = error.what?.replace(/ \([^()]*\bstage\.[^()]*\)$/, ""); // the keys of the rig file
   return error;
 }
 

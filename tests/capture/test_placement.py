@@ -375,6 +375,18 @@ def test_a_restart_within_a_row_gives_no_wrong_byte(size, before, start):
         assert not placed.slipped
 
 
+@pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
+def test_a_late_packet_of_the_first_record_is_not_a_restart(size):
+    """A card that restarts within a row never counts to its end: these counters are of an earlier record."""
+    record = Record.make(size, 5 * size, 5 * -(-size // FULL) + 1)
+    late = Record.make(size, 0, 1, seed=1).packets[7]
+    start = Counters(5 * size, 5 * -(-size // FULL) + 1)
+    placed, out = place(size, [*record.packets[:9], late, *record.packets[9:]], start, FRAME)
+    assert (placed.complete, placed.counts.restarted, placed.past.lost) == (True, 1, False)
+    assert out.tobytes() == record.data
+    assert not place(size, [*record.packets[:9], late, *record.packets[9:-1]], start, FRAME)[0].located
+
+
 def test_overlapping_payload_is_compared():
     """A second network path brings one packet with other bytes: both are masked, and counted under their own name."""
     record = Record.make(20 * FULL + 100, 5000, 7)

@@ -374,8 +374,8 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
         return _Doubt("no packet came")
     if not record.of_row.any():
         return _Doubt("every packet is of another record, of a second card, or came before the first pulse")
-    # A card that restarts within the row begins with its first counters again, and never counts to the row's end. If the
-    # row began with them, too, the same counters come twice.
+    # A card that restarts within the row begins with its first counters again, and never counts to the row's end. If
+    # the row began with them, too, the same counters come twice.
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
     counted_anew = row.counts.restarted > 0 and not record.ends_as_planned
     if counted_anew or (record.start == SWITCHED_ON and counted_twice):

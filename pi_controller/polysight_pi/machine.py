@@ -600,6 +600,7 @@ class Machine:
         row = self._current
         self.stage.slow_down_polling()
         row.points = max(0, _read_integer(reply, "points", row.row.points))
+        row.triggers = _read_integer(reply, "pulses", row.points)
         row.done_ns = reply.written_ns
         row.was_held = bool(_read_integer(reply, "held"))
         end = (_read_integer(reply, "x", -1), _read_integer(reply, "y", -1))

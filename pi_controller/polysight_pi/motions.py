@@ -68,6 +68,8 @@ class RunningRow(_Motion):
     lasting: bool = False
     # Points that the stage has passed, by its own count.
     points: int = 0
+    # Pulses that the stage has given on its trigger pin, by its own count; known at the row's end.
+    triggers: int = 0
     # Bursts that were given to the journal, which reports them to the host.
     bursts: int = 0
     # True if the stage reported a hold within the row.
@@ -79,7 +81,7 @@ class RunningRow(_Motion):
         """Set the result of a row that was not stopped: `done` if all counts and edge times agree, else `fault`."""
         points = self.row.points
         pulses = points * self.job.spec.pulses
-        if self.points == points and counts == Counts(points, points, pulses):
+        if self.points == self.triggers == points and counts == Counts(points, points, pulses):
             time_problem = self.edges.judge(self.was_held, self.done_ns)
             if time_problem:
                 self.decide("fault", PiFault.EDGE_TIME, time_problem)
@@ -89,8 +91,8 @@ class RunningRow(_Motion):
                 self.decide("done")
             return
         reason = (
-            f"{points} points requested, {self.points} passed by the stage, {counts.edges} edges received, "
-            f"{counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
+            f"{points} points requested, {self.points} passed by the stage with {self.triggers} trigger pulses, "
+            f"{counts.edges} edges received, {counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
         )
         self.decide("fault", PiFault.POINTS_MISMATCH, reason)
 

@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Literal, NamedTuple
 
 import msgspec
@@ -372,12 +373,19 @@ class StageLink:
             now = time.monotonic()
             if silent_s := self._watch.silent_s(now):
                 self._lose(f"silent for {silent_s:.1f} s: no valid line")
+                self._stop_unheard()
                 return
             if self._watch.is_due(now):
                 try:
                     self._ask_status(now)
                 except StageLostError:
                     return
+
+    def _stop_unheard(self) -> None:
+        """Stop a moving stage whose answers are lost: it may hear, and its own heartbeat would act 0.5 s later."""
+        if not self._watch.is_at_rest:
+            with self._write_lock, suppress(OSError):
+                self._serial.write(Immediate.STOP.sent)
 
     def _ask_status(self, now: float) -> None:
         """Request the status at `now`, in seconds; stop a moving stage instead if the commanding thread hangs.

@@ -89,6 +89,17 @@ def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
     assert bench.machine.state == "idle", "its position is not known"
 
 
+@pytest.mark.parametrize("extra_pulses", [1, -1])
+def test_a_row_whose_stage_counts_other_trigger_pulses_is_no_row(extra_pulses):
+    bench = Bench().begin_and_home()
+    bench.start()
+    for _ in range(3):
+        bench.edge()
+    bench.row_done(extra_pulses=extra_pulses)
+    finished = bench.list_events(m.RowFinished)[-1]
+    assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
+
+
 @pytest.mark.parametrize("held", [False, True])
 @given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
 def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):

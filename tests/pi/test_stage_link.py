@@ -106,6 +106,16 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
         link.request("SET", 1, 500)
 
 
+def test_a_moving_stage_that_hears_but_is_not_heard_is_stopped(dry_stage, connect):
+    # Its own heartbeat would let it go on for longer than the half second that docs/spec/wire.md promises.
+    link, news = connect(heartbeat_s=0.2)
+    dry_stage.deaf = True
+    link.ask_status_every(0.02)
+    while not isinstance(news.get(timeout=HANG_S), StageLost):
+        pass
+    wait_for(lambda: Immediate.STOP in dry_stage.bytes_seen, "STOP")
+
+
 def test_only_a_status_answers_a_status_request(dry_stage, connect):
     link, news = connect(heartbeat_s=0.2)
     dry_stage.deaf = True

@@ -88,10 +88,11 @@ class Bench:
         fields = {"state": state, "points": str(points), "x": str(x), "y": "0"}
         self.stage_says(Reply("status", fields=fields, **times_ns))
 
-    def row_done(self, dx: int = 0, dy: int = 0, held: int = 0, **times_ns: int) -> None:
-        """The stage ends the row, this many steps away from where it should."""
+    def row_done(self, dx: int = 0, dy: int = 0, held: int = 0, extra_pulses: int = 0, **times_ns: int) -> None:
+        """The stage ends the row, this many steps away from where it should, with so many trigger pulses more."""
         x, y = RowMotion.plan(self.row, self.stage.config, 20.0).end
-        fields = {"points": str(self.row.points), "x": str(x + dx), "y": str(y + dy), "held": str(held)}
+        fields = {"points": str(self.row.points), "pulses": str(self.row.points + extra_pulses)}
+        fields |= {"x": str(x + dx), "y": str(y + dy), "held": str(held)}
         self.stage_says(Reply("done", self.stage.number, fields=fields, **times_ns))
 
     def edge(self) -> None:

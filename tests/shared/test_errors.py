@@ -20,7 +20,7 @@ def test_a_quoted_path_is_one_word_of_a_shell_and_no_option(path):
 
 def test_a_path_in_a_command_that_is_advised_is_quoted():
     """A scan in `my scans/one`: `polysight resume my scans/one` would not find it."""
-    command = re.compile(r"polysight (?:[a-z-]+)(?: --out)? \{(?!quote\(|name)[^}]*\}")
+    command = re.compile(r"polysight (?:[a-z-]+)(?: --out)? \{(?!quote\(|name|kind)[^}]*\}")
     table = Path("acquisition/states.py")  # filled in by page/status.py
     package = Path(polysight.__file__).parent
     sources = [path for path in package.rglob("*.py") if path.relative_to(package) != table]

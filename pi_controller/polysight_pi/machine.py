@@ -549,8 +549,10 @@ class Machine:
         self._loop.disarm()
 
     def _abort(self, reason: str) -> str | None:
+        # STOP first: `_decide` waits for the burst under way, and the call that sets its line may hang.
+        next_state = self._stop()
         self._decide("aborted", PiFault.ABORTED, reason)
-        return self._stop()
+        return next_state
 
     def terminate(self) -> bool:
         """Stop the stage because the program is being ended. Returns True if a row has to end first."""
@@ -563,11 +565,12 @@ class Machine:
         return self.row is not None
 
     def _fail_row(self, number: int, reason: str, lasting: bool = False) -> str | None:
-        """End row or jog with a fault and stop the stage; return as `_stop`."""
+        """Stop the stage and end row or jog with a fault; return as `_stop`."""
+        next_state = self._stop()
         self._report_fault(number, reason)
         self._finish_jog("fault", number, reason)
         self._decide("fault", number, reason, lasting)
-        return self._stop()
+        return next_state
 
     def _fail(self, number: int, reason: str) -> str | None:
         return self._fail_row(number, reason, lasting=True)

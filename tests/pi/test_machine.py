@@ -89,6 +89,27 @@ def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
     assert bench.machine.state == "idle", "its position is not known"
 
 
+@pytest.mark.parametrize(
+    "event",
+    [("Abort", "by hand"), ("row fault", PiFault.HOST_LOST, "silent"), ("lasting fault", PiFault.JOURNAL_FULL, "full")],
+)
+def test_stop_does_not_wait_for_the_burst_under_way(event, monkeypatch):
+    """A call that sets a line may hang, and with it whoever waits for the burst's end."""
+    bench = Bench().begin_and_home()
+    bench.start()
+    bench.edge()
+    sent: list[Immediate] = []
+    disarm = bench.loop.disarm
+
+    def note_and_disarm():
+        sent.extend(bench.stage.sent)
+        return disarm()
+
+    monkeypatch.setattr(bench.loop, "disarm", note_and_disarm)
+    bench.machine.happen(*event)
+    assert sent[-1:] == [Immediate.STOP]
+
+
 @pytest.mark.parametrize("extra_pulses", [1, -1])
 def test_a_row_whose_stage_counts_other_trigger_pulses_is_no_row(extra_pulses):
     bench = Bench().begin_and_home()

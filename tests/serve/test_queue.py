@@ -17,15 +17,24 @@ from polysight_shared.errors import DeviceError, ScanError
 
 
 class Rig:
-    """Starts what it is told to, unless it is busy or out of order."""
+    """Starts what it is told to, unless it is busy or out of order; `states` has scans that did not finish."""
 
     def __init__(self) -> None:
         self.started: list[str] = []
+        # How often it was asked to start a scan.
+        self.asked = 0
         self.is_busy = True
         self.is_broken = False
         self.states: dict[str, str] = {}
 
+    def list_states(self) -> dict[str, str]:
+        """States of the scans by name, the newest first."""
+        started = {name: self.states.get(name, "finished") for name in reversed(self.started)}
+        by_hand = "by hand"
+        return started | {by_hand: self.states[by_hand]} if by_hand in self.states else started
+
     def start(self, request: bytes) -> None:
+        self.asked += 1
         if self.is_busy:
             raise ScanError("another is being scanned", code=ErrorCode.BUSY)
         if self.is_broken:
@@ -42,7 +51,7 @@ def rig() -> Rig:
 @pytest.fixture
 def queue(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
     monkeypatch.setattr(programs, "LOOK_S", 0.01)
-    rig_queue = Queue(tmp_path / "queue", rig.start, lambda name: rig.states.get(name, "finished"))
+    rig_queue = Queue(tmp_path / "queue", rig.start, rig.list_states)
     for name in ("first", "second", "third"):
         rig_queue.add(name, json.dumps({"name": name}).encode())
     yield rig_queue
@@ -83,6 +92,39 @@ def test_what_cannot_be_started_stays_and_says_why(queue, rig):
 
 def test_a_queue_survives_a_restart(queue, rig, tmp_path):
     queue.close()
-    again = Queue(tmp_path / "queue", rig.start, lambda _: "finished")
+    again = Queue(tmp_path / "queue", rig.start, rig.list_states)
     assert again.waiting().names == ["first", "second", "third"]
+    again.close()
+
+
+@pytest.mark.parametrize("state", ["stopped", "failed", "lost"])
+def test_a_scan_that_somebody_else_started_holds_the_queue_too(queue, rig, state):
+    """Whoever aborts a scan may have his hands in the rig."""
+    rig.states["by hand"] = "running"
+    wait_for(lambda: rig.asked > 2, "that the queue has seen it")
+    rig.states["by hand"] = state
+    rig.is_busy = False
+    wait_for(lambda: queue.waiting().held, "that it waits")
+    assert "by hand" in queue.waiting().held
+    assert rig.started == []
+    queue.release()
+    wait_for(lambda: rig.started == ["first"], "the first")
+
+
+def test_a_scan_that_was_stopped_before_anything_waited_holds_nothing(queue, rig):
+    for name in queue.waiting().names:
+        queue.remove(name)
+    rig.states["by hand"] = "stopped"
+    rig.is_busy = False
+    queue.add("first", b'{"name": "first"}')
+    wait_for(lambda: rig.started == ["first"], "the first")
+
+
+def test_after_a_restart_a_newest_scan_that_did_not_finish_holds_the_queue(queue, rig, tmp_path):
+    queue.close()
+    rig.states["by hand"] = "stopped"
+    rig.is_busy = False
+    again = Queue(tmp_path / "queue", rig.start, rig.list_states)
+    wait_for(lambda: again.waiting().held, "that it waits")
+    assert rig.started == []
     again.close()

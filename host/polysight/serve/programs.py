@@ -7,7 +7,8 @@ in `<scan>/control/`; no signal is ever sent to a process number that a file nam
 
 In the queue scans wait one after another over night. Each is a file with its request in `<scans>/.polysight/queue/`, so
 that the queue survives a restart of the server. The next one is started when the rig is free. After a scan that did not
-finish the queue waits for a person: what stopped one scan may stop all of them, or somebody works at the rig.
+finish, whoever started it, the queue waits for a person: what stopped one scan may stop all of them, or somebody works
+at the rig.
 """
 
 from __future__ import annotations
@@ -148,16 +149,17 @@ class Waiting(msgspec.Struct, frozen=True):
 class Queue:
     """The queue of one server; `start` starts a request, and raises ScanError with `BUSY` while the rig is in use.
 
-    `state_of` gives the state of a scan by its name, as lists show it.
+    `list_states` gives the states of all scans by name, as lists show them, the newest first.
     """
 
-    def __init__(self, folder: Path, start: Callable[[bytes], None], state_of: Callable[[str], str]) -> None:
+    def __init__(self, folder: Path, start: Callable[[bytes], None], list_states: Callable[[], dict[str, str]]) -> None:
         self._folder = folder
         self._start = start
-        self._state_of = state_of
+        self._list_states = list_states
         self._held = ""
-        # The last scan that the queue has started.
-        self._last = ""
+        # Unfinished scans that hold nothing: they were so at the last look, or when a person was at the queue.
+        # None: all but the newest, which may have ended while the server was restarted.
+        self._seen: set[str] | None = None
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="queue", daemon=True)
@@ -176,6 +178,9 @@ class Queue:
                     f"{name} cannot be queued", f"it is queued already, or {MAX_WAITING} scans are",
                     "wait, or give another name", code=ErrorCode.NAME_TAKEN,
                 )  # fmt: skip
+            if not names:
+                self._seen = self._find_unfinished(self._list_states())
+                self._held = ""
             self._folder.mkdir(parents=True, exist_ok=True)
             write_atomically(self._folder / f"{time.time_ns()}.json", request)
 
@@ -188,8 +193,9 @@ class Queue:
 
     def release(self) -> None:
         """Go on after a scan that did not finish."""
-        self._held = ""
-        self._last = ""
+        with self._lock:
+            self._seen = self._find_unfinished(self._list_states())
+            self._held = ""
 
     def _list_requests(self) -> list[tuple[str, Path]]:
         """Return the names and files of the requests, oldest first; files that are no requests are left out."""
@@ -208,17 +214,21 @@ class Queue:
                 self._start_next()
 
     def _start_next(self) -> None:
-        """Start the first request if the rig is free; hold the queue if the last scan, or this start, failed."""
+        """Start the first request if the rig is free; hold the queue if a scan, or this start, has failed meanwhile."""
         requests = self._list_requests()
         if not requests or self._held:
             return
         name, path = requests[0]
         try:
-            state = "finished"
-            if self._last:
-                state = self._state_of(self._last)
-            if state in UNFINISHED:
-                self._held = f"{self._last}: {state}"
+            states = self._list_states()
+            unfinished = self._find_unfinished(states)
+            seen = self._seen
+            if seen is None:
+                seen = unfinished - set(list(states)[:1])
+            self._seen = unfinished
+            # Whoever started it: what has stopped it may stop all of them.
+            for new in sorted(unfinished - seen):
+                self._held = f"{new}: {states[new]}"
                 return
             self._start(path.read_bytes())
         except ScanError as e:
@@ -228,8 +238,12 @@ class Queue:
         except (PolysightError, OSError) as e:
             self._held = f"{name}: {e}".splitlines()[0]
             return
-        self._last = name
         path.unlink(missing_ok=True)
+
+    @staticmethod
+    def _find_unfinished(states: dict[str, str]) -> set[str]:
+        """Return the scans after which a person has to look at the rig."""
+        return {name for name, state in states.items() if state in UNFINISHED}
 
     def close(self) -> None:
         """Stop starting scans; those in the queue stay there."""

@@ -116,7 +116,7 @@ class Site:
     def open_queue(self, start: Callable[[bytes], None]) -> None:
         """Start the scans that wait, as `start` does with a request."""
         if self.starts:
-            self._queue = Queue(self.logs / "queue", start, lambda name: self.scans.summary(name).state)
+            self._queue = Queue(self.logs / "queue", start, lambda: {s.name: s.state for s in self.scans.list()})
 
     def name(self, request: Request, key: str = "scan") -> str:
         """Name of the scan that a request asks for: as given, or the only one. Raises ConfigError without one."""

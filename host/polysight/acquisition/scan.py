@@ -630,10 +630,10 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
 
 def _check_cards(scan: ScanFolder, rig: CaptureRig) -> None:
     """Raise ScanError if a card sent another board's rows so far, by its MAC address: boards would be exchanged."""
-    sent: dict[str, set[str]] = {name: set() for name in rig.cards}
+    sent: dict[str, set[str]] = {}
     for row in scan.committed_rows().values():
         for name, board in row.boards.items():
-            sent[name].add(board.card_mac)
+            sent.setdefault(name, set()).add(board.card_mac)
     for name, card in rig.cards.items():
         others = [other for other, macs in sent.items() if card.mac in macs]
         if card.mac and others and name not in others:

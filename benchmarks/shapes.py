@@ -83,8 +83,9 @@ class ObjectFigures:
 
     `normals_inside`, `places_inside`: shares of points whose own 95 % regions hold the surface. `distance2`: squared
     distance of the true permittivity in the region of the object; `points_inside`: share of points whose own region
-    holds it. `normal_68_deg`, `point_68_mm`, `point_error_68`: 68th percentiles over the object's points. Figures are
-    None where nothing was seen or given.
+    holds it. `error`, `half_width`: error of the permittivity and half width of its 95 % region, over its magnitude.
+    `stray`: number of points on neither object nor background. `normal_68_deg`, `point_68_mm`, `point_error_68`: 68th
+    percentiles over the object's points. Figures are None where nothing was seen or given.
     """
 
     kind: str
@@ -186,6 +187,7 @@ def analyse_shapes(
     metal = see_reference(nuisances, scan)
 
     def reference(optics: surfaces.Optics) -> surfaces.Gains:
+        """Return the gains of the channels by the metal sphere, for antennas as the analysis assumes them."""
         return surfaces.learn_gains(surfaces.find_voltages(metal, optics), optics.wave_number)
 
     points = see_shapes((*scene.shapes, *scene.background), nuisances, scan, number=2)
@@ -209,7 +211,7 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
     for shape in scene.background:
         away_from_shape = np.abs(shape.project(surface.points_m)[0])
         background |= away_from_shape < STRAY_M
-        # A table that touches the object's back holds no points of the object: its front alone is seen.
+        # Where a table touches the object, a point is of the one that is nearer: the object's back is not seen.
         on_object &= away_from_shape > np.abs(distances)
     true_real = float("nan")
     true_loss = float("nan")
@@ -348,7 +350,10 @@ def format_line(title: str, figures: Sequence[ObjectFigures], limits: tuple[floa
 
 
 def format_points_line(title: str, figures: Sequence[ObjectFigures]) -> str:
-    """Return one line of the table of points: 68th percentile over the points of an object, and what regions hold."""
+    """Return one line of the table of points, with medians over the objects of the 68th percentiles over their points.
+
+    `in 95 %`: mean share of an object's points whose own regions hold the truth.
+    """
     seen_objects = [f for f in figures if f.points]
     cells = [f"{title:<26}{sum(f.points for f in seen_objects):>5}"]
     columns = (

@@ -146,6 +146,7 @@ def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
     try:
         listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
         while listener.poll(round(timeout_s * 1e3)):
+            # The last part of a message is the event.
             yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
         raise _no_answer_error(instrument.pi.event_address)
     finally:

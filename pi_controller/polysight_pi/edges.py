@@ -231,7 +231,8 @@ class EdgeTimes:
         if not was_held:
             return self._judge_motion([], done_ns)
         stops = sorted(self._stops)
-        # A hold during the travel to the row has no effect on it.
+        # A hold before the first point was either in the travel to the row, without effect on the row's motion, or in
+        # the run-up. Its report does not tell which, so the edges may agree with either.
         fault = self._judge_motion(stops, done_ns)
         if fault and self._early_stops:
             fault = self._judge_motion(sorted(self._early_stops) + stops, done_ns)

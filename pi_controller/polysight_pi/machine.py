@@ -180,6 +180,7 @@ class Machine:
         jog = self.jog
         if jog is None or jog.command.owner != owner:
             return False
+        # Never back: the calls of several threads may come out of order.
         jog.alive_s = max(jog.alive_s, self._clock())
         return True
 
@@ -235,6 +236,7 @@ class Machine:
         time_problem = row.edges.note_edge(sent.edge_ns)
         if time_problem:
             self.happen("row fault", PiFault.EDGE_TIME, time_problem)
+        # Without a pulse there is nothing to journal: the trigger loop reports its fault next.
         if not record.pulses:
             return
         self._journal.add(
@@ -355,6 +357,7 @@ class Machine:
         self._homing_underway = False
         self._is_placed = False
         self._homing_is_watched = self.host_lives
+        # Lets a journal that could not be written try again.
         self._journal.retry()
         self._forget_fault()
         self._post(self._home_now)
@@ -378,6 +381,7 @@ class Machine:
         if end != (0, 0):
             self._report_fault(PiFault.POSITION, f"homing ended at {end}, not at (0, 0) (x, y in steps)")
             return "fault"
+        # Limited to what a message may hold.
         limit = MAX_MM * self.stage.config.steps_per_mm
         lost_x = max(-limit, min(_read_integer(reply, "lostx"), limit))
         lost_y = max(-limit, min(_read_integer(reply, "losty"), limit))
@@ -527,7 +531,10 @@ class Machine:
     # --- actions: how a row ends ------------------------------------------------------------------------------------
 
     def _decide(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
-        """Set the row's result and disarm the trigger loop, unless there is no row or its result is set already."""
+        """Set the row's result and disarm the trigger loop, unless there is no row or its result is set already.
+
+        `lasting`: the state after the row is `fault`, not `ready` or `homed`; noted in either case.
+        """
         if self.row is not None:
             self.row.lasting |= lasting
             if self.row.decide(status, number, reason):
@@ -573,6 +580,7 @@ class Machine:
         return next_state
 
     def _fail(self, number: int, reason: str) -> str | None:
+        """Do as `_fail_row`, with a lasting fault."""
         return self._fail_row(number, reason, lasting=True)
 
     def _lose_stage(self, number: int, reason: str) -> None:
@@ -588,7 +596,7 @@ class Machine:
         self.homed = False
 
     def _time_out(self) -> None:
-        """Handle a motion that has not ended in time: the stage counts as lost."""
+        """Handle a motion that has not ended in time: the stage counts as lost, unless the program is being ended."""
         if not self._terminating:
             reasons = {
                 "homing": f"not homed after {HOMING_TIMEOUT_S} s",

@@ -69,6 +69,8 @@ def _solve_waves(admittances: list[NDArray], delays: list[NDArray]) -> NDArray:
     for m in range(boundaries):
         above = admittances[m]
         below = admittances[m + 1]
+        # Rows: continuity of E and of H at this boundary. Columns: 2 m - 1 is the wave down in the layer above, 2 m the
+        # wave up in it (r in air), then the waves down and up in the layer below.
         electric = 2 * m
         magnetic = 2 * m + 1
         down_below = 2 * m + 1

@@ -61,7 +61,7 @@ def turn(axis: NDArray, angle_deg: float) -> NDArray:
 
 
 def find_mirror_point(tx: NDArray, rx: NDArray, plane_m: float) -> NDArray:
-    """Point of the plane z = `plane_m` in which RX sees TX as in a mirror, 3 metres."""
+    """Point of the plane z = `plane_m` in which RX sees TX as in a mirror, [3], metres."""
     share = (plane_m - tx[2]) / (2 * plane_m - tx[2] - rx[2])
     return np.array([*(tx + share * (rx - tx))[:2], plane_m])
 
@@ -154,7 +154,7 @@ class Boards:
 
 
 def spread_receivers(rig: Rig, step_h_m: NDArray, step_v_m: NDArray, count: int = 4) -> Boards:
-    """Return boards whose `count` RX lie `step` [3] apart about the mean places of `rig`."""
+    """Return boards whose `count` RX lie `step_h_m` or `step_v_m` [3] apart about the mean places of `rig`."""
     places = np.arange(count) - (count - 1) / 2
     h = tuple(replace(rig.h, position=rig.h.position + place * step_h_m) for place in places)
     v = tuple(replace(rig.v, position=rig.v.position + place * step_v_m) for place in places)

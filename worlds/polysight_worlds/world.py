@@ -252,6 +252,7 @@ def draw_world(
             stack = draw_stack(rng, material)
         plates.append(Plate("copper" if is_metal else name, places[index], size_m, stack))
     if with_table:
+        # A board of wood with air behind it.
         wood = Stack(((rng.uniform(1.8, 3.5) - 0.15j, rng.uniform(0.005, 0.03)),), 1.0)
         plates.append(table(wood, behind_mm=rng.uniform(60, 200), centre_m=centre_m, tilt_deg=rng.uniform(-1, 1)))
     return World(tuple(plates))
@@ -262,6 +263,7 @@ def disturb_plates(world: World, nuisances: Nuisances) -> World:
 
     A plate named "table" stays as it is.
     """
+    # The 1 tells these draws from other ones of the same seed.
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:

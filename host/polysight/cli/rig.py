@@ -1,7 +1,8 @@
 """The commands around a rig and its scans, simulated or real.
 
 Simulated: demo, simulate, reproduce. Real: plan, doctor, card, inspect, radar, jog, scan, resume,
-validate, drop-raw.
+validate, drop-raw. A command runs a function of this file, or one of `polysight.jobs` that is given by its
+name, such as "devices.jog_stage". The options named in a tuple behind its example come first in its help.
 """
 
 from __future__ import annotations

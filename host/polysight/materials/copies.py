@@ -45,6 +45,7 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
     """
     amplitudes = [np.abs(h), np.abs(v)]
     copies_of_channels = []
+    # Each channel once, with the other one beside it.
     for amplitude, other in (amplitudes, amplitudes[::-1]):
         copies = _find_copies_in_channel(patches, amplitude, pixel_mm)
         if copies is not None and not _are_plates(copies, patches, other, pixel_mm):
@@ -55,10 +56,11 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
 
 
 def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pixel_mm: float) -> bool:
-    """Return true if the other channel shows the copies of one channel, but not as copies: they are weak plates.
+    """Return true if the patches taken for copies in one channel are weak plates, by the evidence of the other channel.
 
-    `other` float [ny, nx] is the amplitude of the other channel, which a second path copies to another place, or by
-    the same shift and level.
+    A plate stands at one place in both channels, while a second path copies each channel to a place of its own. So they
+    are plates if `other`, float [ny, nx], the amplitude of the other channel, shows all of them, unless some of them
+    are found to be copies there too.
     """
     brightest = max(float(np.median(other[p.mask])) for p in patches)
     visible_patches = [
@@ -72,6 +74,7 @@ def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pix
 
 def _find_copies_in_channel(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:
     """Find the copies of one channel, of `amplitude` float [ny, nx], at the shift with most of them."""
+    # Two copies and two plates at least.
     if len(patches) < 4:
         return None
     # Weak patches may be copies of bright ones.

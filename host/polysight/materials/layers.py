@@ -323,7 +323,10 @@ class LayerFit:
 
     @property
     def ambiguous(self) -> bool:
-        """True if there are rivals, or two sigma of permittivity or of a fitted thickness exceed `DETERMINED` (5 %)."""
+        """True if there are rivals, or two sigma of a fitted thickness, or of a permittivity beside it, exceed 5 %.
+
+        The limit is `DETERMINED`.
+        """
         return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED)
 
     def warnings(self) -> list[str]:
@@ -560,6 +563,7 @@ class _Model:
         # A few frequencies of a sub-band are enough for start values.
         chi2[~outside] = np.sum(self.residuals(grid[~outside], thin=6) ** 2, axis=-1)
         valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~outside
+        # Cells of the grid, not refractive indices.
         index = np.argwhere(valleys)
         order = np.argsort(chi2[tuple(index.T)])[:STARTS]
         return [grid[tuple(cell)] for cell in index[order]]
@@ -619,9 +623,8 @@ class _Model:
     def _draw_second_moments(self, solution: _Solution, covariance: Real) -> Real:
         """Return second moments of the posterior about a solution, [unknowns, unknowns].
 
-        In a straight valley they are the linear ones, `covariance`.
-
-        By importance sampling along thickness times index, in which the valley is straighter than in thickness.
+        In a straight valley they are the linear ones, `covariance`. In a bent one they are found by importance sampling
+        along thickness times index, in which the valley is straighter than in thickness.
         """
         n = self.unknowns
         x = solution.x
@@ -641,6 +644,7 @@ class _Model:
             return linear
         draws = draws[inside]
         unit = unit[inside]
+        # Logarithm of the posterior over the proposal's density, but for a constant.
         log = -0.5 * np.sum(self.residuals(draws) ** 2, axis=-1)
         log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / _DRAW_WIDTH) ** 2, axis=1) / freedom)
         weight = np.exp(log - log.max())

@@ -210,6 +210,7 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
             most = _find_max_pulses(plan)
             with_short_last_packet = (n for n in range(most, 1, -1) if not fills_whole_packets(plan, n))
             pulses = next(with_short_last_packet, most)
+            # A faster stage leaves time for still fewer pulses.
             if pulses < 2:
                 break
             plan = _set_burst(rig, speed, pulses, period)
@@ -279,6 +280,7 @@ def describe(f: Forecast) -> str:
             f"{grid.columns} x {grid.rows} positions, steps {grid.step_x_mm:g} x {grid.step_y_mm:g} mm,"
             f" {width_mm:g} x {height_mm:g} mm",
         ),
+        # One chirp a frame has no `chirp_us`.
         (
             "",
             f"{stage.speed_mm_s:g} mm/s, {burst.chirps_a_position} chirps a position,"

@@ -69,13 +69,15 @@ class JointFit:
         self.windows = windows
         self.values = values.copy()
         self.amplitude = amplitude.astype(complex)
+        # [window, position, 6]: derivatives of the path at each position with respect to its six values.
         self.basis = find_basis(windows.offsets)
         count = np.maximum(windows.valid.sum(axis=1), 1)
         mean_basis = np.einsum("wn,wnp->wp", windows.valid, self.basis) / count[:, None]
         # Derivative of an echo's mean phase with respect to the six values of its path.
         self.mean_rate = fit.middle * mean_basis
-        # An echo's wave and its derivatives are j (steady + nu changing) times the wave, nu the frequency's distance
-        # from the middle; both are given as [window, 7, 6] and [7, 6]: the wave and its six derivatives in the basis.
+        # An echo's wave (row 0) and its derivatives by the six values (rows 1 to 6) are the wave times (steady + nu
+        # changing) in the basis, [window, 7, 6] and [7, 6]; `_find_directions` gives the derivatives their factor j.
+        # `nu` [frequency] is the distance of `omega` (2 pi f / c, rad / m) from its mean, `middle`.
         self.nu = fit.omega - fit.middle
         self.steady = np.zeros((len(mean_basis), 7, 6))
         self.steady[:, 0, 0] = 1
@@ -101,6 +103,7 @@ class JointFit:
             new_energy = find_energy(self.rest[members])
             members = members[new_energy < STEERING_GAIN * energy[members]]
             energy[members] = find_energy(self.rest[members])
+            # One RX is added to nothing: no phases to improve.
             if len(self.fit.lever) == 1 or not members.size:
                 break
 
@@ -220,6 +223,7 @@ class JointFit:
         """Return the products of an echo's wave, and of its 6 derivatives, with the residual `rest`, [window, 7]."""
         added = add_rx(self.steering[members, index] / len(self.fit.lever), self.rest[members])
         turned = self.waves[members, index].conj() * added
+        # Sums over the frequencies with the powers 0 and 1 of nu, [window, 2, position].
         by_power = np.stack([np.ones_like(self.nu), self.nu]).astype(np.complex64) @ turned
         sums = _multiply_parts(by_power * self.windows.valid[members, None], self.basis[members])
         return np.einsum("wpb,wb->wp", self.steady[members], sums[:, 0]) + sums[:, 1] @ self.changing.T
@@ -292,5 +296,6 @@ def _multiply_parts(values: NDArray[np.complexfloating], matrices: Array) -> NDA
 
 def find_energy(samples: NDArray[np.complexfloating]) -> Array:
     """Return the energy of the samples [window, rx, frequency, position] of each window, [window]."""
+    # Real and imaginary parts side by side; each row times itself is the sum of its squares.
     parts = np.ascontiguousarray(samples).view(samples.real.dtype)
     return (parts[..., None, :] @ parts[..., None]).sum(axis=(1, 2, 3, 4), dtype=float)

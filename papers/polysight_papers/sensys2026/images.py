@@ -191,6 +191,8 @@ def _compute_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
     """Return the opacity of P, [y, x]: 0 from 20 dB below metal on, where noise begins, 1 from 14 dB on."""
     power = (np.abs(scan.h).astype(np.float64) ** 2 + np.abs(scan.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
+    # The smaller of a pixel's power and its surroundings': neither a single bright pixel nor a dark one beside a plate
+    # counts as bright.
     level = 10 * np.log10(np.maximum(np.minimum(power, scipy.ndimage.gaussian_filter(power, 1.5)), 1e-12))
     return np.clip((level + 20) / 6, 0.0, 1.0)
 
@@ -228,6 +230,7 @@ def ratio_table(views: dict[str, ScanView]) -> Table:
             else:
                 true = complex(ratio_from_permittivity(eps, theta))
             p = patch.permittivity.ratio
+            # Adding zero removes the sign of a negative zero.
             ratios = [f"{20 * np.log10(abs(z)):.2f} dB, {np.degrees(np.angle(z)) + 0.0:.1f}°" for z in (p, true)]
             error = abs(1 / p - 1 / true)
             rows.append((f"{name}: {patch.truth.name}", f"{np.degrees(theta):.1f}°", *ratios, f"{error:.4f}"))
@@ -364,6 +367,7 @@ def front_on(config: Path, folder: Path) -> Path:
     """Write the rig file with its boards side by side into a folder; return the file."""
     rig = tomllib.loads(config.read_text(encoding="utf-8"))
     for board in rig["boards"]:
+        # The last shift of a mount places the board on the rig: only its side, left or right, is kept in x.
         shift = next(step["shift_mm"] for step in reversed(board["mount"]) if "shift_mm" in step)
         shift[0] = float(np.copysign(FRONT_ON_MM, shift[0]))
     path = folder / "front-on.toml"

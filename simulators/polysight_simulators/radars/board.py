@@ -143,9 +143,12 @@ class RadarBoard:
         self._out = bytearray()
         # Messages not read by the host yet
         self._waiting: deque[bytes] = deque()
+        # Messages that are sent later, with their times
         self._later: list[tuple[float, bytes]] = []
+        # True while the host interrupt is raised for a message
         self._offered = False
         self._ready_at = 0.0
+        # Sequence number of the last command, and its answer, for a retry
         self._last: tuple[int, bytes] = (-1, b"")
         self._pulse_s = float("-inf")
         self._busy_until = -1.0
@@ -197,9 +200,8 @@ class RadarBoard:
     def trigger(self, pulse_s: float | None = None) -> bool:
         """Give a rising edge on SYNC_IN, now or at a time of the pulses' clock; return True if it starts a frame.
 
-        An edge sooner after the last frame's than a frame may follow causes a fault, after which pulses are ignored. A
-        time that lies farther back than that before the last frame's is taken for one of another clock, and is no
-        fault.
+        An edge that follows the edge of the last frame by less than `dead_s` causes a fault, after which pulses are
+        ignored. So does one that is earlier by less than that; a time still earlier is taken for one of another clock.
         """
         self._pulses_seen += 1
         if not self.ready_for_triggers:
@@ -238,6 +240,7 @@ class RadarBoard:
         self._in += word.to_bytes(2, "little")
         while len(self._in) >= 4 and self._in[:4] not in (TO_DEVICE, READY):
             del self._in[:2]
+        # READY: the host asks for the message that the interrupt announced.
         if self._in[:4] == READY and len(self._in) >= 16:
             del self._in[:16]
             self._offered = False
@@ -287,6 +290,7 @@ class RadarBoard:
     def _send_event(self, number: int, data: bytes, delay_s: float) -> None:
         """Send an event after a delay; numbers from 0x4000 on are the main core's, others the RF core's."""
         main = number >= 0x4000
+        # Wide: with a CRC of 32 bits.
         if main:
             wide = self.cores.crc32_events
         else:

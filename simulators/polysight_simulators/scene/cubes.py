@@ -125,7 +125,7 @@ def _draw_noise(shape: tuple[int, ...], rms_of_channel: Real, key: int) -> NDArr
 
 
 def _compute_drift(rig: Instrument, scene: Scene, board: Board) -> NDArray[np.complex64]:
-    """Return the drift of a board's echo at every position, [row, column], in the order of the scan."""
+    """Return the drift of a board's echo at every position, [row, column], by the chirps sent before it."""
     plan = plan_raster(rig.grid)
     factors = np.empty((plan.rows, plan.columns), np.complex64)
     for row in plan:
@@ -152,6 +152,7 @@ def _compute_burst_noise(rig: Instrument, scene: Scene, board: Board, seed: int,
     # The IF is that half way between direct path and echo.
     delay_s = (antennas(rig, board).direct_m[0] + echo_m) / 2 / SPEED_OF_LIGHT_M_S
     if_hz = chirp.slope_hz_per_s * delay_s + power_on(rig, scene, board, seed).if_error_hz.mean()
+    # The first value is the filter, the second its derivative.
     return float(averaged / np.abs(high_pass(np.array(if_hz), chirp)[0]))
 
 

@@ -60,8 +60,8 @@ class Event(Enum):
 def homing_zero() -> int:
     """Return the steps from the closing point of a switch to the zero of homing.
 
-    The creep sees the switch open after its looks, takes the steps of its ramp to stop, and pulls off. Homing has to
-    begin at least the ramp of the search away from the switch.
+    The creep sees the switch open after LOOKS readings (debouncing; one a step), takes the steps of its ramp to stop,
+    and pulls off. Homing has to begin at least the ramp of the search away from the switch.
     """
     engine = StepEngine()
     engine.set_accel(HOME_ACCEL)
@@ -246,6 +246,7 @@ class StageLogic:
         spacing = abs(pitch)
         _require(self._is_within(x0, y) and self._is_within(last, y) and spacing <= MAX_TRAVEL, StageError.SOFT_LIMIT)
         width_us = self.parameters[Parameter.TRIGGER]
+        # A trigger pulse ends before the next begins. The sketch limits the spacing so that its product fits 32 bits.
         _require(width_us * rate < min(spacing, 4000) * 1_000_000, StageError.OUT_OF_RANGE)
         backlash = self.parameters[Parameter.BACKLASH]
         lead = self._engine.ramp_steps(rate) + max(spacing, backlash)
@@ -397,7 +398,8 @@ class StageLogic:
             self._found_switches |= its_switch
         searches_on = step == 0 and not self._found_switches & its_switch and self._searched_steps < farthest
         if self._homing_leg_made and not searches_on:
-            if self._engine.reached != (self._phase % 3 != 2):
+            # Search and release end at the switch; the leg that pulls off does not meet it.
+            if self._engine.reached != (step != 2):
                 return self._raise(StageError.HOMING_FAILED, True)
             if self._phase == 2:
                 if self._was_homed:

@@ -130,7 +130,7 @@ class Take:
     radars: dict[str, BoardState] = field(default_factory=dict)
     # Radars that did not confirm the end of all frames.
     not_done: list[str] = field(default_factory=list)
-    # Pulse of each frame by arrival times, for boards whose record has a certain length.
+    # Pulse of each frame by arrival times, for boards of which it is certain how many frames came.
     frames: dict[str, pulse_times.PlacedFrames] = field(default_factory=dict)
 
     def faults(self, pulses_per_point: int) -> list[TakeFault]:
@@ -632,7 +632,7 @@ class RowTaker:
             take.captures = ending.result()
 
     def _time_frames(self, take: Take) -> None:
-        """Compare the frames of boards whose record has a certain length with the pulses; every pulse was sent."""
+        """Compare frames and pulses of boards of which it is certain how many frames came; every pulse was sent."""
         for name, capture in take.captures.items():
             path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
             if capture.located or capture.slipped:

@@ -179,7 +179,8 @@ class SphereFile(CalibrationFile, frozen=True, kw_only=True):
     """`sphere`: points of a metal sphere, the reference of surfaces; gains are learnt from them with the rig in use.
 
     `points`: by channel ("h", "v") rows of stage offset x, y, z, path (m), its slope x, y and curvature xx, xy, yy (1 /
-    m), amplitude's real and imaginary part and their standard deviation. `radius_mm` is the sphere's own,
+    m), amplitude's real and imaginary part and their standard deviation, and the amplitude's rise over the band
+    (`surfaces.window.Echoes.band_rise`), which files of earlier releases do not have. `radius_mm` is the sphere's own,
     `radius_found_mm` that of the points' curvature; `centre_mm` (rig frame) lies one true radius behind the points,
     whose distances from the sphere scatter by `misfit_mm` (median deviation); `gain_std` is that of ln(H / V).
     """

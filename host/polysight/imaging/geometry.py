@@ -353,7 +353,8 @@ class StageWindow:
             product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
             slope = slope_per_rad * (step_rad - float(np.angle(product)))
             seen_of_level = find_ends(np.abs(image), lit, inside_px)
-            # Ends that both the plate and the level one have within the light.
+            # Ends that both the plate and the level one have within the light. How far from its place an end is seen is
+            # the same for both.
             is_seen = ~touching & np.isfinite(seen_of_level) & np.isfinite(ends_px)
             off_px = seen_of_level[is_seen] - ends_px[is_seen]
             ends_px[is_seen] = seen_px[is_seen] - END_STEP * off_px

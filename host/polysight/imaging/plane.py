@@ -472,6 +472,7 @@ def _estimate_heights_by_phase(
     heights = phases[with_phase] / rad_per_m
     phasors = np.exp(2j * np.pi * (heights - guesses) / ambiguity_m)
     common_height = np.angle(np.mean(phasors, axis=1)) / (2 * np.pi) * ambiguity_m
+    # First onto one plane beside that of the ranges, then together by as many whole turns as bring them nearest to it.
     lifted = heights + ambiguity_m * np.round((guesses + common_height[:, None] - heights) / ambiguity_m)
     lifted += ambiguity_m * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / ambiguity_m)[:, None]
     # The matrix depends on the places alone, so one solution serves all trial tilts.

@@ -308,6 +308,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
     cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
     block = number_blocks(metal.at_m, (0.0, 0.0))
+    # Errors are independent from block to block: each block's shifts the terms by its column of the inverse.
     of_blocks = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
     return Gains(
         ratio_terms=ratio_terms,

@@ -64,6 +64,8 @@ class ReceiveQueue:
         for key in self._keys:
             line_start = text.find(b" " + key + b" ")
             if line_start >= 0:
+                # From the local address on: remote address, state, waiting bytes `sent:received` (hexadecimal); the
+                # last field counts dropped datagrams.
                 fields = text[line_start : text.find(b"\n", line_start)].split()
                 return int(fields[3].partition(b":")[2], 16), int(fields[-1])
         return None

@@ -400,6 +400,7 @@ def _describe_collection(rig: Instrument, scan: str, zero_filling: bool, by_colu
     h, v = rig.receivers
     # The last shift of a mount is its board's origin; the one before it is the offset of the tilted board.
     tilt_offset_mm = [step.shift_mm for step in h.mount if step.shift_mm is not None][-2]
+    # V turns by its own angle first, then with H: the last turns are those of both.
     return {
         "dx": rig.grid.step_x_mm,
         "dy": rig.grid.step_y_mm,
@@ -508,12 +509,13 @@ def write_cube(
         direct_m = antennas(rig, board).direct_m
         if keep_direct:
             cube += (direct_factor(board, scene) * direct_m[0] / direct_m).astype(np.complex64)[:, None, None, None]
+        # The cube is without the direct path of each RX; so much of that path is added again.
         if from_transmitter:
-            removed_m = direct_m
+            added_m = direct_m
         elif common_reference:
-            removed_m = direct_m - direct_m[0]
+            added_m = direct_m - direct_m[0]
         else:
-            removed_m = 0 * direct_m
-        cube *= np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(removed_m, f)).astype(np.complex64)[:, None, None]
+            added_m = 0 * direct_m
+        cube *= np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(added_m, f)).astype(np.complex64)[:, None, None]
         np.save(folder / f"{board_name}_synced.npy", cube.conj() if conjugate else cube)
     return folder

@@ -116,7 +116,7 @@ def fit_spread(
 
     Return the variances of ln eps' and ln eps'' of each material, [materials, 2], and the covariance of placements,
     [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
-    material's own. A material with a single specimen is ignored.
+    material's own. A material with a single specimen tells nothing of it, but its patches count for the placements.
     """
     is_single = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
     has_spread = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)

@@ -75,7 +75,7 @@ def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
 
 
 def time_list(scan: Path, products: Path, root: Path, count: int) -> tuple[Seconds, Seconds]:
-    """Time a list of `count` copies, below `root`, of a scan and its products: the first time, and later ones."""
+    """Time a list of `count` scans below `root`, at first and later; each has manifest and products, but no report."""
     for n in range(count):
         shutil.copytree(
             products, root / f"scan-{n}" / "products", ignore=shutil.ignore_patterns("report.html", "figures")
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
         count = rows_that_fit(rig, most_rows, folder)
         # Four simulated rows, again and again.
         write_scan(folder / "scan", rig, recorded_rows(rig, scene, min(4, count)), count)
-        behind = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
+        after_last_row = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
         same, other_seconds = from_samples(folder / "scan", repeats)
         products = small_products(folder)
         first, again = time_list(folder / "scan", products, folder / "many", scans_in_list)
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     boards = len(rig.receivers)
     lines = []
     for stage, limit in (("image", 0.1), ("report", 4.0)):
-        waited = [seconds_by_stage[stage] for seconds_by_stage in behind]
+        waited = [seconds_by_stage[stage] for seconds_by_stage in after_last_row]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
         lines.append(
             _report_seconds(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note)
@@ -147,7 +147,7 @@ def run(args: argparse.Namespace) -> int:
         note = f"{wall:.2f} s wall"
         lines.append(_report_seconds(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
     show("waiting times, simulated rows", lines, args.quick)
-    write(args.json, "waits", lines, behind=behind, commands=typed)
+    write(args.json, "waits", lines, behind=after_last_row, commands=typed)
     return 0
 
 
@@ -156,6 +156,7 @@ def small_products(folder: Path) -> Path:
     scan = folder / "small"
     products = folder / "made"
     rig = ["--config", str(ROOT / "instrument.toml")]
+    # A scene smaller than the published one, if the examples have it.
     if (SCENE.parent / "own-scene.toml").exists():
         small = SCENE.parent / "own-scene.toml"
     else:

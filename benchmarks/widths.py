@@ -161,7 +161,7 @@ def run(args: argparse.Namespace) -> int:
     scene_number = np.repeat(np.arange(len(scenes)), plate_counts)
     deviation = (true - plain) / plain.real
     parts = [learn_half_widths(features, part, row, scene_number) for part in (deviation.real, deviation.imag)]
-    # Root mean square of the half widths of both parts, as of ours (`declared_figures`); relative to |true|.
+    # Root mean square of the half widths of both parts, as of ours (`compare_with_plate`); relative to |true|.
     rival = np.hypot(*parts) / np.sqrt(2) * plain.real / np.abs(true)
     figures = {}
     print(f"{len(scenes)} scenes, {true.size} plates; median half widths of 95 % regions")

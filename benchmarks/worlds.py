@@ -210,9 +210,10 @@ def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illuminati
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2
     plane_m = rig.geometry.object_distance_mm / 1e3
     boards = [illumination_geometry(Antennas.from_rig(rig, board), plane_m, middle_hz) for board in rig.receivers]
-    moved = np.stack([moved for moved, _ in boards])
-    steep = np.array([steepness for _, steepness in boards])
-    return Illumination(np.ones((2, *shape), np.complex64), moved, steep, (pixel_m, pixel_m))
+    # For a rise of 1: how far the point of the reflection moves, and the growth of the phase.
+    moved_m = np.stack([moved_m for moved_m, _ in boards])
+    steepness_rad_m = np.array([steepness for _, steepness in boards])
+    return Illumination(np.ones((2, *shape), np.complex64), moved_m, steepness_rad_m, (pixel_m, pixel_m))
 
 
 def dispersion_of_worlds(pair: generator.ImagePair) -> Dispersion:
@@ -225,7 +226,10 @@ def dispersion_of_worlds(pair: generator.ImagePair) -> Dispersion:
 
 
 def pixel_boxes(pair: generator.ImagePair) -> list[tuple[generator.Plate, tuple[int, int, int, int]]]:
-    """Return the plates within the picture with their boxes in pixels: left, bottom, right, top."""
+    """Return the plates within the picture without the table, and their boxes in pixels: left, bottom, right, top.
+
+    Right and top are the first pixels beyond the plate.
+    """
     out = []
     for plate in pair.world.plates:
         x0, y0, x1, y1 = plate.box_m
@@ -269,6 +273,7 @@ def analyse_world(
         known_scene = KnownScene(metal=box_in_mm(plates[metal_name][1], pair))
     prior = RigPrior(THETA_STD_RAD, channels_known=True)
     if leakage is not None:
+        # MOVED: probability that the mount has moved since its leakage was measured.
         prior = replace(prior, leakage=leakage, leakage_std=LEAKAGE_STD, leakage_measured=True, moved=MOVED)
     theta_rad = np.radians(pair.incidence_deg) + theta_error_rad
     analysis = analyse(images, Optics(theta_rad, prior), known_scene, classifier)
@@ -298,9 +303,9 @@ def match_plates(
 
 
 def draw_pair(nuisance: str, seed: int, mixed: bool = False) -> generator.ImagePair:
-    """Draw and scan one world: eight materials of Table 2 as half spaces, and copper.
+    """Draw and scan one world of nine plates: one of copper, the others of materials of Table 2, as half spaces.
 
-    `mixed`: a drawn share of them, between `LIBRARY_SHARE`, is of Table 2; the others are pieces that no library has.
+    `mixed`: a drawn share of the materials, between `LIBRARY_SHARE`, is of Table 2, others are of no library.
     """
     rng = np.random.default_rng([seed, sum(map(ord, nuisance))])
     rig = generator.published_rig()
@@ -319,7 +324,7 @@ def draw_piece(rng: np.random.Generator, permittivity: complex) -> complex:
 
 
 def draw_mixed_materials(rng: np.random.Generator) -> dict[str, complex | generator.Stack]:
-    """Draw nine materials: of Table 2, or of those that no library has, whose names are marked."""
+    """Draw nine materials (of which copper replaces one): of Table 2, or of no library, named "foreign ..."."""
     of_library = rng.random(9) < rng.uniform(*LIBRARY_SHARE)
     members = rng.choice(list(generator.TABLE_2), 9, replace=False)
     strangers = rng.choice(list(FOREIGN), 9, replace=False)
@@ -359,14 +364,14 @@ def judge_world(nuisance: str, seed: int, searched: bool = False, mixed: bool = 
         seed,
         verdict.level,
         tuple(f"{r.what}: {r.why}" for r in verdict.reasons),
-        tuple(declared_figures(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
+        tuple(compare_with_plate(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
         missed=len(pixel_boxes(pair)) - len({plate.centre_m for _, plate in judged}),
         stray=len(analysis.patches) - len(judged),
     )
 
 
-def declared_figures(nuisance: str, patch: PatchResult, plate: generator.Plate) -> PatchFigures:
-    """Compare one patch with its plate."""
+def compare_with_plate(nuisance: str, patch: PatchResult, plate: generator.Plate) -> PatchFigures:
+    """Compare one patch with its plate, whose true permittivity is that of its half space."""
     e = patch.permittivity
     if patch.refused is None:
         refused = ""
@@ -426,6 +431,7 @@ def draw_metal_world(rng: np.random.Generator, with_metal: bool) -> generator.Wo
     rig = generator.published_rig()
     materials: dict[str, complex | generator.Stack] = dict(generator.TABLE_2)
     for name, liquid in LIQUIDS.items():
+        # The glass of the dish, 1 to 3 mm thick.
         materials[name] = generator.Stack(((6.9 - 0.5j, rng.uniform(1e-3, 3e-3)),), liquid)
     for number in range(4):
         sheet = rng.uniform(2, 5) * (1 - 1j * rng.uniform(0.001, 0.05))
@@ -463,7 +469,7 @@ def _judge_metal(job: tuple[str, int, bool]) -> MetalFigures:
 
 
 def print_metal(scenes: Sequence[MetalFigures]) -> None:
-    """Print how often a declared metal is withdrawn, and what scenes without metal are given."""
+    """Print for each kind: how often the metal is withdrawn, the verdicts, and in how many scenes there are names."""
     for kind in METAL_KINDS:
         scenes_of_kind = [scene for scene in scenes if scene.kind == kind]
         if scenes_of_kind:
@@ -501,7 +507,7 @@ def format_line(title: str, scenes: Sequence[SceneFigures]) -> str:
 
 
 def verdict_line(title: str, scenes: Sequence[SceneFigures], undisturbed: Sequence[SceneFigures]) -> str:
-    """Return one line of the table of verdicts."""
+    """Return one line of the table of verdicts; in `undisturbed` scenes naming the nuisance is a false alarm."""
     good = [scene for scene in scenes if scene.level == "good"]
     under_good = [p.inside for scene in good for p in scene.patches if p.inside is not None]
     cells = [f"{title:<14}{len(scenes):>7}{100 * len(good) / len(scenes):>8.0f}"]

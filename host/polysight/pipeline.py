@@ -11,7 +11,7 @@ from polysight.settings import DEFAULT, Settings
 
 
 class Pipeline:
-    """Processes a scan: add rows, then `finish`. `live`: images of the rows so far; `samples`: as of `KeptSamples`."""
+    """Processes a scan: add rows, then `finish`. `live`: images of the rows so far."""
 
     def __init__(
         self,
@@ -20,7 +20,7 @@ class Pipeline:
         inputs: process.Inputs = process.NO_INPUTS,
         *,
         live: bool = False,
-        samples: process.Use = "none",
+        samples: process.Use = "none",  # "read" restores samples kept earlier, "keep" also saves those of other rows
     ) -> None:
         self.source = source
         self.settings = settings
@@ -47,7 +47,7 @@ class Pipeline:
 
     def synchronise_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; return the synchronised rows."""
-        return process.map_boards(self.quality.boards, lambda board: self._synchronise(board, row), self.images.live)
+        return process.map_boards(self.quality.boards, lambda b: self._synchronise(b, row), parallel=self.images.live)
 
     def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
         with self.quality.measure_time("read and synchronise"):
@@ -62,6 +62,7 @@ class Pipeline:
     def form_images(self, from_sums: bool = False) -> imaging.Images:
         """Form both images on the rig's plane, not relative to metal; `from_sums`: from a live scan's running sums."""
         if self.settings.sparse and not from_sums:
+            # Reconstructs missing positions: of the images into `samples.filled`, of the sub-bands as returned.
             self.sub_bands = self.samples.fill_missing()
         with self.quality.measure_time("image"):
             if from_sums:
@@ -94,7 +95,7 @@ class Pipeline:
             incidence = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
             result = materials.analyse(images, optics, known_scene, classifier)
-            metal_plane = None if known_scene is None else known_scene.plane
+            metal_plane = None if known_scene is None else known_scene.plane  # of a plate scanned separately
             self.quality.note_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):
             band_images = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
@@ -117,6 +118,7 @@ class Pipeline:
         verdict = process.judge(self.quality, result, self.plane, classifier, self.rig.check)
         if not verdict.usable:
             result = result.without_result()
+        # `plates`, the true ones of the scene if they are known, are handed on.
         return process.Findings(images, result, verdict, self.plane, classifier, plates)
 
     def finish(self, out: Path, plates: materials.Plates = (), progress: Progress = no_progress) -> process.Products:

@@ -163,7 +163,7 @@ def check_receivers(context: CheckContext) -> Finding:
         losses.append(f"{r.mbit_s:.0f} Mbit/s a card: {loss}")
     observed = f"receivers ({scheduling}) with all cores busy: {'; '.join(losses)}"
     facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
-    # Rates above that of this rig's cards are for information.
+    # Packets/s; `card_rates` lists it too. Rates above that of this rig's cards are for information.
     card_rate = 1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)
     rates_of_cards = results[: rates.index(card_rate) + 1]
     if any(r.lost for r in rates_of_cards):
@@ -338,7 +338,7 @@ def _run_row(context: CheckContext) -> RowFinished:
     plan = RasterPlan(_POINTS, 1, rig.grid.step_x_mm, rig.grid.step_y_mm)
     scan_id = f"doctor-{new_scan_id()}"
     burst = rig.burst
-    pi.follow(scan_id, 0, lambda _event: None)
+    pi.follow(scan_id, last_seq=0, on_event=lambda _event: None)
     pi.begin_run(
         BeginRun(
             scan_id=scan_id,
@@ -352,7 +352,7 @@ def _run_row(context: CheckContext) -> RowFinished:
     )
     try:
         make_ready(pi, StopRequest(), lambda _phase, _message: None)
-        pi.run_row(scan_id, 0, 1)
+        pi.run_row(scan_id, row_index=0, take=1)
         return _take_row_end(context)
     finally:
         pi.come_to_rest("end of polysight doctor")
@@ -465,7 +465,7 @@ def _judge_interface(interface: NetworkInterface) -> Finding:
 
 
 def check_buffer(context: CheckContext, board: Board) -> Finding:
-    """Check that the receiving process starts and that the kernel grants its receive buffer."""
+    """Check that the receiving process starts and gets its receive buffer; without a warning, the card is usable."""
     hops = {h.where: h for h in context.surveys[board.name].hops}
     receiver = hops["receiver"]
     buffer = hops["buffer"]
@@ -478,7 +478,7 @@ def check_buffer(context: CheckContext, board: Board) -> Finding:
 
 
 def check_pulses(context: CheckContext) -> Finding:
-    """Capture a few bursts; check that the Pi sent every pulse and that none was too long."""
+    """Capture a few bursts; check that the Pi reports no fault of their pulses (seen: counted at the connector)."""
     if not context.options.pulse:
         return not_checked("--no-pulse: no SYNC_IN pulse is sent", "omit --no-pulse; nothing moves")
     if not context.usable_cards:
@@ -517,17 +517,17 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
         return not_checked("nothing was captured")
     frames = len(captured.valid)
     complete = int(captured.valid.sum())
-    facts = {"frames_expected": frames, "frames": complete, "bytes": captured.row.bytes}
-    facts["packets"] = captured.row.packets
+    row = captured.row
+    facts = {"frames_expected": frames, "frames": complete, "bytes": row.bytes, "packets": row.packets}
     if captured.radar is not None and captured.radar.state is RadarState.FAULT:
         observed = f"the radar stopped: {captured.radar.detail}"
         return error(observed, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
-    text = f"{complete} of {frames} frames, {captured.row.packets} packets"
-    return msgspec.structs.replace(_judge_frames(board, captured.row, text), facts=facts)
+    text = f"{complete} of {frames} frames, {row.packets} packets"
+    return msgspec.structs.replace(_judge_frames(board, row, text), facts=facts)
 
 
 def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
-    """Judge whether the card received the frames of a row; the first fault is the finding."""
+    """Judge if a row's frames came to this machine, by the first fault; `slipped`: only whole frames are missing."""
     if row.packets == 0:
         e = silent_radar(board, row)
         return error(e.what, e.why, e.remedy)
@@ -563,9 +563,9 @@ def check_level(context: CheckContext, board: Board) -> Finding:
     captured = context.captured.get(board.name)
     if captured is None or not captured.valid.any():
         return not_checked("no complete frame was captured")
+    # [chirp, sample, I or Q, RX]; I and Q count together in the rms.
     words = captured.words[captured.valid]
     clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
-    # I and Q count together, for each RX.
     rms = np.sqrt(np.mean(words.astype(np.float64) ** 2, axis=(0, 1, 2)) * 2)
     peak = int(np.abs(words.astype(np.int32)).max())
     observed = f"rms {rms.min():.0f}..{rms.max():.0f} counts over the RX, peak {peak} of {FULL_SCALE}"
@@ -639,12 +639,12 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
             _suggest_start_offset(rig, board, median),
             **facts,
         )
-    # The crystals' share of the delay is not known here, and left out.
-    delay_s = -signal.start_delay_s(rig)[0]
-    if abs(delay_s) > _MAX_DELAY_S:
-        start = board.start_offset_hz + delay_s * rig.chirp.slope_hz_per_s
+    # Positive: early, as if the start offset were larger. The crystals' share, known from the drift, is taken off.
+    early_s = -signal.start_delay_s(rig)[0]
+    if abs(early_s) > _MAX_DELAY_S:
+        start = board.start_offset_hz + early_s * rig.chirp.slope_hz_per_s
         return warning(
-            f"{observed}; {predicted}, {delay_s * 1e9:+.1f} ns away",
+            f"{observed}; {predicted}, {early_s * 1e9:+.1f} ns away",
             "start_offset_hz in the rig file is not the programmed one, the geometry is wrong, or the board is"
             " triggered at another time than the transmitter",
             f"if the board was programmed so: start_offset_hz = {start:.0f} for {board.name}",

@@ -35,6 +35,7 @@ def paper_distance(
     if first.shape[1] % WIDTH:
         distance = np.abs(first[:, None, :] - second[None, :, :]).sum(axis=2)
     else:
+        # It takes 1/P in the place of P, and None for no distance of P.
         channels = channel_distances(ratio_columns(first), ratio_columns(second), measure if p else None)
         distance = h * channels[0] + v * channels[1] + p * channels[2]
     if np.ndim(a) > 1 or np.ndim(b) > 1:
@@ -87,6 +88,7 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
 
     def fit(self, X: npt.ArrayLike, y: npt.ArrayLike) -> Self:
         """Store the pixels X [n, columns] and their materials y [n]."""
+        # The base class would take sparse arrays; these are refused.
         check_array(X, accept_sparse=False)
         return super().fit(X, y)
 

@@ -206,6 +206,7 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
         for speed in _list_speeds(rig, minutes):
+            # Two pulses stand in: the most that fit do not depend on their number.
             plan = _set_burst(rig, speed, 2, period)
             most = _find_max_pulses(plan)
             with_short_last_packet = (n for n in range(most, 1, -1) if not fills_whole_packets(plan, n))
@@ -220,7 +221,7 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
 
 
 def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float) -> Instrument:
-    """Replace speed and burst without validation, for speed; the values keep the rig file's rules."""
+    """Replace speed and burst without validation, which would take long; the values keep the rig file's rules."""
     stage = msgspec.structs.replace(rig.stage, speed_mm_s=speed_mm_s)
     burst = msgspec.structs.replace(rig.burst, pulses=pulses, period_us=period_us)
     return msgspec.structs.replace(rig, stage=stage, burst=burst)
@@ -512,6 +513,7 @@ def forecast_scene(
 ) -> Forecast:
     """Predict a scan, with warnings about the plates of a scene file, if there is one. Raises ConfigError.
 
+    The scene file's own grid, burst, image, stage and distance replace the rig's; then `changes` are applied.
     Other parameters as of :func:`forecast`.
     """
     plates: list[Plate] = []

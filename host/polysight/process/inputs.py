@@ -1,4 +1,4 @@
-"""Inputs of processing: what the settings name (boxes drawn by hand, a metal plate's scan, the library)."""
+"""Inputs of processing: what the settings name (a file of labelled boxes, a metal plate's scan, the library)."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ NO_INPUTS = Inputs()
 
 
 def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> KnownScene:
-    """Return the boxes drawn by hand as patches of an image with axes `x_m`, `y_m`, and the metal in the scene.
+    """Return the boxes of the label file as patches of an image with axes `x_m`, `y_m`, and the metal in the scene.
 
-    The metal is the given metal box; with a scan of a plate no metal in the scene is used; otherwise it is a drawn box
+    The metal is the given metal box; with a scan of a plate no metal in the scene is used; otherwise it is a box
     that the labels declare metal, the first of several. Without label file the patches are searched for later.
 
     Raises DataError if a box holds no pixel; in labels drawn by hand also if they are invalid (`check_labels`).

@@ -1,9 +1,9 @@
 """Access checks of every request: Host, Origin, token, size of head and body; safe headers on every answer.
 
-One middleware in front of the application. Reading needs the token too unless the server is bound to loopback without
-further host names. The token comes in a header, which no form, link or image of another page can send; requests that
-only read (images, event streams) may bring the session's cookie instead. How many connections may be open is limited in
-`front`.
+One middleware in front of the application. Reading below /api/ needs the token too, unless the server is bound to
+loopback without further host names. The token comes in a header, which no form, link or image of another page can send;
+requests that only read (images, event streams) may bring the session's cookie instead. How many connections may be open
+is limited in `front`.
 
 `HANDLERS` turn errors into answers: a code for programs and the three parts that people read.
 """
@@ -53,7 +53,7 @@ class Access:
     Attributes
     ----------
     token
-        Needed for control, and for reading unless `loopback`; "": nobody controls, everybody reads.
+        Needed for control, and for reading below /api/ unless `loopback`; "": nobody controls, everybody reads.
     loopback
         True if the server is bound to this machine only, and has no further names: behind a proxy, which needs one,
         requests of all machines come from this one.
@@ -77,7 +77,7 @@ class Access:
         return hmac.new(self.token.encode(), b"session of the operator's page", "sha256").hexdigest()
 
     def accepts_host(self, host: str) -> bool:
-        """True if a `Host` header names this server (a foreign name that resolves to it does not)."""
+        """True if a `Host` header has a name of this server or any address; bound to loopback, a loopback address."""
         name = read_host_name(host)
         if name in ("localhost", *self.hosts):
             return True
@@ -85,7 +85,7 @@ class Access:
             address = ipaddress.ip_address(name)
         except ValueError:
             return False
-        # No foreign name leads to an address.
+        # A page of another site reaches this server by a name of its own that resolves here, and not by an address.
         return address.is_loopback or not self.loopback
 
     def has_token(self, headers: Headers) -> bool:
@@ -163,7 +163,7 @@ class Guard:
                 403, ErrorCode.ORIGIN_FOREIGN, "The request comes from a page of another site", "only this server's own"
                 " pages may ask", "use the page that this server serves",
             )  # fmt: skip
-        # Of longer numbers int() may refuse to read thousands of digits; such a body is measured while it is read.
+        # int() may refuse thousands of digits; a body with a length of 19 or more digits is measured while it is read.
         length = headers.get("content-length", "0")
         if length.isdecimal() and len(length) < 19 and int(length) > BODY_BYTES:
             return refuse_body()

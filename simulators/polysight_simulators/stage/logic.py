@@ -105,6 +105,7 @@ class StageLogic:
         self.activity = "idle"
         self.alarm: StageError | None = None
         self.homed = False
+        # Of the last motion command, for its `done` line: whether a HOLD came during the row, and which command it was.
         self.held = False
         self.row_command = False
         self.homing_command = False
@@ -153,7 +154,7 @@ class StageLogic:
         return "alarm" if self.alarm else "idle"
 
     def execute(self, verb: str, args: tuple[int, ...]) -> None:
-        """Execute a command. Raises Refused."""
+        """Execute a command; HELLO changes nothing here, the caller answers it. Raises Refused."""
         _require(verb in ARGUMENTS, StageError.UNKNOWN_COMMAND)
         _require(len(args) == ARGUMENTS[verb], StageError.ARGUMENT_COUNT)
         if verb == "HELLO":
@@ -388,8 +389,12 @@ class StageLogic:
         return Event.DONE
 
     def _plan_homing_leg(self) -> Event:
-        """Start the next leg of homing, or end it; the alarm HOMING_FAILED if a switch did not change as it should."""
+        """Start the next leg of homing, or end it; the alarm HOMING_FAILED if a switch did not change as it should.
+
+        At the end of its pull off an axis is at 0; if the stage was homed before, what it counted there are lost steps.
+        """
         along_x = self._phase < 3
+        # 0: search, 1: release, 2: pull off.
         step = self._phase % 3
         its_switch = SWITCH_X if along_x else SWITCH_Y
         travel = self.parameters[Parameter.TRAVEL_X if along_x else Parameter.TRAVEL_Y]

@@ -6,7 +6,7 @@ from scipy import ndimage
 
 from polysight.imaging import Images
 from polysight.materials.analyse import KnownScene, Optics, analyse
-from polysight.materials.common_change import estimate_common_change
+from polysight.materials.common_change import _Explained, estimate_common_change
 from polysight.materials.measure import Scatter, median_ratio
 from polysight.materials.metal import find_halo, metal_by_label, metal_unevenness, to_metal
 from polysight.materials.segment import align, segment
@@ -223,3 +223,38 @@ def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
     glow = 0.3 * ndimage.gaussian_filter(by_level[-1].mask.astype(float), 8.0)
     assert find_halo(by_level[-1].interior, patches, images(h, v + glow)).level > 0
     assert find_halo(by_level[0].interior, patches, images(h, v + glow)).level == 0
+
+
+def _explain_cases(mean: float, std: tuple[float, ...]) -> _Explained:
+    """Return cases of one plate with this mean of drift and fringes, and these standard deviations."""
+    square = np.array([[mean**2 + s**2] for s in std])
+    mean_of_cases = np.full_like(square, mean)
+    return _Explained(
+        log_evidence=np.zeros(len(std)),
+        mean=mean_of_cases,
+        square=square,
+        drift=mean_of_cases,
+        drift_square=square,
+        remaining=np.zeros((len(std), 2, 1)),
+    )
+
+
+@pytest.mark.parametrize("wide_share", [0.0, 0.03, 0.1, 0.2, 0.5, 1.0])
+def test_the_error_of_the_common_change_holds_95_percent_of_unlike_cases(wide_share: float):
+    """A rig is stable or drifts ten times as much: 1.96 times the root mean square hold 92 % if half of them drift."""
+    explained = _explain_cases(0.02, (0.001, 0.01))
+    weight = np.array([1 - wide_share, wide_share])
+    rng = np.random.default_rng(3)
+    std = np.where(rng.random(200_000) < wide_share, 0.01, 0.001)
+    drawn = 0.02 + std * rng.standard_normal(std.size)
+
+    error = float(explained.error(weight)[0])
+
+    assert np.mean(np.abs(drawn - 0.02) < 1.96 * error) >= 0.947
+    assert error >= 0.999 * np.std(drawn - 0.02) - 1e-5
+
+
+def test_the_error_of_a_common_change_is_the_standard_deviation_of_a_single_case():
+    error = _explain_cases(-0.3, (0.004,)).error(np.ones(1))
+
+    assert error == pytest.approx(0.004, rel=1e-3)

@@ -2,7 +2,7 @@
 const KEY = "polysight-token";
 const ANSWER_MS = 40000; // a read may take 30 s on a network drive
 const CONTROL_MS = 8000; // a scan takes a command within 5 s, or it is withdrawn
-const RUNNING_MS = 2000;
+const RUNNING_MS = 1200; // a killed scan is red within 2 s: the server looks every 0.5 s
 export const INTERRUPTED = "interrupted";
 // What advice for a terminal is called on a page.
 const ON_PAGE = [

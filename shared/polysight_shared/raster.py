@@ -162,7 +162,7 @@ class Stage(Section, frozen=True):
                     speed_keys = ", stage.speed_mm_s, stage.accel_mm_s2"
                 return (
                     f"the grid does not fit the stage: {points} points {step:g} mm apart with {margin:g} mm of run-up"
-                    f" reach {half:g} mm to either side of {axis} = {centre:g} mm, and the stage has {travel:g} mm:"
+                    f" reach {half:g} mm to either side of {axis} = {centre:g} mm, and the stage travels {travel:g} mm:"
                     f" {remedy}"
                     f" (grid.{key}, grid.step_{axis}_mm{speed_keys}, stage.centre_{axis}_mm, stage.travel_{axis}_mm)"
                 )

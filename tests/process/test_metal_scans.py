@@ -172,7 +172,9 @@ def test_amplitude_and_sub_bands_resolve_an_ambiguous_layer(products, capsys):
     assert fit("--amplitude", "0")["warnings"]
     single_band = fit()
     three = fit("--bands", "3")
-    assert single_band["rivals"] == three["rivals"] == []
+    assert three["rivals"] == []
+    # Three standard deviations are a chi-square of 9: noise puts the whole sweep's rival at 9 to 11.
+    assert all(rival["chi2"] - single_band["chi2"] > 8 for rival in single_band["rivals"])
     # Bands tell more than the whole sweep, but share what metal and edges are off by.
     assert 0.25 < three["std_real"] / single_band["std_real"] < 2
     for layers in (single_band, three):

@@ -22,7 +22,7 @@ from tests.support.refusals import refused
 
 from polysight.serve.door import MOST_SILENT, is_command
 from polysight.serve.guard import TOKEN_HEADER
-from polysight.serve.server import load_token
+from polysight.serve.server import Place, load_token, serve
 from polysight_shared.error_codes import ErrorCode
 
 
@@ -253,3 +253,14 @@ def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
             assert ask(server, "/api/running", Host=host, **token)[0] == 200
             assert ask(server, "/", Host=host)[0] == 200
         assert ask(server, "/", Host="elsewhere.example.org", **token)[0] == 400
+
+
+def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
+    """A folder elsewhere may lie on a drive that is not mounted: scans would fill another one."""
+    with serving(Path("scans"), tmp_path) as server:
+        assert get(server, "/api/scans")["scans"] == []
+    assert (tmp_path / "scans").is_dir()
+    for folder, control in ((tmp_path / "drive" / "scans", True), (Path("only-shown"), False)):
+        with refused(ErrorCode.FILE_MISSING, folder, "mkdir -p"):
+            serve(folder, Place(), None, control)
+        assert not folder.exists()

@@ -52,7 +52,7 @@ from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Site, Watches
 from polysight.serve.stage import StageControl
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, quote
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Nice value of the reading process, chosen: it gives way to capture and scan.
@@ -139,11 +139,24 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
         if the folder or a file of TLS is missing, the token's file is unsafe, or the address cannot be bound.
     """
     if not root.is_dir():
-        raise ConfigError(f"{root}: no such folder", "scans are listed under it", "make it, or give another")
+        _make_folder(root, control)
     if config is not None:
         config = config.absolute()
     shown_scans = Shown(root.absolute(), None, control, config)
     return _run(shown_scans, place, f"scans in {root}")
+
+
+def _make_folder(root: Path, control: bool) -> None:
+    """Make the folder of scans here. Raises ConfigError for one elsewhere, or if the server only shows."""
+    if root.exists() or not control or root.absolute().parent != Path.cwd():
+        raise ConfigError(
+            f"{root}: no such folder",
+            "scans are listed under it; one that is not here may lie on a drive that is not mounted, so it is not made",
+            f"mkdir -p {quote(root)}, or give another",
+            code=ErrorCode.FILE_MISSING,
+        )
+    root.mkdir()
+    sys.stderr.write(f"polysight serve: made the folder {root}\n")
 
 
 def preview(folder: Path, place: Place, control: bool) -> int:

@@ -11,12 +11,14 @@ from tests.support.doctor.case import QUICK, RIG, make_context
 from tests.support.rigs import programmed_rig
 
 from polysight.calibration.files import write_calibration
+from polysight.capture.card import CardSurvey
 from polysight.capture.network import route_interface
 from polysight.cli.main import main
 from polysight.doctor import checks, context
 from polysight.doctor.checks import CHECKS, run_checks
 from polysight.doctor.context import CheckContext, DoctorOptions, LoadResult, System, error, measure_receivers, ok
 from polysight.doctor.rig_checks import (
+    check_buffer,
     check_calibration,
     check_disk,
     check_host_clock,
@@ -25,6 +27,7 @@ from polysight.doctor.rig_checks import (
     check_receivers,
     check_time,
 )
+from polysight_shared.findings import Finding
 from polysight_shared.messages import GPIOD, WIRES, HelloReply
 from polysight_shared.sockets import HOST_KEYS
 from polysight_shared.tables import to_builtins
@@ -201,3 +204,23 @@ def test_the_receivers_are_measured_with_packets_at_each_rate():
     assert all(r.reached > 0 for r in results)
     # Packets of the second record are not taken for leftovers of the first
     assert results[1].lost < results[0].sent
+
+
+@pytest.mark.parametrize(
+    ("buffer", "receiver", "verdict"),
+    [
+        ("ok", "ok", "ok"),
+        ("warning", "ok", "warning"),
+        ("ok", "warning", "warning"),
+        ("error", "warning", "error"),
+        ("note", "error", "error"),
+    ],
+)
+def test_a_card_is_captured_unless_its_reception_has_an_error(buffer, receiver, verdict):
+    """A scan goes on with a smaller buffer than requested, and so do the checks after it."""
+    board = RIG.by_name("RH")
+    hops = [Finding(receiver, "receiver", where="receiver"), Finding(buffer, "buffer", where="buffer")]
+    context = make_context()
+    context.surveys = {"RH": CardSurvey(board, "2.8", hops)}
+    assert check_buffer(context, board).level == verdict
+    assert context.usable_cards == (set() if verdict == "error" else {"RH"})

@@ -332,7 +332,7 @@ class CheckContext(ExitStack):
     hello, hello_at_ns, hello_took_ns
         The Pi's self-description; this machine's wall clock in the middle of the request, and its duration, in ns.
     usable_cards
-        Names of boards whose card passed the check `buffer`.
+        Names of boards whose card had no error in the check `buffer`.
     captured, signals
         Frames and direct path of each board, by name.
     """

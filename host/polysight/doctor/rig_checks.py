@@ -50,7 +50,7 @@ from polysight_shared import __version__
 from polysight_shared.config import Board, Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.findings import Finding
+from polysight_shared.findings import LEVELS, Finding
 from polysight_shared.geometry import incidence_deg
 from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S, BeginRun, RowFinished, is_simulated
 from polysight_shared.raster import RasterPlan, check_burst_fits
@@ -465,15 +465,15 @@ def _judge_interface(interface: NetworkInterface) -> Finding:
 
 
 def check_buffer(context: CheckContext, board: Board) -> Finding:
-    """Check that the receiving process starts and gets its receive buffer; without a warning, the card is usable."""
+    """Check that the receiving process starts and gets its receive buffer; without an error, the card is usable."""
     hops = {h.where: h for h in context.surveys[board.name].hops}
     receiver = hops["receiver"]
     buffer = hops["buffer"]
-    for level in ("error", "warning"):
-        for hop in (buffer, receiver):
-            if hop.level == level:
-                return hop
-    context.usable_cards.add(board.name)
+    worst = max((buffer, receiver), key=lambda hop: LEVELS.index(hop.level))
+    if worst.level != "error":
+        context.usable_cards.add(board.name)
+    if worst.level in ("error", "warning"):
+        return worst
     return ok(f"{buffer.what}; {receiver.what}")
 
 

@@ -131,5 +131,14 @@ def test_only_a_fault_of_the_radar_itself_is_an_error_beside_complete_frames(sta
     assert ("hot" in finding.what) is (state is RadarState.FAULT)
 
 
+def test_frames_of_several_chirps_are_counted_as_frames():
+    context = with_frames(simulate_frames("RH"))
+    chirps = 4
+    context.loaded_rig = programmed_rig(burst={"pulses": 2, "chirps": chirps, "chirp_us": 143.0, "period_us": 2800.0})
+    context.captured["RH"].valid[5] = False
+    facts = check_radar(context, RIG.by_name("RH")).facts
+    assert (facts["frames_expected"], facts["frames"]) == (FRAMES // chirps, FRAMES // chirps - 1)
+
+
 def test_the_transmitter_has_no_direct_path():
     assert check_direct_path(make_context(), RIG.by_name("LS")).level == "note"

@@ -515,14 +515,14 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
     captured = context.captured.get(board.name)
     if captured is None:
         return not_checked("nothing was captured")
-    frames = len(captured.valid)
-    complete = int(captured.valid.sum())
+    is_complete = captured.valid.reshape(-1, context.rig.burst.chirps).all(axis=1)
+    complete = int(is_complete.sum())
     row = captured.row
-    facts = {"frames_expected": frames, "frames": complete, "bytes": row.bytes, "packets": row.packets}
+    facts = {"frames_expected": is_complete.size, "frames": complete, "bytes": row.bytes, "packets": row.packets}
     if captured.radar is not None and captured.radar.state is RadarState.FAULT:
         observed = f"the radar stopped: {captured.radar.detail}"
         return error(observed, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
-    text = f"{complete} of {frames} frames, {row.packets} packets"
+    text = f"{complete} of {is_complete.size} frames, {row.packets} packets"
     return msgspec.structs.replace(_judge_frames(board, row, text), facts=facts)
 
 
@@ -562,7 +562,7 @@ def check_level(context: CheckContext, board: Board) -> Finding:
     """Check for clipped chirps, which cannot be synchronised, and for an RX without a signal."""
     captured = context.captured.get(board.name)
     if captured is None or not captured.valid.any():
-        return not_checked("no complete frame was captured")
+        return not_checked("no complete chirp was captured")
     # [chirp, sample, I or Q, RX]; I and Q count together in the rms.
     words = captured.words[captured.valid]
     clipped = int(((words >= FULL_SCALE) | (words <= -FULL_SCALE)).any(axis=(1, 2, 3)).sum())
@@ -590,7 +590,7 @@ def check_direct_path(context: CheckContext, board: Board) -> Finding:
     if board.role == "transmit":
         return not_checked("the transmitter has no direct path to itself")
     if captured is None or not captured.valid.any():
-        return not_checked("no complete frame was captured")
+        return not_checked("no complete chirp was captured")
     signal = find_direct(context.rig, board, captured.words, captured.valid)
     if signal.found:
         context.signals[board.name] = signal

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tomli_w
-from tests.support.rigs import published_rig
+from tests.support.rigs import published_rig, rig_with
 
 import polysight
 from polysight.cli.main import main
 from polysight.data import find_packaged
 from polysight.planning import find_scene_warnings, read_scene, warn_of_scene
+from polysight.planning.plan_command import rig_lines
 
 OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
@@ -75,6 +78,24 @@ def test_plan_and_simulate_say_it(tmp_path, capsys):
         warnings.simplefilter("always")
         polysight.simulate(path, tmp_path / "again")
     assert any(str(note.message).startswith("gap: ") for note in notes)
+
+
+def test_proposals_are_of_the_scene_and_say_it_too(tmp_path, capsys):
+    """Its grid is the aperture that they keep; plates are checked in each."""
+    path = tmp_path / "scene.toml"
+    grid = {"columns": 41, "rows": 21, "step_x_mm": 4.0, "step_y_mm": 4.0}
+    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": [plate(-30), plate(15)]}))
+    assert main(["plan", "--minutes", "30", "--scene", str(path), "--json"]) == 0
+    plans = json.loads(capsys.readouterr().out)["plans"]
+    assert plans
+    for plan in plans:
+        assert (plan["columns"] - 1) * plan["step_x_mm"] == pytest.approx(160, abs=plan["step_x_mm"])
+        assert {warning["topic"] for warning in plan["warnings"]} & {"gap"}
+
+
+def test_a_text_of_the_scene_stays_a_text_in_the_lines_of_the_rig_file():
+    lines = rig_lines(rig_with(image={"apodisation": "taylor"}), published_rig())
+    assert tomllib.loads(lines) == {"image": {"apodisation": "taylor"}}
 
 
 @pytest.mark.parametrize(

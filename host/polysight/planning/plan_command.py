@@ -134,7 +134,8 @@ def rig_lines(plan: Instrument, original: Instrument) -> str:
     for section, keys in new.items():
         if not isinstance(keys, dict):
             continue
-        lines = [f"{key} = {value}" for key, value in keys.items() if value != old[section].get(key)]
+        # Strings, numbers and booleans of JSON are those of TOML.
+        lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value != old[section].get(key)]
         if section == "stage" and any(old[section][key] != keys[key] for key in _PI_KEYS):
             lines.append("# set speed_mm_s and accel_mm_s2 also in the Pi's rig file, then restart polysight-pi there")
         if lines:
@@ -490,7 +491,7 @@ class PlanOptions:
     like, snr_db, row_overhead_s
         Scan whose noise and standstill are taken, and either of them as a number, which comes first.
     scene_mm, scene
-        Size of the scene in the object plane, and a scene file whose plates are checked.
+        Size of the scene in the object plane, and a scene file whose plates are checked, with its values of the rig.
     """
 
     minutes: float | None = None
@@ -516,10 +517,19 @@ def forecast_scene(
     The scene file's own grid, burst, image, stage and distance replace the rig's; then `changes` are applied.
     Other parameters as of :func:`forecast`.
     """
-    plates: list[Plate] = []
-    if scene is not None:
-        rig, plates = read_scene(scene, rig)
-    prediction = forecast(changes.apply(rig), noise, row_overhead_s, scene_mm)
+    scene_rig, plates = _apply_scene(rig, scene)
+    return _check_plates(forecast(changes.apply(scene_rig), noise, row_overhead_s, scene_mm), plates)
+
+
+def _apply_scene(rig: Instrument, scene: Path | None) -> tuple[Instrument, list[Plate]]:
+    """Return the rig with a scene file's values, and its plates; without a scene the rig itself. Raises ConfigError."""
+    if scene is None:
+        return rig, []
+    return read_scene(scene, rig)
+
+
+def _check_plates(prediction: Forecast, plates: list[Plate]) -> Forecast:
+    """Return the forecast with the warnings about the plates of a scene."""
     notes = tuple(warn_of_scene(prediction.rig, plates))
     return replace(prediction, warnings=prediction.warnings + notes)
 
@@ -530,7 +540,6 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     Raises PolysightError if the rig file, a value or the scan of --like is invalid.
     """
     original = load_instrument(config)
-    rig = changes.apply(original)
     noise, overhead = _choose_assumptions(options)
     if options.minutes is None:
         f = forecast_scene(original, changes, options.scene, noise, overhead, options.scene_mm)
@@ -539,7 +548,9 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
         else:
             sys.stdout.write(describe(f))
         return int(not f.possible)
-    plans = propose(rig, options.minutes, options.count, noise, overhead, options.scene_mm)
+    rig, plates = _apply_scene(original, options.scene)
+    proposals = propose(changes.apply(rig), options.minutes, options.count, noise, overhead, options.scene_mm)
+    plans = [_check_plates(proposal, plates) for proposal in proposals]
     if options.as_json:
         content = {"minutes": options.minutes, "plans": [forecast_values(p) for p in plans]}
         sys.stdout.write(json.dumps(content, indent=1) + "\n")

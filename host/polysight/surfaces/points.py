@@ -1,12 +1,15 @@
 """Points, normals and curvatures of a surface from the paths of its echoes, and the paths from these.
 
 With u the stage offset, T and R the antennas, p the specular point, t and r the unit vectors from the antennas to p:
-|p - T - u| + |p - R - u| = L and (t + r)_xy = -g (the path is stationary, so its gradient is that of fixed p). The
-normal is n = -(t + r) / |t + r| and cos(theta) = |t + r| / 2: the angle of incidence depends on the place alone. With
-H = sum (I - k k') / distance over both legs, E the tangents and X = -E' H_xy, the second derivative of the path by the
-place on the surface is P = E' H E + 2 cos(theta) K, and eliminating the place gives Q = H_xy - X' P^-1 X, hence
-K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta)). Curvature is positive for convex bodies. P^-1 is how far the point
-moves with the stage: nothing on an edge, and Q is linear in it. All arrays are [n, ...].
+|p - T - u| + |p - R - u| = L and (t + r)_xy = -g, with g the gradient of the path L by u (the path is stationary in p,
+so its gradient is that of fixed p). The normal is n = -(t + r) / |t + r| and cos(theta) = |t + r| / 2: the angle of
+incidence depends on the place alone.
+
+With K the surface's curvature, E the tangents [3, 2], H = sum (I - k k') / distance over both legs (k = t or r) and
+X = -E' H_xy (columns x and y), the second derivative of the path by the place on the surface is P = E' H E +
+2 cos(theta) K. Eliminating the place gives that by u, the curvature of the path, Q = H_xy - X' P^-1 X (rows and
+columns x and y), hence K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta)). Curvature is positive for convex bodies.
+P^-1 is how far the point moves with the stage: nothing on an edge, and Q is linear in it. All arrays are [n, ...].
 """
 
 from __future__ import annotations
@@ -92,7 +95,7 @@ def _compute_second_derivatives(
 
 
 def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
-    """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature `bend`."""
+    """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature Q, `bend`."""
     plane, cross, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     difference = plane - bend
     # The small part keeps the matrix solvable where the path bends as that of a point.
@@ -133,6 +136,7 @@ def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m
     _, _, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     second = along + twice_cosine[:, None, None] * curvature
     root = np.sqrt(np.abs(np.linalg.det(second)))
+    # 1e-9 keeps a focus, where det P is 0, finite.
     return twice_cosine / (2 * out_m * back_m * np.maximum(root, 1e-9))
 
 

@@ -54,9 +54,10 @@ POINTS = "surface.ply"
 MIN_RADIUS_M = 0.040
 # A surface that bends less than this, 1 / m, is flat: a radius of 2 m.
 FLAT_BEND = 0.5
-# Least number of points away from the edges that a permittivity is fitted to; chosen.
+# Least number of points away from the edges that a permittivity is fitted to; chosen. (`LEAST_POINTS`: of a surface.)
 MIN_POINTS = 20
-# Ratio r_s / r_p of metal is 1; a permittivity of 40 without loss has 1.5 at 55 degrees.
+# A segment whose ratio r_s / r_p is nearer to 1 is metal. Metal has 1; a permittivity of 40 without loss has 1.5 at 55
+# degrees.
 METAL_RATIO = 0.15
 # A loss below zero by so many standard deviations is no property of one medium, nor is a real part beyond these: the
 # fit ends at 1.2 and at 40.
@@ -77,10 +78,12 @@ BEHIND_ANOTHER = "it lies behind another surface: an echo from inside a body, wh
 # What an edge diffracts changes the slopes of windows near the border of the zone that its surface reflects to: by up
 # to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065
-# Both faces of a wall make one echo, whose path is that of neither: by the more the more its level changes over the
-# band, and the more the faces cancel. 95 % of 4000 drawn walls (0.5 to 25 mm, evenly on a logarithmic scale,
-# permittivity 2 to 9, loss 0.001 to 1, 53 degrees) appear within 1.96 standard deviations: 2.5 mm for a steady level
-# of at least 0.45 of metal's, more per rise of its logarithm, at most that of two faces that one window just resolves.
+# Both faces of a wall make one echo, whose path is that of neither: it is the farther off the more its level changes
+# over the band, and the more the faces cancel. `estimate_wall_std`: 2.5 mm for a level that does not change, and 35 mm
+# per unit of its logarithm, at most 11 mm (two faces that one window just resolves); times the third power of 0.45 over
+# the reflection if that is below 0.45 (1: metal), at most 20 mm. With these 95 % of 4000 drawn walls (0.5 to 25 mm,
+# evenly on a logarithmic scale, permittivity 2 to 9, loss 0.001 to 1, 53 degrees) appear within 1.96 standard
+# deviations.
 WALL_STD_M = 0.0025
 WALL_STD_OF_RISE_M = 0.035
 MOST_WALL_STD_M = 0.011
@@ -106,8 +109,7 @@ class Segment:
     centre_m, normal
         Means over its points, x, y, z in the rig frame; the normal points towards the antennas.
     radius_mm, radius_std_mm
-        The smallest radius of curvature, and its standard error (of its inverse, over the square of its inverse); None
-        for a plane.
+        The smallest radius R of curvature, and its standard error, R^2 times that of 1 / R; None for a plane.
     incidence_deg
         Mean incidence angle.
     permittivity, covariance
@@ -307,6 +309,7 @@ def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, A
     for number in np.unique(reflecting.segment[is_surface]):
         members = reflecting.segment == number
         if describe_segment(int(number), shape[members]).radius_mm is None:
+            # Flat: only its interior stays.
             is_surface &= interior | ~members
     return reflecting[is_surface], share[is_surface]
 
@@ -329,6 +332,7 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
     changes = [find_changes(find_shape(echoes, rig)) for rig in rigs]
     # Errors of path and slope by noise, one after the other.
     changes.append(find_changes(find_shape(replace(echoes, path_m=echoes.path_m + echoes.path_std_m), optics)))
+    # Along x and y of the stage.
     for axis in np.eye(2):
         slope = echoes.slope + echoes.slope_std * axis
         changes.append(find_changes(find_shape(replace(echoes, slope=slope), optics)))
@@ -344,6 +348,7 @@ def estimate_wall_std(reflection: float, rise: float) -> float:
     that in the lower.
     """
     steady = min(MOST_WALL_STD_M, WALL_STD_M + WALL_STD_OF_RISE_M * abs(rise))
+    # 0.05 keeps it finite: there the result has long been at its limit.
     cancelled = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
     return min(MOST_CANCELLED_STD_M, steady * cancelled**WALL_EXPONENT)
 
@@ -445,6 +450,7 @@ def estimate_bend_std(shape: Shape, axis: Array, bend: float) -> float:
     moved = (shape.points - shape.points.mean(axis=0)) @ tangent
     turned = (shape.normals - shape.normals.mean(axis=0)) @ tangent @ axis
     across = np.array([-axis[1], axis[0]])
+    # How fast normals turn per metre along the axis, and across it.
     rates = np.linalg.lstsq(np.stack([moved @ axis, moved @ across], axis=1), turned, rcond=None)[0]
     return float(np.hypot((high - low) / 2, rates[0] - bend))
 
@@ -496,11 +502,11 @@ def judge_segment(
 
 def add_permittivity(segment: Segment, eps: complex, sources: dict[str, Array]) -> Segment:
     """Add a permittivity with its covariances [2, 2] by source, unless no passive medium has it."""
-    (aa, ab), (_, bb) = sum(sources.values(), np.zeros((2, 2))).tolist()
-    if eps.imag > MAX_GAIN_SIGMA * bb**0.5 or not LEAST_REAL <= eps.real <= MOST_REAL:
+    (real2, mixed), (_, imag2) = sum(sources.values(), np.zeros((2, 2))).tolist()
+    if eps.imag > MAX_GAIN_SIGMA * imag2**0.5 or not LEAST_REAL <= eps.real <= MOST_REAL:
         return replace(segment, reason=NO_SINGLE_MEDIUM)
     dominant = max(sources, key=lambda name: float(np.trace(sources[name])))
-    return replace(segment, permittivity=eps, covariance=((aa, ab), (ab, bb)), dominated_by=dominant)
+    return replace(segment, permittivity=eps, covariance=((real2, mixed), (mixed, imag2)), dominated_by=dominant)
 
 
 def plain_segment(segment: Segment) -> dict[str, Any]:

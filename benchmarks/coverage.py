@@ -84,7 +84,7 @@ WIDE_REAL = (2.0, 12.0)
 WIDE_LOSS_TANGENT = (0.003, 0.4)
 # Columns and rows; the image stays as it is, so that the outer plates lie beyond the smallest aperture.
 WIDE_APERTURES = ((45, 43), (33, 31), (25, 25))
-# Limits of the bins of a name's probability; chosen.
+# Limits of the bins of a name's probability, the upper ones outside: the last bin holds 1. Chosen.
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
 # Squared distances within which a normal distribution in two dimensions holds 68 and 95 %.
 CHI2_68 = 2.279
@@ -104,7 +104,8 @@ class PatchFigures:
     kind: str
     # Squared distance of the true permittivity from the estimate, in units of the estimate's covariance.
     distance2: float
-    # Error and stated standard error (rms of both parts), over the true permittivity's magnitude.
+    # Magnitude of the complex error, and stated standard error (rms of both parts: with equal ones the median magnitude
+    # is 1.18 times it); both over the true permittivity's magnitude.
     relative_error: float
     relative_std: float
     leakage_measured: bool
@@ -126,7 +127,10 @@ class PatchFigures:
 
 
 class Cubes:
-    """A scene as a source of rows that were synchronised already, in memory, for `Pipeline`."""
+    """A scene as a source of rows that were synchronised already, in memory, for `Pipeline`.
+
+    `seed` draws gains and noise; None: the scene's own.
+    """
 
     mirrored = False
     synchronised = True
@@ -155,6 +159,7 @@ class Cubes:
 
 def draw_scene(seed: int, kind: str = "full") -> Scene:
     """Draw a scene of six plates, or another of `KINDS`, with every nuisance at random; the ranges are chosen."""
+    # The first number keeps these scenes apart from others' draws with the same seed.
     rng = np.random.default_rng([20261122, seed, KINDS.index(kind)])
     leak = [complex(0.1 * rng.random() * np.exp(2j * np.pi * rng.random())) for _ in range(2)]
     materials = MATERIALS
@@ -170,11 +175,12 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         metal = None
     else:
         metal = int(rng.integers(len(PLACES)))
-    tilted = rng.random() < 0.5
+    # Either each plate is tilted, or the plane with all of them.
+    plates_tilted = rng.random() < 0.5
     plates = []
     for i, (x, y) in enumerate(PLACES):
         place = {"centre_mm": [x + rng.uniform(-3, 3), y + rng.uniform(-3, 3)], "size_mm": [46.0, 46.0]}
-        relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * tilted).tolist()}
+        relief = {"height_mm": rng.uniform(-0.5, 0.5), "tilt_deg": (rng.uniform(-1, 1, 2) * plates_tilted).tolist()}
         if i == metal:
             material = {"name": "metal", "metal": True}
         else:
@@ -182,9 +188,11 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
         plates.append({**place, **relief, **material})
     if kind == "no metal":
         plates = plates[: int(rng.integers(1, len(PLACES) + 1))]
+    # Standard error with which a calibration has measured the leakage; None: it is not measured.
     measured = None
     if rng.random() < 0.5:
         measured = 0.003
+    # Relative standard deviations of the real part and the loss.
     specimen_spread = [0.03, 0.3]
     if kind == "named":
         specimen_spread = [0.0, 0.0]
@@ -201,7 +209,7 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
             "image": {"columns": 116, "rows": 90},
             "specimen_spread": specimen_spread,
             "plane_shift_mm": rng.uniform(-10, 10),
-            "plane_tilt_deg": (rng.uniform(-1, 1, 2) * (not tilted)).tolist(),
+            "plane_tilt_deg": (rng.uniform(-1, 1, 2) * (not plates_tilted)).tolist(),
             "plates": [] if kind in ("empty", "noise") else plates,
             "disturbances": {
                 "leakage_h": [leak[0].real, leak[0].imag],
@@ -223,12 +231,14 @@ def _draw_materials(rng: np.random.Generator) -> dict[str, tuple[float, float]]:
 
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     """Simulate a metal plate on the rig file's plane with the scene's rig: the same leakage and gains."""
+    # It fills the image of 232 mm by 180 mm, and ends far from it.
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
     alone = msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
     pipeline = _image_scan(Cubes(rig, alone))
     images = pipeline.form_images()
     reference = plane_reference(images.level(images.valid))
+    # A reference is refused for a scan with other settings or calibration files than its own.
     return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 

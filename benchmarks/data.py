@@ -91,7 +91,8 @@ def write_scan(folder: Path, rig: Instrument, rows: dict[str, list[NDArray[np.in
 class RepeatedRows:
     """A scan of any size, for `Pipeline`, whose rows all come from a few short files: only its size is real.
 
-    `files` names each board's files of one row each; a row that is longer than the file repeats its positions.
+    `files` names each board's files of one row each; a row that is longer than the file repeats its positions. All else
+    is what :class:`polysight.store.source.Source` asks for.
     """
 
     instrument: Instrument
@@ -116,7 +117,8 @@ class RepeatedRows:
         """Return a row of a board."""
         files = self.files[board_name]
         chirps = self.plan.columns * self.instrument.burst.chirps_a_position
-        return RowData(partial(_read_repeatedly, files[row % len(files)], self.instrument.row_bytes), [], chirps)
+        pieces = partial(_read_repeatedly, files[row % len(files)], self.instrument.row_bytes)
+        return RowData(pieces, missing=[], frames_expected=chirps)
 
 
 def _read_repeatedly(path: Path, wanted_bytes: int, size: int) -> Iterator[NDArray[np.uint8]]:
@@ -148,7 +150,7 @@ def point_row(
     """Return the summed echoes of equal points [n, 3] at the positions of a row, [rx, position, frequency].
 
     Positions are in the order of the stage; `chosen` is a mask of them. The phase is +2 pi f d / c with d the excess
-    path, as after perfect synchronisation.
+    path (beyond that of the direct path from TX to RX), as after perfect synchronisation.
     """
     offsets = row_offsets_m(rig, row)
     if chosen is not None:
@@ -162,8 +164,8 @@ def point_row(
 def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     """Write a synchronised cube of nine points over the image, complex64 [rx, row, column, sample], columns ascending.
 
-    The points' echoes are made at a few frequencies and interpolated by least squares over paths, which is good to
-    1e-6 with the 24 and 200 of these that are chosen.
+    The points' echoes are made at 24 frequencies and interpolated to the chirp's, by a matrix fitted to the echoes of
+    200 paths: both chosen, the error is 1e-6.
     """
     grid = image_grid(rig)
     chirp = rig.chirp
@@ -174,7 +176,7 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     nodes = np.linspace(sweep[0], sweep[-1], 24)
     low, high = scene_gate_m((antennas,), plan, grid)
-    # An echo's phase per hertz, by path.
+    # An echo's exponent per hertz, [path, 1]; `expand` [node, sample] takes echoes at the nodes to those of the chirp.
     exponent = 2j * np.pi / SPEED_OF_LIGHT_M_S * np.linspace(low, high, 200)[:, None]
     expand = np.linalg.lstsq(np.exp(exponent * nodes), np.exp(exponent * sweep), rcond=1e-9)[0].astype(np.complex64)
     shape = len(antennas.rx_m), plan.rows, plan.columns, chirp.samples

@@ -117,7 +117,7 @@ class Chain:
 def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> dict[str, Any]:
     """Return the settings of the authors' imager for this rig: range spectra of `bins` points, every range bin.
 
-    Keys and the numbers of antennas (TX 4, RX 7 to 10 of 21) are theirs.
+    Keys and the numbers of antennas (TX 4, RX 7 to 10 of 21) are theirs; RH is their name of the board that receives H.
     """
     chirp = rig.chirp
     grid = image_grid(rig)
@@ -147,6 +147,7 @@ def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> 
                 "idx_adc_start": first,
                 "idx_adc_end": last,
                 "ref_idx_aligned": 0,
+                # Spectra of the first 32 range bins of a chirp, which hold the scene, with so many points for each bin.
                 "idx_fft_start_zoom": 0,
                 "idx_fft_end_zoom": 32,
                 "fs_zoom": chirp.samples,

@@ -54,6 +54,7 @@ class Synchroniser:
         tx = np.array(tx_position_m(rig))
         rx = np.array(rx_positions_m(rig, board))
         path = np.linalg.norm(rx - tx, axis=-1)
+        # [rx]: bring the direct path of every RX to the phase of RX1's.
         self._beam = np.exp(-2j * np.pi * middle / SPEED_OF_LIGHT_M_S * (path - path[0])).astype(np.complex64)
         self._n = np.arange(chirp.samples)
         self._n_single = self._n.astype(np.float32)
@@ -211,7 +212,8 @@ def form_image(
         shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full)
     else:
         shape = full
-    window = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
+    # The part of the convolution in which every position counts: one entry for each pixel.
+    pixels = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
     image = np.zeros((ny, nx), np.complex64)
     total = np.zeros(shape, np.complex64)
     for rx in range(n_rx):
@@ -229,10 +231,10 @@ def form_image(
             kernel = np.asarray(scipy.fft.fft2(kernel, shape))
             total += kernel * np.asarray(scipy.fft.fft2(spectrum[:, :, n % points], shape))
         if not tuned:
-            image += np.asarray(scipy.fft.ifft2(total))[window]
+            image += np.asarray(scipy.fft.ifft2(total))[pixels]
             total[:] = 0
     if tuned:
-        return np.asarray(scipy.fft.ifft2(total))[window]
+        return np.asarray(scipy.fft.ifft2(total))[pixels]
     return image
 
 

@@ -131,6 +131,7 @@ def form_image(
     bins = math.ceil((float(reach.max()) - float(reach.min())) / period_m * size) + 3
     first_bin = math.floor(float(reach.min()) / period_m * size)
     k = np.arange(first_bin, first_bin + bins)
+    # The FFT takes the first frequency as 0: `turn` adds its distance from the middle one.
     turn = np.exp(-2j * np.pi * (frequencies_hz[0] - middle_hz) / step_hz * k / size)
     spectrum = np.asarray(scipy.fft.fft(samples, size))[..., k % size] * turn
     real = single(spectrum.real.reshape(len(samples), -1))

@@ -17,13 +17,17 @@ from numpy.typing import NDArray
 
 from polysight_worlds.optics import Antenna
 
-# The chirp's linear part. Six to twelve frequencies hold the range gate of a flat scene; eight are chosen.
+# The chirp's linear part. The echoes of a flat scene lie within so few range cells that six to twelve frequencies
+# describe them; eight are chosen.
 FREQUENCIES_HZ = np.linspace(76.3e9, 79.75e9, 8)
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Antennas at stage offset zero, the object plane's z, the grid of offsets, and the transmit frequencies."""
+    """Antennas at stage offset zero, the object plane's z, the grid of offsets, and the transmit frequencies.
+
+    The defaults are those of the published rig.
+    """
 
     tx: Antenna
     h: Antenna

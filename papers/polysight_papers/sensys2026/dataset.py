@@ -81,7 +81,7 @@ class AuthorsData:
         names = {m.name for m in table2() if m.number in numbers}
         library = self.sources[source]
         near = (e for e in library.entries if abs(e.incidence_deg - angle_deg) <= SAME_ANGLE_DEG)
-        return materials.Library(tuple(e for e in near if e.name in names), {}, library.note)
+        return materials.Library(tuple(e for e in near if e.name in names), fit={}, note=library.note)
 
 
 def read_authors(folder: Path, config: Path, images: Path | None = None, names: Path | None = None) -> AuthorsData:
@@ -243,7 +243,7 @@ def _rename_entries(
             else:
                 renamed_entries.append(replace(e, name=titles[number]))
         if renamed_entries:
-            sources[source] = materials.Library(tuple(renamed_entries), {}, source)
+            sources[source] = materials.Library(tuple(renamed_entries), fit={}, note=source)
     if unknown:
         skipped = ", ".join(sorted(unknown))
         notices.append(
@@ -298,11 +298,11 @@ def find_row(name: str, thickness_mm: float | None = None) -> int | None:
     tries = [theirs]
     if thickness_mm is not None:
         tries.insert(0, theirs | {f"{thickness_mm:g}"})
-    best = sorted(
-        ((max(_share_of_common_words(t, row) for t in tries), row.number) for row in table2()), key=lambda b: -b[0]
+    ranked = sorted(
+        ((max(_share_of_common_words(t, row) for t in tries), row.number) for row in table2()), key=lambda r: -r[0]
     )
-    (first, number), (second, _) = best[:2]
-    if first >= _ENOUGH and first > second:
+    (best, number), (second_best, _) = ranked[:2]
+    if best >= _ENOUGH and best > second_best:
         return number
     return None
 
@@ -388,13 +388,13 @@ def authors_library(data: AuthorsData) -> materials.Library:
     kind = "files"
     if data.simulated:
         kind = "simulated files"
-    return materials.Library(entries, {}, f"{kind} of {data.folder.name}")
+    return materials.Library(entries, fit={}, note=f"{kind} of {data.folder.name}")
 
 
 def _remove_leakage(entry: materials.Entry, leak_hv: complex, leak_vh: complex) -> materials.Entry:
     """Return an entry with at most `PIXELS` pixels, with the cross-polar leakage removed."""
     picked = np.unique(np.linspace(0, entry.p.size - 1, min(PIXELS, entry.p.size)).round().astype(int))
-    # A common phase of H and V has no effect
+    # Entries hold |H|, |V| and P = H / V: the phase that H and V have in common is lost, and has no effect.
     v = entry.v[picked].astype(np.complex128)
     h, v = correct_leakage(entry.p[picked] * v, v, leak_hv, leak_vh)
     return replace(

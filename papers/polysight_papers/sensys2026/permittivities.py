@@ -36,7 +36,16 @@ Complex = npt.NDArray[np.complex128]
 COMMON = (1, 3, 6, 12, 13, 15, 21)
 CONTRAST = (1, 13, 16, 12, 18, 6, 3)
 CLUTTERED = ("Cardboard", "PET (1 mm)", "Acrylic (3 mm)")
-WATER = item.Published(0, "Water (without glass, 75 GHz)", 9.37 - 18.0j, None, "literature value quoted in section 9.2")
+WATER = item.Published(
+    number=0,
+    name="Water (without glass, 75 GHz)",
+    permittivity=9.37 - 18.0j,
+    thickness_mm=None,
+    note="literature value quoted in section 9.2",
+)
+# Numbers in Table 2 of the metal, which has no Brewster angle, and of the material whose loss is not given.
+METAL = 1
+CORK = 23
 LINES = ("-", "--", "-.", ":")
 # Fig. 17: number of scans, as in the paper; plate centres within this distance of the middle and this far apart
 # (chosen); materials by their numbers in Table 2.
@@ -68,7 +77,7 @@ def fig3(run: item.Run) -> item.Item:
         axes[2].plot(angle, 20 * np.log10(np.abs(p)), **style)
         brewster = float(np.degrees(brewster_angle_rad(m.permittivity)))
         magnitudes = [abs(complex(ratio_from_permittivity(m.permittivity, np.radians(a)))) for a in (0, 55, 60)]
-        rows.append((m.name, "–" if m.number == 1 else f"{brewster:.1f}°", *(f"{x:.2f}" for x in magnitudes)))
+        rows.append((m.name, "–" if m.number == METAL else f"{brewster:.1f}°", *(f"{x:.2f}" for x in magnitudes)))
         curves[m.name] = {"R_s": np.abs(r_s) ** 2, "R_p": np.abs(r_p) ** 2, "abs_P": np.abs(p)}
     for ax, title, unit in zip(
         axes,
@@ -175,7 +184,7 @@ def table2_item(run: item.Run) -> item.Item:
             e = estimate_permittivity(measured.h[:, j].ravel(), measured.v[:, j].ravel(), np.radians(group.angle_deg))
             true = m.permittivity
             row = {"number": m.number, "name": m.name, "angle_deg": group.angle_deg}
-            printed = (f"{true.real:.2f}", "–" if m.number == 23 else f"{-true.imag:.2f}")
+            printed = (f"{true.real:.2f}", "–" if m.number == CORK else f"{-true.imag:.2f}")
             if e.value is None or e.real_std is None:
                 rows.append((str(m.number), m.name, "metal", "metal", "metal-like", "", "", ""))
                 data.append(row | {"recovered": None, "metal_like": True})

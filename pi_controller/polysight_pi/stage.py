@@ -113,7 +113,7 @@ class StatusWatch:
         self._unanswered_since_s: float | None = None
         # Time of the last call of `silent_s`.
         self._looked_s = now_s
-        # The reader calls `is_due` and `silent_s` at this interval.
+        # The reader calls `is_due` and `silent_s` at this interval: twice per request; 0.05 s is chosen.
         self.look_s = min(0.05, heartbeat_s / STATUS_PER_HEARTBEAT / 2)
         # Time between status requests; 0: there are none.
         self.interval_s = 0.0
@@ -147,6 +147,7 @@ class StatusWatch:
 
         Time in which the caller itself was late does not count.
         """
+        # Up to one interval more between two calls is usual.
         late_s = now_s - self._looked_s - 2 * self.look_s
         self._looked_s = now_s
         if self._unanswered_since_s is not None and late_s > 0:
@@ -382,7 +383,7 @@ class StageLink:
                     return
 
     def _stop_unheard(self) -> None:
-        """Stop a moving stage whose answers are lost: it may hear, and its own heartbeat would act 0.5 s later."""
+        """Stop a moving stage whose answers are lost: it may hear, and its own heartbeat would act only later."""
         if not self._watch.is_at_rest:
             with self._write_lock, suppress(OSError):
                 self._serial.write(Immediate.STOP.sent)
@@ -580,6 +581,7 @@ class StageDriver:
         except StageRefusedError:
             self.slow_down_polling()
             raise
+        # -1: no `done` has this number.
         return -1 if answer.sequence is None else answer.sequence
 
 

@@ -327,7 +327,7 @@ class PacketLog:
         # Allocate the pages before the first packet.
         memory[:expected].fill(0)
         self.payload = memory
-        # The arrays of headers grow when needed; this many packets need no growth while a row is received.
+        # The arrays of headers grow when needed; this many packets (chosen) need no growth while a row is received.
         packets = 2 * expected // MAX_PAYLOAD_BYTES + 256
         self._heads = np.zeros((packets, PACKET_HEADER_BYTES), dtype=np.uint8)
         self._sizes = np.zeros(packets, dtype=np.uint16)

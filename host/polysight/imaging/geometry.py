@@ -350,6 +350,7 @@ class StageWindow:
             # A plate that rises is seen like a level one at another place; the image of its end is not where it ends.
             at_level = moved_px * slope
             image = self.level_image(ends_px + at_level, columns_px + at_level)
+            # Its angle is the mean phase step between pixels that the level plate seems to have.
             product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
             slope = slope_per_rad * (step_rad - float(np.angle(product)))
             seen_of_level = find_ends(np.abs(image), lit, inside_px)

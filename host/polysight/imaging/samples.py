@@ -103,7 +103,7 @@ class Reduction:
         step_hz = self.sweep_hz[1] - self.sweep_hz[0]
         first = round((sweep_hz[0] - self.sweep_hz[0]) / step_hz - (FOLD - 1) / 2)
         linear = slice(first, first + FOLD * sweep_hz.size)
-        # The middle of a chirp's band lies half way between the direct path and the middle of the gate.
+        # Decimation passes paths about `middle_m`, half way between the direct path (0) and the middle of the gate.
         middle_m = sum(self.gate_m) / 4
         decimated = decimation(FOLD * sweep_hz.size, middle_m * step_hz / SPEED_OF_LIGHT_M_S)
         paths = np.linspace(-_BESIDE_M, max(self.gate_m[1] + _BESIDE_M, middle_m + _PASSED_M), 4 * sweep_hz.size)
@@ -482,7 +482,7 @@ class BoardSamples:
         self._invalidate()
 
     def copy_samples(self, coarse: BoardSamples, steps: tuple[int, int]) -> None:
-        """Take the samples of a scan whose steps (rows, columns) are so many of this one's; others are missing."""
+        """Take the samples of a coarser scan, one for every `steps` (rows, columns) of this; others stay missing."""
         rows, columns = steps
         self._cube[:, :, ::rows, ::columns] = coarse._cube
         self._direct[:, ::rows, ::columns] = coarse._direct

@@ -1,7 +1,8 @@
 """The sign of all phases of images that another program made: an unknown of their analysis, and a part of its errors.
 
 With the wrong sign every loss is a gain. The joint inversion is solved with either sign; the evidence of the patches
-tells which one is likelier, and errors hold both in the share of their probability.
+tells which one is likelier, and errors hold both in the share of their probability. An `inverse_ratio` is V / H, after
+all corrections r_p / r_s.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ def _join_estimates(patch: PatchEstimate, other: PatchEstimate, probability: flo
     ratio_covariance = join(
         patch.inverse_ratio, patch.inverse_ratio_covariance, other.inverse_ratio, other.inverse_ratio_covariance
     )
+    # The ratio by which the patch gets its name.
     evidence = patch.evidence
     if evidence is not None and other.evidence is not None:
         joined = join(

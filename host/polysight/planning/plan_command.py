@@ -57,8 +57,8 @@ _PI_KEYS = ("speed_mm_s", "accel_mm_s2")
 _STEP_MULTIPLES = (1, 2, 3, 4, 5)
 # Largest share of the time between two points that a burst may take; chosen, the rest allows for jitter of the speed.
 _MAX_DUTY = 0.95
-# Largest travel during a burst; chosen. It turns an echo's phase by half a cycle where sin a_tx + sin a_rx is 1
-# (forecast.py), and the average over the burst loses 3.9 dB.
+# Largest travel during a burst; chosen. Where the paths to TX and RX leave the object at angles a to its normal in x
+# with sin a_tx + sin a_rx = 1, it turns the echo's phase by half a cycle: the average over the burst loses 3.9 dB.
 _MAX_TRAVEL_WAVELENGTHS = 0.5
 # Largest number of frames in a row, as in host/polysight/radar/commands.py.
 _MAX_FRAMES = 65535

@@ -50,9 +50,9 @@ EVEN = 0.01
 chosen."""
 OTHER_SIGN = 0.3
 PUBLISHED_OTHER_SIGN = 0.05
-"""Probability a priori that images of another program have the other sign of phase, if their file does not say it; and
-that images of the published form have it, after materials' `restore_phase_sign`. Chosen: the patches decide where they
-can."""
+"""Probability a priori that images of another program are the conjugates of ours (in which a loss is -j eps''), if
+their file does not say it; and that published ones still are after `restore_phase_sign`, which conjugates them on
+reading. Chosen: the patches decide where they can."""
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
@@ -73,7 +73,7 @@ class GivenPair:
     path
         File or folder.
     images
-        Both channels, with ascending axes; `p` is None.
+        Both channels, with ascending axes; their ratio `p` is None.
     x_m, y_m
         The axes in the order of the file, which boxes in pixels refer to.
     labels
@@ -288,6 +288,7 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
                 f"{path}: the largest |{name}| is {peak:.3g}", f"expected {LEAST_PEAK:g} to {MOST_PEAK:g}",
                 "multiply both channels by one number", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
+        # Only one channel is empty: the case of both follows below.
         if not peak and (h[valid] != 0).any() | (v[valid] != 0).any():
             raise DataError(
                 f"{path}: {name} is zero everywhere", "materials are told by the ratio of both channels",
@@ -334,7 +335,8 @@ def _sort_axes(
 def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
     """Read `labels/<scan>`; row 0 of its images is the top of the published pictures, the largest y."""
     scan = materials.read_labelled_scan(folder)
-    # How the boxes' pixels are counted in the images, by what explains their brightness best.
+    # From which row the boxes count y, and whether rows are y at all, is not documented: the images are turned to where
+    # the boxes explain most of their brightness.
     orientation = materials.image_orientation([scan])
     scan = scan.orient(orientation)
     arrays = {"h": scan.h, "v": scan.v}
@@ -411,8 +413,8 @@ def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
 def describe_illumination(images: Images, rig: Instrument) -> Illumination:
     """Return the illumination by which the phase of a plate tells its tilt (`Illumination.rise`), for this rig.
 
-    The footprints are not known and taken as even: nothing is divided out. `moved_m` and `steepness_rad_m` are those
-    at each board's specular point, as in :class:`Illumination`.
+    The footprints are not known and taken as even: nothing is divided out. `moved_m` (how far a tilt moves the point
+    that reflects) and `steepness_rad_m` (phase of a tilt along the plate) are those at each board's specular point.
     """
     chirp = rig.chirp
     middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * float(np.mean(chirp.linear_samples))
@@ -527,6 +529,7 @@ def analyse_given_images(
     if plane is not None and scene.metal is None:
         images = images.within(plane.valid_on(images.x_m, images.y_m))
         scene = replace(scene, metal=plane)
+    # The specular angle, and the pixels' own: without a raster these are the same.
     everywhere = np.full(images.h.shape, np.radians(angle.deg))
     optics = materials.Optics.from_rig(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)

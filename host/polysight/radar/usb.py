@@ -57,6 +57,7 @@ _CHANNELS = ((SPI_DIRECTION, False), (INTERRUPT_DIRECTION, False), (RESET_DIRECT
 # MPSSE commands: set or read pins, shift bytes, answer at once, and the settings of the clock.
 _PINS = 0x80
 _READ_PINS = 0x81
+# Before the bytes: their number less one, 16 bits, the lower byte first.
 _WRITE_BYTES = 0x11
 _READ_BYTES = 0x20
 _NOW = 0x87

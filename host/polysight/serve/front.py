@@ -98,7 +98,7 @@ class RunningScan(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Front:
-    """State of the process: `starts` as programs can be started, `reader` answers everything else.
+    """State of the process: `reader` answers what this one does not, `starts` is true if programs can be started.
 
     `stage` is what home and jog move; None: the page moves nothing.
     """

@@ -168,7 +168,7 @@ def _find_ends(raw: bytes) -> Iterator[int]:
 
 
 class LogDigest(msgspec.Struct, frozen=True):
-    """Length and CRC-32 of the event log at a commit."""
+    """Length and CRC-32 (8 hexadecimal digits) of the event log when a row was committed: written to the manifest."""
 
     bytes: int
     crc32: str

@@ -1,4 +1,6 @@
-"""Delete raw data of processed rows, or place rows again from their stored packets, on request.
+"""Delete raw data of processed rows, or place rows again from their stored packets (`.pkt` files), on request.
+
+To place a row is to put the payload of each packet at its bytes of the row; missing packets leave gaps.
 
 A `raw_dropped` line, which keeps the digests, is written before its files are deleted. After a crash in between, files
 listed as dropped may still exist; dropping again deletes them. Files that are not listed always exist. A row that is
@@ -177,6 +179,7 @@ class Replaced:
 class PlacedAgain:
     """A row placed again from its packets."""
 
+    # What was known for placing it, beside the packets.
     evidence: capture.Evidence
     placed: capture.Placed
     # uint8: the payload as placed now.

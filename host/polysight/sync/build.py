@@ -86,6 +86,7 @@ def build(folder: Path = HERE, target: str = "") -> Path:
     machine = target or platform.machine().lower()
     widths = _WIDTHS if machine.endswith(("x86_64", "amd64")) else {128: ""}
     with tempfile.TemporaryDirectory(prefix="polysight-build-") as build_folder:
+        # Source with its flags, and the name of its object file.
         jobs = [
             ([source, f"-DWIDTH={bits}", *flags.split()], f"{source}-{bits}.o")
             for bits, flags in widths.items()
@@ -95,7 +96,8 @@ def build(folder: Path = HERE, target: str = "") -> Path:
         jobs.append((["width.c"], "width.o"))
         with ThreadPoolExecutor(os.cpu_count()) as workers:
             commands = [
-                [*compiler, *_FLAGS.split(), "-c", *words, "-o", f"{build_folder}/{name}"] for words, name in jobs
+                [*compiler, *_FLAGS.split(), "-c", *arguments, "-o", f"{build_folder}/{name}"]
+                for arguments, name in jobs
             ]
             list(workers.map(_run, commands))
         library = f"{build_folder}/{LIBRARY}"

@@ -39,7 +39,8 @@ from polysight_shared.raster import RasterPlan
 MAGIC = b"PSJRNL1\n"
 # A longer record is damaged: the longest text of an event has 4000 characters.
 MAX_RECORD_BYTES = 1 << 20
-# Upper limit of the record of a position, bytes.
+# Record of a position, bytes: 300 with a scan name of 64 characters; 356 with the longest name, of 120 characters, for
+# which `SPARE_BYTES` make up.
 CAPTURE_BYTES = 320
 # Space on the disk for the records of faults and retakes; chosen, 13,000 positions.
 SPARE_BYTES = 4 << 20
@@ -181,7 +182,7 @@ class JournalFile:
         finally:
             os.close(folder)
 
-    def number_behind(self, seq: int) -> int:
+    def continue_after(self, seq: int) -> int:
         """Continue numbering after `seq`, the host's newest event. Return the number of skipped (lost) events."""
         missing_events = max(0, seq - self.last_seq)
         self.last_seq += missing_events
@@ -351,7 +352,7 @@ class Journal:
                 self._file.close()
             self._file = file
             self.scan_id = scan_id
-        missing_events = file.number_behind(host_seq)
+        missing_events = file.continue_after(host_seq)
         self.position = (scan_id, file.last_seq)
         return begun is not None or host_seq > 0, missing_events
 

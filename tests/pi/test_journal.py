@@ -150,7 +150,7 @@ def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, pa
     path = tmp_path_factory.mktemp("j") / "a.journal"
     write_records(path, first)
     j = JournalFile(path)
-    assert j.number_behind(passed) == max(0, passed - len(first))
+    assert j.continue_after(passed) == max(0, passed - len(first))
     begin = max(passed, len(first)) + 1
     j.write(second)
     j.close()

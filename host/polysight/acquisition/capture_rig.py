@@ -86,7 +86,7 @@ class CaptureRig:
     def configure(self, names: Collection[str] = ()) -> dict[str, Version]:
         """Stop records and configure the named cards (default: all); return FPGA versions.
 
-        Raises DeviceError if a card does not obey, or if one of all has a twin with the same address.
+        Raises DeviceError if a card does not obey. Only for all cards: also if a second card has the address of one.
         """
         versions = {}
         for name in names or self.cards:
@@ -103,17 +103,17 @@ class CaptureRig:
         """Prepare the receivers for a row of `points` positions, then start the records. Raises DeviceError.
 
         `take` is the number of this attempt, `folder` the scan folder. A card whose counters are not known is reset and
-        configured first: it then counts from its first counters.
+        configured first: it then counts from its first counters. During reception the file's suffix is `PART`.
         """
         frame_bytes = self._instrument.frame_bytes
-        expected = points * self._instrument.burst.pulses * frame_bytes
+        expected_bytes = points * self._instrument.burst.pulses * frame_bytes
         cards_to_reset = set(self._start_lost)
         for name in cards_to_reset:
             self.cards[name].reset_fpga()
             self.configure([name])
         for name, receiver in self.receivers.items():
             path = folder / "raw" / name / f"{row:04d}{PART}"
-            receiver.begin_row(row, take, expected, frame_bytes, path, after_reset=name in cards_to_reset)
+            receiver.begin_row(row, take, expected_bytes, frame_bytes, path, after_reset=name in cards_to_reset)
             # If the row is interrupted, the card's count stays unknown; `end_row` removes the name otherwise.
             self._start_lost.add(name)
         self._recording = True
@@ -142,12 +142,13 @@ class CaptureRig:
     def discard_before(self, time_ns: int) -> None:
         """Treat data that arrived before this time (monotonic clock) as left over from an earlier record."""
         for receiver in self.receivers.values():
+            # The request for progress carries this time; its answer is not needed.
             receiver.report(time_ns)
 
     def end_row(self, not_before_ns: int = 0) -> dict[str, RowCapture]:
         """Stop the records and return the rows, whose files are durable then. Raises DeviceError.
 
-        Data before `not_before_ns` is left over, as in :meth:`discard_before`, with the time that is known by now.
+        Data before `not_before_ns` is left over, as in :meth:`discard_before`; of both times the later one counts.
         """
         self.stop_records()
         deadline = time.monotonic() + _COMPLETED_TIMEOUT_S

@@ -165,6 +165,7 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
     Returns its bytes, uint8 [n], and the result. Raises DataError if the packets are not of one record.
     """
     counts = np.array([dca1000.decode_packet_header(p)[1] for p in packets])
+    # Bytes from the first packet in the file to each, negative for one that was sent before it.
     ahead = counter_differences(counts, int(counts[0]), dca1000.BYTE_COUNT_BITS)
     sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
     size = int((ahead + sizes).max() - ahead.min())
@@ -174,7 +175,9 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
         raise DataError(problem, cause, "cut the capture to one record", code=ErrorCode.FILE_DAMAGED)
     log = PacketLog(size)
     for packet in packets:
+        # All with the arrival time 0.
         log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
+    # The record begins with the packet of the lowest byte count.
     sequence, byte_count = dca1000.decode_packet_header(packets[int(np.argmin(ahead))])
     placed, out = place_record(log, past=Past(Counters(byte_count, sequence)))
     return out, placed
@@ -222,6 +225,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
             "record again; `polysight inspect` needs at least one chirp",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
+    # int16, for clipping; `cube` complex [rx, chirp, sample] and `power` [rx, bin] for all else.
     words = payload[: payload.size // 2 * 2].view("<i2")
     shape = min(chirps, MAX_CHIRPS), layout.samples, layout.rx
     if layout.lanes == 4:

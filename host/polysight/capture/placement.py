@@ -449,7 +449,8 @@ class _Row:
         self._log = log
         self._record = record
         self._sizes = log.sizes
-        self._starts = np.cumsum(log.sizes) - log.sizes
+        # Where each packet's payload begins in the log.
+        self._log_starts = np.cumsum(log.sizes) - log.sizes
         is_kept = np.arange(log.count) < log.kept
         self._of_row = record.of_row & is_kept
         self.offsets: Counts = np.full(log.count, -1, dtype=np.int64)
@@ -530,7 +531,7 @@ class _Row:
                 self._duplicate[k] = True
 
     def _slice_payload(self, k: int) -> Bytes:
-        return self._log.payload[self._starts[k] : self._starts[k] + self._sizes[k]]
+        return self._log.payload[self._log_starts[k] : self._log_starts[k] + self._sizes[k]]
 
     def arrivals(self) -> Counts:
         """Return pairs (arrival time, ns; end of the packet) of packets that reach further than all before, [n, 2]."""
@@ -548,7 +549,7 @@ class _Row:
         placed = np.flatnonzero(self._placed)
         payload = log.payload[: log.expected]
         is_whole = not holes and self.extent == log.expected
-        if not is_whole or (self.offsets[placed] != self._starts[placed]).any():
+        if not is_whole or (self.offsets[placed] != self._log_starts[placed]).any():
             payload = np.zeros(log.expected, dtype=np.uint8)
             self._copy(placed, payload)
         payload[self.extent :] = 0
@@ -562,15 +563,15 @@ class _Row:
             return
         offsets = self.offsets[placed]
         sizes = self._sizes[placed]
-        starts = self._starts[placed]
+        log_starts = self._log_starts[placed]
         stops = self._stops[placed]
-        is_joined = (starts[1:] == starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
+        is_joined = (log_starts[1:] == log_starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
         firsts = np.flatnonzero(np.append(True, ~is_joined))
         lasts = np.append(firsts[1:] - 1, len(placed) - 1)
         for i, j in zip(firsts.tolist(), lasts.tolist(), strict=True):
             a = int(offsets[i])
             b = int(stops[j])
-            out[a:b] = self._log.payload[starts[i] : starts[i] + b - a]
+            out[a:b] = self._log.payload[log_starts[i] : log_starts[i] + b - a]
 
 
 def _count_losses(missing: list[Gap], extent: int, expected: int) -> Losses:

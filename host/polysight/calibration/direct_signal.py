@@ -1,7 +1,7 @@
 """The direct path in recorded bursts: start offset, delay and crystal error, and the receivers' high-pass filters.
 
 IF of the direct path with delay tau, start delay dt of the board relative to the transmitter, and relative frequency
-error p of the board's crystal, at the time t of a chirp that starts at f_0 with the slope K:
+error p of the board's crystal, at the time t after the first sample, at which the chirp has f_0 and the slope K:
 
     f = K tau + start offset + p (f_0 + 2 K t) - K dt        (docs/spec/scene-file.md)
 
@@ -90,9 +90,11 @@ class DirectSignal:
         """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds."""
         chirp = rig.chirp
         first, end = sync.whole_blocks(chirp.linear_samples)
-        middle_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * (first + end - 1) / 2
-        expected = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * middle_hz
-        delay = (expected - unwrap_if(self.if_hz, rig)) / chirp.slope_hz_per_s
+        middle_sample = (first + end - 1) / 2
+        # f_0 + 2 K t in the middle of the samples that the IF is estimated from: the crystal error adds p times this.
+        if_per_crystal_error_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * middle_sample
+        expected_if_hz = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * if_per_crystal_error_hz
+        delay = (expected_if_hz - unwrap_if(self.if_hz, rig)) / chirp.slope_hz_per_s
         standard_error = np.inf
         if delay.size > 1:
             standard_error = float(delay.std(ddof=1) / np.sqrt(delay.size))
@@ -137,7 +139,8 @@ def find_direct(
         words.reshape(*shape, *words.shape[1:]), valid.reshape(shape), chirp.linear_samples, setup.equaliser, FULL_SCALE
     )
     # The drift estimate is linearised: the first pass finds 2 ppm within a tenth, the second the rest. `halves` are two
-    # averages of a position's chirps, mixed down, with one sample for every `FOLD` recorded ones.
+    # averages of a position's chirps, mixed down, with one sample for every `FOLD` recorded ones; time is in recorded
+    # samples, so the drift is in radians per sample squared, and the frequencies are in cycles per sample.
     drift = sync.reference(aligned, setup.path, chirp).drift
     time = np.arange(aligned.halves.shape[-1]) * float(sync.FOLD)
     time -= time.mean()
@@ -146,10 +149,10 @@ def find_direct(
     has_direct_path = aligned.good & referenced.found[:, None]
     cycles = (referenced.frequency[:, None] + aligned.frequency)[has_direct_path]
     power = _measure_power(words[has_direct_path.ravel()], cycles, setup, drift + referenced.drift)
-    # The amplitude is a weighted sum of means of `FOLD` samples: so much of a sample's noise remains in it.
-    noise = (
-        _estimate_recorded_noise(aligned, referenced.noise) * (np.abs(setup.path.estimator[0]) ** 2).sum() / sync.FOLD
-    )
+    # The amplitude is a weighted sum of means of `FOLD` samples: so much of a sample's noise remains in it. Row 0
+    # of the estimator has the weights of the amplitude.
+    share_of_noise = (np.abs(setup.path.estimator[0]) ** 2).sum() / sync.FOLD
+    noise = _estimate_recorded_noise(aligned, referenced.noise) * share_of_noise
     # Cycles a sample repeat after one: bring them into the receiver's band.
     if chirp.if_mode == "complex1x":
         cycles = cycles % 1.0
@@ -184,20 +187,25 @@ def _estimate_recorded_noise(aligned: sync.AlignedRow, noise: NDArray[np.float64
 def _measure_power(
     words: NDArray[np.int16], cycles: NDArray[np.float64], setup: sync.BoardSetup, drift: float
 ) -> NDArray[np.float64]:
-    """Return the power of the direct path in each chirp [chirp], by the estimator that suppresses the object."""
+    """Return the power of the direct path in each chirp [chirp], by the estimator that suppresses the object.
+
+    `words` int16 [chirp, sample, 2, rx]; `cycles` [chirp] is the IF in cycles per sample, `drift` its change in radians
+    per sample squared.
+    """
     if not len(words):
         return np.zeros(0)
     first, end = sync.whole_blocks(setup.chirp.linear_samples)
     n = end - first
     path = setup.path
     time = np.arange(n) - (n - 1) / 2
-    # [chirp, sample, rx]
+    # [chirp, sample, rx], then mixed down to a constant
     raw = words[:, first:end, 0] + 1j * words[:, first:end, 1].astype(np.float32)
     derotated = raw * sync.cis(-2 * np.pi * cycles[:, None] * time - 0.5 * drift * time**2)[..., None]
-    folded = (
-        derotated.reshape(len(words), n // sync.FOLD, sync.FOLD, -1).mean(axis=2).swapaxes(1, 2) * path.folded_steering
-    )
-    return np.abs(folded.reshape(len(words), -1) @ path.estimator[0]) ** 2
+    # Means of `FOLD` samples, [chirp, rx, block], with the phases of all RX made equal.
+    blocks = derotated.reshape(len(words), n // sync.FOLD, sync.FOLD, -1).mean(axis=2).swapaxes(1, 2)
+    folded = blocks * path.folded_steering
+    amplitude = folded.reshape(len(words), -1) @ path.estimator[0]
+    return np.abs(amplitude) ** 2
 
 
 def fit_start(source: RawSource, board_name: str) -> BoardStart:
@@ -288,7 +296,7 @@ def _measure_power_of_scan(
 ) -> tuple[Real, Real, Real]:
     """Return IF (Hz), power and noise power (ADC counts squared) of the direct path in chirps of some rows, [chirp]."""
     rig = scan.instrument
-    # Scans of one sweep share the setup.
+    # Scans of one sweep share the setup: it depends on the places of antennas and object, the chirp and the burst.
     key = f"{places_crc32(rig)} {rig.chirp} {rig.burst!r}"
     if key not in setups:
         setups[key] = sync.BoardSetup.from_rig(rig, board)
@@ -337,6 +345,7 @@ def _estimate_corner_errors(if_hz: Real, level: Real, corners_hz: Real) -> tuple
         [(residual(logs + d) - residual(logs - d)) / (2 * step) for d in step * np.eye(logs.size)], axis=1
     )
     misfit = residual(logs)
+    # Least squares: covariance of the logs; its parameters are the corners and the level, which the mean takes away.
     variance = float(misfit @ misfit) / max(1, misfit.size - logs.size - 1)
     errors = np.sqrt(np.diag(np.linalg.inv(slopes.T @ slopes)) * variance)
     return errors * corners_hz, float(np.sqrt(np.mean(misfit**2)) * 20 / np.log(10))

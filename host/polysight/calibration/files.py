@@ -525,6 +525,8 @@ def calibration_of_rig(rig: Instrument) -> Calibration:
 def calibration_of_scan(scan: Source) -> Calibration:
     """Load the calibration of a scan: the copies in its folder, or without copies the files that its rig file names.
 
+    In a scan folder the latter have to lie in it.
+
     Raises ConfigError or DataError if a file is invalid, or a copy is missing or was changed.
     """
     if not isinstance(scan, ScanFolder):

@@ -325,6 +325,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     ranges = [_estimate_heights_by_range(board, masks) for board in builder.boards.values()]
     precision = np.stack([1 / std**2 for _, std in ranges])
     total = precision.sum(axis=0)
+    # Mean over the boards, weighted by their precision.
     with np.errstate(invalid="ignore", divide="ignore"):
         heights = sum(precision[i] * np.nan_to_num(ranges[i][0]) for i in range(len(ranges))) / total
     stds = np.sqrt(1 / np.where(total > 0, total, np.nan))
@@ -337,8 +338,9 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         if mask.any():
             place[:] = x[mask.any(axis=0)].mean(), y[mask.any(axis=1)].mean()
     plane, covariance = _fit_plane(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
-    first_board = next(iter(builder.boards.values()))
-    phase_heights, rad_per_m = _estimate_heights_by_phase(first_board, masks, places, plane)
+    # H: its reflection r_s has nearly the same phase for all plates.
+    board_h = next(iter(builder.boards.values()))
+    phase_heights, rad_per_m = _estimate_heights_by_phase(board_h, masks, places, plane)
     # A plane has three unknowns: only with four plates can their phases contradict it.
     with_phase = determined & np.isfinite(phase_heights)
     by_phase = False
@@ -445,7 +447,8 @@ def _estimate_heights_by_phase(
     """Return the heights by phase [patch], metres, NaN where pixels are not coherent; and the radians per metre.
 
     The multiple of the ambiguity of each height is the one with which all heights fit a plane best, near `plane` [3]
-    (height and rise along x and y, by range). `places` [patch, 2] are the middles of the patches, metres.
+    (height and rise along x and y, by range). `places` [patch, 2] are the middles of the patches, metres. `board` is
+    the one of H.
     """
     image, footprint, _ = board.image()
     moved_image = board.mirror_image(_STEP_M)
@@ -453,10 +456,11 @@ def _estimate_heights_by_phase(
     rates = []
     for i, mask in enumerate(masks):
         # The reflection r_s of a plate is nearly real and negative: the minus turns its phase to about zero.
-        flat = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
-        coherent = abs(flat.sum()) / max(float(np.abs(flat).sum()), 1e-300)
-        if mask.any() and coherent > _COHERENT:
-            phases[i] = np.angle(flat.sum())
+        against_mirror = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
+        coherence = abs(against_mirror.sum()) / max(float(np.abs(against_mirror).sum()), 1e-300)
+        if mask.any() and coherence > _COHERENT:
+            phases[i] = np.angle(against_mirror.sum())
+            # Change of a mirror's phase with its height, radians per metre.
             rates.append(float(np.angle(np.vdot(footprint[mask], moved_image[mask]))) / _STEP_M)
     if not rates:
         return phases, 1.0

@@ -36,10 +36,11 @@ same slope on all plates, as shifted images do. With 0.8 such a drift is missed.
 intervals of undisturbed scenes are 8 % larger than with 0.6 (scenes of the independent generator)."""
 DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.03, 0.06)}
 """Standard deviations of the drift of either part of ln(V / H) over a scan (chosen). Key: True for a stable rig, False
-for one that drifts, as usual or by up to 15 % and 9 degrees. Values of one key are equally probable."""
-# Tried with equal probabilities.
+for one that drifts, as usual (0.03) or by up to 15 % and 9 degrees (0.06: 2.5 of them). Values of one key are equally
+probable."""
 DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
-"""Correlation lengths of the drift along y, the slow axis of the scan: half a wave is 0.13 to 0.4 m."""
+"""Correlation lengths of the drift along y, the slow axis of the scan: it rises and falls within 0.13 to 0.4 m. All are
+equally probable."""
 SLOPE_SEEN = 0.88
 """Slope of ln(V / H) within a plate's image over the slope of the gain. A pixel has the gain averaged over a Fresnel
 zone. Near a plate's edge only the plate's side of that zone echoes, so the average is nearer the gain in the middle of
@@ -299,19 +300,23 @@ class _Fields:
         count = slopes.shape[1]
         measured = slopes.ravel()
         fringes = self.fringes[fringe_m]
-        of_common_causes = common**2 * np.kron(np.eye(2), np.ones((count, count))) + fringe**2 * fringes.of_slopes
+        # One slope that all plates share along x, and an independent one along y.
+        shared_slope = np.kron(np.eye(2), np.ones((count, count)))
+        of_common_causes = common**2 * shared_slope + fringe**2 * fringes.of_slopes
         own_slopes, share = _estimate_own_variances(count)
         cases = []
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = of_common_causes + drift**2 * field.of_slopes
             total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
-            # Gaussian process: the expected value of any quantity is its covariance with the slopes times `answer`.
+            # Gaussian process: the expected value of any quantity is its covariance with the slopes times `answer`,
+            # [case of own slopes, 2 plate].
             inverse = np.asarray(np.linalg.inv(total), np.float64)
             answer = inverse @ measured
             of_drift = drift**2 * field.with_slopes
             of_all = of_drift + fringe**2 * fringes.with_slopes
             variance_of_drift = drift**2 * field.of_itself
             case = _Explained(
+                # Prior of the case, and the normal distribution of the slopes with the covariance `total`.
                 log_evidence=np.log(share / len(DRIFTS[stable]))
                 - 0.5 * answer @ measured
                 + 0.5 * np.linalg.slogdet(inverse)[1],

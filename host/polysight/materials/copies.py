@@ -115,12 +115,13 @@ def _find_copies_at_shift(
     observed = np.logical_or.reduce([p.mask for p in weak])
     if not expected.any() or float((expected & observed).sum()) < LEAST_OVERLAP * float(expected.sum()):
         return None
-    source = np.asarray(scipy.ndimage.shift(amplitude, shift_px, order=0))
+    # The image shifted onto its copy: a patch's level is relative to the plate that it would be the copy of.
+    shifted = np.asarray(scipy.ndimage.shift(amplitude, shift_px, order=0))
     levels_db = {}
     for patch in weak:
         overlap = patch.mask & expected
         if float(overlap.sum()) >= LEAST_OVERLAP * float(patch.mask.sum()):
-            levels_db[patch.label] = 20 * float(np.log10(np.median(amplitude[overlap]) / np.median(source[overlap])))
+            levels_db[patch.label] = 20 * float(np.log10(np.median(amplitude[overlap]) / np.median(shifted[overlap])))
     middle_db = float(np.median(list(levels_db.values()))) if levels_db else 0.0
     labels = tuple(label for label, level in levels_db.items() if abs(level - middle_db) <= SAME_DB)
     if len(labels) < 2 or middle_db > WEAK_DB:

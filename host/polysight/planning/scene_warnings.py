@@ -154,6 +154,7 @@ def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     zone_mm = field_limits(rig).mirror_zone_mm
     aperture_mm = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
     for axis in (0, 1):
+        # A mirror needs this margin of aperture on every side: the first Fresnel zone around its specular point.
         reach_mm = aperture_mm[axis] / 2 - zone_mm[axis]
         low, high = plate.edges(axis)
         beyond_mm = max(-low, high) - reach_mm

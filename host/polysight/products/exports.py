@@ -175,7 +175,8 @@ def _make_axes(scan: ProcessedScan) -> dict[str, Any]:
         # Rounded, so that `.sel(x_mm=20)` finds a pixel whose centre is at 20 mm.
         place_mm = np.round(axis_mm(place_m), 6)
         axes[f"{name}_mm"] = _describe(dims, place_mm, "mm", f"pixel centre, {name} from the image's centre")
-        axes[f"{name}_mm"][2]["axis"] = name.upper()
+        _, _, attributes = axes[f"{name}_mm"]
+        attributes["axis"] = name.upper()
         axes[f"{name}_m"] = _describe(dims, place_m, "m", f"pixel centre, {name} of the rig frame")
     return axes
 
@@ -496,7 +497,7 @@ def table_figures(scan: ProcessedScan) -> list[Figure]:
 
 
 def _patch_figures(patches: Sequence[PatchFigures]) -> tuple[Figure, ...]:
-    """Return the figures that the patches' class declares: a new one may stand in a class of its own."""
+    """Return the figures that the patches' class declares: a subclass of `PatchFigures` may declare more."""
     if not patches:
         return declared_figures(PatchFigures)
     return declared_figures(type(patches[0]))

@@ -17,6 +17,7 @@ from polysight_shared.findings import Finding
 WARNING_SIGMAS = 2.45
 ACTION_SIGMAS = 3.41
 # Weights of the reasons, which order them: a plate that was measured wrongly says more than one that is missing.
+# Chosen.
 _MISSING_WEIGHT = 2.0
 _ACTION_WEIGHT = 3.8
 

@@ -88,7 +88,8 @@ class JointFit:
         first, second = PAIRS
         self.products = windows.valid[..., None] * self.basis[..., first] * self.basis[..., second]
         self.product_sums = self.products.sum(axis=1)
-        # [window, echo, rx, frequency] and [window, echo, frequency, position].
+        # Phase factors with which the RX add in phase, [window, echo, rx, frequency], and waves of amplitude 1,
+        # [window, echo, frequency, position]. `lever` [rx, 3] are the places of the RX.
         self.steering = np.zeros((*self.amplitude.shape, len(fit.lever), fit.omega.size), complex)
         self.waves = np.zeros((*self.amplitude.shape, fit.omega.size, self.basis.shape[1]), np.complex64)
         self.rest = windows.samples.copy()

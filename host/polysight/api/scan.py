@@ -199,7 +199,7 @@ def _open_products_only(path: Path, settings: Settings, process_again: bool) -> 
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
-    """Open recorded data of any layout; without `rig`, with the rig file beside it or the packaged one."""
+    """Open recorded data, also without raw rows; without `rig`, with the rig file beside it or the packaged one."""
     if rig is None:
         rig = path / RIG if (path / RIG).exists() else find_packaged(RIG)
     return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)

@@ -83,7 +83,7 @@ _share = number(float, "a share from 0.5 to below 1", lambda value: 0.5 <= value
 
 
 def add_commands(add: Add) -> None:
-    """Register the commands."""
+    """Register the commands. The last argument of `add` names the options that the help shows first."""
     _add_results(add)
     _add_permittivity(add)
     _add_concentration(add)
@@ -290,7 +290,7 @@ def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:
 
 
 def _parse_pair(text: str) -> str:
-    """Check that a text has the form NAME=TEXT, and return it as it is."""
+    """Check that a text has the form NAME=TEXT, neither of them empty, and return it as it is."""
     if "=" not in text.strip("="):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
     return text

@@ -36,7 +36,7 @@ def _parse_angles(text: str) -> tuple[float, ...]:
 
 
 def _parse_axis(text: str) -> tuple[float, float]:
-    """Parse two lengths in millimetres, separated by a comma."""
+    """Parse x and z of a turntable's axis, millimetres, separated by a comma."""
     x, _, z = text.partition(",")
     return _shift(x), _shift(z)
 

@@ -185,6 +185,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             reading = stack.enter_context(fork_first_reader(shown, Path(folder) / "reader", listener))
             door = None
             if access.control and not access.secure:
+                # One request per connection: the door looks for commands in the first bytes of a connection only.
                 commands = close_after_each(make_command_app(front))
                 door = stack.enter_context(open_door(listener, access.token, _configure(commands)))
             stack.enter_context(_keep_reading_process(reading, shown, Path(folder) / "reader"))

@@ -82,11 +82,13 @@ def make_shapes(table: dict[str, Any], centre_m: Sequence[float]) -> tuple[Shape
     radius_m = table["radius_mm"] / 1000
     length_m = table["length_mm"] / 1000
     axis = tuple(table["axis"])
+    # The table places the point nearest to the rig; z grows away from the rig.
     middle_m = (front_m[0], front_m[1], front_m[2] + radius_m)
     if kind == "sphere":
         return (sphere(name, stack, middle_m, radius_m),)
     if kind == "bottle":
         return bottle(name, stack, middle_m, radius_m, length_m, axis=axis)
+    # With a slope the cylinder is a cone.
     slope = float(np.tan(np.radians(table["slope_deg"])))
     return (cylinder(name, stack, middle_m, radius_m, length_m, axis=axis, slope=slope),)
 

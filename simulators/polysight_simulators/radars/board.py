@@ -43,8 +43,8 @@ class Fault(Enum):
     NACK = "reports a damaged command"
     REFUSE = "refuses the command"
     REFUSE_BARE = "refuses the command without a body"
-    BAD_CRC = "one bit of the answer's body flips"
-    BAD_CHECKSUM = "one bit of the answer's header flips"
+    BAD_CRC = "one bit of the CRC behind the answer flips"
+    BAD_CHECKSUM = "one bit of the checksum in the answer's header flips"
     BAD_SYNC = "words before the answer"
     LOST_INTERRUPT = "the interrupt does not come"
     NO_ANSWER = "does not answer"
@@ -113,6 +113,7 @@ class RadarBoard:
         self.powered = True
         self._faults: deque[Fault] = deque()
         self._pulses_seen = 0
+        # Levels of the reset line (True: in reset) and of the sense-on-power lines
         self._held = True
         self._mode = 0
         self._forget()
@@ -147,10 +148,13 @@ class RadarBoard:
         self._later: list[tuple[float, bytes]] = []
         # True while the host interrupt is raised for a message
         self._offered = False
+        # Time from which the words of `_out` can be read
         self._ready_at = 0.0
         # Sequence number of the last command, and its answer, for a retry
         self._last: tuple[int, bytes] = (-1, b"")
+        # Time of the pulse that started the last frame
         self._pulse_s = float("-inf")
+        # Commands that come before this time are ignored
         self._busy_until = -1.0
         self.cores.forget()
 
@@ -255,7 +259,7 @@ class RadarBoard:
             elif len(self._in) >= 4 + length:
                 raw = bytes(self._in[4 : 4 + length])
                 del self._in[: 4 + length]
-                self._send_message(raw)
+                self._execute_message(raw)
 
     def read_word(self) -> int:
         """Send a word to the host; all ones if there is none yet. Raises DeviceError if unplugged."""
@@ -305,7 +309,7 @@ class RadarBoard:
             delay_s,
         )
 
-    def _send_message(self, raw: bytes) -> None:
+    def _execute_message(self, raw: bytes) -> None:
         """Execute a message of the host (`raw`, without the sync word) and send the answer, with the next fault."""
         opcode, length, flags, remaining, count = struct.unpack_from("<5H", raw)
         fault = None
@@ -324,8 +328,9 @@ class RadarBoard:
                 0.0,
             )
             return
-        if flags & 3 == 3 and self._last[0] == sequence and self._last[1]:
-            # A retry: repeat the answer, without executing the command again
+        is_retry = flags & 3 == 3
+        if is_retry and self._last[0] == sequence and self._last[1]:
+            # Repeat the answer, without executing the command again
             self._send(self._last[1], 0.0)
             return
         delay = ANSWER_S

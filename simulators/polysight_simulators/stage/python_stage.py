@@ -132,6 +132,7 @@ class PythonStage:
         if self._fall is None:
             end = until
         else:
+            # Before the end of the trigger pulse, so that the messages of `wires` stay in the order of time.
             end = min(until, self._fall - 1)
         n = 0
         dx = 0
@@ -144,6 +145,7 @@ class PythonStage:
             self._x += dx
             self._y += dy
             self._next += ticks
+            # The last of the steps was one interval before the next one.
             self.tick = self._next - engine.ticks
             return
         cruised = engine.cruise
@@ -176,6 +178,7 @@ class PythonStage:
                 self._send(self._outcome)
             elif event is Event.ALARM:
                 alarm = Reply("alarm", number=int(self._logic.alarm or 0)).encode()
+                # Of several alarms the first one ended the motion.
                 self._outcome = self._outcome or alarm
                 self._send(alarm)
             if self._logic.status_requested:

@@ -83,7 +83,7 @@ class Theirs:
         """Process the chosen positions of each board one after another; return CPU seconds as :class:`Ours`, scaled."""
         # A frame of the published rig is one chirp.
         pulses = self._rig.burst.pulses
-        size = pulses * self._rig.frame_bytes
+        burst_bytes = pulses * self._rig.frame_bytes
         first = Seconds()
         second = Seconds()
         for method, path in self._boards:
@@ -91,7 +91,7 @@ class Theirs:
             with first.time_block():
                 recording = np.memmap(path, dtype=np.uint8, mode="r")
                 for i in self._chosen:
-                    burst = method.decode(recording[i * size : (i + 1) * size], pulses)
+                    burst = method.decode(recording[i * burst_bytes : (i + 1) * burst_bytes], pulses)
                     aligned.append(method.align(burst))
             with second.time_block():
                 for mean in aligned:

@@ -51,9 +51,9 @@ def rows_then_products(scan: Path, out: Path) -> dict[str, float]:
 
 
 def from_samples(scan: Path, repeats: int) -> tuple[Seconds, Seconds]:
-    """Read all rows back and make both images, on the rig file's plane and on another; return the seconds of both.
+    """Measure reading all rows back and making the images of H and V, each time in a new pipeline.
 
-    Each time in a new pipeline.
+    Return the seconds for images on the rig file's plane, and on another plane.
     """
     same = Seconds()
     other_seconds = Seconds()
@@ -121,7 +121,9 @@ def run(args: argparse.Namespace) -> int:
         same, other_seconds = from_samples(folder / "scan", repeats)
         products = small_products(folder)
         first, again = time_list(folder / "scan", products, folder / "many", scans_in_list)
-        typed = {name: [command(name.format(made=products).split()) for _ in range(repeats)] for name in COMMANDS}
+        command_times = {
+            name: [command(name.format(made=products).split()) for _ in range(repeats)] for name in COMMANDS
+        }
     boards = len(rig.receivers)
     lines = []
     for stage, limit in (("image", 0.1), ("report", 4.0)):
@@ -141,13 +143,13 @@ def run(args: argparse.Namespace) -> int:
                 f"list of {scans_in_list} scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note
             )
         )
-    for name, times in typed.items():
+    for name, times in command_times.items():
         cpu = statistics.median(t[0] for t in times)
         wall = statistics.median(t[1] for t in times)
         note = f"{wall:.2f} s wall"
         lines.append(_report_seconds(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
     show("waiting times, simulated rows", lines, args.quick)
-    write(args.json, "waits", lines, behind=after_last_row, commands=typed)
+    write(args.json, "waits", lines, behind=after_last_row, commands=command_times)
     return 0
 
 

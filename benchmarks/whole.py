@@ -1,7 +1,7 @@
 """A full scan of two boards from raw files to images: time, memory, and the wait after its last row.
 
-Beside it the published method (`published.py`). Limits are those that docs/benchmarks.md has as asked; the aim of the
-ratio is chosen.
+Beside it the published method (`published.py`). Limits are those in the column "asked" of docs/benchmarks.md; the aim
+of the ratio is chosen.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class Published:
         self._tuned = tuned
         self._grid = image_grid(rig)
         self._row = sync.Theirs(rig, files, tuned, POSITIONS)
+        # [rx, row, column, sample]
         shape = len(rig.antennas.rx_mm), rig.grid.rows, rig.grid.columns, rig.chirp.samples
         # The time does not depend on the samples.
         self._cube = np.broadcast_to(np.ones(shape[1:], np.complex64), shape)
@@ -96,15 +97,15 @@ def run(args: argparse.Namespace) -> int:
         beside_scan = live.run()
         memory = max(batch.end(), live.end())
     scale = rig.grid.rows / count
-    whole = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers) * rig.grid.rows
-    size = whole / scale
+    whole_bytes = rig.grid.columns * rig.burst.pulses * rig.frame_bytes * len(rig.receivers) * rig.grid.rows
+    part_bytes = whole_bytes / scale
     if scale > 1:
-        part = f"{count} of {rig.grid.rows} rows ({size / 1e9:.1f} GB)"
+        part = f"{count} of {rig.grid.rows} rows ({part_bytes / 1e9:.1f} GB)"
     else:
-        part = f"all {size / 1e9:.1f} GB"
+        part = f"all {part_bytes / 1e9:.1f} GB"
     # What is done once, such as the images, does not grow with the rows.
     seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
-    quantity = f"raw to image, two boards, {whole / 1e9:.1f} GB"
+    quantity = f"raw to image, two boards, {whole_bytes / 1e9:.1f} GB"
     lines = [
         _make_time_line(quantity, seconds, statistics.median(theirs), statistics.median(theirs_tuned), part),
         _make_last_row_line(beside_scan),
@@ -134,6 +135,7 @@ def _make_time_line(quantity: str, seconds: float, published_s: float, tuned_s: 
 
 def _make_last_row_line(live: dict[str, list[float]]) -> Line:
     """Return the line about the wait after the last row, from figures of `Chain.run`."""
+    # `at_least` holds the most that is allowed where lower is better.
     last = statistics.median(live["last_row_wall_s"])
     last_cpu = statistics.median(live["last_row_cpu_s"])
     return Line(

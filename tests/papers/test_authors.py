@@ -101,7 +101,7 @@ def out(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         # Pixels of a task, and weights tried: it is the page that is tested
-        patch.setattr(authors_items, "ALL", 240)
+        patch.setattr(authors_items, "JUDGED_PIXELS", 240)
         patch.setattr(classify, "GRID", (1.0,))
         assert main(["reproduce", "--authors", str(dataset), "--out", str(folder)]) == 0
     return folder
@@ -317,7 +317,7 @@ def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, caps
 )  # fmt: skip
 @pytest.mark.parametrize("make", [authors_items.authors_fig18, authors_fig20])
 def test_few_scans_of_few_pixels_give_figures_or_are_refused(tmp_path, monkeypatch, stand, make):
-    monkeypatch.setattr(authors_items, "ALL", 240)
+    monkeypatch.setattr(authors_items, "JUDGED_PIXELS", 240)
     monkeypatch.setattr(classify, "GRID", (1.0,))
     for seed in range(3):
         folder = tmp_path / f"{seed}" / "materials"

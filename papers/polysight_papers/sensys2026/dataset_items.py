@@ -57,10 +57,10 @@ from polysight_shared.errors import ConfigError, DataError
 # The second angle of the task of two angles, in the paper.
 SECOND_ANGLE_DEG = 55.0
 TASKS = ("solids", "solids, two angles", "liquids", "powders")
-ALL = 1500
-AT_LEAST = 6
-"""About ALL pixels of a task are judged, equally many of each patch but not fewer than AT_LEAST, if it has them.
-Chosen: all pixels are compared with all, so that the time grows with the square of ALL."""
+JUDGED_PIXELS = 1500
+PATCH_PIXELS = 6
+"""About JUDGED_PIXELS of a task are judged, equally many of each patch but not fewer than PATCH_PIXELS, if it has them.
+Chosen: all pixels are compared with all, so that the time grows with the square of JUDGED_PIXELS."""
 LEFT_OUT = "scans left out"
 OPTIMISTIC = "by pixel (optimistic)"
 
@@ -88,7 +88,7 @@ def task_samples(data: AuthorsData, source: str, task: str) -> Samples | None:
 
 def _samples(library: Library) -> Samples:
     """Return pixels of a library, of each patch so few that all can be compared with all."""
-    return Samples.from_library(library, max(AT_LEAST, ALL // len(library.entries)))
+    return Samples.from_library(library, max(PATCH_PIXELS, JUDGED_PIXELS // len(library.entries)))
 
 
 def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:

@@ -62,7 +62,7 @@ MAKERS: dict[str, Callable[[Run], Item]] = {
 
 
 def reproduce(out: Path, keys: Sequence[str] = (), run: Run | None = None) -> int:
-    """Make items (default: all) into a folder.
+    """Make the items `keys` (default: all) into a folder, with the options `run`.
 
     An item that fails is listed on the page and on stderr; the others are made.
 

@@ -47,8 +47,8 @@ class StillWatch:
         self.motion = Versioned(0, b"{}").publish(Motion(now_s=1_800_000_000))
         self._history = history
 
-    def show(self, key: str) -> None:
-        """Publish a state of the table."""
+    def show(self, key: str, **words: str) -> None:
+        """Publish a state of the table, with other words than `WORDS`."""
         signs = LifeSigns(
             life=Life(), alive=True, killed=False, alive_s=0.0, pi_silent_s=0.1, pi_limit_s=6.0, now_s=1.8e9
         )
@@ -57,7 +57,7 @@ class StillWatch:
         verdict = None
         if key.startswith("result_"):
             verdict = Verdict(key.removeprefix("result_"), (reason("care", **REASON),))  # type: ignore[arg-type]
-        status = replace(say(key, **WORDS), since_s=1.79e9)
+        status = replace(say(key, **(WORDS | words)), since_s=1.79e9)
         self.state = self.state.publish(replace(snapshot, status=status, verdict=verdict))
 
     def close(self) -> None:
@@ -109,6 +109,24 @@ def test_every_state_says_what_the_table_says(browser: Browser, still, size, sch
             assert all(part in browser.text("reasons") for part in REASON.values()), key
         assert axe is None or browser.find_violations(axe) == [], key
     assert browser.errors == []
+
+
+@pytest.mark.parametrize(
+    ("advice", "shown"),
+    [
+        ("Put it in, then `polysight resume scans/one`", "Put it in, then Try again"),
+        ("Put it in (for a scan to resume: `polysight resume SCAN --config a.toml`)", "Put it in; then Try again"),
+        ("At the Pi: `systemctl status`", "At the Pi: systemctl status (commands: in a shell); then Try again"),
+        ("", "Try again"),
+    ],
+)
+def test_advice_beside_try_again_ends_with_the_button(browser: Browser, still, advice, shown):
+    """A scan that could not start cannot be resumed."""
+    watch, view = still
+    browser.visit(f"{view.address}/watch#token={TOKEN}", DESK)
+    watch.show("start_failed", do=advice)
+    browser.wait("document.getElementById('again')", "the button")
+    assert browser.text("do") == shown
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])

@@ -25,6 +25,14 @@ let server = {}, name = scanName, summary = {}, curve = "sync";
 
 // --- what is shown ---
 
+/** A terminal's advice on a scan that could not start: there is nothing to resume, and the button reads the rig file anew. */
+function beforeTryingAgain(advice) {
+  const here = advice.replace(/ \([^()]*`polysight resume [^()]*\)/g, "").replace(", and add --config instrument.toml", "")
+    .replace(/`polysight resume [^`]*`/g, "Try again");
+  const mend = `${here}${here.includes("`") ? " (commands: in a shell)" : ""}`;
+  return mend.includes("Try again") ? mend : [mend, "Try again"].filter(Boolean).join("; then ");
+}
+
 function showStatus() {
   const { status, scan } = state;
   by("status").dataset.level = status.level;
@@ -32,7 +40,7 @@ function showStatus() {
   by("headline").textContent = status.headline;
   tell("detail", status.detail.replace("{since}", span(Math.max(0, (motion.now_s ?? status.since_s) - status.since_s))));
   tell("why", status.why && `Likely: ${status.why[0].toLowerCase()}${status.why.slice(1)}.`);
-  tell("do", status.do);
+  tell("do", status.press.includes("again") && server.starts ? beforeTryingAgain(status.do) : status.do);
   by("progress").hidden = !scan;
   let left = "", ends = "";
   if (scan) {

@@ -371,6 +371,7 @@ def print_pulls(rows: list[PatchFigures]) -> dict[str, Any]:
 
 
 def _measure_scene(job: tuple[int, str, bool]) -> list[PatchFigures]:
+    """Return `figures` of a job (seed, kind, raw): a pool passes one argument."""
     return figures(*job)
 
 

@@ -83,7 +83,7 @@ def write_scan(folder: Path, rig: Instrument, rows: dict[str, list[NDArray[np.in
     layout.start()
     for row in itertools.islice(plan, count):
         payloads = {name: board_rows[row.index % len(board_rows)] for name, board_rows in rows.items()}
-        layout.write_row(row, payloads, {name: [] for name in payloads})
+        layout.write_row(row, payloads, gaps={name: [] for name in payloads})
     layout.end()
 
 
@@ -188,7 +188,10 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
 
 
 def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
-    """Return the part of a synchronised row that imagers read: samples [rx, position, sample], valid [position]."""
+    """Return the part of a synchronised row that imagers read: samples [rx, position, sample], valid [position].
+
+    Without `turn` the stage's motion in a burst is not undone.
+    """
     if valid is None:
         valid = np.ones(samples.shape[1], bool)
     return cast(

@@ -67,6 +67,7 @@ class Seconds:
 
     @property
     def median(self) -> float:
+        """Median of the CPU seconds."""
         return statistics.median(self.cpu)
 
     @property

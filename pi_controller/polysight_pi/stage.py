@@ -528,6 +528,7 @@ class StageDriver:
             Parameter.TRAVEL_Y: config.travel_y_mm * config.steps_per_mm,
             Parameter.TRAVEL_SPEED: config.travel_speed_mm_s * config.steps_per_mm,
             Parameter.BACKLASH: config.backlash_mm * config.steps_per_mm,
+            # A bit for each pin with the other level than in board.h.
             Parameter.PINS: sum(1 << INVERTIBLE.index(pin) for pin in config.inverted),
         }
         for parameter, value in settings.items():

@@ -36,7 +36,7 @@ from polysight_shared.errors import ConfigError, DataError, no_such
 from polysight_shared.findings import Finding
 
 NPZ = ".npz"
-# Arrays of an .npz file: required, optional, and the one that only image.npz of this program has.
+# Arrays of an .npz file: required, optional, and the error of P = H / V, which only image.npz of this program has.
 CHANNELS = ("h", "v")
 AXES = ("x_m", "y_m")
 OPTIONAL = ("valid", "incidence_deg", "simulated", "conjugate")
@@ -374,6 +374,7 @@ def place_rig(rig: Instrument, incidence_deg: float) -> Instrument:
         return msgspec.structs.replace(rig, geometry=geometry)
 
     def miss(distance_mm: float) -> float:
+        """Return the angle at this distance minus the given one, degrees; it falls with the distance."""
         return float(np.degrees(specular_incidence_rad(place_plane(distance_mm)))) - incidence_deg
 
     if not miss(_NEAREST_MM) > 0 > miss(_FARTHEST_MM):

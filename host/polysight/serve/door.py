@@ -205,7 +205,7 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
 
 
 class PagesServer(EndingServer):
-    """The server of the pages: its connections come from the door, and it ends with it."""
+    """The server of the pages: its connections come from `door`, each with a new `protocol`, and it ends with it."""
 
     def __init__(self, config: uvicorn.Config, door: socket.socket, protocol: Any) -> None:
         super().__init__(config)

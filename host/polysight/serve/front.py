@@ -141,6 +141,7 @@ def page_routes(front: Front) -> list[Route]:
     pages = {path: Response(frame_page(*parts), media_type="text/html") for path, parts in PAGES.items()}
 
     async def show_page(request: Request) -> Response:
+        """Send a page, or the one to look at instead: the one scan's, or the list if no scan is named."""
         path = request.url.path
         only = front.scans.only
         if path == "/" and only is not None:
@@ -186,6 +187,7 @@ def control_routes(front: Front) -> list[Route]:
     running = RunningScans(front.scans)
 
     async def open_session(request: Request) -> Response:
+        """Send the session's cookie; the guard has checked the token."""
         answer = JSONResponse({"what": "opened"})
         access = front.access
         cookie = cookie_name(request.scope)

@@ -322,6 +322,7 @@ def _check_line(line: bytes) -> _Head | None:
     content = decode_line(line)
     if content is None:
         return None
+    # Without keys of a chain that can be read the line counts as unchained.
     return head or _Head(content["fact"], "")
 
 

@@ -215,6 +215,7 @@ def analyse_surface(
             segments[index] = add_permittivity(segments[index], fit.eps, sources)
             if segments[index].permittivity is None:
                 continue
+            # The errors that all points share; instead of the segment's scatter each point has its own.
             common = sum((c for name, c in sources.items() if name != "scatter"), np.zeros((2, 2)))
             permittivity[members] = point_permittivity(own_voltages, gains, optics.wave_number)
             covariance[members] = point_covariance(own_voltages, gains, fit, optics.wave_number) + common
@@ -317,17 +318,20 @@ def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, A
 def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
     """Return standard deviations [n] of points along the normal (m) and of normals (rad, both directions together).
 
-    A normal is judged beside that of the surface at the point: a point that slides along a bent surface is beside it.
+    The error of a normal is its turn beyond that of the surface between the two places: a point that only slides along
+    a bent surface has none.
     """
     tangent = tangents(shape.normals)
 
     def find_changes(moved: Shape) -> tuple[Array, Array]:
+        """Return how far points moved along the normal, m [n], and how normals turned from the surface, rad [n, 2]."""
         shift_m = moved.points - shape.points
         turn = np.einsum("nij,ni->nj", tangent, moved.normals - shape.normals)
         slide = np.einsum("nij,ni->nj", tangent, shift_m)
         bent = np.einsum("njk,nk->nj", shape.curvature, slide)
         return np.einsum("ni,ni->n", shift_m, shape.normals), turn - bent
 
+    # Each with one coordinate of one antenna off by its standard error.
     rigs = [rig for source, rig in disturb_optics(optics, uncertainty) if source == "places"]
     changes = [find_changes(find_shape(echoes, rig)) for rig in rigs]
     # Errors of path and slope by noise, one after the other.
@@ -488,6 +492,7 @@ def judge_segment(
     ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
         return replace(segment, reason="its ratio is that of metal", name="metal"), None
+    # Length over which neighbours' errors by edges and other echoes are alike.
     ripple_m = RIPPLE_OF_PLATES_M if segment.radius_mm is None else FRESNEL_ZONE_M
     fit = fit_permittivity(voltages, gains, wave_number, share, ripple_m)
     level, rise = judge_medium(fit, voltages, gains, disturbed, wave_number)

@@ -127,6 +127,7 @@ def fig16(run: item.Run) -> item.Item:
             values = np.abs(measured.h)
         else:
             values = np.abs(measured.h / measured.v)
+        # [scan, material, pixel].
         level = 20 * np.log10(values)
         levels[f"{angle:.0f}"] = {m.name: level[:, j].ravel() for j, m in enumerate(materials)}
         for j in range(len(materials)):
@@ -178,6 +179,7 @@ def table2_item(run: item.Run) -> item.Item:
     axes = fig.subplots(1, 2)
     for colour, (name, group) in zip((PALETTE[0], PALETTE[6], PALETTE[3]), groups().items(), strict=True):
         errors = calibrated_errors(name, count_draws(run.quick))
+        # h and v of `measured` are [scan, material, pixel].
         measured = draw(group.materials, group.angle_deg, errors, seed=2)
         estimated: list[tuple[complex, complex, float]] = []
         for j, m in enumerate(group.materials):

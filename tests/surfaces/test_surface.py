@@ -127,6 +127,18 @@ def test_scans_of_a_turntable_are_joined_where_the_object_stood(glass_ball):
     assert [s.turned_deg for s in joined.segments[len(surface.segments) :]] == [40.0] * len(surface.segments)
 
 
+def test_surfaces_whose_numbers_have_gaps_stay_apart_when_joined(glass_ball):
+    """An edge that was dropped leaves a gap in the numbers, which must not give two surfaces one number."""
+    _, _, surface = glass_ball
+    half = np.arange(len(surface.points_m)) < len(surface.points_m) // 2
+    segments = (surface.segments[0], replace(surface.segments[0], number=2))
+    gapped = replace(surface, segment=np.where(half, 0, 2), segments=segments)
+    joined = join_turned([gapped, gapped], [0.0, 40.0], (0.03, 0.55))
+    assert len({s.number for s in joined.segments}) == 4
+    numbers = [int(n) for part in np.split(joined.segment, 2) for n in dict.fromkeys(part)]
+    assert numbers == [s.number for s in joined.segments]
+
+
 def test_files_hold_what_was_found(glass_ball, tmp_path):
     _, _, surface = glass_ball
     write_surface(tmp_path, surface)

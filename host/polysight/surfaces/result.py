@@ -245,7 +245,7 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
     """Join scans of an object on a turntable into one surface, as the object stood at the angle zero.
 
     The table turns about a vertical axis through `axis_m`, its x and z in the rig frame; a positive angle turns +z
-    towards +x. Segments stay apart and are numbered in order.
+    towards +x. Segments stay apart: the numbers of each scan follow those of the one before.
     """
     x, z = axis_m
     axis = np.array([x, 0.0, z])
@@ -259,7 +259,8 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
         normals = surface.normals @ back.T
         # Curvatures are given in tangents that follow from the normal: they turn with these.
         change = np.swapaxes(tangents(normals), 1, 2) @ (back @ tangents(surface.normals))
-        first = len(segments)
+        # Behind the highest number, which may exceed the count of segments: edges that were dropped leave gaps.
+        first = max((segment.number for segment in segments), default=-1) + 1
         part = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name not in NOT_POINTS}
         part["points_m"] = (surface.points_m - axis) @ back.T + axis
         part["normals"] = normals

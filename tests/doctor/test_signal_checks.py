@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from tests.support.doctor.case import FRAMES, RIG, direct_signal, make_context, simulate_frames
@@ -87,6 +88,17 @@ def test_a_crystal_and_a_late_trigger_are_distinguished(ppm):
     assert signal.crystal_ppm(RIG) == pytest.approx(ppm, abs=0.15)
     mean, unsure = signal.start_delay_s(RIG)
     assert mean * 1e9 == pytest.approx(3.0, abs=5 * unsure * 1e9 + 0.3)
+
+
+@pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])
+def test_the_start_times_of_aliased_direct_paths_lack_no_sample_rate(offset_hz):
+    """RH alone is programmed beyond the band; a sample rate of IF is 55 ns."""
+    beyond = programmed_rig(offset_hz)
+    rig = programmed_rig()
+    rig = msgspec.structs.replace(rig, boards=[beyond.by_name("RH") if b.name == "RH" else b for b in rig.boards])
+    finding = judge_skew(rig, {name: direct_signal(name, rig) for name in ("RH", "RV")})
+    assert finding.level == "ok", finding
+    assert finding.facts["later_ns"]["RH"] == pytest.approx(0.0, abs=2.5)
 
 
 def test_clipped_chirps_are_an_error_and_a_few_a_warning():

@@ -87,14 +87,21 @@ class DirectSignal:
         return self.drift_hz_per_s / (2e-6 * rig.chirp.slope_hz_per_s)
 
     def start_delay_s(self, rig: Instrument) -> tuple[float, float]:
-        """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds."""
+        """Return the mean start delay of the board relative to the transmitter, and its standard error; seconds.
+
+        An IF expected beyond the band was aliased: whole sample rates bring it near the expected one.
+        """
         chirp = rig.chirp
         first, end = sync.whole_blocks(chirp.linear_samples)
         middle_sample = (first + end - 1) / 2
         # f_0 + 2 K t in the middle of the samples that the IF is estimated from: the crystal error adds p times this.
         if_per_crystal_error_hz = chirp.first_sample_hz + 2 * chirp.hz_per_sample * middle_sample
         expected_if_hz = self.expected_hz + self.crystal_ppm(rig) * 1e-6 * if_per_crystal_error_hz
-        delay = (expected_if_hz - unwrap_if(self.if_hz, rig)) / chirp.slope_hz_per_s
+        if_hz = unwrap_if(self.if_hz, rig)
+        low, high = band_hz(rig)
+        if not low <= self.expected_hz <= high:
+            if_hz += chirp.sample_rate_hz * round((expected_if_hz - if_hz.mean()) / chirp.sample_rate_hz)
+        delay = (expected_if_hz - if_hz) / chirp.slope_hz_per_s
         standard_error = np.inf
         if delay.size > 1:
             standard_error = float(delay.std(ddof=1) / np.sqrt(delay.size))

@@ -72,7 +72,10 @@ class Ours:
 
 
 class Theirs:
-    """The published method on some positions of the same files, its time scaled to the row."""
+    """The published method on some positions of the same files, its time scaled to the row.
+
+    `tuned`: in single precision, and without steps that repeat or are too precise (`Synchroniser`).
+    """
 
     def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool, positions: int = POSITIONS) -> None:
         self._boards = [(Synchroniser(rig, rig.by_name(name), tuned), path) for name, path in files.items()]

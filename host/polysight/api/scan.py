@@ -259,7 +259,7 @@ class Scan:
 
     @property
     def rig(self) -> Instrument:
-        """Rig of the images: geometry, chirp, boards, as calibrated; x from TX to RX.
+        """Rig of the images: geometry, chirp, boards, as calibrated; its x runs from TX to RX, as that of the images.
 
         Raises
         ------

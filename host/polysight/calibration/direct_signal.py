@@ -266,7 +266,7 @@ def choose_start_offset(
 
 
 def predict_by_geometry(rig: Instrument, board: Board) -> float:
-    """Return the start offset from the rig file's geometry alone, Hz."""
+    """Return the start offset, Hz, that puts the direct path in the middle of the band by the rig's geometry alone."""
     return board.start_offset_hz + sum(band_hz(rig)) / 2 - direct_if_hz(rig, board)
 
 

@@ -69,8 +69,8 @@ class SourceScan(msgspec.Struct, frozen=True):
 class CalibrationFile(msgspec.Struct, frozen=True, kw_only=True):
     """Fields that all files have.
 
-    `kind` is the key in the rig file's [calibration] that names the file, `made_utc` date and time in ISO 8601,
-    `versions` are those of the programs, `format` is that of the file.
+    `kind` is the key in the rig file's [calibration] that names the file (`start_frequency` is none), `made_utc` date
+    and time in ISO 8601, `versions` are those of the programs, `format` is that of the file.
     """
 
     kind: str

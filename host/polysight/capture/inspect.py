@@ -64,7 +64,7 @@ MAGIC = {
 
 
 def recognise_format(head: bytes) -> str:
-    """Describe the kind of file that begins with these bytes: `a picture (PNG)`, `text`, or `unknown bytes`."""
+    """Describe the kind of file that begins with these bytes: `a picture (PNG)`, `text`, `empty`, `unknown bytes`."""
     for magic, kind in MAGIC.items():
         if head.startswith(magic):
             return kind
@@ -117,11 +117,12 @@ class Report:
     """Content of a recording.
 
     `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
-    float64 [samples]; its highest bin is `peak_bin`, of `peak_db`. `rx_profile_db` is that of every antenna, over the
-    same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC counts. `clipped` counts values
-    at full scale, `left_over_bytes` the bytes behind the last complete chirp. `chirps` are those in the file, of which
-    the first `MAX_CHIRPS` make the statistics. `remarks` are sentences on what is suspicious; `card` is None unless the
-    file is a packet capture. `simulated` is set by the caller.
+    float64 [samples]; its highest bin but those of a constant offset is `peak_bin`, of `peak_db`. `rx_profile_db` is
+    that of every antenna, over the same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC
+    counts. `clipped` counts values at full scale in all of the payload, `left_over_bytes` the bytes behind the last
+    complete chirp. `chirps` are those in the file, of which the first `MAX_CHIRPS` make the other statistics. `remarks`
+    are sentences on what is suspicious; `card` is None unless the file is a packet capture. `simulated` is set by the
+    caller.
     """
 
     path: Path

@@ -20,6 +20,7 @@ def main(card: str, card_port: int, host: str, port: int, first: int, packets: i
         began = due = time.perf_counter()
         for k in range(first, first + packets):
             count = k * size
+            # Header: sequence number, which begins with 1, and bytes sent before, 48 bits; little-endian.
             sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
             due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
             # Shorter sleeps take longer than asked for: several packets are sent at once instead.

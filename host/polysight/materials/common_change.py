@@ -39,8 +39,8 @@ DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.03, 0.06)}
 for one that drifts, as usual (0.03) or by up to 15 % and 9 degrees (0.06: 2.5 of them). Values of one key are equally
 probable."""
 DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
-"""Correlation lengths of the drift along y, the slow axis of the scan: it rises and falls within 0.13 to 0.4 m. All are
-equally probable."""
+"""Correlation lengths of the drift along y, the slow axis of the scan: half a wave of it is 0.13 to 0.4 m long. All
+are equally probable."""
 SLOPE_SEEN = 0.88
 """Slope of ln(V / H) within a plate's image over the slope of the gain. A pixel has the gain averaged over a Fresnel
 zone. Near a plate's edge only the plate's side of that zone echoes, so the average is nearer the gain in the middle of
@@ -124,7 +124,7 @@ class CommonChange:
     def log_ratio(self, plate: int) -> tuple[complex, tuple[float, float]]:
         """Return the change of ln(V / H) from the origin to a plate, and the standard deviations of both parts.
 
-        They include the plate's ripple.
+        They include the plate's ripple; that of the phase has the factor `PHASE_OF_CHANGE`.
         """
         std = complex(self.std[plate])
         ripple = float(self.ripple[plate])

@@ -86,6 +86,7 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
     simulated = "unknown" if scan.simulated is None else scan.simulated
     metal = UNREFERENCED
     if scan.materials is not None:
+        # Products of earlier releases do not say how.
         metal = "given"
         if scan.materials.metal_reference:
             metal = scan.materials.metal_reference.how
@@ -527,8 +528,9 @@ def pack_mat(scan: ProcessedScan) -> bytes:
     """Return the content of a MATLAB file.
 
     `h`, `v`, `p`, `valid` [y, x]; `x_mm`, `y_mm` from the image's centre, `x_m`, `y_m` in the rig frame; structs
-    `materials`, `config`, `versions`. If known also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON).
-    `quality_json` and `materials_json` are the files as text, for jsondecode.
+    `materials`, `config` (the rig file), `versions`; `scan_id`, `simulated` (NaN if unknown), `convention`. If known
+    also `p_sigma` [y, x], `verdict` and `verdict_reasons` (JSON). `quality_json` and `materials_json` are the files as
+    text, for jsondecode.
     """
     images = scan.images
     content = {

@@ -454,7 +454,7 @@ def _check_keys(keys: Sequence[str]) -> None:
 
 
 def describe_origin(data: AuthorsData) -> Origin:
-    """Return the notes on the data for the page."""
+    """Return the origin of the page's numbers: published or simulated files, with the notes on them."""
     contents = "; ".join(
         f"{source}: {len(lib.entries)} boxes of {len(lib.names)} materials in {len(lib.scans)} scans"
         for source, lib in data.sources.items()

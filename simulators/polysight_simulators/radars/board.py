@@ -1,8 +1,8 @@
 """A simulated AWR2243 board at its SPI lines: words, host interrupt, reset and sense lines, SYNC_IN pulses.
 
-It has its own mmWaveLink codec, after TI's interface control document and the observed behaviour of devices: answers
-with a 16-bit CRC, refusals with message id 0, a harmless main core fault at power-up, an empty flash at first, data 1
-ms after the interrupt. The clock is a parameter; `RadarBoard.inject` sets faults. Real timing is not known.
+It has its own mmWaveLink codec, after TI's interface control document (ICD) and the observed behaviour of devices:
+answers with a 16-bit CRC, refusals with message id 0, a harmless main core fault at power-up, an empty flash at first,
+data 1 ms after the interrupt. The clock is a parameter; `RadarBoard.inject` sets faults. Real timing is not known.
 """
 
 from __future__ import annotations
@@ -317,7 +317,8 @@ class RadarBoard:
             fault = self._faults.popleft()
         if fault is Fault.NO_ANSWER or self.destroyed or not self.powered or self.now() < self._busy_until:
             return
-        # The direction of the answer is the command's plus 1; the message's number lies above direction and kind.
+        # The direction of the answer is the command's plus 1; the message's number lies above direction and kind. The
+        # flags have the sequence number in bits 12 to 15, and in a retry 3 in the lowest two.
         direction = (opcode & 15) + 1
         number = opcode >> 6
         sequence = flags >> 12

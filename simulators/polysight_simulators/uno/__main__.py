@@ -56,12 +56,12 @@ def _run(args: argparse.Namespace) -> None:
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)
     rig = load_instrument(args.config)
     # Steps from the closing point of a limit switch to the stage's zero, on both axes.
-    switch_position = homing_zero()
+    zero_steps = homing_zero()
     program = str(emulator())
     command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
     command += [
         "--zero",
-        f"{switch_position},{switch_position}",
+        f"{zero_steps},{zero_steps}",
         "--um-per-step",
         repr(1000.0 / rig.stage.steps_per_mm),
     ]

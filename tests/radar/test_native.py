@@ -10,6 +10,7 @@ from tests.support.radar.boards import BoardWords, with_radar
 from tests.support.refusals import refused
 
 from polysight.radar import board as boards
+from polysight.radar.commands import GET_DIE_ID
 from polysight.radar.control import NativeRadars, RadarState, radar_board
 from polysight.radar.diagnosis import ReplayedWords, read_trace
 from polysight.store.manifest import decode_line, encode_line
@@ -126,12 +127,21 @@ def test_two_names_for_one_board_are_refused(rig, usb, clock):
         NativeRadars(rig, usb.open, clock)
 
 
-def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path):
+@pytest.mark.parametrize("die", ["zero", "not told"])
+def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path, monkeypatch, die):
+    """They would share a file: gains and filters of one board are not another's."""
+
+    def without_die(execute):
+        return lambda number, *rest: (6, b"", 0.0) if number == GET_DIE_ID.ID else execute(number, *rest)
+
     for board in usb.boards.values():
         board.cores.die = 0
+        if die == "not told":
+            monkeypatch.setattr(board.cores, "execute", without_die(board.cores.execute))
     rig_with_calibration = with_radar(rig, calibration_dir=str(tmp_path))
-    with NativeRadars(rig_with_calibration, usb.open, clock):
+    with NativeRadars(rig_with_calibration, usb.open, clock) as radars:
         assert list(tmp_path.iterdir()) == []
+        assert str(radars.report()).count("its calibration is not saved") == len(usb.boards)
 
 
 def test_after_a_fault_the_next_row_resets_only_that_board(radars, usb):

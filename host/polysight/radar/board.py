@@ -338,8 +338,8 @@ class BringUp:
         restored = ""
         if self._board.calibration is not None:
             die = self._read_die()
-            if die == calibration_data.NO_DIE:
-                self._link.warnings.append(f"{self._board.name}: its die id is 0, so its calibration is not saved")
+            if die in calibration_data.NO_DIES:
+                self._link.warnings.append(f"{self._board.name}: its die id is {die}: its calibration is not saved")
             else:
                 saved = self._board.calibration.load(die)
         if saved is not None:
@@ -359,7 +359,7 @@ class BringUp:
                 "measure the RF supplies; power-cycle the board; replace it if the fault remains",
                 code=ErrorCode.RADAR_FAULT,
             )
-        if self._board.calibration is not None and saved is None and die != calibration_data.NO_DIE:
+        if self._board.calibration is not None and saved is None and die not in calibration_data.NO_DIES:
             self._board.calibration.save(die, calibration_data.read_calibration(self._link, self._board.name))
         self._board.facts.calibration_restored = bool(restored)
         return str(event) + restored
@@ -372,7 +372,7 @@ class BringUp:
         return die
 
     def _read_die(self) -> str:
-        """Return the die id, "unknown" if the firmware cannot tell. Raises DeviceError if the rig file has another."""
+        """Return the die id, UNKNOWN_DIE if the firmware has none. Raises DeviceError if the rig file has another."""
         try:
             data = self._board.ask(c.GET_DIE_ID, 16)
         except DeviceError as error:
@@ -380,7 +380,7 @@ class BringUp:
                 raise
             # This firmware does not have the command.
             self._board.log_event(error.what)
-            return "unknown"
+            return calibration_data.UNKNOWN_DIE
         die = "-".join(f"{word:08x}" for word in struct.unpack_from("<4I", data))
         self._board.facts.die_id = die
         if self._board.die_id and die != self._board.die_id:

@@ -29,8 +29,10 @@ PART_BYTES = 224
 RESTORED = 0x14E0
 # Calibrations of the RF init (ICD 63).
 ALL = 0x1FF0
-# A die id that does not identify a board.
+# Die ids that do not identify a board: zeros, and that of firmware that cannot tell it.
 NO_DIE = "-".join(["00000000"] * 4)
+UNKNOWN_DIE = "unknown"
+NO_DIES = (NO_DIE, UNKNOWN_DIE)
 # A larger file is none of ours: it has 1,344 hexadecimal digits and little else.
 _MAX_FILE_BYTES = 2**16
 # Offset of the temperature at the calibration in the data, int16 in degrees Celsius.

@@ -303,7 +303,7 @@ class StageLink:
         )
 
     def _answer(self, sequence: int) -> Reply | None:
-        """Return the answer to this line, or an error for a line that could not be read; None after a timeout."""
+        """Return the answer to this line, or an error for one that could not be read; None: timeout, or link lost."""
         deadline = time.monotonic() + ANSWER_TIMEOUT_S
         while (left_s := deadline - time.monotonic()) > 0:
             try:

@@ -101,6 +101,7 @@ class Reduction:
         if sweep_hz.shape == self.sweep_hz.shape:
             return maps
         step_hz = self.sweep_hz[1] - self.sweep_hz[0]
+        # The chirp's samples that were decimated: each result lies in the middle of `FOLD`.
         first = round((sweep_hz[0] - self.sweep_hz[0]) / step_hz - (FOLD - 1) / 2)
         linear = slice(first, first + FOLD * sweep_hz.size)
         # Decimation passes paths about `middle_m`, half way between the direct path (0) and the middle of the gate.

@@ -350,9 +350,17 @@ def test_parameters_that_cannot_be_used_are_errors(folder, wrong):
         open_scan(folder, **wrong).materials()
 
 
+def test_a_rig_beside_a_scan_folders_own_is_said_to_be_ignored(folder):
+    with pytest.warns(UserWarning, match="`rig` is ignored"):
+        opened = open_scan(folder, rig=REPO / "instrument.toml")
+    assert opened.rig == open_scan(folder).rig
+
+
 def test_products_cannot_be_processed_again(products):
     with refused(ErrorCode.VALUES_CONFLICT, products):
         open_scan(products, bands=3)
+    with refused(ErrorCode.VALUES_CONFLICT, products):
+        open_scan(products, rig=REPO / "instrument.toml")
     with refused(ErrorCode.MISMATCH):
         open_scan(products).image(metal_referenced=False)
 

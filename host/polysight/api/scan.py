@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from html import escape
@@ -90,7 +91,7 @@ def open_scan(
         and none of the parameters below is given (but `rig` for a scan folder); otherwise the rows are processed.
     rig
         Rig file of published data, or the rig itself: `instrument.toml` in that folder, in the current folder or the
-        packaged one if not given. Scan folders bring their own.
+        packaged one if not given. Scan folders bring their own, and warn that this one is ignored.
     library
         Reference library of the materials; the packaged simulated one if not given.
     model
@@ -112,7 +113,7 @@ def open_scan(
     DataError
         when the folder is none of these, or is damaged.
     ConfigError
-        when a parameter or a rig file is wrong, or a folder of products is given with processing parameters.
+        when a parameter or a rig file is wrong, or a folder of products is given with a rig or processing parameters.
     """
     _check_arguments(model, library, metal_box_mm, bands, incidence)
     path = Path(folder)
@@ -128,8 +129,10 @@ def open_scan(
         return Scan(path, None, _analyse_images(path, rig, settings), settings)
     process_again = fresh or settings != Settings()
     if (path / IMAGE).exists() and not (path / MANIFEST).exists():
-        return _open_products_only(path, settings, process_again)
+        return _open_products_only(path, settings, process_again or rig is not None)
     source = _open_source(path, rig)
+    if rig is not None and isinstance(source, ScanFolder):
+        warnings.warn(f"{path}: `rig` is ignored: a scan folder brings its own", stacklevel=2)
     rig_is_used = rig is not None and not isinstance(source, ScanFolder)
     saved = None if process_again or rig_is_used else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
@@ -155,9 +158,7 @@ def _check_arguments(
     elif library is not None and not Path(library).is_file():
         problem = f"library {library}: no such file"
     if problem:
-        raise ConfigError(
-            problem, "the argument is wrong", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID
-        )
+        raise ConfigError(problem, "wrong argument", "see help(polysight.open_scan)", code=ErrorCode.VALUE_INVALID)
 
 
 def find_rig_file(rig: str | os.PathLike[str] | None) -> Path:

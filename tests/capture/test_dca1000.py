@@ -59,7 +59,7 @@ def four_lane(x: np.ndarray) -> bytes:
 
 
 def two_lane(x: np.ndarray) -> bytes:
-    """A whole chirp of RX0, then RX1: I0 I1 Q0 Q1 I2 I3 Q2 Q3."""
+    """A whole chirp of RX1, then RX2: I0 I1 Q0 Q1 I2 I3 Q2 Q3."""
     rx, frames, samples = x.shape
     words = []
     for f in range(frames):

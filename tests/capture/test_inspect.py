@@ -76,11 +76,11 @@ def alter_file(words: np.ndarray, fault: str) -> np.ndarray:
         return np.clip(words * (0.9 * 32767 / words.std()), -32768, 32767).astype("<i2")
     if fault == "no clear peak":
         return np.random.default_rng(1).normal(scale=20, size=words.size).astype("<i2")
-    return {"I and Q": row(4, True), "RX 0 ": row(4, False, dead=0), "RX 3 ": row(4, False, dead=3)}[fault]
+    return {"I and Q": row(4, True), "on RX1:": row(4, False, dead=0), "on RX4:": row(4, False, dead=3)}[fault]
 
 
 @pytest.mark.parametrize(
-    "fault", ["constant offset of", "5 bytes after", "full scale", "I and Q", "RX 0 ", "RX 3 ", "no clear peak"]
+    "fault", ["constant offset of", "5 bytes after", "full scale", "I and Q", "on RX1:", "on RX4:", "no clear peak"]
 )
 def test_a_fault_is_the_only_remark(tmp_path, fault):
     alter_file(row(4, False), fault).tofile(tmp_path / "x.bin")
@@ -97,7 +97,7 @@ def test_the_legend_of_the_range_profile_says_which_antenna_has_no_signal(tmp_pa
         Figure, "savefig", lambda f, *_, **__: legends.append([t.get_text() for t in f.axes[0].get_legend().texts])
     )
     plot_profile(inspect_bin(tmp_path / "x.bin"), tmp_path / "x.png")
-    assert legends == [[f"RX{i}" + " (no signal)" * (i == dead) for i in range(4)] + ["mean"]]
+    assert legends == [[f"RX{i + 1}" + " (no signal)" * (i == dead) for i in range(4)] + ["mean"]]
 
 
 def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import warnings
-import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from html import escape

@@ -246,7 +246,7 @@ def decode_row(
 def decode_two_lane(
     payload: bytes | memoryview | NDArray[np.uint8], chirps: int, samples: int, rx: int = 4, swap_iq: bool = False
 ) -> NDArray[np.complex64]:
-    """Decode a 2-lane recording (xWR16xx/18xx/68xx): a whole chirp of RX0, then RX1..., as I0 I1 Q0 Q1 I2 I3 Q2 Q3.
+    """Decode a 2-lane recording (xWR16xx/18xx/68xx): a whole chirp of RX1, then RX2..., as I0 I1 Q0 Q1 I2 I3 Q2 Q3.
 
     `samples` must be even. Returns complex64 [rx, chirp, sample], ADC counts. Raises DataError as :func:`decode_row`.
     """

@@ -285,8 +285,9 @@ def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
         return ["every sample is zero: nothing was recorded"]
     if mirrored:
         remarks.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
-    if silent := [k for k, v in enumerate(r.rx_rms) if v < _SILENT_SHARE * max(r.rx_rms)]:
-        remarks.append(f"RX {', '.join(map(str, silent))} have no signal: antennas off, or another lane layout")
+    # Counted as on the board's silk screen.
+    if silent := [f"RX{k}" for k, v in enumerate(r.rx_rms, 1) if v < _SILENT_SHARE * max(r.rx_rms)]:
+        remarks.append(f"no signal on {', '.join(silent)}: antennas off, or another lane layout")
     if r.clipped:
         remarks.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
     if r.left_over_bytes:

@@ -54,7 +54,7 @@ def format_report(report: Report) -> str:
             f"shape      {report.chirps} chirps x {layout.rx} RX x {layout.samples} samples, {layout.lanes}-lane,"
             f" {first_of_pair} first",
             f"peak       {report.peak_db:.1f} dB over the median at bin {report.peak_bin} of {layout.samples}",
-            f"level      rms {rms} counts on RX 0.., DC {max(report.rx_dc):.1f}",
+            f"level      rms {rms} counts on RX1.., DC {max(report.rx_dc):.1f}",
             f"clipping   {report.clipped} values at full scale",
             f"profile    {_draw_sparkline(report.profile_db)}",
         ]
@@ -188,7 +188,7 @@ def plot_profile(report: Report, path: Path) -> None:
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    for rx, profile in enumerate(report.rx_profile_db):
+    for rx, profile in enumerate(report.rx_profile_db, 1):
         label = f"RX{rx}"
         if profile.max() < BOTTOM_DB:
             label += " (no signal)"

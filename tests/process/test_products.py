@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +17,11 @@ from tests.support.refusals import refused
 from tests.support.scenes import COPPER, PET, scene_of
 
 from polysight.cli.main import main
+from polysight.jobs import process
 from polysight.jobs.process import make_products, process_rows, publish_images
 from polysight.materials import STEEP
 from polysight.pipeline import Pipeline
-from polysight.products import read_products
+from polysight.products import QUALITY, making_products, read_products
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder
@@ -50,6 +52,21 @@ def test_the_image_is_written_before_anything_is_derived_from_it(
     assert calls == [True]
     assert str(tmp_path / "out" / "image.npz") in capsys.readouterr().err
     assert (tmp_path / "out" / "report.html").exists()
+
+
+def test_an_image_appears_with_its_whole_quality(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A later write would come without the folder's lock: it could fall into products of another program."""
+    first: list[object] = []
+
+    @contextmanager
+    def making(out: Path, scan_id: str) -> Iterator[Path]:
+        with making_products(out, scan_id) as new:
+            yield new
+        first.append(read_json(out / QUALITY))
+
+    monkeypatch.setattr(process, "making_products", making)
+    assert main(["image", str(scan), "--out", str(tmp_path)]) == 0
+    assert first == [read_json(tmp_path / QUALITY)]
 
 
 def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path, tmp_path: Path) -> None:

@@ -35,7 +35,6 @@ from polysight.process import (
 )
 from polysight.products import (
     IMAGE,
-    QUALITY,
     REPORT,
     check_products_folder,
     making_products,
@@ -343,14 +342,10 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
         require_raw(source)
     pipeline = process_rows(source, data, settings)
     images = pipeline.form_images()
+    pipeline.quality.note_imaging(pipeline.images, images)
     with making_products(out, source.scan_id) as new:
         save_images(new, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality))
-    lines = (*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}")
-    print_lines(lines)
-    sys.stdout.flush()
-    # The images are there; quality.json is written again with the point response, which is found only now.
-    pipeline.quality.note_imaging(pipeline.images, images)
-    write_json(out / QUALITY, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality).quality)
+    print_lines((*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}"))
     if not images.valid.any():
         raise _no_pixel_error(pipeline, data)
     return 0

@@ -18,14 +18,13 @@ from polysight.catalogue import Picture, Program
 from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, seconds, sentence
 from polysight.results import Verdict
 from polysight.store import ScanEnded
+from polysight.sync import PUBLISHED_STD
 from polysight_shared.errors import quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import WIDTH_US
 
 SINCE = "{since}"
 """The page puts the elapsed time here."""
-PAPER_PHASE_RAD = 0.022
-"""Phase residual after all stages, POLySIGHT paper, section 9.1."""
 # A fault stays in the headline until so many rows came without one; chosen.
 RECENT_ROWS = 3
 # A row is late after so many usual durations, and after at least so many seconds; chosen.
@@ -220,7 +219,7 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     sync: dict[str, dict[int, float]] = {}
     snr_db: dict[str, dict[int, float]] = {}
     lost: dict[str, dict[int, float]] = {}
-    paper_deg: float = round(math.degrees(PAPER_PHASE_RAD), 2)
+    paper_deg: float = round(math.degrees(PUBLISHED_STD["phase_rad"]), 2)
     verdict: Verdict | None = None
 
 

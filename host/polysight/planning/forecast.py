@@ -21,6 +21,7 @@ from polysight.capture import PACKET_TIME_US
 from polysight.process import why_unnamed
 from polysight.radar import constraints
 from polysight.settings import DEFAULT
+from polysight.sync import PUBLISHED_STD
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.findings import Finding
@@ -41,9 +42,6 @@ MAX_STEPS_PER_S = 20_000
 SIMULATED_DIRECT_SNR_DB = 5.5
 # Speed of the stage of the published rig.
 _PUBLISHED_SPEED_MM_S = 20.0
-# Standard deviation of the phase of the object's peak after all stages of synchronisation (POLySIGHT paper, section
-# 9.1).
-_PUBLISHED_PHASE_RAD = 0.022
 # Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5
 # The window that polysight.imaging.ImageBuilder uses.
@@ -337,9 +335,10 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
         *_check_field(rig, scene_mm, image_mm),
     ]
     phase = predict_noise(rig, noise).direct_phase_rad
-    if phase > _PUBLISHED_PHASE_RAD:
+    published_rad = PUBLISHED_STD["phase_rad"]
+    if phase > published_rad:
         text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
-        warnings.append(_note("noise", f"{text} {_PUBLISHED_PHASE_RAD}): use more pulses a position"))
+        warnings.append(_note("noise", f"{text} {published_rad}): use more pulses a position"))
     if text := why_unnamed(DEFAULT, rig, will_be=True):
         warnings.append(_note("library", text))
     return tuple(sorted(warnings, key=lambda w: w.level != "error"))

@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 
 from polysight.products import write_json
 from polysight.report.style import INK, MUTED, STAMP, png
-from polysight.sync import STAGES, SyncedRow
+from polysight.sync import PUBLISHED_STD, STAGES, SyncedRow
 from polysight_shared.files import write_atomically
-
-PAPER = {"frequency_hz": 138.0, "phase_rad": 0.022}
-"""Standard deviations after all stages, paper section 9.1."""
 
 QUANTITIES = ("frequency_hz", "phase_rad", "amplitude")
 _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
@@ -168,9 +165,11 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
                 ax.plot(x, normal, color="#CC6677", lw=1.2, label=f"Cramér-Rao, one tone {b:.3g}")
             if name == "referenced" and i < 2:
                 for sign in (-1, 1):
-                    ax.axvline(sign * PAPER[QUANTITIES[i]], color=INK, lw=0.8, ls=":")
-                ax.plot([], [], color=INK, lw=0.8, ls=":", label=f"paper ±{PAPER[QUANTITIES[i]]:g}")
-                ax.set_xlim(-1.1 * max(reach, PAPER[QUANTITIES[i]]), 1.1 * max(reach, PAPER[QUANTITIES[i]]))
+                    ax.axvline(sign * PUBLISHED_STD[QUANTITIES[i]], color=INK, lw=0.8, ls=":")
+                ax.plot([], [], color=INK, lw=0.8, ls=":", label=f"paper ±{PUBLISHED_STD[QUANTITIES[i]]:g}")
+                ax.set_xlim(
+                    -1.1 * max(reach, PUBLISHED_STD[QUANTITIES[i]]), 1.1 * max(reach, PUBLISHED_STD[QUANTITIES[i]])
+                )
             ax.legend(fontsize=7, loc="upper right", frameon=False)
     return png(fig)
 
@@ -193,14 +192,14 @@ def format_report(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
             if "phase_rad_bound" in stage:
                 bound = f"   bound {stage['frequency_hz_bound']:.2f} Hz {stage['phase_rad_bound']:.5f} rad"
             lines.append(f"  {name:11s}{values}{bound}   ({STAGES[name]})")
-    lines += ["", f"paper, after all stages: {PAPER['frequency_hz']:g} Hz, {PAPER['phase_rad']:g} rad"]
+    lines += ["", f"paper, after all stages: {PUBLISHED_STD['frequency_hz']:g} Hz, {PUBLISHED_STD['phase_rad']:g} rad"]
     return "\n".join(lines) + "\n"
 
 
 def write_sync_report(out: Path, reports: dict[str, SyncReport], scan: str, simulated: bool) -> str:
     """Write sync.json, sync.txt and sync-BOARD.png into a folder; return the text."""
     boards = {name: report.summary() for name, report in reports.items()}
-    write_json(out / "sync.json", {"scan": scan, "simulated": simulated, "paper": PAPER, "boards": boards})
+    write_json(out / "sync.json", {"scan": scan, "simulated": simulated, "paper": PUBLISHED_STD, "boards": boards})
     for name, report in reports.items():
         write_atomically(out / f"sync-{name}.png", figure_png(report, f"{scan}, {name}", simulated))
     text = format_report(boards, simulated)

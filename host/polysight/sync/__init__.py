@@ -9,7 +9,7 @@ the echoes.
 """
 
 from polysight.sync.backlash import estimate_backlash, object_filter
-from polysight.sync.chain import STAGES, BoardSetup, RowSynchroniser, SyncedRow, synchronise_row
+from polysight.sync.chain import PUBLISHED_STD, STAGES, BoardSetup, RowSynchroniser, SyncedRow, synchronise_row
 from polysight.sync.decimate import FOLD, decimation
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import cis

@@ -61,6 +61,9 @@ STAGES = {
     "referenced": "the object beside the direct path in a position's average",
 }
 
+PUBLISHED_STD = {"frequency_hz": 138.0, "phase_rad": 0.022}
+"""Standard deviations after the last stage on the published rig (POLySIGHT paper, section 9.1)."""
+
 EXAMINED = 32
 """Positions per row used for residuals: standard deviations within 13 % for a row, 1 % for 150 rows."""
 

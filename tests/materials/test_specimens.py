@@ -63,6 +63,17 @@ def test_the_spread_is_found():
     assert np.mean([f[:, 1].mean() for f in spreads]) == pytest.approx(0.2, rel=0.2)
 
 
+def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
+    """Its patch is its mean: a residual of zero is none."""
+    samples = drawn((0.03, 0.2), 6)
+    repeated = np.isin(samples.names, ["a", "b", "c"])
+    once = ~repeated & (samples.groups == samples.groups[0])
+    alone = MODELS[DISCRIMINANT]("H+V+P").fit(samples.take(repeated))
+    beside = MODELS[DISCRIMINANT]("H+V+P").fit(samples.take(repeated | once))
+    np.testing.assert_allclose(beside.spread[:3], alone.spread, rtol=1e-2)
+    np.testing.assert_allclose(np.diag(beside.between), np.diag(alone.between), rtol=1e-2)
+
+
 def test_without_specimens_apart_the_published_spread_stands():
     samples = drawn((0.0, 0.0), 6, labelled=False)
     np.testing.assert_allclose(

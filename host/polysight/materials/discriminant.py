@@ -160,19 +160,21 @@ class ErrorDiscriminant(Model):
             _compute_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1))
         )
         self._effects = self._compute_specimen_effects()
+        # The only patch of a material is its mean: its residual of zero tells nothing of errors.
+        repeated = informative & (np.bincount(material[informative], minlength=self.names.size)[material] > 1)
+        if not repeated.any():
+            repeated = informative
         # The fitted means took degrees of freedom, and variance, from the residuals: they are scaled up for it.
-        self._fit_patches(
-            residual[informative] * np.sqrt(informative.sum() / dof), material[informative], plate[informative], dof
-        )
+        self._fit_patches(residual[repeated] * np.sqrt(repeated.sum() / dof), material[repeated], plate[repeated], dof)
         patches_per_scan = max(informative.sum() / scans, 1.0)
         common = self._decorrelate_angles(_compute_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
         # A scan's offset is a mean over its patches, whose own errors are in it.
         self.scan = _clip_eigenvalues(common - self.between / patches_per_scan) + 1e-8 * np.eye(width)
         self._set_thresholds(
-            (mean - self.level[material])[informative],
-            material[informative],
-            (d - self.level[material_index])[used],
-            material_index[used],
+            (mean - self.level[material])[repeated],
+            material[repeated],
+            (d - self.level[material_index])[repeated[patch]],
+            material_index[repeated[patch]],
             float(dof),
         )
         return self

@@ -2,10 +2,11 @@
 
 At a tilted surface the plane of incidence is turned: H receives p too, and V s. With the fields of the antennas as unit
 vectors across the direction (Ludwig's third definition, carried along the arc from the boresight), a receiver's voltage
-is g spreading exp(-j k L) (r_s (e_T.s)(e_R.s) + r_p (e_T.p_i)(e_R.p_r)). Both coefficients are those of tangential
-fields, r_s = r_p = -1 for metal.
+is g spreading exp(-j k L) (r_s (e_T.s)(e_R.s) + r_p (e_T.p_i)(e_R.p_r)): g is the gain of the antennas, k the wave
+number, L the path, e the fields of TX and RX, s the axis across the plane of incidence, and p_i, p_r the axes in it,
+across the incident and the reflected ray. Both coefficients are those of tangential fields, r_s = r_p = -1 for metal.
 
-At a curved surface they differ from Fresnel's to first order in K / k (`reflect_curved`):
+At a surface of curvature K they differ from Fresnel's to first order in K / k (`reflect_curved`):
 * the wave at the surface is that of a cylinder: the logarithmic derivatives of Hankel functions (by WKB -j cos(theta)
   - K / (2 k cos^2(theta))) replace the plane wave's, inside and outside;
 * the saddle point sums over directions: <d theta^2> = j K / (2 k cos(theta)) in the plane of incidence, where r''
@@ -66,6 +67,7 @@ class Antenna:
 def _carry(start: Array, ends: Array, vector: NDArray) -> NDArray:
     """Turn `vector`, across the unit vector `start`, as `start` is turned to `ends` [n, 3] on the shortest arc."""
     along_ends = ends @ vector
+    # Rodrigues' rotation for start . vector = 0; the limit is for an end opposite to the start (no arc is shortest).
     return vector - (start + ends) * (along_ends / np.maximum(1 + ends @ start, 1e-6))[:, None]
 
 
@@ -90,7 +92,7 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
     """Return the antennas of a rig; the mounts give places and boresights.
 
     Towards their mirror points on the object plane TX has equal parts of s and p, H has s and V p, as the published
-    images show. `leakage`: of p into H and of s into V.
+    images show. `leakage`: of p into H and of s into V. TX has none: its `other` equals its `wanted`.
     """
     plane_m = rig.geometry.object_distance_mm / 1e3
     receivers = [np.array(rx_positions_m(rig, board)).mean(axis=0) for board in rig.receivers]
@@ -100,7 +102,7 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
     h = aim_antenna(receivers[0], _compute_boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
     v = aim_antenna(receivers[1], _compute_boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
     # Echoes have the phase at the middle of the linear samples. At another wave number H / V would turn by the
-    # difference of their paths, 0.7 mm at the metal sphere.
+    # difference of their paths, 0.7 mm at the sphere of the calibration.
     chirp = rig.chirp
     first, end = chirp.linear_samples
     middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * (first + end - 1) / 2
@@ -115,10 +117,12 @@ def _compute_boresight(board: Board) -> Array:
 
 
 def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts: tuple[float, float]) -> Antenna:
-    """Return an antenna with given parts of s and p towards the point of the object plane that mirrors its partner.
+    """Return an antenna with given parts (s, p) towards the point of the object plane that mirrors its partner.
 
-    Places `at_m` and `partner_m` [3] and the plane in metres, rig frame; `boresight` [3] is a unit vector.
+    Places `at_m` and `partner_m` [3] and the plane in metres, rig frame; `boresight` [3] is a unit vector. Its other
+    polarisation has the parts exchanged. The s axis points along +y.
     """
+    # The mirror point divides the way to the partner like the distances of both from the plane.
     share = (plane_m - at_m[2]) / (2 * plane_m - at_m[2] - partner_m[2])
     target = np.array([*(at_m + share * (partner_m - at_m))[:2], plane_m])
     direction = (target - at_m) / np.linalg.norm(target - at_m)
@@ -163,6 +167,7 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
     middle = mirror_point(optics, rig.geometry.object_distance_mm / 1e3)
     half_x = (rig.grid.columns - 1) / 2 * rig.grid.step_x_mm / 1e3
     half_y = (rig.grid.rows - 1) / 2 * rig.grid.step_y_mm / 1e3
+    # The stage at the end in x, at the end in y, and in the middle.
     at_m = np.array([[half_x, 0.0, 0.0], [0.0, half_y, 0.0], [0.0, 0.0, 0.0]])
     normals, cos = find_normals(np.tile(middle, (3, 1)), at_m, optics.tx.at_m, optics.h.at_m)
     tilts = np.degrees(np.arctan2(np.abs(normals[:, :2]), -normals[:, 2:]))
@@ -182,6 +187,7 @@ def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx
 
     `points` and `normals` [n, 3] are seen from stage offsets `at_m` [n, 3].
     """
+    # Unit vectors from TX and from RX to the points.
     t, r, *_ = unit_legs(points, at_m, tx.at_m, rx.at_m)
     s_axis = np.cross(normals, t)
     s_axis /= np.maximum(np.linalg.norm(s_axis, axis=1, keepdims=True), 1e-12)
@@ -202,7 +208,11 @@ def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx
 
 
 def bends_by_incidence(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> Array:
-    """Curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m."""
+    """Curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m.
+
+    `curvature` [n, 2, 2] is that along the `tangents` of the `normals`; `points`, `normals` and the stage offsets
+    `at_m` are [n, 3].
+    """
     ray = points - at_m - tx_m
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
     inside = np.einsum("nij,ni->nj", tangents(normals), ray)
@@ -241,6 +251,8 @@ def reflect_curved(
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
+    # s, then p. `inside` is half the variance of the angle times r''. Across the plane of incidence, the angle grows by
+    # half the squared deviation over tan(theta), and the plane turns by the deviation over sin(theta).
     for local, r, other, up, down in zip(single_wave, middle, middle[::-1], above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
@@ -319,7 +331,8 @@ def _reflect_local(
     r_s, r_p = reflect_flat(eps, theta)
 
     # Cylinder across the plane of incidence. Logarithmic derivatives along the normal, over k: of the waves towards the
-    # surface and away from it in air (`into`, `out`), and of the wave in the medium (`behind`).
+    # surface and away from it in air (`into`, `out`), and of the wave in the medium (`behind`). `outer` and `inner` are
+    # what the curvature changes in them outside and inside.
     outer = bend_inside / (2 * wave_number * cos**2)
     inner = bend_inside / (2 * wave_number * cos_medium**2)
     into = 1j * cos - outer
@@ -327,7 +340,8 @@ def _reflect_local(
     behind = 1j * root * cos_medium - inner
     local_s = -(into - behind) / (out - behind)
     local_p = (into - behind / eps) / (out - behind / eps)
-    # Cylinder along the plane of incidence.
+    # Cylinder along the plane of incidence: the same of the fields along its axis, over the square of the normal wave
+    # numbers (`k_out`, `k_in`, over k), since so the fields around it follow from these.
     k_out = cos
     k_in = root * cos_medium
     outer = bend_across / (2 * wave_number * k_out)

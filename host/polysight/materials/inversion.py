@@ -131,7 +131,8 @@ class RigPrior:
     theta_std_rad
         Standard deviation of the incidence angle's error, which all patches share.
     leakage, leakage_std
-        Leakage (a, b) as measured, or zero; standard deviation of the real part, and of the imaginary part, of either.
+        Leakage (a, b) as measured, or zero; standard deviation of the real part, and of the imaginary part, of either
+        (default: that of the rig file, `leakage_prior`, over sqrt(2)).
     leakage_measured
         True if the leakage was measured; otherwise it is the prior of the mount.
     channels_known
@@ -228,7 +229,7 @@ class Inversion:
     log_evidence
         Logarithm of the probability density of the measurements under the prior.
     fit
-        float64 [patch]: log density of each patch as some material beside this reference; zeros without kinds.
+        float64 [patch]: log density of each patch's V / H over this metal if it is of some kind; zeros without kinds.
     """
 
     patches: tuple[PatchEstimate, ...]
@@ -283,17 +284,17 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
     model = SceneLikelihood(measurements, prior, kinds)
     rng = np.random.default_rng(0)
     z, log_evidence, log_bare = sample_posterior(model, rng)
-    evidence = np.ones(model.patch_count + 1)
+    weights = np.ones(model.patch_count + 1)
     if not prior.leakage_measured:
-        evidence[1:] = WEIGHT_OF_KINDS
-        z, _ = _anneal(model, z, np.ones_like(evidence), evidence, rng)
+        weights[1:] = WEIGHT_OF_KINDS
+        z, _ = _anneal(model, z, np.ones_like(weights), weights, rng)
     patches = []
     parts = model.log_likelihoods(z)
     for i in range(model.patch_count):
         # A patch is measured without the evidence that it must be some material itself.
-        without_patch = evidence.copy()
+        without_patch = weights.copy()
         without_patch[i + 1] = 0.0
-        particles, _ = _anneal(model, z, evidence, without_patch, rng, parts)
+        particles, _ = _anneal(model, z, weights, without_patch, rng, parts)
         patches.append(_estimate(model, particles, i, rng))
     return _solution(model, (z, log_evidence, log_bare), tuple(patches))
 
@@ -370,7 +371,8 @@ class SceneLikelihood:
             t = drawn_ratios[np.isfinite(drawn_ratios[:, i]) & (np.abs(drawn_ratios[:, i]) < 3.0), i]
             if not t.size:
                 t = np.zeros(1, np.complex128)
-            # The particles may wander beyond the first ones: by three own errors and 30 % of their span (chosen).
+            # Particles may wander beyond these (wild ones, of 3 times metal's t, are left out): by three own errors and
+            # 30 % of their span (chosen).
             reach = 3 * np.sqrt(np.trace(self.own[i])) + 0.3 * float(np.abs(t - t.mean()).max()) + 1e-3
             low = complex(t.real.min() - reach, t.imag.min() - reach)
             high = complex(t.real.max() + reach, t.imag.max() + reach)
@@ -426,7 +428,7 @@ class SceneLikelihood:
         rise = self.rise - np.array(self.prior.metal_rise)
         # The phase of V / H is taken to change by a tenth of what the amplitude does (chosen).
         by_patterns = z[..., LIGHT_ACROSS[0], None] + 0.1j * z[..., LIGHT_ACROSS[1], None]
-        across = std_across * by_patterns - 4 * self.turn(z)
+        across = std_across * by_patterns - 4 * self.turn(z)  # turn(z) is -sin(theta), see the module's docstring
         along = std_along * z[..., LIGHT_ALONG, None]
         return along * rise[:, 0] + across * rise[:, 1]
 

@@ -116,8 +116,9 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
                 keywords = dict(zip(named, filled[len(arguments) :], strict=True))
                 return function(*filled[: len(arguments)], **keywords)
 
-            cores: list[list[str]] = [[] for _ in results]
-            labelled = xarray.apply_ufunc(compute, *entries, output_core_dims=cores, keep_attrs="override")
+            # No result has dimensions beside those of the arguments.
+            no_own_dims: list[list[str]] = [[] for _ in results]
+            labelled = xarray.apply_ufunc(compute, *entries, output_core_dims=no_own_dims, keep_attrs="override")
             labelled_arrays = labelled if len(results) > 1 else (labelled,)
             for array, name in zip(labelled_arrays, results, strict=True):
                 array.attrs |= {"units": "1", "long_name": name}

@@ -1,4 +1,8 @@
-"""Processing of recorded data, and of a scan while it runs; commands process, image, focus, sync-report."""
+"""Processing of recorded data, and of a scan while it runs; commands process, image, focus, sync-report.
+
+`data` is the folder of a recorded scan, `out` the folder of its products. A scan folder keeps the samples of each row,
+synchronised and cut to the range of the object, so that later processing need not read the raw data.
+"""
 
 from __future__ import annotations
 
@@ -50,6 +54,7 @@ from polysight_shared.errors import ConfigError, DataError, advice, quote
 PRODUCTS = "products"
 """Folder of the products of a scan, in the scan's folder."""
 Axes = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Pixel centres of images, x and y in metres."""
 
 
 def add_rows(pipeline: Pipeline, data: Path, threads: int | None = None) -> None:
@@ -63,7 +68,7 @@ def add_rows(pipeline: Pipeline, data: Path, threads: int | None = None) -> None
 
 
 def process_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pipeline:
-    """Return a pipeline to which all rows of a source were added."""
+    """Return a pipeline to which all rows of a source were added; a scan folder keeps their samples."""
     pipeline = Pipeline(source, settings, samples="keep")
     add_rows(pipeline, data)
     return pipeline
@@ -112,9 +117,9 @@ def check_inputs(settings: Settings, inputs: Inputs, calibration: Calibration, r
 
 
 def publish_images(pipeline: Pipeline, out: Path) -> None:
-    """Write images and recording quality first, unless `out` contains a report.
+    """Write images and recording quality before the materials are known, unless `out` contains a report.
 
-    Raises PolysightError.
+    The stage's backlash is left to the final products. Raises PolysightError.
     """
     if (out / REPORT).exists():
         return
@@ -181,7 +186,8 @@ def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
 def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> PlaneReference:
     """Make a reference from a scan of a metal plate that covers the plane, and one for each of `bands` sub-bands.
 
-    `config` is the rig file of scans in the authors' layout.
+    `config` is the rig file of scans in the authors' layout. From a recorded scan, the reference holds the plate's
+    dispersion, too: the change of its reflectivity over the sweep.
 
     Raises
     ------
@@ -334,7 +340,7 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
 
 
 def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
-    """Make image.npz and quality.json only; return the exit status. Raises PolysightError."""
+    """Make image.npz, scan.json and quality.json only; return the exit status. Raises PolysightError."""
     source = open_source(data, settings.path("config"), dropped=True)
     check_products_folder(out, source.scan_id)
     if isinstance(source, ScanFolder) and raw_dropped(out):
@@ -373,6 +379,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     else:
         depth_m = sharpest.depth_mm / 1e3
     grid = builder.grid
+    # The image of H in the rig file's plane and in the one that was found, without footprint and notice.
     board = builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
     # A scan recorded column by column is processed as that of a mirrored rig.
@@ -433,6 +440,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     reports = {}
     for board in rig.receivers:
         setup = BoardSetup.from_rig(rig, board, model=calibration.high_pass(board.name))
+        # The search beam for the direct path has one weight for each RX.
         rx = len(setup.path.beam)
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx)
         say(f"rows of {board.name}")

@@ -39,6 +39,7 @@ def open_regular(path: Path) -> BinaryIO:
                 "give a file",
                 code=ErrorCode.FILE_FOREIGN,
             )
+        # The file has a descriptor of its own, so that this one is closed in every case.
         return os.fdopen(os.dup(descriptor), "rb")
     finally:
         os.close(descriptor)
@@ -139,7 +140,7 @@ def write_together(files: Mapping[Path, bytes]) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Make names that were created, renamed or removed in a folder durable. Raises DeviceError."""
+    """Flush names that were created, renamed or removed in a folder to disk. Raises DeviceError."""
     if not hasattr(os, "O_DIRECTORY"):
         # Windows cannot open folders; NTFS writes their changes to its journal.
         return

@@ -33,6 +33,7 @@ def open_standard_streams() -> None:
 
     Python has None in their place. Left closed, the next file that is opened would become standard output.
     """
+    # The system gives the lowest number that is free.
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)

@@ -1,8 +1,15 @@
 """Hub of the simulated wires: relay GPIO edges and stage motion between the processes of a simulated rig.
 
-Protocol: docs/spec/simulated-rig.md. Lines of a client reach every subscriber in order, and none is
-dropped, unless a fault has cut its wire: unread lines are queued up to a limit; a client that exceeds it is
-disconnected with a message.
+Protocol: docs/spec/simulated-rig.md; a line of text for each message, its first letter tells the kind:
+
+    `S <t_ns> <line> <0|1>`                 a GPIO line changed at wire time t_ns
+    `M <t_ns> <x_um> <y_um> <vx_um_s>`      place and speed of the stage from t_ns on
+    `L <line> [<line> ...]`, `W`            subscribe to S of these GPIO lines; subscribe to M
+    `J <line> <other>`, `X <line> <1|0>`    faults: join two GPIO lines; cut one, or repair it
+    `K`                                     the hub confirms L, W, J or X
+
+Lines of a client reach every subscriber in order, and none is dropped, unless a fault has cut its wire: unread lines
+are queued up to a limit; a client that exceeds it is disconnected with a message.
 """
 
 from __future__ import annotations
@@ -147,7 +154,7 @@ class WireHub:
 
         Raises ProtocolError for any other line.
         """
-        other_clients = [p for p in self._clients.values() if p is not sender]
+        other_clients = [client for client in self._clients.values() if client is not sender]
         for line in lines:
             tag = line[:2]
             if tag == b"S ":
@@ -162,9 +169,9 @@ class WireHub:
                 if not isinstance(parse(line.decode("ascii", "replace")), WireMotion):
                     raise ProtocolError(f"not a wire line: {line!r}")
                 self._last_motion = line + b"\n"
-                for p in other_clients:
-                    if p.motion:
-                        p.pending += self._last_motion
+                for client in other_clients:
+                    if client.motion:
+                        client.pending += self._last_motion
             elif tag == b"L " and all(word.isdigit() for word in line[2:].split()):
                 sender.lines.update(line[2:].split())
                 sender.pending += b"K\n"
@@ -191,7 +198,10 @@ class WireHub:
                 client.pending += line + b"\n"
 
     def _write(self, client: _Client) -> None:
-        """Send what a client takes at once; ask for a notice when it takes more. Disconnect it above the limit."""
+        """Send what a client takes at once; if bytes are left, let `step` wake when it takes more.
+
+        Disconnect it if more than the limit is left.
+        """
         try:
             sent = client.connection.send(client.pending)
         except BlockingIOError:

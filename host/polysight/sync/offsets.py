@@ -60,7 +60,7 @@ _UNEXPLAINED = 8.0
 _NEGLIGIBLE = 1e-3
 # Times that a burst is aligned, each without the chirps found disturbed before; chosen.
 _ROUNDS = 4
-# Clipping below full scale: smallest magnitude of the limit, and one in so many words of a chirp at the limit.
+# Clipping below full scale: smallest magnitude of the limit, and one in so many words of a chirp at it; chosen.
 _LEAST_LIMIT = 1024
 _AT_LIMIT = 32
 
@@ -541,22 +541,22 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     covariance = (covariance + _NOISE / FOLD * np.eye(n_rx * n)).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
-    channels_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
+    samples_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
     centre = echoes[:, :, n // 2]
     spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
     beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
     beam = complex64(beam / beam.sum())
     folded_steering = cis(-2 * np.pi * middles * lag_s)
-    bins = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
+    bins_per_m = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
     return DirectPath(
         steering=cis(-2 * np.pi * sweep * lag_s),
         folded_steering=folded_steering,
         estimator=_invert_model(model[:, :2], covariance),
         drift_estimator=_invert_model(model, covariance),
-        half_estimators=np.stack([_invert_model(model[c, :2], covariance[np.ix_(c, c)]) for c in channels_of_half]),
+        half_estimators=np.stack([_invert_model(model[s, :2], covariance[np.ix_(s, s)]) for s in samples_of_half]),
         beam=beam,
         search_weights=complex64(beam[:, None] * folded_steering * _make_window(n)),
-        object_bins=(float(excess.min() * bins), float(excess.max() * bins)),
+        object_bins=(float(excess.min() * bins_per_m), float(excess.max() * bins_per_m)),
         sweep_hz=middles,
     )
 
@@ -607,11 +607,11 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     floor = first.median**2 / np.log(2) / (_make_window(n) ** 2).sum()
     drifts = _divide(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
-    flat = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
+    steering = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))
     scale = half_scale(good_chirps)
 
-    def remove(positions: slice | NDArray[np.intp], start: NDArray[np.float64]) -> Removed:
-        return run.remove(aligned.halves[positions], flat, complex64(path.estimator), start, _STEPS, scale[positions])
+    def remove(chosen: slice | NDArray[np.intp], start: NDArray[np.float64]) -> Removed:
+        return run.remove(aligned.halves[chosen], steering, complex64(path.estimator), start, _STEPS, scale[chosen])
 
     removed = remove(slice(None), first.frequency)
     _try_second_peaks(removed, first.peaks, usable, remove)
@@ -621,14 +621,14 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     amplitude = estimate[:, 0]
     if_frequency = aligned.centre + frequency
     if_frequency = if_frequency % 1.0 if chirp.if_mode == "complex1x" else (if_frequency + 0.5) % 1.0 - 0.5
-    band = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
+    in_passband = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
     strength = np.abs(amplitude)
     chirps = np.maximum(good_chirps, 1)
     # All chirps of a row have the same noise; `noise` is the power in an averaged sample of one RX.
     floor = _find_middle((floor * chirps)[usable]) / chirps if usable.any() else floor
     noise = floor / (np.abs(path.beam) ** 2).sum()
     present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
-    is_found = usable & band & present & (np.abs(step) < 0.02 / (b - a))
+    is_found = usable & in_passband & present & (np.abs(step) < 0.02 / (b - a))
     if is_found.any():
         is_found &= strength > _LOST * _find_middle(strength[is_found])
 
@@ -646,7 +646,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         found=is_found,
         drift=drift,
         noise=noise_power,
-        steering=flat,
+        steering=steering,
     )
 
 

@@ -127,6 +127,8 @@ class BoardRows:
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Compute and store the figures of a synchronised row, of which `frames_valid` frames were received whole."""
+        # Positions are in the order of recording: odd rows are turned round, so that columns count from the smallest x.
+        mask = ~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]
         figures = RowFigures(
             frames_expected=recorded.frames_expected,
             frames_received=frames_valid,
@@ -134,7 +136,7 @@ class BoardRows:
             crc32=recorded.crc32,
             positions=int(synced.valid.size),
             positions_masked=int(synced.valid.size - synced.valid.sum()),
-            masked_columns=find_masked_runs(~synced.valid[:: plan_raster(self.rig.grid).row(row).direction]),
+            masked_columns=find_masked_runs(mask),
             stages=[(name, *spread) for name, spread in synced.stages.items() if np.isfinite(spread).all()],
             chirps_clipped=synced.chirps_clipped,
             chirps_disturbed=synced.chirps_disturbed,
@@ -458,6 +460,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
     no_half_spaces = _find_no_half_spaces(result)
     no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces}
+    # Patches and images.
     reasons += rules.judge_patches(no_plates, len(result.patches), len(result.segmentation.left_out))
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
     copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
@@ -472,6 +475,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
     reasons += rules.judge_flatness(result.ripple, result.relief_rad, is_boxed=bool(result.boxes))
     reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
     reasons += rules.judge_passivity(no_half_spaces)
+    # Many plates with more V than H: the channels may be exchanged.
     plates = len(result.patches) - len(no_plates) - (result.metal.label is not None)
     reasons += rules.judge_exchange([k for k, v in no_half_spaces.items() if v.what == STRONGER_V], plates)
     metal = result.metal
@@ -492,6 +496,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         )
         if metal.given:
             reasons += rules.judge_dark_reference(patch, *_find_brightest(result))
+    # Levels of metal relative to the direct path, boards, leakage, and the plane.
     light = result.calibrated.illumination
     if result.prior.channels_known and (light is None or light.known):
         gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
@@ -504,6 +509,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
         std = float(np.degrees(result.prior.theta_std_rad))
         tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
         reasons += rules.judge_plane(plane.known, 1e3 * plane.offset_m, tilt, std)
+    # Plates that have a permittivity: their tilts and brightness, and the angle of the library.
     judged = {r.patch.label for r in result.patches if r.refused is None}
     reasons += rules.judge_tilts({k: float(np.degrees(result.tilts.across_rad(k))) for k in judged})
     reasons += rules.judge_brightness({k: ln for k, ln in result.brightness_off.items() if k in judged})
@@ -514,7 +520,7 @@ def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifi
 
 
 def _find_no_half_spaces(result: MaterialsResult) -> dict[int, Finding]:
-    """Return patch number to why it is no half space: plates all the same, not noise or several materials."""
+    """Return patch number to the reason why a patch is a plate but no half space (not noise or several materials)."""
     return {
         r.patch.label: r.refused
         for r in result.patches

@@ -55,7 +55,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)
 
     def add(name: str, run: Run, text: str, example: str, most_used: tuple[str, ...] = ()) -> CommandParser:
-        """Add a command with its help, see `options.Add`."""
+        """Add a command: its one-line help `text`, and its options of which `most_used` are shown first."""
         sub = commands.add_parser(name, help=text)
         describe(sub, text, example)
         set_run(sub, run)

@@ -113,8 +113,9 @@ def _make_fresh_folder(out: Path) -> None:
 def run_simulated_rig(config: Path, scene: Path, folder: Path, time_scale: float) -> Iterator[Path]:
     """Run the simulated rig with its Pi process; yield the rig file with their addresses.
 
-    `folder` gets that file and the logs, `time_scale` is the number of simulated seconds per second.
-    It runs in a session of its own, so that Ctrl-C ends the scan first and the rig after it.
+    `folder` gets that file and the logs, `time_scale` is the number of simulated seconds per second. The host controls
+    its radars over simulated USB (`--native`). The rig runs in a session of its own, so that Ctrl-C ends the scan first
+    and the rig after it.
 
     Raises
     ------

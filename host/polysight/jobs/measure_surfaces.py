@@ -49,7 +49,7 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Sampl
     )
     if not is_mirrored:
         return samples
-    # The pipeline holds x and y exchanged; z stays.
+    # The pipeline holds x and y exchanged; z stays. The cube is [rx, frequency, row, column].
     swap = [1, 0, 2]
     return replace(
         samples,
@@ -90,7 +90,7 @@ def see_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
 
 
 def make_reference(metal: surfaces.Seen) -> surfaces.Reference:
-    """Return a function from a rig's optics to the gains that these points of metal give with it."""
+    """Return a function from a rig's optics to the gains of both receivers that these points of metal give with it."""
 
     def learn(optics: surfaces.Optics) -> surfaces.Gains:
         return surfaces.learn_gains(surfaces.find_voltages(metal, optics), optics.wave_number)
@@ -113,6 +113,7 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
     band.
     """
     count = len(rows)
+    # Second derivatives [n, 2, 2] of the path by the stage offset.
     bend = np.stack([rows[:, [6, 7]], rows[:, [7, 8]]], axis=1)
     # Files of older versions end before the rise over the band: none is assumed then.
     band_rise = np.zeros(count)
@@ -125,6 +126,7 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
         bend=bend,
         amplitude=rows[:, 9] + 1j * rows[:, 10],
         amplitude_std=rows[:, 11],
+        # The file does not hold these three, on which the gains do not depend.
         path_std_m=np.zeros(count),
         slope_std=np.zeros((count, 2)),
         share=np.zeros(count),

@@ -273,7 +273,7 @@ def measure_clock_difference() -> int:
 
 
 def usable_packets(buffer_bytes: int) -> int:
-    """Return the number of full packets that a receive buffer of this granted size holds: Linux has twice the bytes."""
+    """Return the number of full packets that fit a receive buffer; Linux has twice the granted `buffer_bytes`."""
     return 2 * buffer_bytes // KERNEL_BYTES_A_PACKET
 
 

@@ -146,8 +146,8 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
 # Suffix of the packet file, which lies beside the row's file.
 PACKETS = ".pkt"
 FORMAT = 2
-"""Files of format 1 describe earlier records in another way, which is not read: placed again, their rows have an
-unknown start and are masked as a whole."""
+"""Files of format 1 are read, but not what they say of earlier records of the card: a row that is placed again from one
+has an unknown start and is masked as a whole."""
 RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
 """Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
 

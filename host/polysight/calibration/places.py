@@ -163,6 +163,7 @@ def fit_places(
     boards = list(echoes.values())
 
     def misfit(unknown: Real, sigma: float) -> Real:
+        """Return residuals in standard deviations: real, then imaginary part of each sample, then the prior's terms."""
         parts = [
             _subtract_echoes(b, unknown[3 * i : 3 * i + 3], _place_points(centre, points_mm, unknown))
             for i, b in enumerate(boards)
@@ -173,7 +174,6 @@ def fit_places(
     # In the order of `Prior.scale`: shift of each board, distance of the plane, x, y and rotation of the target.
     start = np.zeros(scale.size)
     start[-3:-1] = _find_target(boards, centre, points_mm)
-    # The misfit has real and imaginary part of each sample, then the terms of the prior.
     size = sum(b.samples.size for b in boards)
     sigma = float(np.sqrt(np.mean(misfit(start, 1.0)[: 2 * size] ** 2)))
     fit: Any = None
@@ -204,6 +204,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     reduced = []
     direct = []
     offsets = []
+    # Every so many-th row, and position in it.
     stride = max(1, int(np.ceil(np.sqrt(plan.positions / POSITIONS))))
     for row, words, valid in files.board_rows(source, name):
         if row % stride:
@@ -257,6 +258,7 @@ def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray
     difference = places_m[None] - board.offsets_m[:, None]
     out_m = np.linalg.norm(difference - tx, axis=-1)
     back = np.linalg.norm(difference[None] - rx[:, None, None], axis=-1)
+    # [rx, position, point]
     path = out_m + back - np.linalg.norm(rx - tx, axis=-1)[:, None, None]
     f = board.frequencies_hz / SPEED_OF_LIGHT_M_S
     step = _rotate_phase(path * (f[-1] - f[0]) / (f.size - 1))

@@ -57,6 +57,7 @@ GRACE_S = 20.0
 _PRODUCTS = (IMAGE, MATERIALS, QUALITY)
 SUMMARISED = (MANIFEST, NOTES, *(f"{place}{name}" for place in ("", "products/") for name in (LABELS, *_PRODUCTS)))
 Stamp = tuple[tuple[int, int], ...]
+"""Time of the last change (ns) and size of each of the `SUMMARISED`; (0, -1) for a file that is not there."""
 
 
 # --- one line of the list ---

@@ -366,6 +366,7 @@ class Classifier:
                 "give the incidence angle of the scan",
                 code=ErrorCode.KEY_MISSING,
             )
+        # Of the library, what it holds for each angle.
         parts = [library.at_angle(a) for a in angles_deg or library.angles_deg]
         if len({p.angles_deg[0] for p in parts}) < len(parts):
             raise DataError(
@@ -425,7 +426,7 @@ class Classifier:
             return [self._name_by_votes(x) for x in patches]
         named = []
         for x, of_patch in zip(patches, evidence or [None] * len(patches), strict=True):
-            ratios = split_by_angle(x)[2]
+            _, _, ratios = split_by_angle(x)
             if of_patch is None:
                 of_patch = [
                     derive_evidence_from_pixels(t, kinds) for t, kinds in zip(ratios.T, self.kinds, strict=True)

@@ -172,7 +172,10 @@ class Status(msgspec.Struct, frozen=True):
 
 
 class ScanState(msgspec.Struct, frozen=True, kw_only=True):
-    """The scan, its plan, and its rows so far: their number, one letter for each (`MARKS`), and their pulses."""
+    """The scan, its plan, and its rows so far: their number, one letter for each (`MARKS`), and their pulses.
+
+    `pulse_limit_us` is the longest pulse that a radar's SYNC_IN takes.
+    """
 
     folder: str
     rig: str
@@ -224,7 +227,10 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True):
-    """Stage offset in the rig frame (x, y), mm, and time left with its origin (`measured`, `first row`, `plan`)."""
+    """Stage offset in the rig frame (x, y), mm, and time left with its origin (`measured`, `first row`, `plan`).
+
+    `row` is the running row (-1: none), `point` the last point that it has passed.
+    """
 
     now_s: int
     left_s: int | None = None

@@ -573,7 +573,7 @@ def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
         filter_remedy = "set corners of the devices: chirp.hpf1_khz of at least 175 and hpf2_khz of at least 350"
         yield Constraint("high-pass filters", "lower corner", lowest, "kHz", filter_remedy, low=HPF_FIRST_KHZ[0])
     gain = rig.radar.rx_gain_db
-    # ICD table 5.24; the 24..52 dB of error 52 are not reached at every temperature and RF target.
+    # ICD table 5.24; the radar's error 52 allows 24..52 dB, which are not reached at every temperature and RF target.
     yield Constraint("RX gain", "RX gain", gain, "dB", "set radar.rx_gain_db to 32..52, even", low=32, high=52)
     yield Constraint("RX gain step", "RX gain modulo 2", gain % 2, "dB", "set an even radar.rx_gain_db", high=0)
     back_off = rig.radar.tx_backoff_db

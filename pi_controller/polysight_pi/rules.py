@@ -50,7 +50,8 @@ RULES = (
     Rule("Abort", "jogging", "same", "abort_jog"),
     Rule("Abort", "idle homed ready stopping ending fault", "same"),
     Rule("Pulse", "idle homed fault", "same"),
-    # Replies of the stage; ignored in all other states.
+    # Replies of the stage; ignored in all other states. `homed`, `moved`, `passed`: homing, jog or row came to its end.
+    # `stopped`: the alarm that STOP latches. `stage lost`: no link, a reset, or another alarm.
     Rule("homed", "homing", "homed ready fault", "note_homed"),
     Rule("moved", "jogging", "homed ready fault", "note_moved"),
     Rule("passed", "running held", "done ending", "note_passed"),
@@ -63,7 +64,8 @@ RULES = (
     Rule("stage lost", "idle homing jogging homed ready", "fault", "lose_stage"),
     Rule("stage lost", "running held stopping done", "ending", "lose_stage"),
     Rule("stage lost", "ending fault", "same", "lose_stage"),
-    # Trigger line, host, journal, time.
+    # Trigger line, host, journal, time. A `row fault` ends the row or jog, a `lasting fault` leads to `fault`. `all
+    # sent`: the row's last burst was sent. `settled`: the bursts in the queue when the row ended are journalled.
     Rule("row fault", "running held", "stopping ending", "fail_row"),
     Rule("row fault", "done", "ending", "fail_row"),
     Rule("row fault", "jogging", "same", "fail_jog"),

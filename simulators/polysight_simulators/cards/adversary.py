@@ -196,6 +196,7 @@ class Adversary:
             made_ns = [self._find_time_made_ns(byte, edges_ns) for byte in last_bytes]
         # A card that was reset may send nothing.
         made_ns = made_ns or [begin_ns]
+        # Delayed packets of earlier records: those that come before the first of this record, and those among its own.
         packets_before = self.take_late(0.5)
         in_between = self.take_late(0.7)
         arriving = self._transmit(packets, made_ns, sent)
@@ -205,6 +206,7 @@ class Adversary:
             twin = [bytes(p) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
             arriving += [Arrival(made_ns[min(k, len(made_ns) - 1)], p, -1) for k, p in enumerate(twin)]
             arriving.sort(key=lambda a: a.t_ns)
+        # Half of them come among the first three packets.
         for late in in_between:
             latest_place = len(arriving)
             if chance.random() < 0.5:
@@ -291,10 +293,11 @@ class Adversary:
         return self._note_last_bytes(self._card.feed(self._bytes[data]))
 
     def _end(self) -> list[bytes]:
+        """Return the short packet with the bytes that wait for a full one."""
         return self._note_last_bytes(self._card.flush())
 
     def _note_last_bytes(self, rows: NDArray[np.uint8]) -> list[bytes]:
-        """Note the last byte of each packet."""
+        """Note the number of the last data byte in each packet (`_made`); return the packets as bytes."""
         for row in rows:
             size = len(row) - DATA_HEADER_BYTES
             last_byte = 0
@@ -331,6 +334,7 @@ class Adversary:
         if "backlog" in t:
             late |= set(range(max(0, n - chance.randint(1, 4)), n))
         self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - lost_packets)]
+        # Arrival time, number in the record, and bytes of each packet.
         coming = [(made_ns[k], k, self._damage(packets[k], t)) for k in range(n) if k not in lost_packets | late]
         if "duplicate" in t and coming:
             coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
@@ -343,6 +347,7 @@ class Adversary:
         if "flows" in t:
             coming = [(t_ns + 100_000 * (k % 3), k, p) for t_ns, k, p in coming]
         if "held" in t:
+            # Two of three packets wait for the fifth or the tenth after them.
             coming = [(made_ns[min(k + 5 * (k % 3), n - 1)] + k % 3, k, p) for _, k, p in coming]
         return [Arrival(t_ns, p, sent.number) for t_ns, _, p in sorted(coming, key=lambda c: c[0])]
 

@@ -49,6 +49,7 @@ class ReceiveQueue:
     """Unread data of a UDP socket of this machine, from the kernel's table of sockets (`table`)."""
 
     def __init__(self, address: str, port: int, table: Path = Path("/proc/net/udp")) -> None:
+        # The table has local address and port in hexadecimal; 0 is a socket bound to any address.
         address_number = struct.unpack("=I", socket.inet_aton(address))[0]
         self._keys = tuple(f"{a:08X}:{port:04X}".encode() for a in (address_number, 0))
         try:
@@ -491,9 +492,11 @@ class SimulatedCard:
             wait_for_receiver=wait_for_receiver,
         )
         self._burst = rig.burst
+        # Time after a pulse in which the radar hears no other: chirps after the first, the last ramp, and recovery.
         later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
         dead_s = (later_us + rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6
         native = rig.radar.control == "native"
+        # Number of the chip, by which the host tells boards apart.
         die = 1 + [b.name for b in rig.boards].index(board.name)
         if native:
             self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die)
@@ -536,6 +539,7 @@ class SimulatedCard:
         x_mm, y_mm = track.offsets_mm(
             [p.t_ns + round(n * burst.chirp_us * 1e3) for p in run for n in range(burst.chirps)]
         )
+        # int16 [chirp, sample, I and Q of each RX]; the card gets them over LVDS, and may lose some to an overflow.
         chirps = self._source.chirps(self.board.name, x_mm, y_mm, run[0].number * burst.chirps)
         frames = chirps.reshape(len(run), -1, *chirps.shape[2:])
         counts["frames"] += len(frames)

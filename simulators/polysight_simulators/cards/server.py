@@ -104,6 +104,7 @@ class CardServer:
             self._select_cards()
             timeout = min(self._work(card) for card in self._cards)
             gather_s = self._next_read_s - self._clock_s()
+            # Let pulses gather at the wires for a moment, and leave them there while a card cannot send what it has.
             self._listen(gather_s <= 0 and not any(card.endpoint.sender.full for card in self._cards))
             if gather_s > 0:
                 timeout = min(timeout, gather_s)
@@ -151,6 +152,7 @@ class CardServer:
     def _work(self, card: SimulatedCard) -> float:
         """Send data and end the record in time; return the seconds until this card has more to do."""
         endpoint = card.endpoint
+        # Seconds until more data may be sent; None: all is sent.
         wait = endpoint.flush()
         # Pulses that wait at the wires keep the record from ending.
         if wait is None and endpoint.due and not self._take_edges():

@@ -144,8 +144,10 @@ class OwnLayout:
         self._plan = plan
         self._scan_id = scan_id
         self._started_utc = started_utc
+        # Of the events: the last number, and the Pi's monotonic clock.
         self._seq = 0
         self._now_ns = NS_PER_S
+        # Of the manifest: number of lines, and digest of the last one; rows that were written.
         self._lines = 0
         self._digest = ""
         self._rows = 0
@@ -504,6 +506,7 @@ def write_cube(
     rig = apply_scene(rig, scene)
     write_settings(folder, rig, zero_filling=True, by_columns=by_columns)
     f = sample_frequencies_hz(rig)
+    # Cubes are complex [rx, row, column, sample].
     for board_name, cube in reference_cube(rig, scene).items():
         board = rig.by_name(board_name)
         direct_m = antennas(rig, board).direct_m

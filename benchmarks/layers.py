@@ -56,6 +56,7 @@ KINDS = (IN_AIR, ON_METAL, LIQUID)
 # Relative error up to which a result counts as right; chosen.
 ENOUGH = 0.05
 Setting = tuple[float, float | None]
+"""Trust in |H| and reach of the thickness's range, see `SETTINGS`."""
 SETTINGS: tuple[Setting, ...] = ((0.1, None), (0.04, None), (0.1, 0.2))
 """Relative error to which |H| is trusted (0.1: the command's default; 0.04: for flat, smooth plates), and the reach of
 the thickness's range on either side of the truth, as a share (None: `RANGE_M`)."""
@@ -131,6 +132,7 @@ def draw_scene(seed: int) -> Scene:
             "name": f"layers {seed}",
             "seed": 2000 + seed,
             "grid": GRID,
+            # That of the packaged rig file, and an image that holds all plates.
             "object_distance_mm": 499.0,
             "image": {"columns": 116, "rows": 90},
             "plane_shift_mm": rng.uniform(-5, 5),

@@ -69,6 +69,7 @@ KEPT_POINTS = 240
 # Positions of a quick scan: every so many-th in x and y; chosen.
 QUICK_STEP = 2
 # Limits of the 68th percentile over objects (chosen): normals in degrees, points in mm, permittivity in % (None: none).
+# `LARGE`: for radii of 100 mm and more, and other shapes; a radius of 50 mm has wider limits.
 LARGE = (0.5, 0.5, 3.0)
 MUST_HOLD: dict[str, tuple[float | None, float | None, float | None]] = {
     **dict.fromkeys(("plate", "sphere", "cylinder", "cone", "barrel", "saddle", "sheet"), LARGE),
@@ -239,7 +240,7 @@ def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> Obje
         point_mm=float(1000 * np.median(away_m)),
         normal_68_deg=float(np.percentile(turns_deg, 68)),
         point_68_mm=float(1000 * np.percentile(away_m, 68)),
-        # A normal turns in two directions: 1.96 of their sum bounds the less sure one alone.
+        # A normal turns in two directions, of which this is the root of both variances: 95 % or more lie within 1.96.
         normals_inside=float(np.mean(turns_deg < 1.96 * surface.normal_std_deg[on_object])),
         places_inside=float(np.mean(away_m < 1.96 * surface.position_std_m[on_object])),
     )

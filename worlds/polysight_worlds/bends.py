@@ -104,6 +104,7 @@ def _compare(stack: Stack, axis: tuple[float, float, float], radius_m: float) ->
         specular = find_specular(shape, tx_m, rx_m)
         patch = shape.evaluate(*specular)
         path = follow_path(patch, tx_m, rx_m)
+        # Dipoles, whose polarisation in the specular direction is the given one.
         for sent, received in PAIRS:
             tx = Antenna(tx_m[:, 0], -tx_way, axes[0][sent], 0.0, is_dipole=True)
             rx = Antenna(rx_m[:, 0], -rx_way, axes[1][received], 0.0, is_dipole=True)

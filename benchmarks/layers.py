@@ -208,6 +208,7 @@ def judge_fit(seed: int, plate: Plate, fit: LayerFit | None, setting: Setting) -
     size_mm = layer.thickness_mm or 0.0
     if fit is None or fit.covariance is None:
         return Case(seed, kind, setting, true, size_mm)
+    # In the order of the fit's covariance: eps', eps'' (and the thickness, left out here).
     difference = np.array([fit.permittivity.real - true[0], -fit.permittivity.imag - true[1]])
     found_mm = 1e3 * (fit.thickness_m or 0.0)
     return Case(

@@ -162,7 +162,7 @@ _MAX_RUN_BYTES = 256 << 20
 def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
     """Write a row's packets durably and return the file's CRC-32; without `placed`, with all of the payload.
 
-    Raises DeviceError if the disk fails.
+    Of packets beyond the first `log.kept` only their arrival is written. Raises DeviceError if the disk fails.
     """
     sizes = log.sizes[: log.kept]
     # Payload that does not lie unchanged in the row's file is stored in this one.

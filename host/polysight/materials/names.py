@@ -170,7 +170,7 @@ def name_patch(
     if not usable.any():
         return make_patch_without_pixels(usable.size)
     kind_evidence = [
-        move_to_angle_of_kinds(evidence, kind) for evidence, kind in zip(kind_evidence, kinds, strict=True)
+        move_to_angle_of_kinds(evidence, of_scan) for evidence, of_scan in zip(kind_evidence, kinds, strict=True)
     ]
     odds = weigh_kinds(kinds, kind_evidence)
     # The kinds are the same at every angle; only their ratios differ.
@@ -212,6 +212,7 @@ def _find_verdict(
     if literature_name:
         probability[literature_name] = float(odds.kinds[in_literature_name].sum())
         distances[literature_name] = float(odds.distance[in_literature_name].min())
+    # Sheets are thin plates; stacks of layers count with them.
     if kinds.sheet_share:
         probability[LAYER] = odds.sheet
     likely = _sort_likeliest_first(probability)
@@ -297,11 +298,11 @@ def _name_pixels(
     scan_covariance = scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
     errors = scan_covariance + pixel_covariance + 1e-10 * np.eye(parts)
     # [kind, parts, ways in which specimens differ].
-    effects = np.concatenate([kind.effects[has_name] for kind in kinds], axis=1)
+    effects = np.concatenate([of_scan.effects[has_name] for of_scan in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + errors)
 
     # Squared Mahalanobis distance of each pixel to each kind, [n, kind].
-    means = np.stack([kind.t[has_name] for kind in kinds], axis=1)
+    means = np.stack([of_scan.t[has_name] for of_scan in kinds], axis=1)
     ratios: npt.NDArray[np.complex128] = np.where(usable.reshape(-1, 1), inverse_ratios, 0)
     difference = split_complex(ratios[:, None, :] - means).reshape(pixel_count, -1, parts)
     distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)

@@ -339,6 +339,7 @@ def _collect_notices(inputs: Inputs) -> list[Finding]:
     if inputs.failure is not None and not stopped_on_request:
         notices.append(inputs.failure)
     if history is not None:
+        # Why the Pi's events cannot be received.
         if inputs.pi.deaf is not None and history.ended is None:
             notices.append(inputs.pi.deaf)
         if inputs.shown.problem is not None:

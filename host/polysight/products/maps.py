@@ -280,6 +280,7 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
             continue
         of_patch = scan.labels == patch.label
         pixels = of_patch & np.isfinite(inverse)
+        # Of patches with a known interior, that alone: pixels at the edges hold the neighbours, too.
         if scan.interior is not None:
             pixels &= scan.interior
         if not pixels.any():

@@ -422,7 +422,7 @@ class CardEndpoint:
 
     @property
     def due(self) -> bool:
-        """True if the record's deadline has passed, unless more data is pending."""
+        """True if a record runs and its deadline has passed, whether or not more pulses wait at the wires."""
         deadline_s = self.card.deadline_s
         return deadline_s is not None and self.wire_s() >= deadline_s
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.store.facts import facts_of
 
-from polysight.catalogue import NOTES, Notes, Scans, read_notes, scans, write_notes
+from polysight.catalogue import NOTES, PROGRAM, Notes, Scans, find_program, read_notes, scans, write_notes
 from polysight.catalogue.scans import Program, explain_failure, is_scan
 from polysight.results import NoResult
 from polysight.store import MANIFEST, ScanFolder, manifest
@@ -259,3 +260,21 @@ def test_a_failure_is_the_last_error_in_the_log_or_that_it_was_killed():
     assert (failed.what, failed.why, failed.do) == ("no rows", "none whole", "scan")
     for status, running in ((0, False), (NoResult.exit_status, False), (None, True)):
         assert explain_failure(structs.replace(program, status=status, running=running, log=log)) is None
+
+
+def test_of_a_huge_record_and_status_only_the_beginning_is_read(tmp_path):
+    """As on a drive with damaged files: sparse ones of 64 MiB."""
+    record = {"pid": 0, "ticks": 0, "words": [], "started_utc": ""}
+    for name, content in (("scan.json", json.dumps(record)), ("scan.status", "7\n")):
+        path = tmp_path / PROGRAM / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(content)
+        os.truncate(path, 64 << 20)
+    tracemalloc.start()
+    try:
+        find_program(tmp_path, "scan")
+        scans._read_status(tmp_path / PROGRAM / "scan.status")
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < 1 << 20

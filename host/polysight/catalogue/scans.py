@@ -45,6 +45,8 @@ MAX_SCANS = 5000
 LOG_BYTES = 16384
 # Longest record of a started program that is read: its command line is short; chosen.
 MAX_RECORD_BYTES = 100_000
+# Longest exit status, with its sign and the end of its line; chosen.
+MAX_STATUS_BYTES = 8
 # Characters of a program's message, and of its cause and remedy, that the list shows; chosen.
 MESSAGE_CHARACTERS = 300
 REMEDY_CHARACTERS = 500
@@ -262,7 +264,8 @@ def find_program(folder: Path, kind: str) -> Program | None:
     if (folder / PROGRAM).is_symlink() or not is_plain(path):
         return None
     try:
-        record = msgspec.json.decode(path.read_bytes()[:MAX_RECORD_BYTES], type=ProgramRecord)
+        with path.open("rb") as f:
+            record = msgspec.json.decode(f.read(MAX_RECORD_BYTES), type=ProgramRecord)
     except (OSError, ValueError):
         return None
     words = record.words
@@ -276,9 +279,10 @@ def find_program(folder: Path, kind: str) -> Program | None:
 def _read_status(path: Path) -> int | None:
     """Return the exit status that a program has left; None if there is none."""
     try:
-        if is_plain(path):
-            return int(path.read_text(encoding="ascii")[:8])
-        return None
+        if not is_plain(path):
+            return None
+        with path.open("rb") as f:
+            return int(f.read(MAX_STATUS_BYTES))
     except (OSError, ValueError):
         return None
 

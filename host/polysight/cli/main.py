@@ -1,4 +1,6 @@
-"""The program `polysight`: parse the command line and run one command. Exit status 0 only when it worked.
+"""The program `polysight`: parse the command line and run one command.
+
+The exit status is 0 only when the command worked, or when the reader of its output has closed the pipe (`| head`).
 
 Only the module of the command is imported, so that every command starts at once; this module imports what `main` needs
 to be interrupted, and the rest is loaded below it. Errors go to stderr: what happened, why, and what to do.

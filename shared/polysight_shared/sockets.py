@@ -203,6 +203,7 @@ def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 class HandshakeMonitor:
     """Detect that a server refused this client's key, as opposed to not answering. `socket`: the client's.
 
+    `lacks_curve` is True if :meth:`is_refused` found that the server has no CURVE, so that no key would help.
     A wrong server key in this client is not detected: it looks like a server that does not answer.
     """
 
@@ -210,12 +211,18 @@ class HandshakeMonitor:
         self._socket = socket
         self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
         self._refused = False
+        self.lacks_curve = False
+        # A refusal before this monitor would not come again: the socket connects anew.
+        if endpoint := socket.getsockopt_string(zmq.LAST_ENDPOINT):
+            socket.disconnect(endpoint)
+            socket.connect(endpoint)
 
     def is_refused(self) -> bool:
         """Return True if so far the server refused this client's key, or is a server without CURVE."""
         while self._monitor.poll(0):
-            recv_monitor_message(self._monitor)
+            failure = recv_monitor_message(self._monitor)["value"]
             self._refused = True
+            self.lacks_curve = failure == zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH
         return self._refused
 
     def close(self) -> None:

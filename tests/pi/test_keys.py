@@ -24,6 +24,7 @@ from polysight_pi.service import Server
 from polysight_shared import messages as m
 from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import DeviceError
 from polysight_shared.faults import PiFault
 from polysight_shared.sockets import HOST_KEYS, HandshakeMonitor, requester
 from polysight_shared.tables import decode, to_builtins
@@ -162,6 +163,28 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
     client = PiClient(context, replace(rig, pi=pi, limits=replace(rig.limits, command_timeout_s=0.6)))
     with client, expect_refused(ErrorCode.REFUSED_BY_PEER, tmp_path / "mine"):
         client.hello()
+
+
+def test_a_server_without_keys_is_not_said_to_refuse_this_hosts(tmp_path, context):
+    """Either end may notice first: if the server does, it only hangs up, and the client connects again."""
+    make_keys(tmp_path)
+    rig = published_rig()
+    replace = msgspec.structs.replace
+    with context.socket(zmq.ROUTER) as keyless:
+        address = f"tcp://0.0.0.0:{keyless.bind_to_random_port('tcp://127.0.0.1')}"
+        pi = replace(rig.pi, command_address=address, event_address=address, key_dir=str(tmp_path))
+        client = PiClient(context, replace(rig, pi=pi, limits=replace(rig.limits, command_timeout_s=0.6)))
+        codes = []
+
+        def is_told() -> bool:
+            with pytest.raises(DeviceError) as caught:
+                client.hello()
+            codes.append(caught.value.code)
+            return codes[-1] is ErrorCode.MISMATCH
+
+        with client:
+            wait_for(is_told, "that it has no keys")
+        assert ErrorCode.REFUSED_BY_PEER not in codes
 
 
 def test_without_a_list_the_host_key_is_allowed(tmp_path):

@@ -309,8 +309,16 @@ class PiClient:
         return reply
 
     def _no_answer_error(self, command: str) -> DeviceError:
-        """Return the error for a Pi that is silent, or that refuses the key of this host."""
-        if self._handshake.is_refused():
+        """Return the error for a Pi that is silent or refuses this host's key, or a program without CURVE there."""
+        is_refused = self._handshake.is_refused()
+        if self._handshake.lacks_curve:
+            return DeviceError(
+                f"the program at {self._address} does not use CURVE keys",
+                "it is another program, or a tunnel to the Pi's loopback address, which needs no keys",
+                "correct pi.command_address and pi.event_address; with a tunnel they are tcp://127.0.0.1:PORT here",
+                code=ErrorCode.MISMATCH,
+            )
+        if is_refused:
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",
                 "the key was revoked or never allowed, or pi.key here is another Pi's",

@@ -620,6 +620,7 @@ def check_run(run: m.BeginRun, stage: Stage) -> None:
     _require(plan.columns >= 1 and plan.rows >= 1, f"plan of {plan.columns} x {plan.rows} points is empty")
     _require(plan.step_x_mm > 0 and plan.step_y_mm > 0, "steps of the plan must be positive")
     fastest = max(stage.speed_mm_s, stage.travel_speed_mm_s)
+    # MIN_FEED is in motor steps per second.
     slowest = MIN_FEED / stage.steps_per_mm
     _require(
         slowest <= run.speed_mm_s <= fastest,

@@ -179,6 +179,7 @@ class Server:
             return
         end = parts.index(b"", 1) + 1
         envelope = tuple(parts[:end])
+        # "User-Id" is the key in hexadecimal digits, as `_authenticate` answered.
         if self._secret and not self._allowed.client_name(bytes.fromhex(str(frames[-1].get("User-Id")))):
             reply = make_refusal(PiFault.NOT_OWNER, "this client's key was revoked", "see `polysight-pi keys --list`")
         else:

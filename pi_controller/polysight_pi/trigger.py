@@ -564,6 +564,7 @@ class TriggerWatch:
     """Detects a trigger wire that is off: the stage passes points and no edges arrive."""
 
     def __init__(self) -> None:
+        # Counts of edges and points when an edge was last new, and the number of statuses since.
         self._edges = -1
         self._points = 0
         self._statuses = 0
@@ -578,4 +579,5 @@ class TriggerWatch:
         # The stage counts from 0 in each row.
         self._points = min(self._points, points)
         self._statuses += 1
+        # At that time a status could count fewer points than there were edges: those do not count as passed since.
         return self._statuses >= SILENT_STATUSES and points - max(edges, self._points) >= SILENT_POINTS

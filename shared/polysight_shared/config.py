@@ -183,8 +183,11 @@ class MountStep(Section, frozen=True):
     about: Literal["x", "y", "z"] | None = None
 
     def __post_init__(self) -> None:
+        has_angle = self.turn_deg is not None
+        has_axis = self.about is not None
+        has_shift = self.shift_mm is not None
         require(
-            (self.turn_deg is None) == (self.about is None) == (self.shift_mm is not None),
+            has_angle == has_axis and has_shift != has_angle,
             "a mount step is either { shift_mm = [x, y, z] } or { turn_deg = a, about = axis }",
         )
 

@@ -337,8 +337,8 @@ class HelloReply(_Message, frozen=True, kw_only=True):
     """Identity and state of the Pi.
 
     `backend` is what makes the pulses (GPIOD, SPI or WIRES), `last_seq` the newest event of `scan_id`, `in_run` True
-    while a run is active. `t_unix_ns`: the Pi's clock; `stage`: `Stage.placement_settings`; older releases send 0 and
-    {}.
+    while a run is active. `t_unix_ns`: the Pi's clock; `stage`: settings by which the Pi places rows, to compare with
+    the host's (`Stage.placement_settings`); older releases send 0 and {}.
     """
 
     pi_release: Name
@@ -368,7 +368,7 @@ class Refused(_Message, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
 
 
 class StatusReply(_Message, frozen=True, kw_only=True):
-    """Status of the Pi. `row_index` is -1 if no row is running.
+    """Status of the Pi. If no row is running, `row_index` is -1 and `take` 0.
 
     `points` and `pulses` are bursts and pulses that were sent in the running row. `fault` and `reason` are the first
     fault since the last homing, row or jog began; 0 and "" if there was none.
@@ -400,10 +400,7 @@ class ReplayReply(_Message, frozen=True, kw_only=True):
 
 
 class Pulsed(_Message, frozen=True, kw_only=True):
-    """Result of `Pulse`: pulses, upper bound of their widths, largest delay of an edge, fault number.
-
-    `pulses_seen`: as in `Capture`.
-    """
+    """Result of `Pulse`: the fields of a burst as in `Capture`, and the fault number."""
 
     pulses: Natural
     width_max_ns: Natural

@@ -2,11 +2,12 @@
 
 The narrowest honest error bar of a plate follows from all nuisances, marginalised over the prior that they are drawn
 from. That bound has no closed form here, so a rival stands for it: it is told which nuisance a scene has, and learns
-the error of the plain estimate (Eq. 3 of the mean images, relative to copper, the measured leakage removed) from
-other scenes of the same generator, as gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of
-all plates, widened or narrowed until they hold 95 % in each row. It does not know which materials there are; the
-program does, but neither the nuisance nor its size. For each nuisance: median relative half widths of 95 % regions of
-both, and their ratio. All is simulated.
+the error of the plain estimate from other scenes of the same generator. The plain estimate is Eq. 3 of the POLySIGHT
+paper (a half space's permittivity by H / V) of a plate's mean H and V relative to copper, the measured leakage removed.
+The rival learns by gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of all plates, widened
+or narrowed until they hold 95 % in each row. It does not know which materials there are; the program does, but neither
+the nuisance nor its size. For each nuisance: median relative half widths of 95 % regions of both, and their ratio. All
+is simulated.
 
 The rival is above the bound, by how much is not known: about a slope of 20 times the noise its intervals are three
 times too wide (tests/benchmarks/test_widths.py), and errors that only the inversion of a whole scene finds (leakage,
@@ -58,11 +59,11 @@ def describe_plate(h: Complex, v: Complex) -> tuple[complex, complex, list[float
     """Return the means of H and V over the pixels [ny, nx] of a plate, and its features.
 
     These are the share of known pixels, slopes and bends (x y, x^2, y^2) of H and V relative to their means, and the
-    scatter of magnitude and phase of H, V and V / H.
+    scatter of magnitude and phase of H, V and V / H; of V / H also the medians.
     """
     known = np.isfinite(h) & np.isfinite(v) & (h != 0) & (v != 0)
-    count = max(int(known.sum()), 1)
-    means = complex(np.sum(h, where=known) / count), complex(np.sum(v, where=known) / count)
+    known_count = max(int(known.sum()), 1)
+    means = complex(np.sum(h, where=known) / known_count), complex(np.sum(v, where=known) / known_count)
     # From -1 to 1 over the plate.
     y, x = np.meshgrid(*(np.linspace(-1, 1, count) for count in h.shape), indexing="ij")
     features = [float(known.mean())]
@@ -84,6 +85,7 @@ def collect_scene(job: tuple[str, int]) -> SceneData | None:
     pair = draw_pair(nuisance, seed)
     leakage, theta_error_rad = draw_calibration(nuisance, seed)
     into_h, into_v = leakage or (0j, 0j)
+    # Of each: the plate, its means of H and V, its features.
     plates = []
     for plate, (left, bottom, right, top) in pixel_boxes(pair):
         inner = slice(bottom + EDGE_PX, top - EDGE_PX), slice(left + EDGE_PX, right - EDGE_PX)
@@ -92,7 +94,8 @@ def collect_scene(job: tuple[str, int]) -> SceneData | None:
     if metal is None:
         return None
     dielectrics = [entry for entry in plates if not entry[0].stack.is_metal]
-    # Relative to metal, with leakage: V / H = (t + b) / (1 + a t) * (1 + a) / (1 + b).
+    # With the leakage a of V into H and b of H into V, a plate's true V / H = t (1 for metal) is measured, relative to
+    # metal, as (t + b) / (1 + a t) * (1 + a) / (1 + b).
     measured = np.array([v / h for _, h, v, _ in dielectrics]) * (metal[1] / metal[2]) * (1 + into_v) / (1 + into_h)
     t = (measured - into_v) / (1 - into_h * measured)
     plain = permittivity_from_ratio(1 / t, np.radians(pair.incidence_deg) + theta_error_rad)

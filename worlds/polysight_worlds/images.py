@@ -297,6 +297,7 @@ def backproject(rig: Rig, rx: Antenna, data: NDArray, pixels: int, kaiser_beta: 
     shape = fast_length(rig.rows + pixels - 1), fast_length(rig.columns + pixels - 1)
     x_m, y_m = pixel_centres(rig, pixels)
     offsets_x, offsets_y = rig.offsets_m()
+    # v - u at the lags of a circular convolution: 0 .. pixels - 1, then the negative ones.
     x = x_m[0] - offsets_x[0] + signed_lags(shape[1], pixels) * rig.step_m
     y = y_m[0] - offsets_y[0] + signed_lags(shape[0], pixels) * rig.step_m
     out = _measure_distance(rig.tx, x, y, rig.plane_m)

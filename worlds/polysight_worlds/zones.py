@@ -52,10 +52,9 @@ def window(units: NDArray) -> NDArray:
 
 def _fade_shadow(normals: NDArray, response: Response) -> NDArray:
     """Smooth step from 1 to 0 towards grazing incidence or scattering; `normals` [3, ...]."""
-    # The gradient is incident minus scattered direction.
-    rise = np.einsum("i...,i...->...", normals, response.gradient)
-    cosine = np.minimum(response.cos_incidence, -response.cos_incidence - rise)
-    share = np.clip(cosine / GRAZING, 0, 1)
+    # The gradient of the path is the direction of incidence minus that of scattering, and cos_incidence their -n i.
+    cos_scattering = -response.cos_incidence - np.einsum("i...,i...->...", normals, response.gradient)
+    share = np.clip(np.minimum(response.cos_incidence, cos_scattering) / GRAZING, 0, 1)
     return share**2 * (3 - 2 * share)
 
 
@@ -68,6 +67,7 @@ def spread_of_ray(patch: Patch, path: PathAt, tx_m: NDArray, rx_m: NDArray) -> N
     out_m = np.linalg.norm(patch.point - tx_m, axis=0)
     back_m = np.linalg.norm(patch.point - rx_m, axis=0)
     cosine = np.einsum("in,in->n", patch.normal, tx_m - patch.point) / out_m
+    # [tangent, parameter, n]: turns derivatives by the parameters into those by metres along the tangents.
     basis = patch.tangents()
     bends = np.linalg.eigvalsh(np.moveaxis(np.einsum("ij...,jk...,lk...->il...", basis, path.hessian, basis), -1, 0))
     return cosine / (out_m * back_m * np.sqrt(np.abs(bends.prod(axis=1)))) * 1j ** (bends < 0).sum(axis=1)
@@ -81,9 +81,10 @@ def sum_window(
     offsets: NDArray,
     places: tuple[NDArray, ...],
 ) -> NDArray:
-    """Physical optics about the specular points (a, b), without the specular path's phase: [frequencies, offsets].
+    """Physical optics about specular points, without the specular path's phase: complex [frequencies, offsets].
 
-    Antennas are dipoles whose fields towards these points are theirs, as for the series.
+    `places`: the surface's parameters a and b at the specular point of each offset. Antennas are replaced by dipoles
+    with the same fields towards these points, as in the exact series (series.py). The sum is that of `Response`.
     """
     units = window_units()
     xi, eta = (grid.ravel() for grid in np.meshgrid(units, units))
@@ -129,9 +130,10 @@ def _fresnel_zones(tangents: NDArray, hessian: NDArray, k: float) -> tuple[NDArr
     # vectors [n, component, axis]
     rates = np.einsum("nia,ijn,na->ajn", vectors, tangents, lengths)
     units = window_units()
-    seen = SPACING * (window(units) @ np.exp(-0.5j * units**2)) / np.sqrt(-2j * np.pi)
-    missed = np.where(eigenvalues > 0, seen, seen.conj()).prod(axis=1)
-    return rates, np.abs(rates[0, 0] * rates[1, 1] - rates[0, 1] * rates[1, 0]) / missed
+    # Share of the integral of exp(-j units^2 / 2) that the windowed sum finds.
+    found = SPACING * (window(units) @ np.exp(-0.5j * units**2)) / np.sqrt(-2j * np.pi)
+    found_of_both = np.where(eigenvalues > 0, found, found.conj()).prod(axis=1)
+    return rates, np.abs(rates[0, 0] * rates[1, 1] - rates[0, 1] * rates[1, 0]) / found_of_both
 
 
 class CosineTable:

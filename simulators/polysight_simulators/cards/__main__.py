@@ -52,7 +52,7 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--offset-in-rig",
         action="store_true",
-        help="the rig file's start frequencies include the scene's offset",
+        help="the rig file's start frequencies include the scene's if_offset_hz",
     )
     parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene")
     parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
@@ -105,7 +105,7 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     names = _check_arguments(args, board_names)
     scene = None
     seed = 0
-    base = {}
+    scene_faults = {}
     disturbances = Disturbances()
     if args.scene is not None:
         scene = load_scene(args.scene)
@@ -113,10 +113,10 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
             scene = without_offset(scene)
         seed = scene.seed
         disturbances = scene.disturbances
-        base = {"loss": disturbances.packet_loss}
+        scene_faults = {"loss": disturbances.packet_loss}
     if args.seed is not None:
         seed = args.seed
-    faults = read_faults(args.faults, args.fault, board_names, base, rig.radar.control)
+    faults = read_faults(args.faults, args.fault, board_names, scene_faults, rig.radar.control)
     source = _make_source(args, rig, scene, names)
     # The signal asks to switch the cards off and on.
     power_cycle = Event()

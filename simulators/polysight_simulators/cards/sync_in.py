@@ -14,7 +14,8 @@ from polysight_shared.units import us_to_ns
 from polysight_shared.wires import WireMotion
 from polysight_simulators.radars import RadarBoard
 
-# Shortest time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger; ICD 93).
+# Shortest time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger: TI mmWave Radar
+# Interface Control, page 93).
 RECOVERY_US = 150.0
 # The last so many motion lines, and triggers, are kept at least; they are cut to it at twice as many; chosen.
 _KEEP = 4096

@@ -41,6 +41,7 @@ class Pixels(products.ProcessedScan):
     def from_scan(cls, scan: products.ProcessedScan) -> Self:
         """Return the pixels of a result, saved or just computed."""
         pixels = cls(scan.folder)
+        # What was read or computed of the scan is in its `__dict__` (cached properties).
         vars(pixels).update(vars(scan))
         return pixels
 

@@ -62,10 +62,11 @@ class _Model:
 
     def __init__(self, board: BoardSamples) -> None:
         self.imager, _ = choose_imager(board.aperture)
+        # G, [frequency, frequency].
         self._gate = board.model.astype(np.complex64)
 
     def samples(self, image: NDArray[np.complexfloating]) -> NDArray[np.complex64]:
-        """Return the samples that an image predicts, divided by the gains, [rx, frequency, row, column]."""
+        """Return the samples that an image predicts, as of `calibrate_samples`: [rx, frequency, row, column]."""
         echoes = self.imager.samples(image)
         return (self._gate @ echoes.reshape(*echoes.shape[:2], -1)).reshape(echoes.shape)
 
@@ -113,7 +114,7 @@ def reconstruct(
         return model.adjoint(y * weights)
 
     matched = adjoint(data)
-    # Steps of 1 / lipschitz cannot overshoot.
+    # Steps of 1 / lipschitz cannot overshoot. `threshold` is the module's, times the length of a step.
     lipschitz = _estimate_largest_eigenvalue(lambda x: adjoint(forward(x)), matched)
     threshold = strength * float(np.abs(matched).max()) / lipschitz
     norm = float(np.linalg.norm(data)) or 1.0
@@ -191,11 +192,11 @@ def fill_missing(
     for name, board in filled.boards.items():
         board.copy_samples(builder.boards[name], steps)
         if board.valid.any() and not board.valid.all():
-            _, slow = choose_imager(board.aperture)
-            if slow is not None:
+            _, direct_sum_notice = choose_imager(board.aperture)
+            if direct_sum_notice is not None:
                 raise ConfigError(
                     "missing positions cannot be reconstructed on this grid of pixels",
-                    slow,
+                    direct_sum_notice,
                     "leave --sparse out, or give pixels whose distance divides that of the positions (--grid, [image])",
                 )
             errors[name] = _fill(board, iterations)
@@ -262,6 +263,6 @@ def _choose_test_positions(recorded: Mask) -> Mask:
 
 
 def _measure_image(model: _Model, samples: NDArray[np.complexfloating], weights: NDArray[Any]) -> float:
-    """Return the root of the sum of the squares of an image's pixels; 1e-30 if it is dark."""
+    """Return the norm of the image of samples [rx, frequency, row, column] under weights [row, column]; never 0."""
     image = model.imager.image((samples * weights).astype(np.complex64))
     return float(np.linalg.norm(image)) or 1e-30

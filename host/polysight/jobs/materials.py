@@ -463,6 +463,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
             "the object was moved between the scans, or these are scans of other objects",
             "scan the same patches in the same places",
         )
+    # Evidence: V / H of the patch in each scan, as the joint inversion estimated it with its errors.
     named = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
     content = {
         "source": _describe_origin(any(s.simulated for s in scans)),
@@ -537,7 +538,7 @@ def _describe_contradictions(
         return []
     names_by_angle = []
     for i, angle_deg in enumerate(angles_deg):
-        # Features of the angles are side by side in columns; evidence has one row for each angle.
+        # Features of the angles are side by side in columns; evidence has one entry for each angle.
         features = [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
         evidence = [m.evidence if m.evidence is None else m.evidence[i : i + 1] for m in matched]
         names_by_angle.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))

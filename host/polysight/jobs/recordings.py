@@ -244,7 +244,10 @@ def inspect_placement(file: Path, as_json: bool) -> int:
 
 
 def _format_placement(file: Path, result: PlacedAgain, same: bool) -> list[str]:
-    """Return lines about the placement of a row's packets; `same` says that it was committed like this."""
+    """Return lines about the placement of a row's packets; `same` says that it was committed like this.
+
+    `start`: the card's packet and byte counts at the row's first byte; `located`: the place of each byte is certain.
+    """
     placed = result.placed
     evidence = result.evidence
     counts = ", ".join(f"{n} {name.replace('_', ' ')}" for name, n in vars(placed.counts).items() if n)

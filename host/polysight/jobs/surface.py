@@ -49,6 +49,7 @@ def process_to_points(data: Path, rig: Path | Instrument | None) -> tuple[Pipeli
 
     `rig`: rig, or rig file, of published data; scan folders bring their own.
     """
+    # Where the raw data was deleted, the samples that the scan folder keeps are used.
     source = open_source(data, rig, dropped=True)
     pipeline = process_rows(source, data, Settings(depth_range_mm=1e3 * DEPTH_M))
     optics = measure_surfaces.make_rig_optics(pipeline.rig)

@@ -190,6 +190,7 @@ class ErrorDiscriminant(Model):
         if not len(self.angles_rad):
             return {}
         dielectric = (abs(self._anchor_t - 1) > METAL_SPECIMENS).all(axis=1)
+        # t is V / H relative to metal, at each angle.
         kinds = zip(self.names[dielectric], self._anchor_t[dielectric], strict=True)
         return {str(name): apparent_permittivity(t, self.angles_rad) for name, t in kinds}
 
@@ -280,6 +281,7 @@ class ErrorDiscriminant(Model):
         `material` [n] is the index of each pixel's material. Set also which pairs of features are of one angle, and
         which are both gains or both phases, [features, features]; the others are taken as uncorrelated.
         """
+        # |H|, |V| and t = V / H relative to metal, complex; [n, angles] each.
         h, v, t = split_by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
         of_material = [material == k for k in range(self.names.size)]

@@ -138,8 +138,8 @@ def _make_row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: S
 class BoardCounts(msgspec.Struct):
     """Data of one board over the committed rows.
 
-    `retaken` counts takes that were rejected because of it, `masked` positions without a direct path, `counts` the
-    kinds of `RECEPTION`.
+    `retaken` counts takes that were rejected because of it, `masked` positions without a direct path (from the page's
+    synchronisation, 0 here), `counts` the kinds of `RECEPTION`.
     """
 
     name: str

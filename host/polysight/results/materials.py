@@ -557,8 +557,9 @@ class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
 class MetalScore(msgspec.Struct, frozen=True, kw_only=True):
     """Evidence that the reference is metal.
 
-    `score` comes from the `others`, the number of other patches; `channel_ratio_db` is V / H relative to the direct
-    path. `painted` is the probability that the metal is painted, `paint_mm` the thickness of the paint in that case.
+    `score` is ln of the evidence for metal over that for a dielectric, by the other patches, `others` in number;
+    `channel_ratio_db` is V / H relative to the direct path. `painted` is the probability that the metal is painted,
+    `paint_mm` the thickness of the paint in that case.
     """
 
     score: float | None = None

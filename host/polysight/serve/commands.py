@@ -158,6 +158,7 @@ class ExportRequest(Body, frozen=True):
 
 AnyBody = TypeVar("AnyBody", bound=Body)
 Words = list[str | Path]
+"""Words of a `polysight` command line, after the program's name."""
 
 
 class Named(NamedTuple):
@@ -355,7 +356,7 @@ def _check_free(site: Site) -> None:
 
 
 def _is_starting(site: Site, s: Summary) -> bool:
-    """True if the scan's program runs without a sign of life yet, or is processing."""
+    """True if the scan is listed as not begun, or as killed, but its program runs: no sign of life of it came yet."""
     if s.state in ("begun", "lost"):
         program = find_program(site.scans.root / s.name, "scan")
     else:

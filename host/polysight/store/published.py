@@ -219,7 +219,8 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled
     first = int(log.sequence[0])
     last = int(log.sequence[-1])
     begin = first
-    ends_complete = full > log.size[-1] == shape.bytes - (expected - 1) * full
+    last_size = int(log.size[-1])
+    ends_complete = last_size < full and last_size == shape.bytes - (expected - 1) * full
     if zero_filled is not None:
         silent_packets = _find_silent(zero_filled, full)
         # Index of the first packet that is not silent: so many are before it.

@@ -128,6 +128,7 @@ def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> C
     eps_of_receivers = np.asarray(eps)[..., None]
     r_s, r_p = reflect_curved(eps_of_receivers, v.theta, v.bend_inside[:, None], v.bend_across[:, None], wave_number)
     mixed = mix_twisted(eps_of_receivers, v.theta, v.twist[:, None], wave_number)
+    # What the reflection of a spherical wave has beyond that of a plane one.
     more_s, more_p = reflect_spherical(eps_of_receivers, v.theta, v.path_m, wave_number)
     return np.stack([r_s + more_s, r_p + more_p, mixed, mixed], axis=2)
 
@@ -138,7 +139,10 @@ def receive(v: Voltages, coefficients: Complex) -> Complex:
 
 
 def expansion_parameter(v: Voltages, wave_number: float) -> Array:
-    """Return K / (k cos^3 theta) of each point [n]: ratio of successive orders of reflection at a curved surface."""
+    """Return K / (k cos^3 theta) of each point [n]: ratio of successive orders of reflection at a curved surface.
+
+    K is the mean of both curvatures' sizes, k the wave number.
+    """
     bend = (np.abs(v.bend_inside) + np.abs(v.bend_across)) / 2
     return bend / (wave_number * np.cos(v.theta[:, 0]) ** 3)
 

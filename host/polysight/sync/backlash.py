@@ -73,14 +73,15 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     if len(inner) < _GROUPS:
         return None
     k = 2 * np.pi * np.fft.fftfreq(2 * plan.columns, plan.step_x_mm)
-    travel = mean_burst_travel_mm(rig.burst, rig.stage)
+    # A burst's middle lies so far beyond the planned position, in the direction of motion.
+    travel_mm = mean_burst_travel_mm(rig.burst, rig.stage)
     window = np.pad(np.hanning(plan.columns + 2)[1:-1], (0, plan.columns))
 
     def compute_row_spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
         """Return the spectrum of a row at its planned positions, odd rows shifted back by `shift_mm`."""
         direction = plan.row(r).direction
         backlash_mm = shift_mm if r % 2 else 0.0
-        return _compute_spectrum(rows[r][:, ::direction], k, direction * travel + backlash_mm)
+        return _compute_spectrum(rows[r][:, ::direction], k, direction * travel_mm + backlash_mm)
 
     def sum_groups(shift_mm: float) -> NDArray[np.float64]:
         """Return sums over groups of rows: slope times difference, slope squared, power, power at the highest k."""

@@ -55,7 +55,7 @@ class Bench:
         return image
 
     def _map_rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
-        """Return rows [rx, position, sample] of the cube's file in the order of the stage: odd rows run backwards."""
+        """Yield the index and samples [rx, position, sample] of each row as the stage ran: odd rows run backwards."""
         cube = np.load(self.path, mmap_mode="r")
         for row in range(cube.shape[1]):
             yield row, cube[:, row, :: 1 - 2 * (row % 2)]

@@ -34,9 +34,9 @@ Complex = npt.NDArray[np.complex128]
 Integers = npt.NDArray[np.intp]
 
 ROWS = ("none", *NUISANCES, "all")
-# Pixels that are cut off at each edge of a plate.
+# Pixels that are cut off at each edge of a plate; chosen.
 EDGE_PX = 2
-# Groups of scenes for cross-validation.
+# Groups of scenes for cross-validation; chosen.
 FOLDS = 5
 
 
@@ -118,7 +118,7 @@ def learn_half_widths(features: Real, deviation: Real, row: Integers, scene: Int
     """Return half widths [plate] of intervals that hold 95 % of `deviation` [plate] in each row.
 
     `features` are [plate, feature]; `row` and `scene` [plate] are numbers. A scene's intervals are learnt from scenes
-    of other folds.
+    of other folds. Settings of the regression are chosen.
     """
     # They take a second to load.
     from sklearn.ensemble import HistGradientBoostingRegressor

@@ -27,7 +27,8 @@ from polysight_shared.units import us_to_ns
 # From edge to first pulse. A fixed delay, longer than the usual wake-up time, keeps the pulses of all positions at the
 # same distance behind their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
-# Timeout of waiting for an edge, after which the loop checks if it has to stop or to send a burst without an edge.
+# Timeout of waiting for an edge, after which the loop checks if it has to stop or to send a burst without an edge;
+# chosen.
 LOOK_UP_S = 0.1
 # The trigger wire is off if so many consecutive stage statuses came without an edge, while the stage passed at least
 # so many points; chosen: one status may come just before its edge.

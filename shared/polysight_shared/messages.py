@@ -21,7 +21,7 @@ WIRE_VERSION = "1.0"
 # Limits of `Pulse`: number of pulses, and duration, so that the reply arrives well before the timeout of a command.
 MAX_PULSES_AT_REST = 256
 MAX_PULSES_AT_REST_S = 2.0
-# The Pi closes the connection after a longer command.
+# The Pi closes the connection after a longer command; chosen.
 MAX_COMMAND_BYTES = 65_536
 # Longest heartbeat period of the host (chosen): a host that has died keeps others out for four periods.
 MAX_HEARTBEAT_MS = 10_000

@@ -194,7 +194,7 @@ def _draw_bad_positions(rng: Generator, rig: Rig, nuisances: Nuisances) -> NDArr
 
 
 def _add_runs(rng: Generator, marked: NDArray, share: float) -> NDArray:
-    """Mark runs of 1 to 20 positions in a row until at least this share is marked; changes and returns `marked`."""
+    """Mark runs of 1 to 20 (chosen) positions until at least this share is marked; changes and returns `marked`."""
     while marked.mean() < share:
         row = rng.integers(marked.shape[0])
         first = rng.integers(marked.shape[1])
@@ -257,7 +257,10 @@ def _draw_fringes(rng: Generator, rig: Rig) -> NDArray:
 
 
 def _draw_drift(rng: Generator, shape: tuple[int, int], nuisances: Nuisances) -> NDArray:
-    """Complex gain over the scan [rows, columns]: smooth in time, row after row; its span is what the nuisances say."""
+    """Complex gain over the scan [rows, columns]: smooth in time, row after row; its span is what the nuisances say.
+
+    The shape is chosen: a line, and 1, 2 and 3 half waves of falling size.
+    """
     time = np.arange(shape[0])[:, None] / shape[0] + np.arange(shape[1]) / (shape[0] * shape[1])
     gains = []
     for span in (nuisances.drift, np.radians(nuisances.drift_deg)):

@@ -149,6 +149,7 @@ class CosineTable:
 
     def __init__(self, stack: Stack, frequency_hz: float) -> None:
         cosines = np.linspace(0, 1, 513)
+        # At 0 the formula of r_p divides by it.
         cosines[0] = 1e-6
         tables = reflect(stack, frequency_hz, cosines)
         # Values, and their steps to the next place.

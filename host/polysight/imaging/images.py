@@ -326,20 +326,20 @@ def specular_point_m(antennas: Antennas, z_m: float) -> NDArray[np.float64]:
 
 
 def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -> tuple[NDArray[np.float64], float]:
-    """Return `moved_m` [2, 2] and `steepness_rad_m` of a board at its specular point on the plane at `z_m`."""
+    """Return H^-1 C (`moved_m`, [2, 2]) and k C (`steepness_rad_m`) of a board's specular point on the plane `z_m`."""
     tx = antennas.tx_m
     rx = antennas.rx_m.mean(axis=0)
     point = np.append(specular_point_m(antennas, z_m), z_m)
-    bend = np.zeros((2, 2))
+    hessian = np.zeros((2, 2))
     cosines = 0.0
     for antenna in (tx, rx):
         leg = point - antenna
         r = float(np.linalg.norm(leg))
         e = leg / r
-        bend += (np.eye(2) - np.outer(e[:2], e[:2])) / r
+        hessian += (np.eye(2) - np.outer(e[:2], e[:2])) / r
         cosines += float(e[2])
     wave = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
-    return np.asarray(np.linalg.inv(bend) * cosines, np.float64), wave * cosines
+    return np.asarray(np.linalg.inv(hessian) * cosines, np.float64), wave * cosines
 
 
 def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -> Images:
@@ -513,7 +513,7 @@ class ImageBuilder:
         pitch = self.grid.pixel_m
         moved_m = np.stack(shifts)
         steepness_rad_m = np.array(steep)
-        # Half of the second derivative of the phase with respect to the distance from the specular point, rad / m^2.
+        # k H / 2: half of the phase's second derivative by the distance from the specular point, rad / m^2.
         bend_rad_m2 = steepness_rad_m.mean() * np.diagonal(np.linalg.inv(moved_m.mean(axis=0))) / 2
         specular_m = np.mean([specular_point_m(a, z_m) for a in self._antennas], axis=0)
         offsets_m = scan_offsets_m(self.rig)

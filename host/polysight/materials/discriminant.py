@@ -256,7 +256,8 @@ class ErrorDiscriminant(Model):
     def _fit_patches(self, residual: Real, material: npt.NDArray, plate: npt.NDArray, dof: int) -> None:
         """Set `spread` and `between` from the residuals of patches [patches, d] with this number of degrees of freedom.
 
-        With few degrees of freedom correlations between features are shrunk.
+        With few degrees of freedom correlations between features are shrunk. With all channels the gain errors of H and
+        V are taken as equally large.
         """
         width = residual.shape[1]
         total = self._decorrelate_angles(_compute_covariance(residual, len(residual)))
@@ -302,6 +303,7 @@ class ErrorDiscriminant(Model):
         if self.channels == "V":
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
         log_h = np.log(np.maximum(h, 1e-6))[:, None] - self._anchor_h
+        # `relative` makes deviations of ln|H|, ln|V| and arg P of these of ln|H| and of t.
         return self._select_channels(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
 
     def _select_channels(self, every: Real) -> Real:

@@ -341,7 +341,7 @@ def _put_away(site: Site, scan: Named, typed: str) -> Path:
 
 
 def _check_free(site: Site) -> None:
-    """Refuse what needs the rig while a program that the list shows has it. Raises ScanError."""
+    """Raise ScanError while a scan of the list, or the doctor, uses the rig."""
     running = [s.name for s in site.scans.list() if s.state in ("running", "paused", "frozen") or _is_starting(site, s)]
     doctor = find_program(site.logs, "doctor")
     if running:

@@ -87,6 +87,7 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
     tx_m = optics.tx.at_m
     k = optics.wave_number
     solid = (shape.points, shape.normals, shape.curvature)
+    # Stage offsets: those of H's echoes, and those from which V sees the same points, to which its echoes are moved.
     seen_from = {"h": seen.h.at_m, "v": find_offset_that_sees(*solid[:2], seen.v.at_m, tx_m, optics.v.at_m)}
     b = []
     std = []

@@ -102,16 +102,17 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
         high_v = ant.centre_m[i] * 1e3 + np.max(table[:, i] + table[:, i + 2])
         spans.append(np.array([-half, half, low_v - half, high_v + half]) / 1e3 + [0, 0, -MARGIN_M, MARGIN_M])
     # The path changes fastest at the edges of the kernel and in the nearest plane (heights count away from the radars).
-    corners = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
+    # 9 x 9 kernel positions from edge to edge, x and y.
+    kernel_m = np.meshgrid(*(np.linspace(s[2] - FADE_M, s[3] + FADE_M, 9) for s in spans))
     wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
     nearest_z = ant.plane_z_m + min([0.0, *(p.height_mm for p in (*scene.plates, *scene.points))]) / 1e3
     axes = []
     for i, span in enumerate(spans):
         steepest = 0.0
         for rx in ant.rx_m:
-            slope = np.zeros_like(corners[0])
+            slope = np.zeros_like(kernel_m[0])
             for antenna in (ant.tx_m, rx):
-                distances_m = np.stack([corners[0] - antenna[0], corners[1] - antenna[1]])
+                distances_m = np.stack([kernel_m[0] - antenna[0], kernel_m[1] - antenna[1]])
                 slope += distances_m[i] / np.sqrt(
                     distances_m[0] ** 2 + distances_m[1] ** 2 + (nearest_z - antenna[2]) ** 2
                 )

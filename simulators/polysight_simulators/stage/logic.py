@@ -115,6 +115,7 @@ class StageLogic:
         # Why the motion is to end once the stage rests.
         self._stopping: StageError | None = None
         self._enabled = False
+        # A STOP, and a confirmed RESUME, that `service` still has to obey.
         self._stop = False
         self._resume = False
         # RESUME counts only when it comes twice in a row; True after the first.

@@ -69,7 +69,8 @@ def read_allowed(folder: Path) -> dict[str, str]:
 def make_keys(folder: Path, replace: bool = False) -> list[Path]:
     """Make `pi.key`, `pi.key_secret`, `host.key` and `host.key_secret`; secret files are readable by the owner only.
 
-    Returns the files. Raises ConfigError if there are keys already, unless `replace`.
+    Only the host is allowed then: keys of other clients leave the list. Returns the files. Raises ConfigError if there
+    are keys already, unless `replace`.
     """
     existing = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
     if existing and not replace:

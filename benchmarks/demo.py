@@ -120,7 +120,10 @@ def _list_parents() -> Iterator[tuple[int, int]]:
 
 
 def _make_seconds_line(name: str, value: float, limit: float, note: str) -> Line:
-    """Return a line of the table for seconds that must not exceed the limit, without another program to compare."""
+    """Return a line of the table for seconds that must not exceed the limit (`at_least` is the worst accepted value).
+
+    There is no other program to compare with.
+    """
     return Line(
         name, f"{value:.2f} s", theirs="", value=value, at_least=limit, aim=limit, higher_is_better=False, note=note
     )

@@ -6,7 +6,7 @@ tables of woods, rocks and solvents in the open literature), each piece drawn wi
 20 % in the loss. Dishes show liquids behind 3 mm of glass; sheets are 1 to 5 mm of real part 2 to 5 before air. All is
 simulated. For each kind of piece: names of the library said at 0.8 and at 0.9 (each is wrong), names of the literature
 said at 0.5, how many of them are of values within 15 % of the truth, possible layers, and pieces with a permittivity
-whose 99 % region misses while its half width is below 10 %.
+whose 99 % region misses while it claims to be known within 10 % (95 %).
 """
 
 from __future__ import annotations
@@ -36,8 +36,10 @@ LIQUIDS: dict[str, complex] = {
 KINDS = ("plates", "dishes", "sheets")
 # Squared distance within which a normal distribution in two dimensions holds 99 %.
 CHI2_99 = 9.21
-# A region whose relative half width is below this claims to know the value.
+# A permittivity whose relative half width (95 %) is below this claims to be known; chosen.
 NARROW = 0.10
+# Diameter of a dish; chosen: as wide as a plate.
+DISH_M = 0.046
 # Relative distance from the truth within which a name of the literature counts as alike; chosen.
 ALIKE = 0.15
 
@@ -56,7 +58,7 @@ class Piece:
     alike: bool
     # True if it was refused as a possible layer.
     thin: bool
-    # True if the 99 % region of its permittivity misses the truth and is narrow.
+    # True if the 99 % region of its permittivity misses the truth, and the half width is below `NARROW`.
     misled: bool
 
 
@@ -70,8 +72,8 @@ def draw_scene(rng: np.random.Generator, kind: str, first: int) -> World:
     elif kind == "sheets":
         real = rng.uniform(2, 5, 9)
         tangent = rng.uniform(0.002, 0.05, 9)
-        size_m = rng.uniform(1e-3, 5e-3, 9)
-        stacks = {f"sheet {k}": Stack(((real[k] * (1 - 1j * tangent[k]), size_m[k]),), 1.0) for k in range(9)}
+        thickness_m = rng.uniform(1e-3, 5e-3, 9)
+        stacks = {f"sheet {k}": Stack(((real[k] * (1 - 1j * tangent[k]), thickness_m[k]),), 1.0) for k in range(9)}
     else:
         stacks = {name: Stack(below=draw_piece(rng, eps)) for name, eps in LIQUIDS.items()}
     world = draw_world(rng, centre, materials=stacks, half_spaces=True)
@@ -82,7 +84,7 @@ def draw_scene(rng: np.random.Generator, kind: str, first: int) -> World:
         if plate.stack.is_metal:
             plates.append(plate)
         else:
-            plates.append(dish(plate.name, plate.centre_m, 0.046, plate.stack.below, wall_m=3e-3))
+            plates.append(dish(plate.name, plate.centre_m, DISH_M, plate.stack.below, wall_m=3e-3))
     return replace(world, plates=tuple(plates))
 
 
@@ -107,8 +109,8 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
         misled = False
         if patch.refused is None and e.value is not None and e.covariance is not None:
             deviation = np.array([(e.value - true).real, (e.value - true).imag])
-            width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
-            misled = float(deviation @ np.linalg.solve(e.covariance, deviation)) > CHI2_99 and width < NARROW
+            half_width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
+            misled = float(deviation @ np.linalg.solve(e.covariance, deviation)) > CHI2_99 and half_width < NARROW
         thin = patch.refused is not None and patch.refused.what == "possible layer"
         name = "not judged"
         source = None

@@ -63,6 +63,7 @@ def _make_rig(folder: Path, points: int) -> Instrument:
     """Return the rig file's rig with one row of so many points, and its devices and journals in `folder`."""
     rig = load_instrument(RIG)
     replace = msgspec.structs.replace
+    # Half of a row with steps of 2 mm lies before the stage's centre, and the run-up.
     stage = replace(rig.stage, port=str(folder / "tty"), centre_x_mm=points + 5.0, centre_y_mm=2.0)
     pi = replace(
         rig.pi, gpio_chip=str(folder / "chip"), one_shot=True, journal_dir=str(folder / "journal"),
@@ -111,6 +112,7 @@ def _measure(rig: Instrument, points: int, folder: Path, stack: ExitStack) -> di
     status = Path(f"/proc/{process.pid}/status").read_text().split()
     captures = [c for c, _ in rows.bursts]
     late_us = sorted((c.first_pulse_ns - c.edge_ns) / 1e3 for c in captures)
+    # Of the edges of a burst every second one rises.
     rises = [[e.t_ns for e in burst[::2]] for _, burst in rows.bursts]
     error_us = sorted(abs((b - a) / 1e3 - rig.burst.period_us) for burst in rises for a, b in pairwise(burst))
     high_us = sorted((b.t_ns - a.t_ns) / 1e3 for _, e in rows.bursts for a, b in zip(e[::2], e[1::2], strict=True))
@@ -201,6 +203,7 @@ class _Rows:
 
 def _read_cpu_s(pid: int) -> float:
     """Return the CPU seconds of a process so far."""
+    # After the name, which is in brackets, from the state on: utime and stime (proc(5)).
     user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
     return (int(user) + int(system)) * TICK_S
 

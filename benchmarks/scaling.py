@@ -51,6 +51,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure threads, then sizes; print both. Return 0."""
     rig, scene = published_scene()
     with temporary(args.folder) as folder:
+        # Two recorded rows of each board, which stand in turn for all rows.
         files: dict[str, list[Path]] = {}
         for name, rows in recorded_rows(rig, scene, 2).items():
             files[name] = [folder / f"{name}{i}.bin" for i in range(len(rows))]

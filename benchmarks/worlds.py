@@ -271,6 +271,7 @@ def analyse_world(
         known_scene = KnownScene(segmentation, metal, names)
     elif metal_name is not None:
         known_scene = KnownScene(metal=box_in_mm(plates[metal_name][1], pair))
+    # Amplitudes of these images are relative to the direct path.
     prior = RigPrior(THETA_STD_RAD, channels_known=True)
     if leakage is not None:
         # MOVED: probability that the mount has moved since its leakage was measured.
@@ -302,16 +303,21 @@ def match_plates(
     return out
 
 
+def number_name(name: str) -> int:
+    """Return a number of a name for seeds: unlike `hash` the same in every run."""
+    return sum(map(ord, name))
+
+
 def draw_pair(nuisance: str, seed: int, mixed: bool = False) -> generator.ImagePair:
     """Draw and scan one world of nine plates: one of copper, the others of materials of Table 2, as half spaces.
 
     `mixed`: a drawn share of the materials, between `LIBRARY_SHARE`, is of Table 2, others are of no library.
     """
-    rng = np.random.default_rng([seed, sum(map(ord, nuisance))])
+    rng = np.random.default_rng([seed, number_name(nuisance)])
     rig = generator.published_rig()
     materials = None
     if mixed:
-        materials = draw_mixed_materials(np.random.default_rng([seed, sum(map(ord, nuisance)), 2]))
+        materials = draw_mixed_materials(np.random.default_rng([seed, number_name(nuisance), 2]))
     world = generator.draw_world(rng, tuple(rig.centre_m), materials=materials, half_spaces=True)
     return generator.simulate(world, generator.draw_nuisances(rng, nuisance), rig)
 
@@ -342,7 +348,7 @@ def draw_calibration(nuisance: str, seed: int) -> tuple[tuple[complex, complex] 
 
     A rig that knew its leakage exactly would be better than its error bars say.
     """
-    rng = np.random.default_rng([seed, sum(map(ord, nuisance)), 1])
+    rng = np.random.default_rng([seed, number_name(nuisance), 1])
     into_h, into_v = LEAKAGE_STD * (rng.standard_normal(2) + 1j * rng.standard_normal(2))
     theta_error_rad = THETA_STD_RAD * float(rng.standard_normal())
     leakage = None if nuisance in UNMEASURED else (complex(into_h), complex(into_v))
@@ -365,6 +371,7 @@ def judge_world(nuisance: str, seed: int, searched: bool = False, mixed: bool = 
         verdict.level,
         tuple(f"{r.what}: {r.why}" for r in verdict.reasons),
         tuple(compare_with_plate(nuisance, patch, plate) for patch, plate in judged if not plate.stack.is_metal),
+        # Several patches may lie on one plate.
         missed=len(pixel_boxes(pair)) - len({plate.centre_m for _, plate in judged}),
         stray=len(analysis.patches) - len(judged),
     )

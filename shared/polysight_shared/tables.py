@@ -99,6 +99,7 @@ def _rewrite_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
         return f"the key {match[1]!r} is missing", ErrorCode.KEY_MISSING
     if match := re.fullmatch(r"Invalid enum value (.*)", rule):
         return f"{match[1]} is not an allowed value", ErrorCode.VALUE_INVALID
+    # Such as: Expected `int | null`, got `str`; Expected `float` > 0.0.
     match = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
     if match is None:
         return rule, ErrorCode.VALUE_INVALID

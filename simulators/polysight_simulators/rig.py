@@ -4,6 +4,7 @@
 
 Writes into DIR instrument.toml, the rig file with the addresses of these processes, truth.json, the truth of the scene
 (not with --pattern), reports of the cards, and logs. Prints `ready DIR/instrument.toml` when all processes are ready.
+The *wires* process relays edges of GPIO lines and the stage's motion between the others.
 SIGTERM, SIGINT or the end of a process ends all of them; SIGUSR1 switches all cards off and on. *Wire time* is the
 clock of the simulated signals: wall time times the time scale.
 """
@@ -46,6 +47,8 @@ STOP_TIMEOUT_S = 5.0
 UNO_TIME_SCALE = 2.0
 # Time between two looks if a process is ready; chosen.
 _POLL_S = 0.02
+# Time between two looks if a process of the ready rig has ended; chosen.
+_WATCH_S = 0.2
 # Start offset of the receivers: it puts the published rig's direct path in the middle of its IF window.
 _NATIVE_OFFSET_HZ = 790e3
 # Last lines of a log that an error shows; chosen.
@@ -61,6 +64,7 @@ def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
     A start offset in the rig file stays. The board's address follows in `move_to_free_subnet`.
     """
     names = [board["name"] for board in table["boards"]]
+    # A simulated board's USB serial number is its name.
     table["radar"] |= {"control": "native", "native": {name: {"usb_serial": name} for name in names}}
     for board in table["boards"]:
         if board["role"] != "transmit" and not board["start_offset_hz"]:
@@ -75,7 +79,7 @@ def _apply_if_offset(table: dict[str, Any], if_offset_hz: float) -> None:
 
 
 def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = False) -> Instrument:
-    """Derive the rig file of a simulated rig in `folder`: the scene's overrides, free addresses, paths.
+    """Derive the rig file of a simulated rig in `folder`: the scene's overrides, free addresses, paths, heartbeats.
 
     `native` overrides the radar control of the rig file; the scene's IF offset is then that of receivers without a
     start offset of their own. It is left out if the rig file itself has native control. Raises ConfigError if an
@@ -343,7 +347,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
     try:
         if not stop.is_set():
             announce_ready(str(folder / "instrument.toml"))
-        while not stop.wait(0.2):
+        while not stop.wait(_WATCH_S):
             processes.check()
             if power_cycle.is_set():
                 power_cycle.clear()

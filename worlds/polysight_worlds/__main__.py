@@ -1,6 +1,7 @@
 """Draw a scene and write its images: `python -m polysight_worlds --seed 1 --out scene.npz`.
 
-Writes the arrays h, v, x_m, y_m, incidence_deg, simulated and, beside them, a JSON file of what is true.
+Writes the arrays h, v, x_m, y_m, incidence_deg, simulated and, beside them, a JSON file of what is true. *Nuisances*
+disturb the scan: noise, leakage, errors of position and others.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="file that ends in .npz")
     parser.add_argument("--nuisances", nargs="+", default=["none"], help=f"none, all, or of: {', '.join(NUISANCES)}")
-    parser.add_argument("--strength", type=float, default=1.0, help="factor on what is drawn")
-    parser.add_argument("--half-spaces", action="store_true", help="no thin plates")
+    parser.add_argument("--strength", type=float, default=1.0, help="factor on the nuisances drawn")
+    parser.add_argument("--half-spaces", action="store_true", help="plates are half spaces: none is thin")
     parser.add_argument("--table", action="store_true", help="a table behind the plates")
     parser.add_argument("--rig", type=Path, help="instrument.toml; without it, the published rig")
     options = parser.parse_args(arguments)

@@ -47,7 +47,7 @@ def reflect(stack: Stack, frequency_hz: ArrayLike, cos_incidence: ArrayLike) -> 
     # Vertical wave numbers over k0. The principal root of eps' - j eps'' decays downwards.
     kz = [np.sqrt(complex(eps) - (1 - cos_incidence**2) + 0j) for eps in permittivities]
     kz[0] = cos_incidence + 0j
-    # Phase over each layer. Air and half space have none: their values do not matter.
+    # Factor of the wave's phase and decay over each layer. Air and half space have none: their values do not matter.
     delays = [np.ones_like(kz[0])]
     for (_, thickness_m), root in zip(stack.layers, kz[1:-1], strict=True):
         delays.append(np.exp(-1j * k0 * root * thickness_m))

@@ -123,16 +123,17 @@ def scan_shapes(
     nominal = published_boards() if boards is None else boards
     true_boards = disturb_boards(nominal, nuisances)
     cubes = record_shapes(shapes, true_boards, frequencies_hz, offsets_m)
-    gains = np.random.default_rng([nuisances.seed, 12])
-    noise = np.random.default_rng([nuisances.seed, 13, number])
+    gain_rng = np.random.default_rng([nuisances.seed, 12])
+    noise_rng = np.random.default_rng([nuisances.seed, 13, number])
     # Each of the fewer frequencies stands for several samples of the chirp, whose noise averages.
     sigma = nuisances.noise * NOISE_A_SAMPLE * np.sqrt(len(frequencies_hz) / SAMPLES)
     for channel, cube in cubes.items():
-        level_db = gains.normal()
-        phase = gains.uniform(0, 2 * np.pi)
+        level = gain_rng.normal()
+        phase = gain_rng.uniform(0, 2 * np.pi)
         if nuisances.gain_db:
-            cube *= np.complex64(10 ** (nuisances.gain_db * level_db / 20) * np.exp(1j * phase))
-        pair = noise.standard_normal((2, *cube.shape), dtype=np.float32)
+            cube *= np.complex64(10 ** (nuisances.gain_db * level / 20) * np.exp(1j * phase))
+        # Real and imaginary part.
+        pair = noise_rng.standard_normal((2, *cube.shape), dtype=np.float32)
         cubes[channel] = cube + np.float32(sigma * np.sqrt(0.5)) * (pair[0] + 1j * pair[1])
     return cubes
 

@@ -44,6 +44,8 @@ from polysight_shared.errors import ScanError
 PLATE_MM = 45.0
 GRID = {"columns": 49, "rows": 49, "step_x_mm": 10.0, "step_y_mm": 6.0}
 """The sparse aperture of `examples/nine-materials.toml`, explained there."""
+# Distance of the object plane there: 55 degrees of incidence.
+PLANE_MM = 499.0
 
 
 def plate(name: str, eps: complex | None, x_mm: float, y_mm: float) -> dict[str, Any]:
@@ -63,7 +65,7 @@ def simulate_scan(
 
     `more` are further keys of the scene file. Raises ScanError.
     """
-    content = {"name": name, "seed": seed, "object_distance_mm": 499.0, "grid": GRID, "plates": list(plates)} | more
+    content = {"name": name, "seed": seed, "object_distance_mm": PLANE_MM, "grid": GRID, "plates": list(plates)} | more
     with tempfile.TemporaryDirectory(prefix="polysight-reproduce-") as temporary:
         file = Path(temporary) / "scene.toml"
         folder = Path(temporary) / "scan"
@@ -132,7 +134,7 @@ class ScanView:
 
 
 @cache
-def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = 499.0) -> ScanView:
+def view_scan(name: str, rows: tuple[int, ...], run: Run, distance_mm: float = PLANE_MM) -> ScanView:
     """Scan plates with the permittivities of these rows of Table 2, and a copper plate in the middle.
 
     `rows`: eight at most. `distance_mm`: of the object plane.
@@ -188,7 +190,7 @@ def _label_plates(ax: Any, scan: ProcessedScan) -> None:
 
 
 def _compute_opacity(scan: ProcessedScan) -> npt.NDArray[np.float64]:
-    """Return the opacity of P, [y, x]: 0 from 20 dB below metal on, where noise begins, 1 from 14 dB on."""
+    """Return the opacity of P, [y, x]: 0 at a level of -20 dB of metal and below (noise), 1 at -14 dB and above."""
     power = (np.abs(scan.h).astype(np.float64) ** 2 + np.abs(scan.v).astype(np.float64) ** 2) / 2
     power = np.nan_to_num(power)
     # The smaller of a pixel's power and its surroundings': neither a single bright pixel nor a dark one beside a plate

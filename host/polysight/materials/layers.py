@@ -449,7 +449,11 @@ class _Solution:
 
 
 def _drop_repetitions(solutions: Sequence[_Solution], level: float, relative: float) -> list[_Solution]:
-    """Return solutions up to a chi-square `level`, without repetitions (closer than `relative`), best first."""
+    """Return solutions up to a chi-square `level`, without repetitions, best first.
+
+    A repetition has all unknowns closer to another's than the share `relative` of the value; 0.1 (chosen) stands for a
+    smaller one.
+    """
     distinct: list[_Solution] = []
     for solution in solutions:
         if solution.chi2 <= level and all(
@@ -507,6 +511,7 @@ class _Model:
         Only every `thin`-th frequency of each sub-band is computed.
         """
         x = np.asarray(x, np.float64)
+        # [..., 1, 1, n]: with axes of sub-band and frequency.
         wide = x[..., None, None, :]
         eps: list[npt.ArrayLike] = [
             wide[..., 0] - 1j * wide[..., 1] if i == self.layer_index else complex(layer.permittivity or 1.0)
@@ -563,10 +568,9 @@ class _Model:
         # A few frequencies of a sub-band are enough for start values.
         chi2[~outside] = np.sum(self.residuals(grid[~outside], thin=6) ** 2, axis=-1)
         valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~outside
-        # Cells of the grid, not refractive indices.
-        index = np.argwhere(valleys)
-        order = np.argsort(chi2[tuple(index.T)])[:STARTS]
-        return [grid[tuple(cell)] for cell in index[order]]
+        cells = np.argwhere(valleys)
+        order = np.argsort(chi2[tuple(cells.T)])[:STARTS]
+        return [grid[tuple(cell)] for cell in cells[order]]
 
     def _differentiate(self, x: Real) -> Real:
         """Return the Jacobian of the residuals, [data, n], by central differences."""

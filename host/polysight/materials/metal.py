@@ -167,8 +167,8 @@ def log_evidence_of_dielectric(
 class _DielectricReference(SceneLikelihood):
     """Likelihood of a scene whose reference is a dielectric of unknown permittivity instead of metal.
 
-    A particle has two more columns than in the base class, standard normal, too: for eps' and for the loss tangent of
-    the reference.
+    `z` [..., width] are particles: samples of all unknowns as standard normal variables. They have two columns more
+    than in the base class, for eps' and for the loss tangent of the reference.
     """
 
     width = WIDTH + 2
@@ -212,7 +212,8 @@ class _DielectricReference(SceneLikelihood):
         size = np.abs(reference)
         measured = half_spaces.t / reference
         # The measured ratio is t / t0, so its density is |t0|^2 that of t. A plate may also be of the material of the
-        # reference, with the prior probability of metal beside metal.
+        # reference, with the prior probability of metal beside metal: its ratio is then 1, with this variance of real
+        # and imaginary part each.
         variance = METAL_SPREAD**2 + self.own_variance
         of_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
         of_some_kind = parts[..., 1:] + 2 * np.log(size)

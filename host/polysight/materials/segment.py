@@ -194,6 +194,7 @@ def make_patch(
         float(x[cols].max() + half),
         float(y[rows].max() + half),
     )
+    # The longest contour is the outer one; 1 is the padding.
     contour = max(skimage.measure.find_contours(padded.astype(np.float64), 0.5), key=len) - 1
     outline = np.column_stack([np.interp(contour[:, 1], range(x.size), x), np.interp(contour[:, 0], range(y.size), y)])
     return Patch(label, box, drop_corners(outline, pixel / 2), int(mask.sum()), mask, interior)
@@ -236,8 +237,9 @@ def segment(
     The steps are total variation against speckle, a falling threshold on the level in dB, morphological opening,
     connected components (scikit-image), each cut at half of its own amplitude. Otsu's threshold gives the background.
 
-    `h` and `v` complex [ny, nx] are flattened by the footprint; their gains may differ. `valid` bool [ny, nx] are the
-    pixels to use, None all finite ones. The result has no patches if bright and dark cannot be separated.
+    `h` and `v` complex [ny, nx] are divided by the antennas' footprint (equal brightness everywhere); their gains may
+    differ. `valid` bool [ny, nx] are the pixels to use, None all finite ones. The result has no patches if bright and
+    dark cannot be separated.
 
     Raises DataError if shapes differ or no pixel is valid.
     """
@@ -493,6 +495,7 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     # To a twentieth of a pixel (chosen). The type stub knows only the default's type, but None is documented.
     options: dict[str, Any] = {"upsample_factor": 20, "normalization": None}
     registration = skimage.registration.phase_cross_correlation(edges_h, edges_v, **options)
+    # The shift that moves V onto H: rows, columns.
     back_px = np.asarray(registration[0], np.float64)
     pixel_mm = abs(float(images.x_m[1] - images.x_m[0])) * 1e3
     apart_mm = -back_px[::-1] * pixel_mm
@@ -529,6 +532,7 @@ def reduce_variation(level: Real, weight: float) -> Real:
 
     It minimises half the squared distance from `level` plus `weight` times the sum of the gradient's magnitude.
     """
+    # Dual field, one plane for each direction of the gradient, and what is added to the image.
     field = np.zeros((2, *level.shape))
     gradient = np.zeros_like(field)
     change = np.zeros_like(level)
@@ -580,8 +584,8 @@ def drop_corners(outline: Real, tolerance: float) -> Real:
 class TruthPlate:
     """A rectangular plate of the true scene.
 
-    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, strips and stacks of layers;
-    thickness, None if it is not given; `metal`: the plate is metal.
+    Box in millimetres from the image centre; permittivity eps' - j eps'', None for metal, metal strips (they measure
+    leakage) and stacks of layers; thickness, None if it is not given; `metal`: the plate is metal.
     """
 
     name: str

@@ -310,6 +310,7 @@ class RowSynchroniser:
         rig = self._source.instrument
         chirp_bytes = rig.frame_bytes // rig.burst.chirps
         for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * chirp_bytes):
+            # Without a list of missing bytes: `synchronise` finds the valid chirps.
             yield row_words(piece, (), piece.size // chirp_bytes, rig.chirp.samples, len(rig.antennas.rx_mm))[0]
 
     @property
@@ -625,7 +626,8 @@ def _average_direct_path(
 
 def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[float, float]:
     """Return the smallest and largest excess path of echoes from the object plane."""
-    dx, dy = (m.ravel() for m in np.meshgrid(*2 * [np.linspace(-1, 1, 9) * _SPREAD_M]))
+    offsets_m = np.linspace(-1, 1, 9) * _SPREAD_M
+    dx, dy = (m.ravel() for m in np.meshgrid(offsets_m, offsets_m))
     excess = excess_path_m(tx, rx, np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1))
     return float(excess.min()), float(excess.max())
 

@@ -53,7 +53,7 @@ R = TypeVar("R", bound=m.AnyReply)
 class HostHeartbeat:
     """Sends `Alive` for run `scan_id` every `interval_s` while this process lives, in its own thread and socket.
 
-    `owner` as in `BeginRun`.
+    `scan_id` is "" for a jog. `owner` as in `BeginRun`.
     """
 
     def __init__(

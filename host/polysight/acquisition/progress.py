@@ -84,8 +84,8 @@ def _yield_to_capture() -> None:
 class ScanProgress:
     """Progress of a scan.
 
-    `phase` is check, connect, home, row, state, held, wait, committed, retake, warning, stop or end; `message` is for
-    people; `state` is the row's (docs/spec/row.md).
+    `phase` is check, connect, home, row, state, held (the stage, by a command), wait (for processing, disk or stage, or
+    paused), committed, retake, warning, stop or end; `message` is for people; `state` is the row's (docs/spec/row.md).
     """
 
     phase: str

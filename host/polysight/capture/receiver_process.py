@@ -147,6 +147,7 @@ class Receiver:
             return self._begin(request)
         if isinstance(request, messages.EndRow):
             return self._end(request)
+        # A `Report`: the request for the progress.
         if self._row is None:
             return messages.Progress(-1, 0, 0, False, 0)
         self._row.not_before_ns = request.not_before_ns or self._row.not_before_ns
@@ -229,13 +230,14 @@ class Receiver:
         begun = row.request
         log = row.log
         path = Path(row.request.path)
-        dropped = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
+        # Names of the status bits by which the card reports data lost before its packets were numbered.
+        loss_bits = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
         not_before_ns = max(request.not_before_ns, row.not_before_ns)
-        evidence = Evidence(begun.expected_bytes, begun.frame_bytes, not_before_ns, dropped, row.past)
-        placed, out = place_record(log, begun.frame_bytes, row.past, not_before_ns, dropped)
+        evidence = Evidence(begun.expected_bytes, begun.frame_bytes, not_before_ns, loss_bits, row.past)
+        placed, payload = place_record(log, begun.frame_bytes, row.past, not_before_ns, loss_bits)
         self._past = placed.past
         self._memory = log.payload
-        crc = row.segment.finish(out)
+        crc = row.segment.finish(payload)
         facts = {"row": begun.row, "take": begun.take, **placed.facts(), "card_status": request.card_status}
         index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
         counts = vars(placed.counts).copy()

@@ -18,7 +18,7 @@ SCAN_COMMANDS = ("pause", "continue", "stop", "abort")
 
 
 def add_commands(add: Add) -> None:
-    """Register the commands."""
+    """Register the commands: name, function (`module.function`: loaded when it is run), help, example, main options."""
     _add_serve(add)
     _add_lists(add)
     _add_results(add)

@@ -163,7 +163,7 @@ def check_receivers(context: CheckContext) -> Finding:
         losses.append(f"{r.mbit_s:.0f} Mbit/s a card: {loss}")
     observed = f"receivers ({scheduling}) with all cores busy: {'; '.join(losses)}"
     facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
-    # Packets/s; `card_rates` lists it too. Rates above that of this rig's cards are for information.
+    # Packets/s, one of the ascending `rates`. Those above that of this rig's cards are for information.
     card_rate = 1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)
     rates_of_cards = results[: rates.index(card_rate) + 1]
     if any(r.lost for r in rates_of_cards):

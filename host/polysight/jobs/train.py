@@ -167,6 +167,7 @@ def _read_optics(saved: ProcessedScan) -> Optics:
     path = saved.folder / SCAN
     if rig is None:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
+    # "one": the same incidence angle for all pixels.
     optics = Optics.from_rig(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
     budget = (saved.materials and saved.materials.error_budget) or None
     if budget is None or budget.incidence is None or budget.leakage is None:
@@ -274,8 +275,8 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
             scenes_drawn = list(product(files, range(times)))
-            labels = [f"simulating and imaging {file.name}, specimens {again}" for file, again in scenes_drawn]
-            for file, again in steps(scenes_drawn, labels):
+            texts = [f"simulating and imaging {file.name}, specimens {again}" for file, again in scenes_drawn]
+            for file, again in steps(scenes_drawn, texts):
                 folder = Path(temporary) / f"{file.stem}-{again}"
                 command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
                 if run_simulator([*command, "--specimens", str(again)]):

@@ -98,11 +98,12 @@ def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]
     """Return the mean power over RX and positions against excess path, relative to the direct path at 0.
 
     An echo of excess path d is `exp(+j 2 pi f d / c)` (sync/chain.py), so a Fourier transform along the linear
-    samples, Hann-windowed, has it at bin `d N df / c` (N is `FFT_POINTS`). Returns dB, float64 [n] as `excess_m`, no
-    less than `PROFILE_FLOOR_DB`, and that where no position is valid.
+    samples, Hann-windowed, has it at bin `d N df / c` (N is `FFT_POINTS`), counted modulo N for d < 0. Returns dB,
+    float64 [n] as `excess_m`, no less than `PROFILE_FLOOR_DB`, and that where no position is valid.
     """
     first, last = (chirp.first_sample_hz + chirp.hz_per_sample * n for n in chirp.linear_samples)
     linear = (row.sweep_hz >= first) & (row.sweep_hz < last)
+    # [RX, position, frequency]
     samples = row.samples[:, row.valid][..., linear]
     if not samples.size:
         return np.full(excess_m.size, PROFILE_FLOOR_DB)
@@ -162,6 +163,7 @@ class RowViewer:
                 continue
             row, take = waiting[0]
             try:
+                # "read": samples that processing kept are used, and none are written.
                 pipeline = pipeline or Pipeline(self._source, live=True, samples="read")
                 self._add(pipeline, row, take, draws=len(waiting) == 1)
             except PolysightError as e:
@@ -419,7 +421,8 @@ class Watch:
     """Follows a scan folder, which may not exist yet, in a thread of its own, and writes nothing.
 
     `control`: pages may offer to pause and stop the scan. `lapse_s` is the timeout of the scan program's signs of life.
-    Pages are sent `state` (a `Snapshot`) and `motion` as JSON; `shown` has the pictures.
+    Pages are sent `state` (a `Snapshot`: status, rows, boards) and `motion` (place of the stage, point, time left) as
+    JSON; `shown` has the pictures.
     """
 
     def __init__(self, folder: Path, control: bool = False, lapse_s: float = LAPSE_S) -> None:
@@ -554,10 +557,12 @@ class Watch:
         if life is None:
             patience_s = GRACE_S
             if self._history is not None and self._history.row_seconds is not None:
-                patience_s = max(GRACE_S, UNATTENDED_ROWS * self._history.row_seconds[0])
+                row_s, _ = self._history.row_seconds
+                patience_s = max(GRACE_S, UNATTENDED_ROWS * row_s)
             is_alive = now - self._grown_at < patience_s
         else:
             is_alive = not killed and now - self._life_at < self._lapse_s
+        # Unix time of the last sign of life; not needed while there are some.
         alive_s = 0
         if not is_alive:
             alive_s = round(life_s or self._manifest.file.modified_s)

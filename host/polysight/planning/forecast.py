@@ -44,6 +44,8 @@ SIMULATED_DIRECT_SNR_DB = 5.5
 _PUBLISHED_SPEED_MM_S = 20.0
 # Loss by the motion during a burst from which on the forecast warns (chosen).
 _MAX_BURST_LOSS_DB = 0.5
+# Share of the time with chirps below which more pulses are suggested (chosen).
+_LEAST_DUTY = 0.5
 # The window that polysight.imaging.ImageBuilder uses.
 _FAST_TIME_WINDOW = "hann"
 
@@ -240,7 +242,7 @@ def forecast(
     row_overhead_s: float = ROW_OVERHEAD_S,
     scene_mm: tuple[float, float] | None = None,
 ) -> Forecast:
-    """Predict a scan of a rig file to which `Changes` were applied.
+    """Predict a scan of a rig file; of a plan, with the plan's changes in it.
 
     `noise`: default the simulated rig's. `row_overhead_s`: standstill for each row apart from motion. `scene_mm`: width
     and height of the scene in the object plane; default: the image's.
@@ -283,7 +285,7 @@ def predict_burst(rig: Instrument) -> BurstForecast:
     travel_mm = stage.speed_mm_s * burst_duration_s(rig.burst)
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * sum(rig.chirp.linear_samples) / 2
     half_m = (grid.columns - 1) / 2 * grid.step_x_mm / 1e3
-    # Turn of the echo's phase during the burst, at the aperture's end; an average over it is a sinc.
+    # Turn of the echo's phase during the burst, at the aperture's end in x (axis 0); an average over it is a sinc.
     change_rad = travel_mm / 1e3 * abs(imaging.PhaseSlope(rig, 0).slope(half_m, middle_hz))
     average = abs(np.sinc(change_rad / (2 * np.pi)))
     return BurstForecast(
@@ -394,7 +396,7 @@ def _check_burst(rig: Instrument, burst: BurstForecast) -> Iterator[Finding]:
             f" echoes at the aperture's ends lose {burst.edge_loss_db:.1f} dB in the average; use fewer or faster"
             " pulses",
         )
-    if rig.burst.pulses > 1 and burst.duty < 0.5:
+    if rig.burst.pulses > 1 and burst.duty < _LEAST_DUTY:
         text = f"the radars are idle for {1 - burst.duty:.0%} of a row: up to {max_pulses} pulses a position take no"
         yield _note("idle", f"{text} extra time")
     if rig.burst.chirps_a_position == 1:

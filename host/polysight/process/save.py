@@ -199,6 +199,7 @@ def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsRes
     save_images(out, scan)
     boxes = make_labels(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / products.LABELS, pack_labels(boxes))
+    # `stamped`: the scan is simulated, or it is not known.
     write_atomically(out / PATCHES, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
     products.write_json(out / products.MATERIALS, scan.materials)
     write_report(out, scan)

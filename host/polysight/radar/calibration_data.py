@@ -2,8 +2,7 @@
 
 Each power-up calibrates RX gains and filters slightly differently; restored values stay the same. There is one file for
 each die (chip) and each set of settings. Only the calibrations that TI recommends are restored; clocks and synthesizers
-calibrate at every start. "ICD 70" is page 70 of the document that `messages` names. In this file `e` is the module
-`messages`. Not run on hardware yet.
+calibrate at every start. "ICD 70" is page 70 of the document that `messages` names. Not run on hardware yet.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from polysight.radar import messages as e
+from polysight.radar import messages
 from polysight.radar.commands import Command
 from polysight.radar.link import Link
 from polysight_shared.error_codes import ErrorCode
@@ -142,6 +141,7 @@ def read_calibration(link: Link, name: str) -> bytes:
     data = b""
     for part in range(PARTS):
         blocks = link.call(SaveCalibration(part)).blocks
+        # Four bytes come before the data: the number of parts, and that of this one.
         if not blocks or len(blocks[0].data) != PART_BYTES + 4:
             raise DeviceError(
                 f"{name}: the answer has no calibration data",
@@ -160,7 +160,9 @@ def read_calibration(link: Link, name: str) -> bytes:
     return data
 
 
-def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, note: Callable[[e.Event], None]) -> str:
+def restore_calibration(
+    link: Link, name: str, data: bytes, timeout_s: float, note: Callable[[messages.Event], None]
+) -> str:
     """Send a board the calibration of an earlier start and exclude it from the next RF init; return a description.
 
     `note` is called with every event until the board has taken it over, for at most `timeout_s`. Raises DeviceError if
@@ -170,7 +172,7 @@ def restore_calibration(link: Link, name: str, data: bytes, timeout_s: float, no
     selected_data = struct.pack("<2I", RESTORED, RESTORED) + data[8:]
     for part in range(PARTS):
         link.call(RestoreCalibration(part, selected_data[PART_BYTES * part : PART_BYTES * (part + 1)]))
-    event = link.wait_for((e.RF_INIT_DONE,), timeout_s, note)
+    event = link.wait_for((messages.RF_INIT_DONE,), timeout_s, note)
     passed = event.values.get("passed")
     if not isinstance(passed, int) or passed & RESTORED != RESTORED:
         raise DeviceError(

@@ -123,7 +123,8 @@ def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmw
     """Create a board of a rig with its word link and firmware."""
     native = rig.radar.native[name]
     commands = program(rig, rig.by_name(name))
-    settings = b"".join(command.block().data for command in (*commands.basic, *commands.waveform))
+    # Calibration data is kept for one chip with the same settings.
+    settings = b"".join(sent.block().data for sent in (*commands.basic, *commands.waveform))
     folder = rig.radar.calibration_dir
     calibration = None
     if folder:
@@ -264,6 +265,7 @@ class NativeRadars(RadarControl):
         """Raise DeviceError if two boards have the same die id, so that two names refer to one board."""
         names_by_die: dict[object, str] = {}
         for name, board in self._boards.items():
+            # Zeros (`NO_DIE`), as a chip without an id gives them, do not identify it.
             die = board.facts.die_id or name
             if die != NO_DIE and die in names_by_die:
                 raise DeviceError(

@@ -286,6 +286,7 @@ class TraceLine(msgspec.Struct, omit_defaults=True):
     """
 
     t: Annotated[float, msgspec.Meta(ge=0, le=_MAX_S)]
+    # Signal of the board that was set or has changed.
     line: Literal["HOST_INTR", "NRST"] | None = None
     level: Literal[0, 1] | None = None
     # Queries of the interrupt with the former level, since the line before.

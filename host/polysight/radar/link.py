@@ -109,7 +109,7 @@ class Link:
     def call(self, command: Command, *, timeout_s: float = RESPONSE_TIMEOUT_S, remaining: int = 0) -> messages.Message:
         """Send a command, with retries, and return the device's answer; `remaining` chunks follow it.
 
-        RF power-up is never sent twice.
+        RF power-up is never sent twice (ICD 20).
 
         Raises DeviceError if the device does not answer or refuses the command.
         """
@@ -323,6 +323,7 @@ def _is_answer(message: messages.Message, request: messages.Message) -> bool:
     if request.direction is messages.Direction.HOST_TO_RF:
         reply_direction = messages.Direction.RF_TO_HOST
     is_from_device = message.direction in (messages.Direction.RF_TO_HOST, messages.Direction.MAIN_TO_HOST)
+    # A refusal without a body.
     if message.error == (None, None) and message.sequence == 0 and is_from_device:
         return True
     if message.kind is not messages.Kind.RESPONSE or message.direction is not reply_direction:

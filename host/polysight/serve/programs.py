@@ -157,8 +157,8 @@ class Queue:
         self._start = start
         self._list_states = list_states
         self._held = ""
-        # Unfinished scans that hold nothing: they were so at the last look, or when a person was at the queue.
-        # None: all but the newest, which may have ended while the server was restarted.
+        # Unfinished scans that do not hold the queue, because they were unfinished already at the last look, or when a
+        # person added or released. None: all but the newest, which may have ended while the server was restarted.
         self._seen: set[str] | None = None
         self._lock = threading.Lock()
         self._ended = threading.Event()

@@ -82,6 +82,7 @@ def time_sizes(folder: Path, files: dict[str, list[Path]], largest: float) -> li
         if size > largest:
             break
         grid = {"columns": columns, "rows": count, "step_x_mm": step_x, "step_y_mm": step_y}
+        # "batch": all rows, then the images; not images after every row.
         chain = Chain(folder, "batch", {"files": names, "grid": grid})
         figures = chain.run()
         memory = chain.end()

@@ -222,7 +222,10 @@ class EdgeTimes:
         return f"a spurious edge: {edges} edges came before {points} points were passed"
 
     def judge(self, was_held: bool, done_ns: int) -> str:
-        """Judge a row whose counts are right, with its `done` written by `done_ns`; return what is wrong, or ""."""
+        """Judge a row whose counts are right, with its `done` written by `done_ns`; return what is wrong, or "".
+
+        `was_held`: the stage says in its `done` that it was held.
+        """
         for points, written_ns in self._statuses:
             latest_ns = written_ns + round(STATUS_TOLERANCE * self._interval_s * 1e9)
             edges = bisect_right(self._edges_ns, latest_ns)
@@ -269,6 +272,7 @@ class EdgeTimes:
             return ""
         if late_s < 0:
             kind = "a spurious or early edge"
+        # Several intervals in one, each with its tolerance.
         elif lost_edges and abs(late_s - lost_edges * self._interval_s) <= (lost_edges + 1) * tolerance_s:
             kind = f"{lost_edges} edges lost"
         else:

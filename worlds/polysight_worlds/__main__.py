@@ -48,6 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
     rig = load_rig(options.rig) if options.rig else published_rig()
     centre_m = float(rig.centre_m[0]), float(rig.centre_m[1])
     world = draw_world(rng, centre_m, half_spaces=options.half_spaces, with_table=options.table)
+    # "none" and "all" are words of their own, not names in a list.
     names = options.nuisances[0] if len(options.nuisances) == 1 else options.nuisances
     nuisances = draw_nuisances(rng, names, strength=options.strength)
     save(simulate(world, nuisances, rig), options.out)

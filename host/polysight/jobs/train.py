@@ -271,6 +271,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         check_labelled(folder)
     if files:
         check_scenes(files, config)
+    # `steps` prints each text before the work on it, and its duration.
     scans = [training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:

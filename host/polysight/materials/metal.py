@@ -454,12 +454,13 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     levels = [float(np.median(np.abs(channel[metal]))) if metal.any() else 0.0 for channel in (images.h, images.v)]
     if min(levels) <= 0:
         return Halo()
+    # |H| and |V| over those of the metal.
     relative = [np.abs(channel) / level for channel, level in zip((images.h, images.v), levels, strict=True)]
     metal_mask = next((p.mask for p in patches if (p.mask & metal).any()), metal)
     plates = np.logical_or.reduce([metal_mask, *(p.mask for p in patches)])
     other_plates = [patch for patch in patches if patch.interior.any() and not (patch.mask & metal).any()]
-    strongest = max((float(np.median(relative[1][patch.interior])) for patch in other_plates), default=0.0)
-    if OVERDRIVING * strongest > 1:
+    strongest_v = max((float(np.median(relative[1][patch.interior])) for patch in other_plates), default=0.0)
+    if OVERDRIVING * strongest_v > 1:
         return Halo()
     free = images.usable & (_measure_distance_mm(plates, pixel_mm) > AROUND_MM[0])
     level = _measure_excess(relative, free, metal_mask, HALO_MM, pixel_mm)

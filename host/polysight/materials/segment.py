@@ -295,7 +295,7 @@ def touches_border(mask: Mask) -> bool:
 def _is_cut(mask: Mask, smallest_px: float) -> bool:
     """Return true if more than the smallest patch's width lies at the border of the image.
 
-    Where the scan ends within the image, the footprint falls slowly: interiors end before it.
+    An end of the scan within the image cuts none: there the footprint falls slowly, and interiors end before it.
     """
     at_border = mask.copy()
     at_border[1:-1, 1:-1] = False

@@ -393,6 +393,7 @@ def _reference_halves(
     """Return the halves of some positions' bursts as averages, referenced like `samples`: [position, 2, rx, block]."""
     blocks = aligned.halves.shape[-1]
     frequency = referenced.frequency[positions] - aligned.centre[positions]
+    # What removes the rest of the direct path's frequency (cycles a sample) and its phase, [position, block].
     turn = phasor(-frequency * FOLD, -np.angle(referenced.amplitude[positions]), blocks, (blocks - 1) / 2)
     scale = half_scale(aligned.good[positions].sum(axis=1))[..., None, None]
     return complex64(aligned.halves[positions] * (scale * (referenced.steering * turn[:, None])[:, None]))

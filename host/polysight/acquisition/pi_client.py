@@ -113,7 +113,8 @@ class PiClient:
         self._address = instrument.pi.command_address
         self._event_address = instrument.pi.event_address
         self._timeout_s = instrument.limits.command_timeout_s
-        # Silence on both sockets after which the Pi is asked if it still answers: ten of its heartbeats.
+        # Silence on both sockets after which the Pi is asked if it still answers: ten of its heartbeats, and no less
+        # than a command's timeout.
         self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
         self._on_event: Callable[[m.AnyEvent], object] = lambda _: None
         keys = Path(instrument.pi.key_dir)

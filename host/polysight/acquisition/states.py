@@ -1,8 +1,9 @@
 """The states of a scan as people read them: the one table that page, list, terminal and `polysight ask` speak from.
 
 Each state has a colour, words, the buttons that may be pressed, and phrases that are never shown with it. Words in
-braces are filled in: `{folder}`, `{safe}` (rows that are safe), `{asker}` (who pressed the button), and what the
-state is about. `{since}` is filled in by the page, as the time since the status's `since_s`.
+braces are filled in: `{folder}`, `{safe}` (rows that are safe), `{gaps}` (that all are, and how many with gaps),
+`{asker}` (who pressed the button), `{now}` (the row being scanned), and what the state is about. `{since}` is filled in
+by the page, as the time since the status's `since_s`.
 """
 
 from __future__ import annotations

@@ -243,6 +243,7 @@ class Receiver:
         counts = vars(placed.counts).copy()
         losses = vars(placed.losses)
         arrivals = placed.arrivals
+        # The other counts and losses have the names that `RowCapture` gives them.
         counts["packets"] = counts.pop("placed")
         first_arrival_ns = 0
         last_arrival_ns = 0

@@ -18,7 +18,15 @@ from polysight.materials import Library, classify
 from polysight.materials.library import Entry
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_papers.sensys2026 import dataset_items as authors_items
-from polysight_papers.sensys2026.dataset import IMAGES, LABELS, MATERIALS, find_row, read_authors, read_names
+from polysight_papers.sensys2026.dataset import (
+    IMAGES,
+    LABELS,
+    MATERIALS,
+    AuthorsData,
+    find_row,
+    read_authors,
+    read_names,
+)
 from polysight_papers.sensys2026.dataset_items import (
     AXIAL_RATIO,
     METAL_FACTOR,
@@ -31,7 +39,9 @@ from polysight_papers.sensys2026.dataset_items import (
     task_samples,
     without_leakage,
 )
+from polysight_papers.sensys2026.dataset_sugar import authors_fig21
 from polysight_papers.sensys2026.item import table2
+from polysight_shared.config import load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 
@@ -140,6 +150,20 @@ def test_the_figures_stand_beside_the_published_values(out):
     assert sugar["published_median_error_percent"] == 1.548
     assert 0 < sugar["median_error_percent"] < 3
     assert len(sugar["left_out"]) == 12
+
+
+def test_sugar_is_judged_at_the_angle_with_the_most_solutions_whatever_else_was_scanned_at_another(tmp_path):
+    def entry(name, percent, angle_deg):
+        ratio = np.full(4, np.tan(np.radians(40 + percent / 10)), np.complex64)
+        return Entry(name, "1", np.abs(ratio), np.ones(4, np.float32), ratio, angle_deg, True)
+
+    solutions = [entry(f"sugar ({percent}%)", percent, 60.0) for percent in (2, 4, 6, 8)]
+    others = [entry(f"solid {k}", 0, 55.0) for k in range(9)]
+    library = Library((entry("sugar (2%)", 2, 55.0), *others, *solutions))
+    data = AuthorsData(tmp_path, load_instrument(RIG_FILE), {MATERIALS: library}, {}, ())
+    judged = authors_fig21(data).data[MATERIALS]
+    assert judged["angle_deg"] == 60.0
+    assert len(judged["left_out"]) == len(solutions)
 
 
 def test_the_page_says_that_the_files_were_simulated_and_what_was_left_out(out, dataset):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -32,18 +32,22 @@ def authors_fig21(data: AuthorsData) -> Item:
     reasons = []
     for source, library in data.sources.items():
         concentration_of_name = concentrations(library.names, {WATER_IN_GLASS: 0.0})
-        angles = [e.incidence_deg for e in library.entries if e.name in concentration_of_name]
-        if not angles:
+        solutions = [e for e in library.entries if e.name in concentration_of_name]
+        if not solutions:
             continue
-        best = max(set(angles), key=lambda angle: len({e.name for e in _select_entries_near(library, angle)}))
-        near = Library(tuple(e for e in _select_entries_near(library, best) if e.name in concentration_of_name))
+        # The line holds for one incidence angle: that of the most solutions.
+        angles = {e.incidence_deg for e in solutions}
+        best = max(angles, key=lambda angle: len({e.name for e in _select_entries_near(solutions, angle)}))
+        near = Library(tuple(_select_entries_near(solutions, best)))
         try:
             result = fit_concentration(near, {WATER_IN_GLASS: 0.0})
         except DataError as e:
             reasons.append(f"{source}: {e.what}")
             continue
+        # Of every patch: the median over its pixels, and the true concentration.
         x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in near.entries])
         y = np.array([concentration_of_name[e.name] for e in near.entries])
+        # Of the line through all patches, which has seen the concentrations that it estimates.
         median_error = float(np.median(np.abs(result.line.percent(x) - y)))
         median = f"{result.median_error:.3f} %"
         count = str(len(result.left_out))
@@ -83,13 +87,16 @@ def authors_fig21(data: AuthorsData) -> Item:
     )
 
 
-def _select_entries_near(library: Library, angle_deg: float) -> list[Entry]:
-    """Entries within a degree of an incidence angle."""
-    return [e for e in library.entries if abs(e.incidence_deg - angle_deg) < 1]
+def _select_entries_near(entries: Iterable[Entry], angle_deg: float) -> list[Entry]:
+    """Return the entries within a degree of an incidence angle."""
+    return [e for e in entries if abs(e.incidence_deg - angle_deg) < 1]
 
 
 def _tabulate_solutions(result: Any, concentration_of_name: Mapping[str, float]) -> list[tuple[str, ...]]:
-    """Return a row for each solution: name, true and mean estimated concentration, patches, median error."""
+    """Return a row for each solution: name, true and mean estimated concentration, patches, median error.
+
+    `result` is that of `fit_concentration`; its `left_out` has the estimate of every patch.
+    """
     rows = []
     names = {r.name for r in result.left_out}
     for name in sorted(names, key=lambda n: concentration_of_name[n]):

@@ -121,6 +121,7 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
 def one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
     """Return rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
     rng = np.random.default_rng([SEED, 1, round(10 * snr_db)])
+    # The linear samples of the published chirp.
     samples = 192
     frequency = rng.uniform(-0.4, 0.4, trials)
     phase = rng.uniform(-np.pi, np.pi, trials)
@@ -182,6 +183,7 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     # Without the direct path's own phase, which is constant.
     error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))
     rms = float(np.sqrt((error**2).mean()))
+    # Mean over some of the trials' phases between the paths.
     bound = np.sqrt(np.mean([_compute_phase_bound(direct, echo, x, (a, b), snr_db) for x in between[:200]]))
     return rms, rms / float(bound)
 
@@ -248,6 +250,7 @@ def image_error(rig: Instrument, board: Board) -> float:
     chosen = rng.choice(image.size, PIXELS, replace=False)
     chosen[0] = np.abs(image).argmax()
     weights = builder.boards[board.name].weights
+    # Weights [row, column] go from the smallest x, rows are recorded in their direction.
     taper = np.concatenate([weights[r.index, :: r.direction][used[r.index]] for r in plan])
     true = _match_filter(
         rig=rig,
@@ -297,7 +300,7 @@ def _match_filter(
 
 __all__ = ["add_arguments", "run"]
 # Signal-to-noise ratios and the distance of the two tones in FFT bins; chosen. Alignment is measured below what a rig
-# has (7.2 dB: the POLySIGHT paper's figures, see static_chirps), tones from there on.
+# has (7.2 dB: the POLySIGHT paper's figures, see benchmarks/static_chirps.py), tones from there on.
 ALIGN_SNR_DB = (0.0, 2.5, 5.0)
 TONE_SNR_DB = (7.0, 16.0, 22.0, 30.0)
 BINS = 2.5
@@ -323,7 +326,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
-    """Return the lines of the table about alignment."""
+    """Return the lines of the table about alignment; as in all lines, two limits follow the value: required, aim."""
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
     gross = sum(a.ours_gross for a in aligned)

@@ -22,7 +22,7 @@ from polysight.capture.receiver import ReceiverProcess, receiver_cores
 from polysight_shared.config import Board, Instrument, load_instrument
 
 RIG = ROOT / "instrument.toml"
-# Blocks of one board: 286 MB, twelve published rows.
+# Blocks (`PACKETS` packets each) of one board in one row file: 286 MB, as much as twelve rows of the published scan.
 ROW_BLOCKS = 48
 # Share of the requested rate at which the senders count as in pace (chosen).
 KEEPS_PACE = 0.98
@@ -36,6 +36,7 @@ class Cards:
     """
 
     def __init__(self, rig: Instrument, config: Path, folder: Path, stack: ExitStack) -> None:
+        # Last bytes as the DCA1000's defaults have them: cards from .180 on, the host at .30.
         subnet = f"127.{random.randint(2, 250)}.{random.randint(1, 250)}"
         self.rig = rig
         self.folder = folder
@@ -50,6 +51,7 @@ class Cards:
             child = Child("benchmarks.capture_helpers", "send", config, k, *addresses)
             stack.callback(child.close)
             self.senders.append(child)
+        # Each answers "ready" once its packets are built.
         for sender in self.senders:
             sender.hear()
 
@@ -58,7 +60,7 @@ class Cards:
         for sender in self.senders:
             sender.say(packets, rate / len(self.senders))
 
-    def sent(self) -> float:
+    def wait_until_sent(self) -> float:
         """Wait for the senders; return the longest time that one took, seconds."""
         return max(sender.hear()["seconds"] for sender in self.senders)
 
@@ -154,7 +156,8 @@ class Receivers:
         ]
         self.text = "; ".join(f"{r.board.name} {r.scheduling}, buffer {r.granted_bytes}" for r in self._receivers)
         self._row = 0
-        self._crc: dict[int, list[int]] = {}
+        # By index of the board: CRC-32 of 0, 1, 2, ... blocks, see `_expected_checksum`.
+        self._checksums: dict[int, list[int]] = {}
 
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
         """Receive rows for about `seconds` of sending; the time to make them durable in between does not count.
@@ -164,7 +167,7 @@ class Receivers:
         cards = self._cards
         blocks_of_card = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
         rows = -(-blocks_of_card // ROW_BLOCKS)
-        # Of one card in one row; so many packets.
+        # Sent by one card in one row.
         blocks = round(blocks_of_card / rows)
         packets = blocks * PACKETS
         state_before = ask(beside)
@@ -189,13 +192,13 @@ class Receivers:
             size = packets * MAX_PAYLOAD_BYTES
             for r in self._receivers:
                 path = cards.folder / r.board.name / f"{self._row:04d}.part"
-                # The senders count from their first packet on, as cards that were reset.
+                # Take 1: no row is repeated. The senders count from their first packet on, as cards that were reset.
                 r.begin_row(self._row, 1, size, cards.rig.frame_bytes, path, after_reset=self._row == 0)
             if ended:
                 trial.turn_s = max(trial.turn_s, time.perf_counter() - ended)
             cards.start_sending(packets, rate)
             self._watch(trial, packets / (rate / len(cards.boards)))
-            trial.seconds += cards.sent()
+            trial.seconds += cards.wait_until_sent()
             self._drain()
             ended = time.perf_counter()
             captures = [r.end_row() for r in self._receivers]
@@ -236,7 +239,7 @@ class Receivers:
 
     def _expected_checksum(self, board: int, blocks: int) -> int:
         """Return the CRC-32 of so many blocks of a board, one after another."""
-        checksums = self._crc.setdefault(board, [0])
+        checksums = self._checksums.setdefault(board, [0])
         while len(checksums) <= blocks:
             checksums.append(zlib.crc32(self._cards.blocks[board], checksums[-1]))
         return checksums[blocks]
@@ -263,7 +266,7 @@ class PlainLoops:
         for loop in self._loops:
             loop.say(packets)
         self._cards.start_sending(packets, rate)
-        took = self._cards.sent()
+        took = self._cards.wait_until_sent()
         answers = [loop.hear() for loop in self._loops]
         wall = time.perf_counter() - began
         total = packets * len(self._loops)
@@ -308,7 +311,7 @@ def run(args: argparse.Namespace) -> int:
             sink = Receivers(cards, ours)
             show(f"{len(cards.boards)} cards, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; {sink.text}")
             show(HEAD)
-            # Also makes the row that is processed beside.
+            # A slow trial first (chosen rate): it warms up, and its row is the one that is processed beside.
             show(sink.try_rate(20_000, min(args.seconds, 2.0), None).line())
             beside = None
             if not args.alone:

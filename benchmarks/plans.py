@@ -83,7 +83,8 @@ def tell(text: str) -> None:
 def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     """Image every n-th row, by matched filter or (`rebuilt`) by reconstruction; the builder is not changed.
 
-    A reconstruction predicts the image of all rows, so it is divided by the footprints of all rows.
+    A reconstruction predicts the image of all rows, so it is divided by the footprints of all rows, the images of a
+    uniform mirror.
     """
     valid = {name: board.valid.copy() for name, board in builder.boards.items()}
     # Weights and images of all rows, before some are left out.
@@ -120,6 +121,7 @@ def image_error(images: Images, ideal: Images) -> float:
 
 def name_patches(rig: Instrument, images: Images, plates: tuple[TruthPlate, ...]) -> MaterialsResult:
     """Analyse the image with the simulated library: patches, permittivities and names; `plates` are the truth."""
+    # One angle for all pixels.
     angles = incidence_choice(rig, images.x_m, images.y_m, "one")
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     return analyse(images, Optics.from_rig(rig, angles), given_scene=KnownScene(plates=plates), classifier=classifier)

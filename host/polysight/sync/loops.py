@@ -2,10 +2,11 @@
 
 * Tones: frequency and phase of a tone in many short records, at the Cramer-Rao bound (`signal.h`).
 * Passes over a burst (`passes.h`): `match` and `reduce_chirps` read the raw samples; `against_others` and `average` use
-  the reduced chirps, one sample for every block of four (`decimate.py`). `offsets.py` decides between them. Words are
-  int16 [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies by
+  the reduced chirps, one sample for every block of `FOLD` = 4 (`decimate.py`). `offsets.py` decides between them. A
+  burst is the chirps of a position; its linear samples are those in which the sweep is linear. Words are int16
+  [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies by
   `exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
-* `NumpyLoops`: loops over positions that find the direct path (`direct_path.c`); `offsets.py` has the method.
+* `NumpyLoops`: loops over positions that find the direct path from TX to RX (`direct_path.c`; method: `offsets.py`).
 * `Library` calls `burst.c` and `direct_path.c` through ctypes, which releases the interpreter. :func:`library` returns
   it, or None and one warning if nothing was compiled; then the slower NumPy form is used.
 """
@@ -29,10 +30,8 @@ from polysight.sync.decimate import FOLD, decimator, flatten, fold
 
 CHUNK = 8
 """Positions per chunk: the working set fits in the second-level cache."""
-
 RX = 4
 """Number of RX that the compiled loops support."""
-
 # Blocks of a record whose sums the Newton steps of `refine` use, see `block_edges`.
 _BLOCKS = 8
 MOST_CHIRPS = 256
@@ -125,6 +124,7 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
     w = np.zeros(blocks.shape[:-1])
     limit = 2 * np.pi / (times[-1] - times[0])
     turned, s0, s1, s2, step = blocks, w, w, w, w
+    # Slope and curvature are half the derivatives of |s0|^2 by w; a step is at most a cycle per record.
     for i in range(steps):
         if i > 0:
             turned = blocks * cis(-w[..., None] * times)
@@ -298,9 +298,8 @@ def against_others(
         float64 [position, chirp, part]: energy of a chirp's part that is no multiple of the others' sum.
     """
     positions, chirps, rx, blocks = reduced.shape
-    total = (good[:, None].astype(np.complex64) @ reduced.reshape(positions, chirps, rx * blocks)).reshape(
-        positions, 1, rx, blocks
-    )
+    good_sum = good[:, None].astype(np.complex64) @ reduced.reshape(positions, chirps, rx * blocks)
+    total = good_sum.reshape(positions, 1, rx, blocks)
     edges = block_edges(blocks)
     times, starts = block_times(edges) * FOLD, edges[:-1]
     product = reduced * total.conj()
@@ -310,6 +309,7 @@ def against_others(
     own_energy = np.add.reduceat(energy, starts, axis=-1).astype(np.float64)
     sum_energy = np.add.reduceat((total.real**2 + total.imag**2).sum(axis=(1, 2)), starts, axis=-1).astype(np.float64)
     correlation = sums[0] + sums[1]
+    # A good chirp c is in the total T: without it, c (T - c)* = c T* - |c|^2, |T - c|^2 = |T|^2 - 2 Re c T* + |c|^2.
     with_others = correlation - np.where(good[..., None], own_energy, 0)
     others_energy = sum_energy[:, None] - np.where(good[..., None], 2 * correlation.real - own_energy, 0)
     has_others = others_energy > 1e-30
@@ -395,8 +395,8 @@ class Removed(NamedTuple):
 class NumpyLoops:
     """Loops over positions that find and remove the direct path; :class:`Library` has `find` and `remove`, too.
 
-    Halves are complex64 [position, 2, rx, block] from burst alignment (`offsets.AlignedRow`); frequencies are in cycles
-    per sample.
+    Halves are complex64 [position, 2, rx, block] from burst alignment (`offsets.AlignedRow`): what the good chirps at
+    even and at odd places add to the burst's average, which is their sum. Frequencies are in cycles per sample.
     """
 
     @staticmethod
@@ -497,9 +497,9 @@ class NumpyLoops:
         halves
             Both halves are added.
         steering
-            complex64 [rx, block].
+            complex64 [rx, block]: phases after which all RX share the direct path's tone.
         estimator
-            complex64 [2 or 3, rx * block]: see `offsets.DirectPath`.
+            complex64 [2 or 3, rx * block]: rows give A, A w and the drift (`offsets.DirectPath`) of a tone A exp(jwt).
         frequency
             [position]: starting values.
         steps
@@ -540,7 +540,7 @@ class NumpyLoops:
         halves
             Both halves are added.
         steering
-            complex64 [rx, block].
+            complex64 [rx, block]: as of :meth:`refine`.
         frequency, phase
             [position], cycles per sample; radians at the middle of the linear samples.
         scale
@@ -548,7 +548,7 @@ class NumpyLoops:
 
         Returns
         -------
-        The averages complex64 [rx, position, block], and the energy of the scaled halves' difference [position].
+        The halves' sums complex64 [rx, position, block], and the energy of the scaled halves' difference [position].
         """
         n = halves.shape[-1]
         turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2)
@@ -605,7 +605,7 @@ class Library:
         """Align positions into the fields of an `offsets.AlignedRow`; parameters as in `offsets.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
-        # Without corners the reach has no effect; at this one the factors of the taps are finite.
+        # Sample rate, reach, sign, corners in Hz. Without corners reach has no effect; at this one all is finite.
         filters = [1.0, 1 / 8 / FOLD, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]

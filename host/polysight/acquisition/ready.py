@@ -44,7 +44,8 @@ def make_ready(
     Raises ScanError if the stage is not ready and must not be homed, or homing fails.
     """
     status = pi.status()
-    if status.state == "ready" and status.homed and status.scan_id == (scan_id or status.scan_id):
+    same_run = scan_id in ("", status.scan_id)
+    if status.state == "ready" and status.homed and same_run:
         return not stop.now
     check_between_rows(status, scan_id, first)
     if status.state in MOVING:
@@ -92,6 +93,7 @@ def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
                 "look at the stage; `journalctl -u polysight-pi -n 20` on the Pi",
                 code=ErrorCode.STAGE_NOT_READY,
             )
+        # Up to 0.1 s, or until an event comes; reading the events notes that the Pi is alive.
         pi.event_socket.poll(100)
         pi.events()
 

@@ -17,6 +17,7 @@ from polysight.settings import Settings, path_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
+# The rig file, the settings of the whole instrument, as it is named in a folder.
 RIG = Path("instrument.toml")
 # Number of options that help shows before "more options"; chosen.
 _FIRST = 3
@@ -51,6 +52,7 @@ class CommandParser(argparse.ArgumentParser):
         groups = self._action_groups[2:]
         grouped = [a for group in groups for a in group._group_actions]
         options = [a for a in self._actions if a.option_strings and a not in grouped]
+        # False sorts first: the required ones, the most used, the others, --help.
         options.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
         # A section with --help alone is left out.
         first = _FIRST
@@ -232,7 +234,7 @@ def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> No
 
 
 def add_material_options(sub: argparse.ArgumentParser) -> None:
-    """Add the options that say how patches are named."""
+    """Add the options that say how patches (areas of one material in the image) are found and which names they get."""
     sub.add_argument("--library", type=Path, metavar="FILE", help="reference library (default: the simulated one)")
     sub.add_argument(
         "--metal-box",

@@ -119,7 +119,7 @@ def find_scans(paths: Sequence[Path]) -> list[Path]:
 
 
 def _is_data(path: Path) -> bool:
-    """True for a scan of any layout, and for given images."""
+    """True for a scan of any layout, and for given images (H and V from elsewhere, without raw data)."""
     return is_source(path) or is_given_images(path)
 
 
@@ -199,6 +199,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     files: list[Path] = []
     # Errors are left to the program that processes the scan: its message is the result.
     with suppress(PolysightError):
+        # Without its raw data, too.
         source = open_source(folder, config, dropped=True)
         if isinstance(source, ScanFolder) and dropped_rows(source):
             patterns = (*patterns, f"{SAMPLES}/*")
@@ -214,6 +215,7 @@ def is_finished(job: Job) -> bool:
         mark = read_json(job.out / FINISHED)
     except (OSError, ValueError, PolysightError):
         return False
+    # Compared as JSON, in which tuples are lists.
     same = isinstance(mark, dict) and mark.get("made_with") == json.loads(json.dumps(job.made_with))
     return same and all((job.out / name).exists() for name in _PRODUCTS)
 

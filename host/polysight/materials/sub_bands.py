@@ -193,11 +193,13 @@ def _measure_band(band: SubBand, h: Image, v: Image, sweep_channels: tuple[Image
 
     `sweep_channels` are H and V of the same pixels of the whole sweep, `error` the metal reference's relative error.
     """
+    # The ratio is H / V, standard deviations are those of V / H: a relative error of the metal counts times |V / H|.
     ratio = median_ratio(h, v)
     std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
         return BandFigures(first_hz=band.first_hz, last_hz=band.last_hz)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # Of the differences to the whole sweep.
         spread = inverse_spread(np.ones_like(h), v / h - sweep_channels[1] / sweep_channels[0])
         spread_h = _relative_spread(np.abs(h / sweep_channels[0]))
     own_amplitude_std = None
@@ -398,6 +400,7 @@ def incidence_std_rad(materials: ScanMaterials | None) -> float:
 def layer_content(fit: LayerFit) -> dict[str, Any]:
     """Return a fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
     has_thickness = fit.std_thickness_m > 0
+    # Of eps', eps'' and the thickness.
     units = np.array([1.0, 1.0, 1e3])[: 3 if has_thickness else 2]
     if fit.covariance is None:
         covariance = None

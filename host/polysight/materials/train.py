@@ -458,6 +458,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
             pairs = list(folds_kept.split(samples.x, samples.names))
         yield from pairs
         return
+    # Scans; those that show the same labelled specimen are one group.
     independent = samples.independent
     groups = np.unique(independent)
     if groups.size < 2:
@@ -474,6 +475,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
             "process a second scan with the same materials",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
+    # The rarest material has no more groups than one fold may have.
     if held_out.min() <= -(-groups.size // folds):
         folds = groups.size
     yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, independent)
@@ -507,6 +509,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             row = np.searchsorted(predicted.patches, samples.patches[test_set])
             in_scan[test_set] = predicted.pixel_names
             of_patch[test_set] = predicted.names[row]
+            # Distances are in units of the limit up to which a patch gets a name.
             unknown[test_set] = (predicted.distance > 1)[row]
             sure[test_set] = predicted.confidence[row]
     names = np.unique(samples.names)

@@ -71,6 +71,7 @@ class FolderLock:
             self._descriptor = os.open(self._beside, os.O_RDWR | os.O_CREAT)
         try:
             lock_file(self._descriptor)
+            # Between opening and locking, the program that held the lock may have moved the folder into its place.
             if self._beside is None and not os.path.samestat(os.fstat(self._descriptor), folder.stat()):
                 raise BlockingIOError("it has just replaced another folder")
         except BaseException:

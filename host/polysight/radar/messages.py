@@ -533,6 +533,7 @@ def _read_cpu(codes: tuple[str, ...]) -> Callable[[bytes], _Read]:
         if kind == 0xFF:
             return "no fault", False, {}
         detail = ""
+        # Only the firmware's own fatal error, the fourth of `_CPU_FAULTS`, has a code and a line.
         if kind == 3 and codes:
             detail = f", {_format_word(codes, code)}, firmware line {line}"
         return _format_word(_CPU_FAULTS, kind) + detail, True, {"type": kind, "code": code, "line": line}
@@ -588,6 +589,7 @@ def _read_boot(data: bytes) -> _Read:
         cure = "firmware"
     else:
         cure = ""
+    # Ticks of 5 ns.
     values = {"power_up_us": ticks * 0.005, "boot_errors": boot, "tests_failed": tests, "cure": cure}
     return "; ".join(parts), False, values
 

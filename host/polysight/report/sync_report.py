@@ -64,6 +64,7 @@ class SyncReport:
         self.stages: dict[str, _Stage] = {}
         self.positions = 0
         self.chirps = 0
+        # Of each row: power ratio as of `snr`, and its number of positions, the weight.
         self._snr: list[tuple[float, int]] = []
 
     def add(self, row: SyncedRow) -> None:

@@ -1,11 +1,14 @@
 """The scan folder: raw rows, the manifest with the committed rows (docs/spec/scan-folder.md), and kept samples.
 
+A fact is one line of the manifest. A take is one recording of a row; a fact commits it once its files are durable.
+
 `ScanFolder` reads a scan; its `writer` opens it for appending. A scan is resumed with the rig file it was begun with.
 Only the connection may change: `extract_connection` and `with_connection` take addresses and limits from another rig
 file; `check_same_scan` refuses one that differs in anything else. A folder may come from anywhere: `check_inside` and
 `check_links` refuse names and links that lead out of it, `open_npz` refuses oversized arrays.
 
-Kept samples (docs/spec/samples.md) are made and restored by `process/rows.py`. What their files say of themselves is
+Kept samples (docs/spec/samples.md) are the synchronised rows, cut to the ranges of the image: small, and enough to make
+images when the raw rows are dropped. `process/rows.py` makes and restores them. What their files say of themselves is
 read here, without anything of the processing, so that `validate` and `drop-raw` check them.
 """
 
@@ -170,6 +173,7 @@ class ScanFolder:
     of the last resume.
     """
 
+    # As every `Source` says: rows are lines of the stage's x, and the chirps are there as the boards recorded them.
     mirrored = False
     synchronised = False
 
@@ -316,6 +320,7 @@ class ScanFolder:
             *self._read_cached_rows()
         }
         lost_rows = counted - len(rows)
+        # The faults found so far account for that many lines.
         if lost_rows <= sum(fault.facts["lost"] for fault in faults):
             return faults
         problem = f"scan_ended counts {counted} rows, the lines before it commit {len(rows)}"
@@ -373,7 +378,9 @@ class ScanFolder:
     def _read_pieces(self, path: Path, board: BoardRow, size: int) -> Iterator[NDArray[np.uint8]]:
         """Read a payload in pieces of `size` bytes (0: everything), all in the same memory, and check its CRC."""
         digest = 0
-        memory = allocate_pages(min(size, board.bytes) or board.bytes or 1)
+        # At least a byte, of an empty file too: it is the step of the loop.
+        piece_bytes = min(size, board.bytes) or board.bytes or 1
+        memory = allocate_pages(piece_bytes)
         try:
             with path.open("rb") as file:
                 size_on_disk = os.fstat(file.fileno()).st_size
@@ -420,7 +427,7 @@ class ScanFolder:
 
 
 def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
-    """Return the payload files (relative to the scan folder) that were dropped, each with its fact."""
+    """Return the payload files (relative to the scan folder) that `drop-raw` was to delete, each with its fact."""
     files: dict[str, RawDropped] = {}
     for fact in scan.content.facts:
         # The row was recorded again or withdrawn: its dropped files no longer count.
@@ -456,7 +463,7 @@ def read_sample_rows(folder: Path, start: int = 0) -> tuple[dict[int, dict[str, 
 
 
 def open_records(path: Path) -> NDArray[Any] | None:
-    """Return a board's records, structured [row], memory-mapped; None if the file cannot be read."""
+    """Return a board's kept samples, a structured record [row] each, memory-mapped; None if the file cannot be read."""
     try:
         with HEADER_LOCK:
             return np.load(path, mmap_mode="r", allow_pickle=False)

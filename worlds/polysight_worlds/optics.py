@@ -133,7 +133,9 @@ class Response:
 class Waves:
     """Waves between the antennas and points, whatever lies there: unit directions and fields [3, ...], distances [...].
 
-    `received_magnetic` is the receive antenna's magnetic field times the impedance of free space.
+    `out_m` and `incident` lead from TX to the point, `back_m` and `scattered` from there to RX. `field` and `received`
+    are the electric fields of TX, and of RX if it sent, towards the point at unit distance; `received_magnetic` is
+    minus the magnetic field of RX times the impedance of free space.
     """
 
     out_m: NDArray
@@ -192,6 +194,7 @@ def respond(waves: Waves, normals: NDArray) -> Response:
     # Reflected wave of unit s: E = s, eta H = p_out; of unit p: E = p_out, eta H = -s.
     from_s = _dot(waves.received, n_cross_p) - _dot(waves.received_magnetic, n_cross_s)
     from_p = -_dot(waves.received, n_cross_s) - _dot(waves.received_magnetic, n_cross_p)
+    # With the minus a large plate's echo is r_s times the direct field at the distance of the mirror image.
     spread = np.where(lit, -1 / (waves.out_m * waves.back_m), 0)
     return Response(
         path_m=waves.out_m + waves.back_m,

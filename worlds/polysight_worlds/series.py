@@ -103,6 +103,7 @@ def sphere_coefficients(
     xi = psi + 1j * x * special.spherical_yn(orders, x)
     n = orders[1:]
     if permittivity is None:
+        # Derivatives: psi_n' = psi_{n-1} - n / x psi_n, and so xi_n'.
         psi_rate = psi[:-1] - n / x * psi[1:]
         xi_rate = xi[:-1] - n / x * xi[1:]
         return psi_rate / xi_rate, psi[1:] / xi[1:]
@@ -123,6 +124,7 @@ def _inner_rates(y: complex, count: int, with_inside: bool) -> NDArray:
     """
     rates = np.zeros(count + 1, complex)
     if not with_inside and y.imag < ABSORBED:
+        # y h2_0(y) is a multiple of exp(-i y).
         rates[0] = -1j
         for n in range(1, count + 1):
             rates[n] = 1 / (n / y - rates[n - 1]) - n / y
@@ -141,8 +143,8 @@ def scatter_sphere(
 ) -> NDArray:
     """Echo of a sphere at the origin, complex [n]: dyadic Green's function of the sphere (Tai 1971, section 10-2).
 
-    The sum over azimuthal orders is done by the addition theorem: with c the cosine between the two directions,
-    sum M M' = z z' (r x grad)(r' x grad') P_n(c), and likewise N N'.
+    The sum over azimuthal orders is done by the addition theorem: with c the cosine between the two directions and z
+    the radial functions, sum M M' = z z' (r x grad)(r' x grad') P_n(c), and likewise N N'.
     """
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     electric, magnetic = sphere_coefficients(radius_m, k, permittivity, with_inside=with_inside)
@@ -159,8 +161,9 @@ def scatter_sphere(
     p_r = _dot(p, to_tx)
     q_t = _dot(q, to_tx) - c * q_r
     p_t = _dot(p, to_rx) - c * p_r
-    # By both directions. Of M, what goes with the second and the first derivative of P_n.
+    # With the derivative of c by both directions.
     mixed = _dot(q, p) - _dot(p, to_rx) * q_r - p_r * q_t
+    # Of M, what goes with the second and the first derivative of P_n.
     across = np.cross(q, to_rx, axis=0)
     m_second = _dot(across, to_tx) * _dot(p, np.cross(to_tx, to_rx, axis=0))
     m_first = _dot(p, np.cross(to_tx, across, axis=0))
@@ -429,6 +432,7 @@ def sum_orders(
         wave = q_m * (m * p_m + coupling * p_n) + q_n * (n * p_n + coupling * p_m)
         wave_back = q_m_back * (m * p_m_back - coupling * p_n_back) + q_n_back * (n * p_n_back - coupling * p_m_back)
         wave_back[orders == 0] = 0
+        # Powers of `turn`, exp(i n phi) with phi the angle from TX to RX, go on from the last block of orders.
         factors = np.repeat(turn[None], len(orders), axis=0)
         factors[0] = power
         powers = np.cumprod(factors, axis=0)

@@ -127,8 +127,9 @@ def shows_inside(shape: Shape) -> bool:
     if choose_solution(shape) is sum_bent or shape.stack.is_metal:
         return False
     loss = abs(np.sqrt(shape.stack.below).imag)
-    # Two diameters: the way through the body and back.
+    # Two diameters: the way through the body and back. The radius is the metres per radian of b.
     across_m = 4 * shape.scale_m()[1]
+    # In the middle of the radars' band.
     return bool(np.exp(-2 * np.pi * 78e9 / LIGHT_M_PER_S * loss * across_m) > INSIDE_LEVEL)
 
 
@@ -181,6 +182,7 @@ def _end_factors(shape: Shape, hessian: NDArray, along: NDArray, frequencies_hz:
     """
     # Second derivative of the path along the cylinder, if the point slides around it so that the path stays stationary.
     bend = hessian[0, 0] - hessian[0, 1] ** 2 / hessian[1, 1]
+    # Places along the axis in Fresnel zones about the specular point, under a window that fades to both sides.
     units = window_units()
     weights = window(units) * np.exp(-0.5j * units**2)
     weights /= weights.sum()
@@ -281,6 +283,7 @@ def _find_missing_parts(
     tangents = np.einsum("ijn,jcn->icn", patch.tangents(), np.array([patch.d_a, patch.d_b]))
     directions = np.array([[np.einsum("cn,cn->n", t, d) for t in tangents] for d in (along, s_axis)])
     curvature = np.einsum("xin,ijn,yjn->xyn", directions, patch.curvature(), directions)
+    # [offset, 4], of the terms' four rows: plane, curvature along, across, and twist.
     weights = np.stack([np.ones_like(cosine), curvature[0, 0], curvature[1, 1], curvature[0, 1]], axis=1)
     sent = tx.field(incident)
     received = rx.field(-scattered)

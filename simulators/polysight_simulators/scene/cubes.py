@@ -166,7 +166,8 @@ def _sample_field(
 ) -> NDArray[np.complex64]:
     """Return the field at the true positions, [rx, row, column, frequency], with the phase of path `path_m_of_rx` [rx].
 
-    Complex `gains` [rx] multiply the samples; in rows towards -x the stage lags behind by `backlash_mm`.
+    That is the field's `centre_path_m`, whose phase it lacks, less a direct path from which phases count. Complex
+    `gains` [rx] multiply the samples; in rows towards -x the stage lags behind by `backlash_mm`.
     """
     if np.array_equal(field.nodes_hz, f):
         to_frequencies = np.eye(len(f))

@@ -4,7 +4,7 @@ A chirp is the sum of direct path and object, times a factor per chirp, through 
 
     s[n, k] = factor[n, k] (H(f_n,k) F[n, k] + H'(f_n,k) F1[n, k]) gain + noise
 
-F is the undisturbed signal, f_n,k the middle of its band shifted by that chirp's offset, and
+for chirp n and sample k. F is the undisturbed signal, f_n,k the middle of its band shifted by that chirp's offset, and
 F1 = (dF/dt) / (2 pi j) - middle F. This is the filter's response to first order around the middle of a signal of about
 50 kHz bandwidth; the error is H'' df^2 / 2, below 1e-3 for the published offset of about 1 MHz.
 
@@ -112,7 +112,7 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
 
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     ppm = getattr(d.crystal_ppm, board.role) - d.crystal_ppm.transmit
-    # A relative crystal error p raises the start frequency by p f and the slope by 2 p K.
+    # A relative crystal error p raises the start frequency by p f and the slope K by 2 p K: steps and clock both scale.
     # Under native control the host programs the start frequencies of the rig file, without further offset.
     programmed_hz = 0.0 if rig.radar.control == "native" else d.if_offset_hz
     constant = programmed_hz + board.start_offset_hz - rig.transmitter.start_offset_hz
@@ -217,11 +217,13 @@ class _ReceivingBoard:
         gains = self.receiver.gains[:, None]
         shift = chirp.slope_hz_per_s * tau[:, None] - self.middle_hz
         self.direct = (gains * direct * np.stack([np.ones_like(shift), shift])).astype(np.complex64)
+        # Values and derivatives by frequency; a derivative by time is the chirp's slope times that.
         values, slopes = node_matrix(self.field, f)
         carrier = np.exp(2j * np.pi * f * centre)
-        first = (chirp.slope_hz_per_s * centre - self.middle_hz) * values
-        first = first + slopes * chirp.slope_hz_per_s / 2j / np.pi
-        self.expand = np.stack([values * carrier, first * carrier]).astype(np.complex64)
+        # F and F1 without the carrier.
+        f1 = (chirp.slope_hz_per_s * centre - self.middle_hz) * values
+        f1 = f1 + slopes * chirp.slope_hz_per_s / 2j / np.pi
+        self.expand = np.stack([values * carrier, f1 * carrier]).astype(np.complex64)
 
 
 class SimulatedRig:
@@ -370,9 +372,9 @@ class SimulatedRig:
         d = self.scene.disturbances
         simulated = self._make_receiving_board(board.name)
         chirp = self.rig.chirp
-        # All chirps of a frame start with one pulse.
-        frames = pulses // self.rig.burst.chirps
-        delay = sync_delay_s(d, self.seed, board, frames) - sync_delay_s(d, self.seed, self.rig.transmitter, frames)
+        # One SYNC_IN pulse starts several chirps, which share its delay.
+        triggers = pulses // self.rig.burst.chirps
+        delay = sync_delay_s(d, self.seed, board, triggers) - sync_delay_s(d, self.seed, self.rig.transmitter, triggers)
         if d.random_phase:
             turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses)
         else:
@@ -380,6 +382,7 @@ class SimulatedRig:
         factor, shift = compute_chirp_factors(simulated.receiver, delay, 2 * np.pi * turns, d.hpf)
         inside = simulated.field.covers(x_m, y_m)
         self.outside[board.name] += int(np.sum(~inside))
+        # [chirp, rx, node]: the field at the frequencies at which it was computed.
         nodes = np.zeros((len(x_m), *simulated.direct.shape[1:2], simulated.expand.shape[1]), dtype=np.complex64)
         if inside.any():
             gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * simulated.receiver.gains

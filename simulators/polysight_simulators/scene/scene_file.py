@@ -97,6 +97,7 @@ Leakage = tuple[Annotated[float, msgspec.Meta(ge=-10, le=10)], Annotated[float, 
 Pair = tuple[float, float]
 MAX_FACETS = 100_000
 """Largest number of facets of a rough plate; chosen."""
+# Tables of the rig file whose keys a scene may replace.
 _OVERRIDES: dict[str, type] = {"grid": Grid, "burst": Burst, "image": Image, "stage": Stage}
 
 
@@ -216,8 +217,9 @@ class Shape(_Table, frozen=True):
     """A sphere, cylinder (with `slope_deg` a cone), bottle, or plate that may be tilted and bent.
 
     `centre_mm` and `height_mm` are those of its front: the point nearest to the radars, of a plate its middle. `axis`
-    is along a cylinder or bottle, `length_mm` of a bottle that of its body. `bends_per_m`: 1 / radius along the plate's
-    sides and its twist, positive where it bends away. With `thickness_mm` it is a thin wall in air.
+    is along a cylinder or bottle, `length_mm` of a bottle that of its body. `turn_deg` rotates a plate's sides about
+    its normal. `bends_per_m`: 1 / radius along the plate's sides and its twist, positive where it bends away. With
+    `thickness_mm` it is a thin wall in air.
     """
 
     kind: Literal["sphere", "cylinder", "bottle", "plate"]

@@ -1,4 +1,4 @@
-"""Client of the running service, for the commands `home`, `take-over` and `events`. The host has its own.
+"""Client of the running service, for the commands `home`, `take-over` and `events`. The host has a client of its own.
 
 Commands that use the hardware themselves are refused while the service runs (`refuse_beside_service`).
 """
@@ -124,6 +124,7 @@ def take_over(instrument: Instrument, action: str) -> str:
 
     Raises DeviceError if the service refuses or does not answer, or if the take-over key cannot be read.
     """
+    # The service takes this key in place of the secret of the run's owner.
     try:
         owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
     except OSError as e:

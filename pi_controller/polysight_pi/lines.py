@@ -192,10 +192,11 @@ def _line_lost_error(e: OSError) -> DeviceError:
 class TriggerInput:
     """The trigger input: rising edges with kernel time stamps (CLOCK_MONOTONIC), bias and debouncing.
 
-    Raises DeviceError if the chip or the line is not available.
+    `check_width` and `is_real_time` as in `Lines`. Raises DeviceError if the chip or the line is not available.
     """
 
     def __init__(self, pi: Pi) -> None:
+        # A one-shot behind the output gives the pulses their width, however late the line is cleared.
         self.check_width = not pi.one_shot
         # Events that the kernel has delivered and `wait_edge` has not returned yet.
         self._events: deque[Any] = deque()
@@ -242,6 +243,7 @@ class GpiodLines(TriggerInput):
 
     def __init__(self, pi: Pi) -> None:
         self._output = request_output(pi)
+        # The return wire, from SYNC_IN to another input: counts the pulses at the connector.
         self._return: Any = None
         self._set = partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(1, 1))
         self._clear = partial(fcntl.ioctl, self._output.fd, SET_VALUES, _VALUES.pack(0, 1))
@@ -337,6 +339,7 @@ class SpiDevice:
                 fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_NO_CS]))
             except OSError:
                 fcntl.ioctl(self._fd, WRITE_MODE, bytes([MODE_0]))
+            # A byte of zeros sets MOSI low, at any clock.
             self.transfer(bytes(1), 1_000_000)
         except OSError as e:
             os.close(self._fd)

@@ -176,6 +176,7 @@ class TaskScores:
     @staticmethod
     def score(task: str, quick: bool) -> TaskScores:
         """Judge both models on a task, and the KNN on |H| alone."""
+        # In the order of the fields.
         scores = [
             score_simulated(task, model, channels, by_pixel, quick)
             for model, channels in ((PAPER, "H+V+P"), (DISCRIMINANT, "H+V+P"), (PAPER, "H"))
@@ -418,7 +419,8 @@ def pixel_bound(
         Pixels a decision is taken from: their own errors average out, those of the patch do not.
     """
     eps = np.array([m.permittivity for m in materials])
-    # In units of a pixel's variance: the part common to its patch, the reference's, which is as large, and its own.
+    # In units of a pixel's variance, of which `errors.shared` is common to its patch: that part, the reference's, which
+    # is as large, and the pixel's own.
     variance = errors.shared * (2 if reference else 1) + (1 - errors.shared) / pixels
     columns = []
     std = []

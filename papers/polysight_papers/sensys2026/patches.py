@@ -96,6 +96,7 @@ class Pixels:
         """Return the pixels as samples for classifiers; a scan is a group."""
         scan, material, _ = np.indices(self.h.shape)
         names = np.array([m.name for m in self.materials])
+        # A row for each pixel: four features, material, scan (the group), number of the patch, specimen.
         return Samples(
             feature_matrix(self.h, self.v, self.h / self.v).reshape(-1, 4),
             names[material.ravel()],

@@ -142,6 +142,7 @@ def _is_alike(name: str, true: complex) -> bool:
 
 
 def _judge(job: tuple[str, int, str]) -> list[Piece]:
+    """Judge a scene by the arguments of `judge_scene`, as one value for a pool."""
     return judge_scene(*job)
 
 

@@ -472,6 +472,7 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
 
 
 def _judge_metal(job: tuple[str, int, bool]) -> MetalFigures:
+    """Judge a scene by the arguments of `judge_metal`, as one value for a pool."""
     return judge_metal(*job)
 
 
@@ -489,6 +490,7 @@ def print_metal(scenes: Sequence[MetalFigures]) -> None:
 
 
 def _judge(job: tuple[str, int, bool, bool]) -> SceneFigures:
+    """Judge a world by the arguments of `judge_world`, as one value for a pool."""
     return judge_world(*job)
 
 

@@ -95,6 +95,7 @@ def disturb_boards(boards: Boards, nuisances: ShapeNuisances) -> Boards:
     rng = np.random.default_rng([nuisances.seed, 11])
 
     def disturb(antennas: tuple[Antenna, ...], leakage: float) -> tuple[Antenna, ...]:
+        """Shift and turn the antennas of one board together, and give them a drawn leakage."""
         shift_m = nuisances.misplaced_mm / 1000 / np.sqrt(3) * rng.standard_normal(3)
         rotation = turn(antennas[0].boresight, nuisances.axes_deg * rng.standard_normal())
         real, imaginary = leakage / np.sqrt(2) * rng.standard_normal(2)

@@ -419,6 +419,7 @@ def _find_place_mm(status: m.StatusReply, axis: m.Axis) -> float:
 
 
 def _belongs_to_take(event: m.AnyEvent, row_index: int, take: int) -> bool:
+    """Return True if an event says that this take of the row has begun or ended."""
     if isinstance(event, m.RowStarted):
         return event.row.index == row_index and event.take == take
     return isinstance(event, m.RowFinished) and (event.row_index, event.take) == (row_index, take)

@@ -601,9 +601,11 @@ class _Model:
         n = self.unknowns
         covariance = np.asarray(np.linalg.pinv(solution.jacobian.T @ solution.jacobian), np.float64)
         own_covariance = self._draw_second_moments(solution, covariance) if by_sampling else covariance[:n, :n]
-        wider = max(1.0, solution.chi2 / self.freedom) if self.freedom > 0 else 1.0
+        # As `LayerFit.stretch`.
+        stretch = max(1.0, solution.chi2 / self.freedom) if self.freedom > 0 else 1.0
+        # Metres instead of millimetres.
         units = np.array([1.0, 1.0, 1e-3])[:n]
-        own_covariance = np.asarray(wider * own_covariance * np.outer(units, units), np.float64)
+        own_covariance = np.asarray(stretch * own_covariance * np.outer(units, units), np.float64)
         std = np.sqrt(np.maximum(np.diag(own_covariance), 0.0))
         thickness_m = self.stack[self.layer_index].thickness_m
         if self.fits_thickness:

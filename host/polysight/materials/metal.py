@@ -253,6 +253,7 @@ def metal_evidence(
         inversion = invert(measurements, prior, kinds)
     score = inversion.log_evidence - log_evidence_of_dielectric(measurements, prior, kinds, level_db)
     if level_db is not None:
+        # Of metal it is 0 dB; the evidence for a dielectric has a term for it, too.
         score -= 0.5 * (level_db / CHANNEL_RATIO_STD_DB) ** 2
     # The evidence for bare metal is that for metal, times the probability of bare after over that before.
     bare = score + inversion.log_bare - float(np.log1p(-prior.painted))

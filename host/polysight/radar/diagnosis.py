@@ -468,4 +468,5 @@ def _invalid_error(file: Path, what: str) -> ConfigError:
 
 
 def _format_hex(words: Sequence[int]) -> str:
+    """Return words as the digits of `Words`."""
     return struct.pack(f"<{len(words)}H", *words).hex()

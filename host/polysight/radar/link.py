@@ -1,10 +1,10 @@
 """mmWaveLink over 16-bit words: send commands with timeouts and retries, receive answers and events.
 
-Procedure: section 3 of the ICD, the document that `messages` names ("ICD 20": page 20). The host sends commands; the
-device raises the *host interrupt* line when it has a message: an answer, or an event. After a timeout the same message
-is sent again with the retry flag, so that the device answers without executing it twice; after a NACK (the device could
-not read it) it is sent with a new sequence number. Every wait has a timeout, also with a device that sends events
-without end. Not run on hardware yet.
+Procedure: section 3 of the ICD, the document that `messages` names ("ICD 20": page 20; "ICD 4.4": a section). The host
+sends commands; the device raises the *host interrupt* line when it has a message: an answer, or an event. After a
+timeout the same message is sent again with the retry flag, so that the device answers without executing it twice; after
+a NACK (the device could not read it) it is sent with a new sequence number. Every wait has a timeout, also with a
+device that sends events without end. Not run on hardware yet.
 """
 
 from __future__ import annotations

@@ -250,6 +250,7 @@ class SlopeFit:
     def apply(self, echoes: Echoes, others: NDArray[np.int_]) -> tuple[Array, Array]:
         """Return the symmetric curvature [2, 2], and the variance [2] of the slopes' ripple.
 
+        `others` [n] are the indices of the windows in `echoes`.
         Ripple is what is neither a smooth change nor noise of the windows. Where there is none, its variance scatters
         about zero.
         """
@@ -283,6 +284,7 @@ def correlate_windows(d: Array) -> tuple[Array, Array]:
     across = np.moveaxis(1 - distance, -1, 0)
     along = np.moveaxis(1 - 3 * distance + 2 * distance**3, -1, 0)
     ripple = across[0] * across[1]
+    # The slope in x has x along and y across, that in y the reverse.
     return along * across[::-1], np.stack([ripple, ripple])
 
 

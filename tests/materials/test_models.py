@@ -1,5 +1,7 @@
 """Classifiers judged on what they have not seen: a split by pixel flatters, a split by scan does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.support.refusals import refused
@@ -67,6 +69,19 @@ def test_groups_never_straddle_and_every_pixel_is_judged_once(folds):
         assert sorted([*train, *test]) == list(range(data.names.size))
         judged[test] += 1
     assert (judged == 1).all()
+
+
+def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the_same_specimen():
+    """However the groups fall into folds: here the material's two are the smallest, and would go into one."""
+    data = samples(materials=2, groups=10, pixels=20)
+    last = np.isin(data.groups, ["s7", "s8", "s9"])
+    first_pixels = np.isin(np.arange(data.names.size), np.unique(data.patches, return_index=True)[1])
+    data = data.take(np.where(last, first_pixels, data.names == "m0"))
+    labelled = (data.names == "m1") & np.isin(data.groups, ["s8", "s9"])
+    data = replace(data, specimens=np.where(labelled, "one piece", ""))
+    assert np.unique(data.independent[data.names == "m1"]).size == 2
+    for train, test in splits(data):
+        assert set(data.names[test]) <= set(data.names[train])
 
 
 def test_the_split_by_pixel_does_straddle_and_says_so():

@@ -27,7 +27,7 @@ import pickle
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -467,16 +467,17 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
             "whole scans are left out, and none would remain for training",
             "process more scans", code=ErrorCode.NOT_ENOUGH_DATA,
         )  # fmt: skip
-    held_out = samples.groups_of_material[samples.shared]
-    if not held_out.size:
+    if not samples.shared.any():
         raise DataError(
             f"no material is in two of the {groups.size} scans",
             "a scan left out has no material of the training scans",
             "process a second scan with the same materials",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    # The rarest material has no more groups than one fold may have.
-    if held_out.min() <= -(-groups.size // folds):
+    joined = replace(samples, groups=independent)
+    group_counts = joined.groups_of_material[joined.shared]
+    # The rarest material that can be judged has no more groups than one fold may have.
+    if group_counts.size and group_counts.min() <= -(-groups.size // folds):
         folds = groups.size
     yield from GroupKFold(min(folds, groups.size)).split(samples.x, samples.names, independent)
 

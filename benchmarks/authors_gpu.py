@@ -27,8 +27,8 @@ def main(checkout: str, settings_path: str, image_path: str) -> int:
     image = np.empty(0)
     for _ in range(ROUNDS):
         started_s = time.perf_counter()
-        # "RH" is their name of the board that receives H. Images come back as NumPy arrays, so the time includes the
-        # GPU's work and the copy.
+        # "RH" is their name of the board that receives H. Images come back as a NumPy array [RX, ny, nx], so the time
+        # includes the GPU's work and the copy; the mean over the RX is the board's image.
         image = sar_eval(settings, "RH", sum_bins=True).mean(axis=0)
         seconds.append(time.perf_counter() - started_s)
     np.save(image_path, image)

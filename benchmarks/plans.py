@@ -52,8 +52,9 @@ HEAD = (
 
 
 def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilder]:
-    """Simulate, synchronise and reduce every row; return the samples with bursts in their true places, and as if they
-    lay at their triggers (the motion during a burst is then not compensated).
+    """Simulate, synchronise and reduce every row into two sets of samples.
+
+    In the first, bursts lie at their true places, in the second at their triggers: motion is then not compensated.
     """
     radar = SimulatedRig(rig, scene)
     plan = plan_raster(rig.grid)

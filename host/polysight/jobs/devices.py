@@ -257,6 +257,7 @@ def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
     name = str(words.facts.get("board", ""))
     if not as_json:
         sys.stdout.write(f"replayed from {trace}, not a board\n")
+    # The trace stands for both the clock and the link to the board.
     return _run_check(_load_native_rig(config, name), name, words, lambda: words, as_json)
 
 

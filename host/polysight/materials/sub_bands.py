@@ -179,6 +179,7 @@ def _divide_by_metal(
     if not metal.mask.any():
         nothing = np.full(images.valid.shape, complex(np.nan, np.nan))
         return nothing, nothing, float("nan")
+    # Illuminated as if every patch lay level.
     pair, _ = level(images, result.segmentation, result.tilts)
     h = np.where(images.valid, pair.h, complex(np.nan, np.nan)).astype(pair.h.dtype)
     v = np.where(images.valid, pair.v, complex(np.nan, np.nan)).astype(pair.v.dtype)
@@ -379,6 +380,7 @@ def fit_row(
     PolysightError
         if the stack has not exactly one unknown layer, or a thickness is missing.
     """
+    # Segments refused as half spaces alone may be layers.
     if row.metal_reference or (row.refused is not None and row.refused.what not in NOT_PASSIVE):
         return None
     if bands is None:

@@ -581,7 +581,8 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
     """Return model and scores on labelled pixels, as plain values for a library's file.
 
     The scores are of materials in two or more scans; `not_judged` lists the others. `pixel_accuracy`, `patch_accuracy`
-    and `named` are None, and `judged` is empty, if no material but metal is in two scans.
+    and `named` are None, and `judged` is empty, if no material but metal is in two scans. `weights`, `thresholds` and
+    `by_channel` are for the paper's KNN (`fit_weights`).
     """
     scores = {model: score(samples, model) for model in MODELS}
     weighted = fit_weights(samples)

@@ -11,17 +11,14 @@ from polysight.materials import LAYER, UNKNOWN, clean_name
 from polysight.materials.kinds import (
     Kind,
     Kinds,
-    Odds,
     PatchDispersion,
     RatioEvidence,
     draw_sheets,
     inverse_ratio,
     layer_odds,
     literature,
-    may_be_thin,
-    weigh_kinds,
 )
-from polysight.materials.names import name_patch, summarise_literature
+from polysight.materials.names import Odds, may_be_thin, name_patch, summarise_literature, weigh_kinds
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 from polysight_shared.errors import DataError
 

@@ -92,7 +92,6 @@ from polysight.materials.measure import (
     STRONGER_V as STRONGER_V,
     Permittivity as Permittivity,
     estimate_permittivity as estimate_permittivity,
-    format_permittivity as format_permittivity,
 )
 from polysight.materials.metal import (
     WEAK_V_DB as WEAK_V_DB,
@@ -102,6 +101,7 @@ from polysight.materials.names import (
     UNKNOWN as UNKNOWN,
     NamedPatch as NamedPatch,
     PatchName as PatchName,
+    format_permittivity as format_permittivity,
 )
 from polysight.materials.result import (
     PATCHES as PATCHES,

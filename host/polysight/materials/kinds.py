@@ -73,10 +73,6 @@ ODD_DISPERSION_STD = 0.05
 """Share of half spaces whose surroundings change over the sweep, and the standard deviation of that change; chosen."""
 LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens, in addition to that in proportion to eps''; chosen."""
-POSSIBLY_THIN = 0.2
-"""Probability of layers (thin plate or stack) above which a patch gets no permittivity, which would be wrong with this
-probability. Chosen: with a `SHEET_SHARE` of 0.15 none of 383 half spaces of an independent generator had more; of the
-published picture's plates only thin wood has."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat. Chosen."""
 LEAST_STD_OF_T = 1e-6
@@ -89,9 +85,8 @@ _CELL_NUMBERS = np.arange(float(_COORDINATE_CELLS))
 LEAST_RATIO_STD = 1e-6
 # Step of numerical derivatives with respect to ln eps' and to eps''; chosen.
 _STEP = 1e-4
-# Numbers of thin plates that are drawn, and of half spaces that are drawn to join scans at several angles; chosen.
+# Number of thin plates that are drawn; chosen.
 _SHEETS = 6000
-_HALF_SPACES = 4000
 # Frequencies of the sweep at which a thin plate is computed; chosen.
 _FREQUENCIES = 9
 # Keeps products of odds over several scans finite.
@@ -592,109 +587,3 @@ def _compute_histogram(draws: Complex, real: Real, imag: Real, covariance: Real)
     count = np.histogram2d(draws.imag, draws.real, edges)[0] / (draws.size * step.prod())
     width = np.sqrt(np.diag(covariance)[::-1] + SHEET_KERNEL**2) / step
     return scipy.ndimage.gaussian_filter(count, width, mode="nearest")
-
-
-@dataclass(frozen=True)
-class Odds:
-    """Probabilities that a patch is of each kind, `kinds` [kind], of layers, `sheet`, or of no kind, `other`; sum 1.
-
-    `distance` [kind]: distance of t from the kind over the radius of its 99 % region. Beyond 1 the kind has probability
-    0, and what it would have is in `other`.
-    """
-
-    kinds: Real
-    sheet: float
-    other: float
-    distance: Real
-
-
-def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Odds:
-    """Return the probabilities of materials of a patch from one scan, or from several at different incidence angles.
-
-    Errors of different scans are independent. `kinds` has the same materials for each scan, at the angle of that scan.
-    """
-    first = kinds[0]
-    size = 2 * len(scan_evidence)
-    errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in scan_evidence))
-    t = np.array([evidence.inverse_ratio for evidence in scan_evidence])
-    effects = np.concatenate([kind.effects for kind in kinds], axis=1)
-    inverse = np.linalg.inv(effects @ effects.mT + 1e-10 * np.eye(size) + errors)
-    difference = split_complex(t - np.stack([kind.t for kind in kinds], axis=1)).reshape(-1, size)
-    distance2 = np.einsum("ki,kij,kj->k", difference, inverse, difference)
-    weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
-    library_shares = [evidence.library_share for evidence in scan_evidence]
-    library_share = float(np.mean(library_shares)) if first.in_library.any() else 0.0
-    weight = weight * np.where(first.in_library, library_share, 1 - library_share)
-    drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
-    by_dispersion = _weigh_dispersion(kinds, scan_evidence)
-    density = _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))
-    density = density * _weigh_brightness(kinds, scan_evidence) * by_dispersion
-    sheet = (1 - library_share) * first.sheet_share * float(np.mean(density))
-    # Stacks of layers count only where the change over the sweep can tell them from half spaces.
-    if any(evidence.dispersion is not None for evidence in scan_evidence):
-        sheet += (1 - library_share) * STACK_SHARE / np.pi ** len(scan_evidence) * float(np.mean(by_dispersion))
-    other_weight = (1 - library_share) * first.other * _evaluate_other_density(kinds, scan_evidence)
-    distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
-    total = float(weight.sum()) + sheet + other_weight
-    if not total > 0:
-        return Odds(np.zeros(len(weight)), 0.0, 1.0, distance)
-    probability = np.where(distance <= 1, weight, 0.0) / total
-    sheet = sheet / total
-    return Odds(probability, sheet, 1 - sheet - float(probability.sum()), distance)
-
-
-def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
-    """Return True if the probability of layers is above `POSSIBLY_THIN`: then the patch gets no permittivity."""
-    return weigh_kinds((kinds,), (evidence,)).sheet > POSSIBLY_THIN
-
-
-def _weigh_dispersion(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
-    """Return the product of `layer_odds` over the scans in which the change over the sweep was measured, [draw]."""
-    odds = np.ones(kinds[0].sheets.size)
-    for kind, evidence in zip(kinds, scan_evidence, strict=True):
-        if evidence.dispersion is not None:
-            odds = odds * layer_odds(evidence.dispersion, kind.theta_rad)
-    return odds
-
-
-def _weigh_brightness(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
-    """Return the likelihood of |H| for each drawn thin plate over that for a half space, product of scans, [draw]."""
-    odds = np.ones(kinds[0].sheets.size)
-    for kind, evidence in zip(kinds, scan_evidence, strict=True):
-        if np.isfinite(evidence.brightness_off):
-            of_sheets = evidence.brightness_off - kind.sheet_brightness_off
-            density = brightness_density(of_sheets, evidence.brightness_std)
-            odds = odds * density / brightness_density(evidence.brightness_off, evidence.brightness_std)
-    return odds
-
-
-def _evaluate_normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
-    """Return the normal density of draws [draw, scan] about `mean` [scan], with `covariance` [2 scan, 2 scan]."""
-    inverse = np.linalg.inv(covariance)
-    difference = split_complex(draws - mean).reshape(len(draws), -1)
-    scale = np.sqrt(np.linalg.det(inverse / (2 * np.pi)))
-    return scale * np.exp(-0.5 * np.einsum("ni,ij,nj->n", difference, inverse, difference))
-
-
-def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> float:
-    """Return the density of the measured t, one per scan, as a half space of no kind.
-
-    With several scans it is averaged over half spaces drawn from the most exact measurement.
-    """
-    best = min(range(len(scan_evidence)), key=lambda i: float(np.linalg.det(scan_evidence[i].covariance)))
-    mean = scan_evidence[best].inverse_ratio
-    covariance = scan_evidence[best].covariance
-    if len(scan_evidence) == 1:
-        return float(kinds[best].compute_half_space_density(np.array(mean), covariance))
-    noise = np.random.default_rng(0).multivariate_normal(np.zeros(2), covariance, _HALF_SPACES, method="cholesky")
-    t = mean + noise[:, 0] + 1j * noise[:, 1]
-    # The draws have the errors already: hardly any is added.
-    density = kinds[best].compute_half_space_density(t, 1e-8 * np.eye(2))
-    eps = permittivity_from_ratio(t, kinds[best].theta_rad)
-    for i, evidence in enumerate(scan_evidence):
-        if i != best:
-            ratio = inverse_ratio(eps, evidence.theta_rad)
-            density = density * _evaluate_normal(
-                ratio[:, None], np.array([evidence.inverse_ratio]), evidence.covariance
-            )
-    return float(np.mean(density))

@@ -26,7 +26,7 @@ import numpy.typing as npt
 import scipy
 
 from polysight.imaging import window_weights
-from polysight.materials.measure import format_permittivity
+from polysight.materials.names import format_permittivity
 from polysight.polarimetry import multilayer
 from polysight_shared.config import Chirp
 from polysight_shared.error_codes import ErrorCode

@@ -18,7 +18,8 @@ import scipy
 
 from polysight.imaging import Dispersion, Image, Images, Mask
 from polysight.materials.inversion import PatchEstimate
-from polysight.materials.kinds import Kinds, PatchDispersion, PatchMeasurement, may_be_thin, permittivity_slope
+from polysight.materials.kinds import Kinds, PatchDispersion, PatchMeasurement, permittivity_slope
+from polysight.materials.names import may_be_thin
 from polysight.materials.segment import Patch, Segmentation, touches_border
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
 from polysight.polarimetry import PlaneReference, inverse_spread, permittivity_from_ratio
@@ -564,17 +565,6 @@ class Permittivity:
     def metal_like(self) -> bool:
         """True if P is known and too close to 1 for a permittivity."""
         return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_WITHOUT_PERMITTIVITY
-
-
-def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
-    """Format a permittivity: `2.89 - j0.43` for a lossy medium, `2.89 + j27.30` for one with gain.
-
-    `digits` stand behind the point; `width` is the least width of the real part, for aligned columns.
-    """
-    # Adding zero after rounding removes the sign of a negative zero.
-    real = round(float(value.real), digits) + 0.0
-    imag = round(float(value.imag), digits) + 0.0
-    return f"{real:{width}.{digits}f} {'+' if imag > 0 else '-'} j{abs(imag):.{digits}f}"
 
 
 def median_ratio(h: Image, v: Image) -> complex:

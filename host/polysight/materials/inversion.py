@@ -58,7 +58,7 @@ BRIGHTNESS_RANGE = (0.03, 0.7)
 differ by 3 %; thin, tilted, unevenly lit ones by a factor of two (published pictures)."""
 METAL_BRIGHTNESS_STD = 0.5
 """Prior standard deviation of the metal's own ln kappa; chosen."""
-LIBRARY_SHARE = (0.05, 0.95)
+LIBRARY_SHARE = (0.05, 0.85)
 """Prior range of the share of a scene's patches that are of the library's materials; uniform. Up to 0.95 it expected
 55 % where 50 % were (308 scenes of the independent generator), and names were surer than right."""
 WEIGHT_OF_KINDS = 0.8

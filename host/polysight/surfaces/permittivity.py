@@ -235,6 +235,7 @@ def _linearise(
     usual = float(np.median(size)) + 1e-12
     # If all points fit far better than their errors, good ones must not become outliers (0.3 is chosen).
     used = size < OUTLIER * max(usual, 0.3)
+    # Misses of more than twice the usual size lose most of their weight (chosen).
     falloff = 1 / (1 + (size / (2 * usual)) ** 2)
     weights = share * used / scale**2 * falloff
     # A miss that grows loses weight. On average over the phases of its change, it counts by the square of the falloff.
@@ -306,10 +307,9 @@ def _compute_covariance_of_scatter(
     """
     measured_terms = (influence * miss).real.T
     # Ripple may have any phase: its real part and its imaginary part are independent errors of half the variance each.
-    expected_terms = np.concatenate([influence.real * ripple, -influence.imag * ripple]).T / np.sqrt(2)
+    expected_terms = [part.T * ripple[:, None] / np.sqrt(2) for part in (influence.real, -influence.imag)]
     measured, blocks = _sum_over_blocks(measured_terms, influence, at_m, BLOCK_M)
-    parts = np.split(expected_terms, 2, axis=1)
-    expected = np.sum([_sum_over_blocks(part, influence, at_m, ripple_m)[0] for part in parts], axis=0)
+    expected = np.sum([_sum_over_blocks(part, influence, at_m, ripple_m)[0] for part in expected_terms], axis=0)
     # Each block gives two numbers, and two were fitted.
     freedom = max(0.0, 2 * blocks - 2)
     unbiased = measured * blocks / max(blocks - 1, 0.5)

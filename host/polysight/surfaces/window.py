@@ -72,6 +72,7 @@ class Samples:
         y = self.offsets_m[:, 0, 1]
         x = self.offsets_m[0, :, 0]
         steps = [abs(axis[-1] - axis[0]) / max(1, axis.size - 1) for axis in (y, x)]
+        # At least five positions a side (chosen): fewer would not carry the six values and a plane of the amplitude.
         rows, columns = (max(5, round(WINDOW_M / step)) for step in steps)
         return min(rows, y.size), min(columns, x.size)
 
@@ -177,12 +178,13 @@ class BoardFit:
         if board.model is None:
             model = np.eye(self.omega.size)
             # Any paths: without a model the effect is 1 at all. 24 of them are enough for a mean (chosen).
-            gate = np.linspace(0.05, 0.6, 24)
+            excess_m = np.linspace(0.05, 0.6, 24)
         else:
             model = board.model
-            gate = np.linspace(*_find_gate(board), 24)
-        phases = np.exp(1j * np.outer(self.omega, gate))
-        weights = np.mean((model @ phases) * phases.conj(), axis=1).real
+            excess_m = np.linspace(*_find_gate(board), 24)
+        unit_echoes = np.exp(1j * np.outer(self.omega, excess_m))
+        # The factor that the gate leaves of an echo at each frequency.
+        weights = np.mean((model @ unit_echoes) * unit_echoes.conj(), axis=1).real
         self.gain = float(weights.sum())
         self.upper_half = np.arange(weights.size) >= weights.size // 2
         self.band_rise = float(np.log(weights[self.upper_half].sum() / weights[~self.upper_half].sum()))
@@ -214,8 +216,8 @@ def _find_gate(board: Samples) -> tuple[float, float]:
 
 def find_mirror_path(board: Samples, z_m: float) -> float:
     """Return the path from TX over a mirror in the plane z = `z_m` of the rig frame to the middle of the RX, metres."""
-    image = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
-    return float(np.linalg.norm(board.middle_m - image))
+    mirrored_tx = board.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
+    return float(np.linalg.norm(board.middle_m - mirrored_tx))
 
 
 def find_basis(offsets: Array) -> Array:
@@ -266,7 +268,8 @@ def maximise(
     amplitude is measured.
     """
     # Expected curvature of the maximum: the covariance, over positions and frequencies, of the phase's rates by the six
-    # values. It is scaled to a diagonal of ones, for the values differ by orders of magnitude.
+    # values. It is scaled to a diagonal of ones, for the values differ by orders of magnitude; the small terms here
+    # and below only keep matrices invertible and divisors from zero.
     basis = find_basis(offsets)
     count = np.maximum(valid.sum(axis=1), 1)
     weighted = valid[:, :, None] * basis
@@ -284,6 +287,7 @@ def maximise(
     for step in range(iterations + 1):
         paths = (basis @ values[..., None])[..., 0]
         sums, changing, upper = np.moveaxis(rows @ (make_waves(fit, paths).conj() * added), 1, 0)
+        # Derivative of each position's sum by its path; the gradient is that of ln |total| by the six values.
         rates = -1j * (fit.middle * sums + changing)
         total = (sums * valid).sum(axis=1)
         if step == iterations:
@@ -298,14 +302,16 @@ def maximise(
     plane_inverse = np.linalg.inv(matrix)
     plane_terms = np.einsum("wpq,wnq,wn->wp", plane_inverse, plane, sums, optimize=True)
     residual = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], plane_terms)) * valid
-    # Less six values and the plane's three.
+    # Residual power of a position; the fit has used up nine of them: for six values and the plane's three.
     power = (np.abs(residual) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
     # Variance of the mean's real part, and of its imaginary part.
     noise = power / count / 2
     amplitude = plane_terms[:, 0] / fit.gain
+    # The mean's phase has the variance noise / |amplitude|^2; the inverse of the curvature carries it to the values.
     inverse = np.linalg.inv(scaled)
     spread = np.einsum("wpp->wp", inverse) / scale**2
     std = np.sqrt(spread * (noise / np.maximum(np.abs(amplitude) ** 2, 1e-30))[:, None])
+    # An echo of amplitude 1 has the power gain^2 / frequencies in the waves that the matched filter compares with.
     energy = np.einsum("wfn,wn->w", np.abs(added) ** 2, valid)
     share = count * np.abs(amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
     upper_total = (upper * valid).sum(axis=1)
@@ -314,6 +320,7 @@ def maximise(
     return Maximum(
         values=values,
         amplitude=amplitude,
+        # At an offset zero beside the window's centre, the plane's value is less certain than the mean.
         rest=np.sqrt(noise * np.maximum(1, count * plane_inverse[:, 0, 0])),
         std=std,
         share=share,
@@ -361,6 +368,7 @@ def add_up(fit: BoardFit, windows: Windows, values: Array) -> NDArray:
 
 def add_rx(factors: NDArray, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Sum over the RX of factors [window, rx, frequency] times samples [window, rx, frequency, position]."""
+    # For each window and frequency: [1, rx] @ [rx, position].
     by_frequency = np.moveaxis(factors, 1, 2).astype(np.complex64)[:, :, None]
     return (by_frequency @ np.moveaxis(samples, 1, 2))[:, :, 0]
 
@@ -388,6 +396,7 @@ def synthesise(
     """
     factors = (amplitude[..., None, None] * steering.conj()).astype(np.complex64)
     echoes = np.empty((len(waves), *factors.shape[2:], waves.shape[-1]), np.complex64)
+    # For each window and frequency: [rx, echo] @ [echo, position].
     np.matmul(factors.transpose(0, 3, 2, 1), np.swapaxes(waves, 1, 2), out=np.moveaxis(echoes, 1, 2))
     if not valid.all():
         echoes *= valid[:, None, None].astype(np.float32)
@@ -424,7 +433,7 @@ def choose_thinned(shape: tuple[int, int]) -> NDArray[np.int_]:
     """
     step = max(1, round(shape[0] * shape[1] / THINNED_POSITIONS))
     rows, columns = np.indices(shape)
-    # With the golden ratio the lattice is about as wide in all directions.
+    # With the golden ratio (1 - 0.618) the lattice is about as wide in all directions.
     turn = max(1, round(0.382 * step))
     return np.flatnonzero((turn * rows + columns) % step == 0)
 

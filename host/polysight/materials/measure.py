@@ -393,9 +393,9 @@ def measure_patch(
 def border_errors(patch: Patch, lit: Mask, x_m: Real) -> tuple[float, float]:
     """Return the errors of a patch's ln|V / H| and of its phase by the end of what the aperture lights.
 
-    `lit`, bool [ny, nx], are the illuminated pixels, of the metal, too; `x_m` [nx] is the image's axis. A patch that
-    fills them has none, as the metal was lit in the same way. The image's border is such an end for patches that reach
-    it.
+    `lit`, bool [ny, nx]: illuminated pixels, in the images of a separate metal plate, too; `x_m` [nx]: the image's
+    axis. A patch that fills them has no such errors, for the metal was lit in the same way. The image's border is such
+    an end for patches that reach it.
     """
     if not patch.interior.any() or not (lit & ~patch.mask).any():
         return 0.0, 0.0
@@ -592,8 +592,8 @@ def estimate_permittivity(
     The error of V / H is the spread of the pixels, **not** divided by the root of their number: the main errors inside
     a patch, diffraction at its edges and the neighbours' sidelobes, are as wide as the patch and do not average out.
     Differences between the illumination of H and V that vary more slowly than a patch are not included; a reference
-    over the whole plane removes them. Eq. 3 is holomorphic, so both parts of the permittivity have the standard error
-    |d eps / d q| times that of q = V / H.
+    over the whole plane removes them. Eq. 3 is holomorphic and takes P and 1 / P alike, so both parts of the
+    permittivity have the standard error |d eps / d q| times that of q = V / H.
 
     On simulated scans (eight placements of eight materials, all disturbances) the error is half of what is claimed,
     rms, and 94 % of the values lie within one standard error.
@@ -612,10 +612,10 @@ def estimate_permittivity(
         return Permittivity.not_estimated(ratio, inverse_std, float(distance), n)
     theta = np.broadcast_to(np.asarray(theta_rad, np.float64), h.shape)[usable]
     value = complex(permittivity_from_ratio(ratio, float(theta.mean())))
-    pixels = permittivity_from_ratio(v[usable].astype(np.complex128) / h[usable], theta)
-    pixels = pixels[np.isfinite(pixels)]
-    re = np.percentile(pixels.real, [30, 70])
-    im = np.percentile(pixels.imag, [30, 70])
+    pixel_values = permittivity_from_ratio(v[usable].astype(np.complex128) / h[usable], theta)
+    pixel_values = pixel_values[np.isfinite(pixel_values)]
+    re = np.percentile(pixel_values.real, [30, 70])
+    im = np.percentile(pixel_values.imag, [30, 70])
     std = float(abs(permittivity_slope(inverse, float(theta.mean()))) * inverse_std)
     return Permittivity(
         value=value,

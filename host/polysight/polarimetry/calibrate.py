@@ -486,9 +486,10 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
             code=ErrorCode.VALUES_CONFLICT,
         )
     g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
-    matrix = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
+    # (H, V) by the estimate, [standard, 2], scaled as `m`.
+    predicted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
     # Sine of the angle between the measured pair and that of the estimate, for each standard.
-    sine = np.abs(m[:, 1] * matrix[:, 0] - m[:, 0] * matrix[:, 1]) / np.linalg.norm(matrix, axis=1)
+    sine = np.abs(m[:, 1] * predicted[:, 0] - m[:, 0] * predicted[:, 1]) / np.linalg.norm(predicted, axis=1)
     if len(standards) > 3:
         residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2)))
     else:
@@ -504,6 +505,7 @@ def estimate_axial_ratio(plate: Standard, strips: Standard) -> Leakage:
     # Relative to the plate (H, V) ~ (s + a p, p + a s).
     h, v = (m / plate_value for m, plate_value in zip(strips.measured, plate.measured, strict=True))
     s, p = strips.wave
+    # Strips must reflect s and p that differ by a tenth of their size (chosen), and the divisor must not vanish.
     size = float(np.hypot(abs(s), abs(p)) * np.hypot(abs(h), abs(v)))
     if abs(s - p) * np.hypot(abs(h), abs(v)) < 0.1 * size or abs(v * p - h * s) < 1e-9 * size:
         raise DataError(

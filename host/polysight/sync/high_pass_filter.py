@@ -51,7 +51,8 @@ class HighPass:
         inverse: NDArray[np.complex128] = np.ones(np.shape(f), complex)
         for corner in self.corners_hz:
             inverse *= 1 - 1j * corner / f
-        return inverse * np.minimum(1.0, (inverse.real**2 + inverse.imag**2) ** -1 / SMALLEST_GAIN**2)
+        power_gain = 1 / (inverse.real**2 + inverse.imag**2)
+        return inverse * np.minimum(1.0, power_gain / SMALLEST_GAIN**2)
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,8 @@ class Equaliser:
     @classmethod
     def from_model(cls, model: HighPass, chirp: Chirp, spacing: int) -> Equaliser:
         """Return the equaliser of a chirp: exact at the signal's centre and `REACH_BINS` IF bins away."""
-        a, b = chirp.linear_samples
-        return cls(model, chirp.sample_rate_hz, chirp.if_mode == "complex2x", spacing, REACH_BINS / (b - a))
+        first, end = chirp.linear_samples
+        return cls(model, chirp.sample_rate_hz, chirp.if_mode == "complex2x", spacing, REACH_BINS / (end - first))
 
     def taps(self, frequency: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the taps [..., 3] for signals centred at frequencies [...] in cycles per sample."""
@@ -96,6 +97,7 @@ class Equaliser:
             f = f % 1.0
         low, middle, high = np.moveaxis(self.model.inverse(f * self.sample_rate_hz), -1, 0)
         w = 2 * np.pi * self.reach * self.spacing
+        # The inverse filter at the three frequencies gives t_0 + t_2 (even) and t_2 - t_0 (odd).
         even_part = ((low + high) / 2 - middle) / (np.cos(w) - 1)
         odd_part = (high - low) / (2j * np.sin(w))
         return np.stack([(even_part - odd_part) / 2, middle - even_part, (even_part + odd_part) / 2], axis=-1)

@@ -49,6 +49,7 @@ PROFILE_POINTS = 121
 PROFILE_FLOOR_DB = -50.0
 # Smallest spread of a material's ratio between its patches, each part; chosen, since a material of one patch has none.
 LEAST_SPREAD = 5e-3
+# Colour map of matplotlib for differences: white at zero.
 DIFFERENCE = "RdBu"
 SIGNIFICANT = 3.0
 """Standard deviations above which a difference is significant."""
@@ -292,6 +293,7 @@ def _rank_materials(pixels: Pixels, row: int, column: int, library: Path | None)
     except (PolysightError, OSError):
         # The library was made at another angle, or cannot be read.
         return []
+    # Ratios are compared as V / H = 1 / P, which has the error of P over |P|^2.
     p = complex(pixels.p[row, column])
     p_std = float(pixels.p_std[row, column])
     pixel_std = 0.0
@@ -525,6 +527,7 @@ def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
         )
     a_deg = float(np.degrees(a.theta_rad))
     b_deg = float(np.degrees(b.theta_rad))
+    # Chosen: |P| changes by about a tenth in a degree.
     if abs(a_deg - b_deg) > 0.5:
         notes.append(f"the incidence angles differ: {a_deg:.1f} and {b_deg:.1f} degrees; P depends on them")
     if a.simulated != b.simulated:

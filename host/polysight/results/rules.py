@@ -259,7 +259,7 @@ def judge_metal(
             f"the given metal reference ({patch}) does not look like metal",
             "relative to the direct path it reflects less of V than of H, as no metal does", do, 8.0,
         )]  # fmt: skip
-    # First: with this score paint explains the others less well than a dielectric does.
+    # Before paint: where other patches speak against the metal, a dielectric explains them better than a coating does.
     if is_given and culprit is not None and not likely:
         return [reason(
             "care",

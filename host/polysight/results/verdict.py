@@ -128,7 +128,7 @@ def percent(part: int, whole: int, digits: int) -> str:
 class Coverage(msgspec.Struct, frozen=True):
     """Recorded rows, positions and frames beside the plan, and the faults of the manifest.
 
-    `rows_absent` are their numbers; frames and positions of absent rows count as not received.
+    `rows_absent`: numbers of the rows without data; their frames and positions count as not received.
     """
 
     rows_planned: int

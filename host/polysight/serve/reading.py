@@ -35,7 +35,7 @@ REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src
 # Bytes of a file that are read and sent at a time; chosen.
 CHUNK_BYTES = 1 << 18
 LIST_S = 0.5
-"""Time after which a list of scans is sent as far as it was read: the first of 2,000 that no index has take 8 s."""
+"""Time after which a list of scans is sent as far as it was read: 2,000 scans without an index take 8 s."""
 # Number of attempts to read products, which may be replaced meanwhile; chosen.
 MAX_TRIES = 5
 T = TypeVar("T")
@@ -215,7 +215,7 @@ async def _send_result(site: Site, request: Request) -> Response:
 
 
 async def _read_products(site: Site, request: Request, work: Callable[[Path], T]) -> T:
-    """Read products of one generation: the one that the request names, or the present one.
+    """Read products of one generation (of one run of processing): that which the request names, or the present one.
 
     Raises ScanError if the page shows another one, which it then loads, or if they are replaced again and again.
     """

@@ -33,7 +33,7 @@ from polysight_shared.errors import ConfigError, DeviceError
 READ_S = 30.0
 """Time limit of one read. Longer ones are refused, and so is their folder until they have returned."""
 SIZE_S = 30.0
-"""Time after which other folders are counted by another thread; chosen."""
+"""When the count of a folder's size takes longer, another thread goes on with the other folders; chosen."""
 HIDDEN = ".polysight"
 """Hidden folder beside the scans: logs of programs that belong to no scan, the queue, the archive, the list's index."""
 LIBRARIES = "libraries"
@@ -114,7 +114,7 @@ class Site:
         return self._queue
 
     def open_queue(self, start: Callable[[bytes], None]) -> None:
-        """Start the scans that wait, as `start` does with a request."""
+        """Open the queue, where scans can be started; `start` is given the waiting request of each, as it came."""
         if self.starts:
             self._queue = Queue(self.logs / "queue", start, lambda: {s.name: s.state for s in self.scans.list()})
 
@@ -286,7 +286,7 @@ class Sizes:
         self._lock = threading.Lock()
 
     def read_size(self, folder: Path) -> int | None:
-        """Return the size in bytes at the last count; None before the first."""
+        """Return the size in bytes at the last count, None before the first; an old one (`SIZE_AGE_S`) is renewed."""
         size, counted_at = self._counted.get(folder, (None, float("-inf")))
         now = time.monotonic()
         if now - counted_at > SIZE_AGE_S:

@@ -67,7 +67,7 @@ class RowData:
     pieces: Pieces
     # Byte ranges (start, stop) that never arrived: sorted, not touching, half open.
     missing: list[tuple[int, int]]
-    # Chirps in `payload`: points of the row x chirps of a position; most frames are one chirp.
+    # Chirps in `payload`, also where a frame has several: positions of the row x chirps of a position.
     frames_expected: int
     # Digest of the recorded payload, hexadecimal; "" if the recording has none.
     crc32: str = ""

@@ -76,7 +76,7 @@ def reflect(permittivity: complex) -> tuple[complex, complex]:
 
 
 def draw_scene(seed: int, gap_cells: float, same_material: bool) -> PlateScene:
-    """Draw plates in one or two rows, a number of resolution cells apart along both axes."""
+    """Draw plates in one or two rows, a number of resolution cells apart along both axes; all ranges are chosen."""
     rng = np.random.default_rng(seed)
     cells_mm = rng.uniform(4.0, 12.0, 2)
     tapered = bool(rng.integers(2))
@@ -113,6 +113,7 @@ def draw_scene(seed: int, gap_cells: float, same_material: bool) -> PlateScene:
     for channel in (s + leakage[0] * p, p + leakage[1] * s):
         noise = rng.standard_normal((2, *s.shape))
         noise = np.fft.ifft2(np.fft.fft2(noise[0] + 1j * noise[1]) * transfer)
+        # 35 dB below the brightest plate.
         noise *= 10 ** (-35 / 20) * brightest / np.sqrt(np.mean(np.abs(noise) ** 2))
         light = np.exp(rng.uniform(0.0, 0.15) * _draw_uneven_light(rng, s.shape))
         channels.append(np.fft.ifft2(np.fft.fft2(channel * light) * transfer) + noise)

@@ -330,7 +330,8 @@ def main(argv: list[str] | None = None) -> int:
         from polysight_shared.errors import PolysightError, os_error
 
         if isinstance(e, OSError):
-            error = os_error(e, "a path is wrong, the disk is full, or it belongs to another user", AS_THE_SERVICE)
+            cause = "a path is wrong, the disk is full, or it belongs to another user"
+            error = os_error(e, cause, remedy=AS_THE_SERVICE)
         elif isinstance(e, PolysightError):
             error = e
         else:

@@ -39,6 +39,7 @@ def move_to_subnet(rig: Instrument, subnet: str) -> Instrument:
     native = table["radar"].get("native", {})
     for name, board in native.items():
         place = f"tcp://{cards[name]}:{_RADAR_PORT}"
+        # The acknowledgement of LDO bypass repeats the name of its board, which changes here.
         if board["usb_serial"] and board["ldo_bypass_acknowledged"] == board["usb_serial"]:
             board["ldo_bypass_acknowledged"] = place
         board |= {"usb_serial": place, "usb_path": "", "die_id": ""}

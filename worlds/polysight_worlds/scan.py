@@ -30,7 +30,7 @@ SLOPE_STEP = 0.01
 
 @dataclass(frozen=True)
 class Surface:
-    """Cells of a plate: coordinates of the first (metres), cover 0..1, z beyond the reference plane, slopes.
+    """Cells of a plate, [rows, columns]: x, y of the first (metres), cover 0..1, z beyond the reference plane, slopes.
 
     `local_slopes` are those of bow, waviness and roughness, without the mean ones; None on a flat plate.
     """
@@ -128,13 +128,13 @@ class PlateEchoes:
         bend_mean = float(np.sum(weight * main.curvature_z))
         self._path_mean = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
         k = 2 * np.pi * rig.frequencies_hz[-1] / LIGHT_M_PER_S
-        largest = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_deviation**2))
-        # The series has one term at least, and twelve at most (chosen).
+        rms_phase = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_deviation**2))
+        # Twice the rms stands for the largest phase. The series has one term at least, and twelve at most (chosen).
         self._orders = 1
-        term = 2 * largest
+        term = 2 * rms_phase
         while term > SERIES_ERROR and self._orders < 12:
             self._orders += 1
-            term *= 2 * largest / self._orders
+            term *= 2 * rms_phase / self._orders
 
     def _list_points(self, plate: Plate) -> NDArray:
         """Cell minus offset for all circular lags, [3, lags_y, lags_x], and z of the plate's reference height."""
@@ -167,9 +167,10 @@ class PlateEchoes:
         surface = self._surface
         frequency_hz = rig.frequencies_hz[index]
         k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
-        shape = integrate_steps(self._steps_m, frequency_hz)
+        phase_integral = integrate_steps(self._steps_m, frequency_hz)
         area_m2 = float(np.linalg.norm(np.cross(*self._find_edges())))
-        common = (1j * k / (4 * np.pi) * area_m2 * shape).astype(np.complex64) * self._phase.phases(index)
+        # Physical optics of a facet, see `optics.Response`.
+        common = (1j * k / (4 * np.pi) * area_m2 * phase_integral).astype(np.complex64) * self._phase.phases(index)
         terms = self._reflect(index)
         kernel = (common * terms[0]).astype(np.complex64)
         mask = self._brightness * surface.cover * np.exp(-1j * k * self._path_mean)
@@ -217,10 +218,10 @@ class _PhaseSteps:
     """exp(-jk path) for evenly spaced frequencies, each made from the one before."""
 
     def __init__(self, path_m: NDArray, frequencies_hz: NDArray) -> None:
-        turns = path_m / LIGHT_M_PER_S
-        self._now = np.exp(-2j * np.pi * frequencies_hz[0] * turns).astype(np.complex64)
+        delay_s = path_m / LIGHT_M_PER_S
+        self._now = np.exp(-2j * np.pi * frequencies_hz[0] * delay_s).astype(np.complex64)
         spacing_hz = frequencies_hz[1] - frequencies_hz[0] if len(frequencies_hz) > 1 else 0.0
-        self._factor = np.exp(-2j * np.pi * spacing_hz * turns).astype(np.complex64)
+        self._factor = np.exp(-2j * np.pi * spacing_hz * delay_s).astype(np.complex64)
         self._index = 0
 
     def phases(self, index: int) -> NDArray:

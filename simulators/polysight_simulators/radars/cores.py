@@ -50,6 +50,7 @@ def frame(direction: int, kind: int, number: int, body: bytes, count: int, seque
     `direction`: code of sender and receiver, four bits; `kind`: such as RESPONSE; `number`: message id; `body`: `count`
     encoded sub-blocks; `sequence`: the host's number of the command, four bits.
     """
+    # Bits 2 and 3: acknowledgement. Bits 10 and 11: length of the CRC, 0 for 16 bits, 1 for 32.
     flags = sequence << 12 | 0xC
     crc_bytes = 2
     if wide:
@@ -82,9 +83,8 @@ def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
     """
     filler = bytes(n * 7 % 251 for n in range(size - 4))
     image = bytearray(filler)
-    image[:0x80] = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4).ljust(0x5C, b"\0") + b"MEND".ljust(
-        0x24, b"\0"
-    )
+    head = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4)
+    image[:_MAIN_AT] = head.ljust(0x5C, b"\0") + b"MEND".ljust(0x24, b"\0")
     for offset, patch in ((_MAIN_AT, _MAIN_PATCH), (_RF_AT, _RF_PATCH)):
         image[offset : offset + 0x60] = b"RPRC".ljust(0x38, b"\0") + rom.ljust(0x10, b"\0") + patch.ljust(0x18, b"\0")
     return bytes(image) + zlib.crc32(image).to_bytes(4, "little")
@@ -282,6 +282,7 @@ class Cores:
         """
         if number == DOWNLOAD:
             return self._download(data, remaining)
+        # A first-generation board does not know the PLL bandwidths, 0x008D.
         if number not in SIZES or (self.first_generation and number == 0x008D):
             return UNKNOWN_COMMAND, b"", 0.0
         if len(data) != SIZES[number]:

@@ -255,8 +255,8 @@ def _write_rows(
         x, y = row_offsets_mm(radar, row)
         if by_columns:
             x, y = y, x
-        first = row.index * len(x)
-        payloads = {b.name: radar.chirps(b.name, x, y, first) for b in boards}
+        first_chirp = row.index * len(x)
+        payloads = {b.name: radar.chirps(b.name, x, y, first_chirp) for b in boards}
         writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
         if progress is not None:
             progress(row.index + 1, plan.rows)

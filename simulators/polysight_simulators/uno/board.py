@@ -92,7 +92,7 @@ class EmulatedUno:
         # Number of bytes sent to the pseudo terminal.
         self.sent = 0
         self._counted: dict[int, int] = {}
-        self._cost_pins = (0, 0, 0)
+        self._pulse_cycles = (0, 0, 0)
         command = [str(program), "--parent", str(os.getpid()), "--start", f"{start[0]},{start[1]}"]
         command += ["--watch", ",".join(map(str, watch)), *(["--pty", str(pty)] if pty else []), str(image)]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -122,7 +122,7 @@ class EmulatedUno:
                 self._counted[int(rest[0])] = int(rest[2])
             elif tag == "W":
                 pulse, setup, hold = map(int, rest)
-                self._cost_pins = (pulse, setup, hold)
+                self._pulse_cycles = (pulse, setup, hold)
             else:
                 self.troubles.append(" ".join(rest[1:]))
         raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
@@ -182,7 +182,7 @@ class EmulatedUno:
         """Return the worst cases, and begin anew with those of interrupts."""
         self._counted = {}
         self._apply_action("cost")
-        return Cost(self._counted, *self._cost_pins)
+        return Cost(self._counted, *self._pulse_cycles)
 
     def close(self) -> None:
         """End the emulator."""

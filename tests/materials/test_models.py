@@ -84,6 +84,17 @@ def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the
         assert set(data.names[test]) <= set(data.names[train])
 
 
+def test_scans_are_left_out_if_joined_ones_share_no_material():
+    """Two pairs of scans, each of its own specimen and materials: joined there is nothing to judge, and no nan."""
+    data = samples(materials=4, groups=4, pixels=9)
+    in_first = np.isin(data.groups, ["s0", "s1"])
+    data = data.take(in_first == np.isin(data.names, ["m0", "m1"]))
+    specimens = np.where(np.isin(data.groups, ["s0", "s1"]), "a", "b")
+    judged = score(replace(data, specimens=specimens), DISCRIMINANT)
+    assert "4 scans" in judged.split
+    assert np.isfinite([judged.pixels, judged.by_patch, judged.patches, judged.unknown]).all()
+
+
 def test_the_split_by_pixel_does_straddle_and_says_so():
     data = samples(groups=5, pixels=7)
     assert all(set(data.patches[train]) & set(data.patches[test]) for train, test in splits(data, by_pixel=True))

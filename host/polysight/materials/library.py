@@ -14,7 +14,7 @@ import os
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -384,7 +384,7 @@ class Samples:
     def independent(self) -> npt.NDArray:
         """Groups without common specimens, [n]: scans of the same labelled plate are joined.
 
-        If that leaves a single group, the scans themselves: then the same specimens are in training and test.
+        If no material is in two groups then, the scans themselves: the same specimens are in training and test.
         """
         if self.specimens is None or not (self.specimens != "").any():
             return self.groups
@@ -399,7 +399,7 @@ class Samples:
                 if first_group in joined_groups:
                     joined[group] = min(joined_groups)
         out = np.array([joined[g] for g in self.groups.tolist()])
-        return out if np.unique(out).size > 1 else self.groups
+        return out if replace(self, groups=out).shared.any() else self.groups
 
     @property
     def groups_of_material(self) -> npt.NDArray[np.int64]:

@@ -63,7 +63,8 @@ def predict_image(board: BoardSamples, image: np.ndarray, weights: np.ndarray) -
     """
     imager, _ = choose_imager(board.aperture)
     samples = imager.samples(image)
-    # Recorded samples have passed the range gate: `model` is what it does to an echo.
+    # Recorded samples have passed the range gate: `model` [frequency, frequency] is what it does to an echo. `samples`
+    # are [rx, frequency, row, column].
     gated = (board.model.astype(np.complex64) @ samples.reshape(*samples.shape[:2], -1)).reshape(samples.shape)
     # The mean over RX and weighted positions, as `BoardSamples.image`.
     return imager.image((gated * weights).astype(np.complex64)) / (weights.sum() * len(samples))

@@ -556,6 +556,7 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             card.reset_fpga()
             card.configure(instrument.card)
             listened = Path(folder) / "listened.bin"
+            # As row 0, take 1.
             receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, listened, after_reset=True)
             card.record_start()
             deadline = time.monotonic() + listen_s

@@ -153,8 +153,11 @@ def _cut(
     a = aperture.antennas
     total = np.zeros(len(voxels), complex)
     for rx, samples in enumerate(of_point):
-        places = (a.tx_m + shift, a.rx_m[rx] + shift, voxels, np.full(len(shift), a.direct_m[rx]))
-        total += backproject(samples.reshape(len(samples), -1).T, aperture.frequencies_hz, *places)
+        by_position = samples.reshape(len(samples), -1).T
+        tx_m = a.tx_m + shift
+        rx_m = a.rx_m[rx] + shift
+        direct_m = np.full(len(shift), a.direct_m[rx])
+        total += backproject(by_position, aperture.frequencies_hz, tx_m, rx_m, voxels, direct_m)
     cut = np.abs(total)
     return cut / (cut[count] or 1.0), step
 

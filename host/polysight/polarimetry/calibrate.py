@@ -163,7 +163,7 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
 
     Pixels that are not finite do not spread and stay so: the filter is normalised by the weight of the finite pixels.
     `sigma_px` in pixels; zero or less returns the image itself. Smooth H and V only after the phase of the distance was
-    removed (divided by the footprint).
+    removed: divided by the footprint, the image of a mirror in the plane.
     """
     if sigma_px <= 0:
         return image

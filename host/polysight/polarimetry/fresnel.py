@@ -257,8 +257,8 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     """Return the incidence angle of each pixel, averaged over the scanned stage offsets; radians, float64 [ny, nx].
 
     The weight of offset u for a pixel is exp(-(k D)^2 / 8), where k D is the phase of the path at u minus that of the
-    specular path: 1 at the specular offset, about 0.3 at the edge of the first Fresnel zone (k D = pi). H and V are
-    averaged. Pixels with less than a thousandth of the full weight get the specular angle.
+    specular path: a Gaussian of 2 rad (chosen), 1 at the specular offset, about 0.3 at the edge of the first Fresnel
+    zone (k D = pi). H and V are averaged. Pixels with less than a thousandth of the full weight get the specular angle.
 
     Parameters
     ----------

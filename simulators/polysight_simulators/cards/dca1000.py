@@ -194,6 +194,7 @@ class Card:
         no_data_floor_s: float = 0.0,
     ) -> None:
         self.network = network
+        # Number of records begun.
         self.records = 0
         self._eeprom = network
         self._no_data_floor_s = no_data_floor_s

@@ -2,6 +2,10 @@
 
 The actions are methods of `Machine`, which control stage, trigger loop and the motion under way. The first fault is
 kept until the next `Home`, row or jog.
+
+At each point of a row the stage gives a trigger edge, and the trigger loop answers it with a burst of pulses to the
+radars. A row that has reached its end is `done` while its last burst is awaited, and `ending` while the bursts in the
+queue are still to be journalled.
 """
 
 from __future__ import annotations

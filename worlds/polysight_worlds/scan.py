@@ -105,7 +105,7 @@ class PlateEchoes:
         rows, columns = surface.cover.shape
         self._shape = fast_length(rig.rows + rows - 1), fast_length(rig.columns + columns - 1)
         waves = Waves.between(rig.tx, rx, self._list_points(plate))
-        # Responses at the mean slopes, and with either slope varied.
+        # What a facet gives before medium and frequency are known: at the mean slopes, and with either slope varied.
         slopes = surface.mean_slopes
         variations = [slopes]
         if surface.local_slopes is not None:

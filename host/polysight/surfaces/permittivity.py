@@ -1,14 +1,15 @@
 """Permittivity of surface segments from the voltages of H and V, referenced to metal of known shape.
 
-A *point* is one echo, measured in one window of stage positions (`WINDOW_M` wide). A *segment* is a connected surface
-with many points, numbered n in the shapes below. Each segment gets one permittivity eps, by least squares over its
-points (`fit_permittivity`) of the equation
+A *point* is one echo, measured in one window of stage positions (34 mm wide, `window.WINDOW_M`). A *segment* is a
+connected surface with many points, numbered n in the shapes below. Each segment gets one permittivity eps, by least
+squares over its points (`fit_permittivity`) of the equation
 
     b_H (M r)_V = b_V (M r)_H
 
 * r: reflection coefficients of the curved surface at the point, which depend on eps; [n, 2 receivers, 4].
 * M: effect of the antennas' polarisations on r (`Voltages.m`); (M r)_H and (M r)_V are the voltages for gains of 1.
-* b_H, b_V: measured voltages of H and V (`Voltages.b`), divided by the receivers' gains (`Gains`).
+* b_H, b_V: measured voltages of H and V (`Voltages.b`), divided by the receivers' gains (`Gains`). These depend on the
+  direction in which V sees the point (`Voltages.arrival`).
 
 Receivers are in the order H, V. The four coefficients are r_s, r_p, s to p, p to s. The last two are 0 without a
 *twist*, a curvature whose axes lie askew to the plane of incidence. The difference of both sides of the equation is the

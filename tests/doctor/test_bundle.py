@@ -126,6 +126,13 @@ def test_the_value_of_a_name_like_key_or_token_is_removed(text: str) -> None:
         assert word not in Redactor([])(text.format(word))
 
 
+def test_a_key_with_equals_signs_is_removed_as_a_whole(tmp_path: Path) -> None:
+    # Z85, the form of CurveZMQ's keys, has "=" among its characters: one piece between them may be short.
+    key = "0123456789abc=0123456789abc=0123456789ab"
+    (tmp_path / "host.key_secret").write_text(f'curve\n    secret-key = "{key}"\n')
+    assert Redactor([tmp_path])(f"connected with {key}") == f"connected with {HIDDEN}"
+
+
 def test_tokens_of_known_forms_are_removed_without_a_name() -> None:
     assert "abcdefghijklmnop" not in Redactor([])("pushed with ghp_abcdefghijklmnopqrst")
     assert "pw99" not in Redactor([])("from http://u:pw99@host:80/x")

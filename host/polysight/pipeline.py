@@ -11,7 +11,7 @@ from polysight.settings import DEFAULT, Settings
 
 
 class Pipeline:
-    """Processes a scan: add rows, then `finish`. `live`: images of the rows so far."""
+    """Processes a scan: add rows, then `finish`. `live`: images of the rows so far; `inputs`: the settings' files."""
 
     def __init__(
         self,

@@ -1,8 +1,8 @@
 """Spectral imagers: for a plane parallel to the stage, imaging is a convolution.
 
 TX and RX move together, so the matched filter of a position u at a pixel v depends only on `v - u`:
-`image = sum over rx, f of g * k`, with the kernel `k(x, y) = exp(-j 2 pi f d_rx(x, y) / c)`. All products are summed in
-the spectrum, and one inverse transform gives the image.
+`image = sum over rx, f of g * k`, a convolution of the samples g with the kernel `k(x, y) = exp(-j 2 pi f d_rx / c)` of
+the excess path d_rx(x, y). All products are summed in the spectrum, and one inverse transform gives the image.
 
 Along y, rows and pixels share a lattice on which the kernel is sampled, without interpolation. Along x each row has its
 own shift (travel of the stage within a burst, backlash), a phase ramp in the spectrum.
@@ -39,7 +39,8 @@ _cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
 
 SLACK_M = 2e-3
 """Largest deviation of a row's start along x from the aperture; chosen: one step of the published grid."""
-# Relative to the strongest principal component: weaker ones are left out (chosen: 17 of the published rig's 40 stay).
+# Amplitude relative to the strongest principal component: weaker ones are left out (chosen: 17 of the published rig's
+# 40 stay).
 _LEFT_OUT = 6e-6
 # Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
 _CHUNK = 8
@@ -108,10 +109,11 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     first = grid.x_m[0] - x.max() - slack_m
     last = grid.x_m[-1] - x.min() + slack_m
     step = column_step_m(offsets) or grid.pixel_m
-    spans = (last - first) / step + 1
-    # Number of columns of one period.
-    columns = _find_fast_length(math.ceil(spans + max(_FADE * spans, _FADE_COLUMNS)))
+    exact_columns = (last - first) / step + 1
+    # Number of columns of one period: the exact lags and the cross-fade.
+    columns = _find_fast_length(math.ceil(exact_columns + max(_FADE * exact_columns, _FADE_COLUMNS)))
     band = _find_band(aperture, first, last, step, columns)
+    # The period has at least as many points as the band has bins.
     stride_x = -(-band.size // columns)
     pitch = step / stride_x
     return Lattice(
@@ -174,6 +176,7 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
     spectrum = np.zeros(size)
     for delay in delays_s(aperture, x, np.linspace(grid.y_m[0] - y.max(), grid.y_m[-1] - y.min(), 9)):
         for f in aperture.frequencies_hz[[0, -1]]:
+            # exp(-j 2 pi f delay)
             kernel = cross_fade(np, turn(np, delay * f, np.float64, np.complex128), size)
             spectrum = np.maximum(spectrum, np.abs(np.fft.fft(kernel, axis=1)).max(axis=0))
     filled = np.fft.fftfreq(size, 1 / size)[spectrum > _FILLED * spectrum.max()]
@@ -274,6 +277,7 @@ class RowSpectra:
         self.device = device
         self.lattice: Lattice = get_cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
         self._fft = fft_module(xp)
+        # Columns of a transform of rows; its spectrum repeats, so that each bin of the band is one of it.
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._band_bins = self.put(self.lattice.band % self.period)
         self._origin = float(row_starts_m(aperture.offsets_m).min())

@@ -115,8 +115,8 @@ class Optics:
     ) -> Optics:
         """Return the optics of a rig under the chosen incidence angles, with this standard deviation of the angle.
 
-        Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero.
-        `channels_known`: the images' amplitudes are relative to the direct path.
+        Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero, and
+        `leakage_prior` is the size of both its parts. `channels_known`: amplitudes are relative to the direct path.
         """
         p = rig.polarimetry
         leakage = (0j, 0j)
@@ -217,8 +217,8 @@ UNEVEN_METAL = 0.5
 the median of pixels: where metal lies at the end of the scan neither is right (`benchmarks coverage`)."""
 HALO_OF_METAL = 4.0
 HALO_OF_PATCH = 3.0
-"""Error of the metal's V / H, and of V on a plate, relative to the halo of V around them: in scenes of an independent
-generator where 10 to 50 % of the largest amplitude were clipped."""
+"""Error of the metal's V / H, and of V on a plate, relative to the halo of V (light beside the patches) around them: in
+scenes of an independent generator where 10 to 50 % of the largest amplitude were clipped."""
 UNEVEN_AT_END = 0.01
 """Error of ln|V / H| by the end of the aperture above which a plate's slopes tell nothing of the whole scan; chosen."""
 ANGLE_BY_APART = 1.0
@@ -261,6 +261,7 @@ def analyse(
     sv = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
     sp = ratio(sh, sv)
     estimates = dict(zip(labels, inversion.patches, strict=True))
+    # ln of |H| over that of a half space of the same ratio; NaN where |H| was not used.
     brightness_off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
     patches = {
         p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _mean_angle(theta, p), estimates.get(p.label))
@@ -269,8 +270,10 @@ def analyse(
     refused = relative.refused | refuse_impossible(patches, estimates, kinds)
     named = _name_patches(classifier, (sh, sv, sp), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
-    labels_of_all = [(p, p.label) for p in segmentation.patches]
-    results = tuple(PatchResult(p, patches[k], named.get(k), truth.get(k), refused.get(k)) for p, k in labels_of_all)
+    results = tuple(
+        PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
+        for p in segmentation.patches
+    )
     return MaterialsResult(
         calibrated=calibrated, h=sh, v=sv, p=sp, metal=relative.metal, segmentation=segmentation, patches=results,
         theta_rad=theta, inversion=inversion, prior=relative.prior, tilts=tilts,
@@ -523,8 +526,8 @@ class _Scene:
         raw = to_metal(images, reference, self.plane)
         rh = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
         rv = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
-        dark = background(raw.h, raw.v, segmentation, images.usable)
-        refused = check_patches(segmentation, rh, rv, dark, reference.mask)
+        background_rms = background(raw.h, raw.v, segmentation, images.usable)
+        refused = check_patches(segmentation, rh, rv, background_rms, reference.mask)
         refused |= {p.label: STEEP for p in segmentation.patches if p.label in self.tilts.steep}
         judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
         scatter = SceneScatter.collect(
@@ -621,16 +624,12 @@ def _mean_angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
 
 
 def _weigh_metal(
-    images: Images,
-    metal: MetalReference,
-    labels: Sequence[int],
-    solution: _Solution,
-    kinds: Kinds,
+    images: Images, metal: MetalReference, labels: Sequence[int], solution: _Solution, kinds: Kinds
 ) -> MetalReference:
     """Return the metal reference with the evidence for metal and against.
 
-    Of the signs of the phases that are possible for a metal that nobody declared the one that speaks least for metal
-    counts.
+    If nobody declared the metal, it is weighed with each possible sign of the phases, and the sign with the least
+    evidence for metal counts.
     """
     evidence = []
     for measured, prior, inversion in solution.signs[:1] if metal.given else solution.signs:

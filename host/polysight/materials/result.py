@@ -212,16 +212,16 @@ class MaterialsResult:
         v = self.calibrated.v
         if self.withheld:
             return np.full(h.shape, np.nan, np.float32)
-        dark = background(h, v, self.segmentation, usable)
+        background_rms = background(h, v, self.segmentation, usable)
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = np.where(usable, v / h, np.nan)
-        return ratio_sigma(h, v, dark, ratio_error(self.inversion, self.prior, inverse))
+        return ratio_sigma(h, v, background_rms, ratio_error(self.inversion, self.prior, inverse))
 
     def errors_by_disturbance(self) -> dict[int, float]:
         """Return patch number to the relative error of its permittivity by `disturbed`, at most that of V / H.
 
-        Without a permittivity it is that of V / H. Refused patches are left out. Near the Brewster angle V is nearly
-        zero, and half of it means little.
+        Without a permittivity it is that of V / H. Refused patches are left out. Near the Brewster angle V nearly
+        vanishes, and even a large relative error of V / H changes the permittivity little.
         """
         out = {}
         for r in self.patches:
@@ -291,6 +291,7 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     with np.errstate(invalid="ignore"):
         by_real_part = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
     by_error = np.stack([by_real_part, 1j * by_real_part], axis=-1).reshape(*t.shape, 6)
+    # The square root of the covariance, of which rounding can make an eigenvalue negative.
     values, vectors = np.linalg.eigh(estimate.nuisance_covariance)
     return np.stack([by_error.real, by_error.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 

@@ -87,6 +87,7 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
 
     To first order; with :func:`soft_modulus` instead of |t|, so that they stay finite if V vanishes.
     """
+    # dt / t: its real part is the change of ln|V / H|, its imaginary part that of arg(V / H) = -arg P.
     along = dt * np.exp(-1j * np.angle(t)) / soft_modulus(t)
     return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
 
@@ -94,6 +95,7 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
     """Return the permittivity of the half space of t = V / H [angles]: mean of Eq. 3 over the angles, made passive."""
     eps = complex(np.mean([complex(permittivity_from_ratio(q, angle)) for q, angle in zip(t, angles_rad, strict=True)]))
+    # Above that of vacuum, 1, where nothing would be reflected.
     return complex(max(eps.real, 1.01), min(eps.imag, -_LEAST_LOSS))
 
 
@@ -107,7 +109,8 @@ def fit_spread(
 ) -> tuple[Real, Real]:
     """Estimate the spread of specimens and the covariance of placements from patches, by expectation maximisation.
 
-    A patch's residual is `F_m s + u`: s is the specimen's deviation, equal in all its patches, u the placement's.
+    A patch is one placement of a specimen in a scan. Its residual is `F_m s + u`: s is the specimen's deviation, equal
+    in all its patches, u the placement's.
 
     `residuals` [patches, d] are patch means minus their material's mean, `material` and `specimen` the numbers of each
     patch (specimens are numbered over all materials), `effects` [materials, d, 2] those of :func:`effect`, `noise`

@@ -71,6 +71,7 @@ MAKING = 1
 Use = Literal["none", "read", "keep"]
 """Use of kept samples, see `KeptSamples`."""
 Filters = Mapping[str, HighPass | None]
+"""The receivers' high-pass filters by board name; None: as the chirp profile programs them."""
 Gate = tuple[float, float]
 """Smallest and largest excess path of a range gate, metres."""
 Result = TypeVar("Result")
@@ -86,6 +87,7 @@ def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
     They are plain values as JSON holds them, to be compared with a file.
     """
     imaged = msgspec.to_builtins(ImagedWith.from_rig(rig, filters))
+    # The window over the aperture acts on images, not on samples.
     imaged.pop("apodisation")
     parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
     return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
@@ -178,6 +180,7 @@ class KeptSamples:
         samples: Use = "none",
     ) -> None:
         view = View(settings.depth_mm, settings.columns, settings.rows, settings.pixel_mm)
+        # Echoes of planes so much nearer and farther are kept: images of the rig's view move to the plates' plane.
         depth_m = 0.0
         if view == AS_IN_RIG_FILE:
             depth_m = PLANE_REACH_M
@@ -193,6 +196,7 @@ class KeptSamples:
         self._quality = quality
         self._bands = settings.bands
         self._keep = samples == "keep"
+        # Lines of rows.jsonl by row, and the bytes of the file that were read.
         self._lines: dict[int, dict[str, Any]] = {}
         self._read_bytes = 0
         # File descriptor of rows.jsonl, locked, while rows are written.
@@ -384,6 +388,7 @@ class KeptSamples:
     def _record(self, board: str, row: int) -> tuple[NDArray[Any], RowFigures]:
         """Return the record of a row, and its quality figures for rows.jsonl."""
         record = np.zeros((), self._type(board))
+        # Quality is in order of recording, records in order of x.
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
             record[name], record[f"{name}_direct"], record["valid"] = builder.boards[board].read_reduced(row)

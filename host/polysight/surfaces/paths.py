@@ -3,6 +3,9 @@
 `find_echoes` fits path and complex amplitude of each window's echoes (`window`), the strongest first; what it explains
 is subtracted, the next one is searched in the rest, and all are fitted together (`joint`). `measure_echoes` measures
 the echoes of another receiver along known paths.
+
+The six values of a path are its length in the window's middle, its slopes g_x and g_y (first derivatives by the stage's
+place), and its bends xx, xy and yy (second ones).
 """
 
 from __future__ import annotations
@@ -54,13 +57,16 @@ THINNED_WIDENING = 5 * MERGED_WIDENING
 # An echo this far below the strongest of the scan, 32 dB in power, is taken for a side lobe or the echo of an edge;
 # chosen.
 MIN_POWER = 10 ** (-3.2)
+# Echoes whose windows are in memory together while they are measured; chosen.
+_ECHOES_AT_A_TIME = 100
 
 
 class _Search:
     """Coarse search of path and slope: phase tables for windows whose positions form a lattice.
 
     A window is multiplied by the conjugate phases of its frequencies (`along_f`), rows (`along_y`) and columns
-    (`along_x`); `lead` is the phase of each RX relative to the board's middle.
+    (`along_x`); `lead` is the phase of each RX relative to the board's middle. Phases follow from metres of path by
+    `fit.omega` at each frequency, by `fit.middle` at the middle one.
     """
 
     def __init__(self, fit: BoardFit, gate_m: tuple[float, float]) -> None:
@@ -72,8 +78,9 @@ class _Search:
         x = board.offsets_m[0, :width, 0] - board.offsets_m[0, :width, 0].mean()
         self.along_y = np.exp(-1j * fit.middle * np.outer(y, self.slopes)).astype(np.complex64)
         self.along_x = np.exp(-1j * fit.middle * np.outer(x, self.slopes)).astype(np.complex64)
-        band = SPEED_OF_LIGHT_M_S / np.ptp(board.frequencies_hz)
-        self.paths = np.arange(gate_m[0], gate_m[1] + band / 4, band / 2)
+        # Two paths in a resolution cell.
+        cell_m = SPEED_OF_LIGHT_M_S / np.ptp(board.frequencies_hz)
+        self.paths = np.arange(gate_m[0], gate_m[1] + cell_m / 4, cell_m / 2)
         excess = self.paths[None, :] - board.direct_m[:, None]
         self.along_f = np.exp(-1j * excess[:, :, None] * fit.omega).astype(np.complex64)
         path, gy, gx = np.meshgrid(self.paths, self.slopes, self.slopes, indexing="ij")
@@ -81,6 +88,7 @@ class _Search:
         zero = np.zeros((slope.shape[0], 3))
         points = locate(path.ravel(), slope, zero, board.tx_m, board.middle_m)
         _, back, *_ = unit_legs(points, zero, board.tx_m, board.middle_m)
+        # An RX that is nearer to the point by back . lever has so much less path.
         lead = np.exp(1j * fit.middle * (back @ fit.lever.T))
         # Places behind the stage or far away (limits chosen) are no surfaces of the scene.
         lead[(points[:, 2] < 0.2) | (points[:, 2] > 1.5)] = 0
@@ -124,6 +132,7 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
     search = _Search(fit, gate_m)
     height, width = search.shape
     shape = board.valid.shape
+    # The stride in rows and in columns; a window has WINDOW_M on each side.
     steps = [max(1, round(STRIDE_M * n / WINDOW_M)) for n in (height, width)]
     columns = np.arange(0, shape[1] - width + 1, steps[1])
     strongest = _measure_strongest(board)
@@ -200,6 +209,7 @@ def _refine(
     for index, (windows_of_rank, maximum) in enumerate(echoes):
         values = joint.values[:, index]
         alone = replace_samples(part, joint.rest + joint.synthesise(index))
+        # Without iterations the path of the joint fit stays, and only the amplitude is measured.
         better = maximise(fit, add_up(fit, alone, values), part.valid, part.offsets, values, iterations=0)
         # The other echoes make an echo's amplitude and path less certain.
         better.rest = better.rest * widening[:, index, 0]
@@ -245,6 +255,7 @@ def _select_echoes(echoes: list[tuple[NDArray, Maximum]], members: NDArray[np.in
 def _compute_power_share(fit: BoardFit, windows: Windows, maximum: Maximum, energy: Array) -> Array:
     """Return the share [window] of a window's `energy` that an echo explains."""
     count = windows.valid.sum(axis=1) * len(fit.lever)
+    # Over the F frequencies of one position and RX an echo of amplitude a has the energy |a gain|^2 / F.
     return count * np.abs(maximum.amplitude) ** 2 * fit.gain**2 / fit.omega.size / np.maximum(energy, 1e-30)
 
 
@@ -283,14 +294,15 @@ def measure_echoes(
     for index in np.flatnonzero(is_known):
         known_of_window.setdefault(int(window[index]), []).append(int(index))
     chosen = np.flatnonzero(inside)
+    # Each measured echo first, then the others of its window.
     members = [[index, *(o for o in known_of_window[int(window[index])] if o != index)] for index in chosen.tolist()]
     counts = np.array([len(group) for group in members], int)
     parts: list[Echoes] = []
     order: list[NDArray] = []
     for count in np.unique(counts):
         of_count = np.flatnonzero(counts == count)
-        for first in range(0, of_count.size, 100):
-            part = of_count[first : first + 100]
+        for first in range(0, of_count.size, _ECHOES_AT_A_TIME):
+            part = of_count[first : first + _ECHOES_AT_A_TIME]
             group = np.array([members[index] for index in part])
             measured = group[:, 0]
             windows = gather_windows(board, rows[measured], columns[measured], at_m[measured])

@@ -66,6 +66,7 @@ def decimator() -> Decimator:
     first[_BESIDE:-_BESIDE] = 1 / FOLD
     cycles = np.linspace(-_PASS, _PASS, 121)
     weight = np.where(np.abs(cycles) < _SCENE, 10.0, 1.0)
+    # `turns @ taps` is the response of `fold`, [cycle].
     turns = np.exp(2j * np.pi * np.outer(cycles, np.arange(TAPS) - (TAPS - 1) / 2))
     # `flatten` of each of the first blocks, and of an inner one: taps over `FLAT` blocks whose response, together with
     # that of `fold`, is 1 in the passband.
@@ -94,8 +95,11 @@ def _design_low_pass() -> NDArray[np.float64]:
     """Return symmetric taps of sum 1 with the least response where decimation would move echoes into the passband."""
     aliases = [np.linspace(0.25 - _PASS, 0.25 + _PASS, 61), np.linspace(0.5 - _PASS, 0.5, 31)]
     cycles = np.concatenate(aliases)
+    # Distance from the scene's middle after decimation, which moves 1/4 and 1/2 cycle per sample to 0.
     off_middle = np.minimum(np.abs(cycles - 0.25), np.abs(cycles - 0.5))
+    # Outside the scene the response may be twenty times as high.
     weight = np.where(off_middle < _SCENE, 1.0, 0.05)
+    # Response of each pair of equal taps, half a sample, one and a half... before and after the middle.
     pairs = 2 * np.cos(2 * np.pi * np.outer(cycles, np.arange(TAPS // 2) + 0.5))
     # The sum of the taps is 1, so the last tap is what the others leave.
     basis = pairs[:, :-1] - pairs[:, -1:]
@@ -120,7 +124,7 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
 
 
 def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Undo the attenuation by :func:`fold` in averages over chirps [..., block]; fewer blocks than `FLAT` stay."""
+    """Undo the attenuation by :func:`fold` in averages over chirps [..., block]; leave fewer blocks than `FLAT`."""
     blocks = folded.shape[-1]
     if blocks < FLAT:
         return folded
@@ -146,6 +150,7 @@ def decimation(samples: int, middle: float) -> NDArray[np.complex128]:
     The blocks are turned back, so that an echo keeps its frequency.
     """
     time = np.arange(samples) - (samples - 1) / 2
+    # Row k is a chirp whose sample k alone is 1, mixed down.
     mixed = np.diag(np.exp(-2j * np.pi * middle * time)).astype(np.complex64)
     blocks = flatten(fold(mixed)).T.astype(np.complex128)
     return blocks * np.exp(2j * np.pi * middle * time.reshape(-1, FOLD).mean(axis=1))[:, None]

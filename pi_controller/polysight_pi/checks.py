@@ -33,7 +33,8 @@ from polysight_shared.sockets import is_loopback, make_server_context, publisher
 JOURNAL_BYTES = 100 << 20
 # Number of SPI transfers that are timed; chosen, the shortest counts.
 TRANSFERS = 5
-# Longest duration of a bit relative to the nominal one: the system call adds some 100 us to a transfer of 22 ms.
+# Longest duration of a bit relative to the nominal one, as `MIN_PART` is the shortest: the system call adds some 100 us
+# to a transfer of 22 ms.
 MAX_PART = 1.05
 # Number of pairs of system calls (set the line, clear it) that are timed; chosen.
 PAIRS = 500

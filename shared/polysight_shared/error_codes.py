@@ -1,6 +1,6 @@
 """Codes of errors, so that programs and tests distinguish them without comparing sentences.
 
-The general codes fit most cases; a room adds its own only for an error that callers or tests distinguish.
+The general codes fit most cases; a package adds its own only for an error that callers or tests distinguish.
 """
 
 from __future__ import annotations

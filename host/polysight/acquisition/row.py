@@ -62,7 +62,7 @@ class FaultKind(StrEnum):
     COUNTS_DIFFER = "counts_differ"
     # No packet of the board came.
     NO_DATA = "no_data"
-    # The row was held so long that the cards ended their records.
+    # The row was held (paused by a command) so long that the cards ended their records.
     HELD = "held"
     # Frames are missing at known pulses.
     PULSES_MISSED = "pulses_missed"
@@ -193,6 +193,7 @@ class Take:
                 detail = ""
             return TakeFault(FaultKind.NO_DATA, f"no data: {capture.reason}{detail}", name)
         if displaced is not None:
+            # `slots` has the pulse of each frame that came.
             if held_text:
                 kind = FaultKind.HELD
             elif displaced.slots.size < displaced.pulses:

@@ -107,6 +107,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
             of another length.
         """
         pixels, names = _validate(self, X, y, ensure_min_samples=2)
+        # `SHORT`: name of a model in options to that in library files.
         if self.model not in SHORT:
             raise ValueError(f"model is {self.model!r}: one of {', '.join(SHORT)}")
         check_classification_targets(names)

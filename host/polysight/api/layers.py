@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 def layer_dataset(
     scan: ProcessedScan, chirp: Chirp, stack: Sequence[str | Layer], bands: int | None, amplitude_percent: float
 ) -> xarray.Dataset:
-    """Fit the unknown layer of a stack at each patch; parameters and errors as `Scan.layers`.
+    """Fit the unknown layer of a stack at each patch; errors as `Scan.layers`.
 
-    A patch without enough data has no fit: not a number in each column.
+    `bands` are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
+    trusted. A patch without enough data has no fit: not a number in each column.
     """
     import xarray
 
@@ -30,12 +31,13 @@ def layer_dataset(
         raise scan.verdict.error("the images are kept")
     layers = [_parse_layer(layer) for layer in stack]
     angle_std_rad = incidence_std_rad(scan.materials)
-    fits = [fit_row(row, chirp, layers, bands, amplitude_percent / 100, angle_std_rad) for row in scan.segments]
+    fits = [fit_row(patch, chirp, layers, bands, amplitude_percent / 100, angle_std_rad) for patch in scan.segments]
 
     def describe(values: Sequence[object], units: str, about: str) -> tuple[str, np.ndarray, dict[str, str]]:
         return "patch", np.asarray(values), {"units": units, "long_name": about}
 
     def read(attribute: str, factor: float = 1.0) -> list[float]:
+        """Return an attribute of each fit, times `factor`; not a number where it is missing."""
         values = [getattr(fit, attribute, None) for fit in fits]
         return [np.nan if value is None else factor * value for value in values]
 

@@ -192,11 +192,18 @@ class RowCapture(_Message, frozen=True):
     """Reception of one row of one board.
 
     `expected` are the bytes of the whole row, `bytes` counts placed ones, `missing` are the other byte ranges (the
-    whole row if `located` is False, for which `reason` says why). Arrival times are of the host's monotonic clock, 0
-    without packets. `packets` is the count `placed` of :class:`polysight.capture.placement.PacketCounts`, whose other
-    counts have their names here; lost bytes as in :class:`polysight.capture.placement.Losses`, `holes` and `slipped` as
-    in :class:`polysight.capture.placement.Placed`. Not of the row are `strangers` (packets from another address than
-    the card's), `stale` (packets from between rows) and `kernel_drops` (dropped by the kernel during the row).
+    whole row if `located` is False, for which `reason` says why): `head_bytes` before the first packet, `gap_bytes` in
+    `gaps` gaps, `tail_bytes` after the last one. `holes` are the missing ranges before the furthest byte that came;
+    `slipped` if nothing but missing whole frames keeps the row from being located. Arrival times are of the host's
+    monotonic clock, 0 without packets.
+
+    `packets` were placed, some of them `late` (after a packet of a later place, by at most `late_by_bytes`) or `short`
+    (not full). Not placed were `duplicates`, `conflicting` (equal counters, other bytes), `leftover` (of an earlier
+    record; `before_pulses` of them came before the first pulse), `restarted` (the card restarted within the row),
+    `outside` (behind the row's end), `disagreeing` (their counters contradict each other) and `malformed` packets. Not
+    of the row are `strangers` (packets from another address than the card's), `stale` (packets from between rows) and
+    `kernel_drops` (dropped by the kernel during the row).
+
     `card_status` are the bits the card reported during the row. The three CRC-32 are of the row's files: payload,
     index, packets.
     """

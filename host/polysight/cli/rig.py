@@ -1,8 +1,8 @@
 """The commands around a rig and its scans, simulated or real.
 
 Simulated: demo, simulate, reproduce. Real: plan, doctor, card, inspect, radar, jog, scan, resume,
-validate, drop-raw. A command runs a function of this file, or one of `polysight.jobs` that is given by its
-name, such as "devices.jog_stage". The options named in a tuple behind its example come first in its help.
+validate, drop-raw. `add` takes a command's name, its function (of this file, or the name of one of `polysight.jobs`,
+such as "devices.jog_stage"), a line of help, examples, and the options that come first in its help.
 """
 
 from __future__ import annotations
@@ -261,8 +261,9 @@ def _inspect(args: argparse.Namespace) -> int:
 
     if args.placement:
         return inspect_placement(args.file, args.as_json)
-    options = {name: value for name in ("lanes", "samples", "q_first") if (value := getattr(args, name)) is not None}
-    return inspect_file(args.file, args.config, args.plot, args.card, args.as_json, options)
+    options = {"lanes": args.lanes, "samples": args.samples, "q_first": args.q_first}
+    given_options = {name: value for name, value in options.items() if value is not None}
+    return inspect_file(args.file, args.config, args.plot, args.card, args.as_json, given_options)
 
 
 def _add_inspect(add: Add) -> None:

@@ -51,7 +51,8 @@ _KEY_BYTES = 64 << 10
 _MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
-# Values that a name like `token` or `password`, or the word "bearer", announces.
+# Values that a name like `token` or `password`, or the word "bearer", announces: the first group is the name, which
+# stays, the second is the value in quotes or as a word.
 _NAMED = re.compile(
     r"""(?ix)((?:[\w-]*(?:secret|token|password|passwd|passphrase|psk)[\w-]*|(?:private|public|curve|api)[_-]?key
     |authorization)["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)

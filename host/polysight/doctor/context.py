@@ -212,6 +212,7 @@ def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], f
     """Send `packets` packets to each receiver, as cards that were reset: losses at an earlier rate do not count."""
     for receiver in receivers:
         part = folder / f"{receiver.board.name}.part"
+        # The packets hold no frames.
         receiver.begin_row(
             row=0, take=1, expected_bytes=packets * MAX_PAYLOAD_BYTES, frame_bytes=1, path=part, after_reset=True
         )
@@ -219,7 +220,8 @@ def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], f
     for receiver in receivers:
         card = (receiver.board.card_address, CARD_SOURCE_PORT)
         host = (receiver.board.host_address, receiver.board.data_port)
-        words = map(str, (*card, *host, 0, packets, rate, MAX_PAYLOAD_BYTES))
+        first_packet = 0
+        words = map(str, (*card, *host, first_packet, packets, rate, MAX_PAYLOAD_BYTES))
         command = [sys.executable, "-I", str(_SENDER), *words]
         senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
     # A sender prints the seconds that it took; one that failed prints nothing.
@@ -404,6 +406,7 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         states = radars.states()
         captured = {}
         for name, row in rows.items():
+            # The recording of row 0 keeps the name of an unfinished one: nothing commits it.
             payload = np.fromfile(Path(folder) / "raw" / name / f"0000{PART}", np.uint8)
             chirps = frames * rig.burst.chirps
             words, valid = row_words(payload, row.missing, chirps, rig.chirp.samples, len(rig.antennas.rx_mm))

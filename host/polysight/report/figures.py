@@ -99,6 +99,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
             inside.append(part / np.abs(part))
     if not inside:
         return None
+    # Every patch counts alike, whatever its size.
     middle = np.angle(sum(part.mean() for part in inside))
     from_middle = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
     low, high = np.percentile(from_middle, _PERCENTILES) + np.degrees(middle)
@@ -137,6 +138,7 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
         colours = "cividis" if phase_deg else "twilight"
     if quantity == "phase" and phase_deg is not None:
         limits = phase_deg
+        # Each phase is turned by whole circles to within 180 degrees of the limits' middle.
         middle = sum(phase_deg) / 2
         numbers = (numbers - middle + 180) % 360 - 180 + middle
     image = ax.imshow(
@@ -193,6 +195,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[sty
     colours = style.assign_colours(scan)
     rgb = np.ones((*scan.h.shape, 3)) * np.array(to_rgb("#f3f5f8"))
     for patch in scan.segments:
+        # Pale, so that the interior's pixels stand out.
         rgb[scan.labels == patch.label] = 0.55 + 0.45 * np.array(to_rgb(style.patch_colour(patch, colours)))
     refused = {patch.label for patch in scan.segments if patch.refused is not None}
     for label, (names, interior) in scan.pixel_names.items():

@@ -1,7 +1,7 @@
 """Write `report.html`, one self-contained page with inline images, and the same figures as files.
 
-Tables are plain dicts (caption, head, rows) for the page's template. The columns of the patches' figures are those that
-the type of the scan's patches (`polysight.results.PatchFigures` or a subclass) declares with a title.
+Tables are plain dicts (caption, head, rows) for the page's template. Of a patch, a figure is a number: the columns are
+those that the type of the scan's patches (`polysight.results.PatchFigures` or a subclass) declares with a title.
 """
 
 from __future__ import annotations

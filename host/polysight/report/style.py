@@ -112,6 +112,7 @@ def figure_label(name: str, number: str) -> str:
 def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     """Return the colour of each material in the results or the truth, the same in all figures."""
     names = {patch.name for patch in scan.segments if patch.name} | {plate.name for plate in scan.plates}
+    # Of each patch: the names of its pixels, and the mask of these.
     for names_of_pixels, _ in scan.pixel_names.values():
         names |= set(np.unique(names_of_pixels).tolist())
     names.discard("unknown")
@@ -130,7 +131,7 @@ def new_figure(width: float, height: float, right_in: float) -> Figure:
 def set_margins(fig: Figure, right_in: float, below_in: float = 0.0) -> None:
     """Leave room for titles, axis labels and tick labels, `right_in` on the right, and `below_in` for a legend.
 
-    Matplotlib's "constrained" layout measures all texts four times, and takes longer than the drawing.
+    It stands for matplotlib's "constrained" layout, which measures all texts four times: longer than the drawing.
     """
     width, height = fig.get_size_inches()
     fig.subplots_adjust(
@@ -252,11 +253,13 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
     engine = fig.get_layout_engine()
     if engine is not None:
         engine.execute(fig)
+    # Axes of equal aspect get their final size only when drawn; the labels are measured in it now.
     for ax in fig.axes:
         ax.apply_aspect()
     gap = _GAP_PT * fig.dpi / 72
     boxes = [label.text.get_window_extent() for label in labels]
     frames = [(label.text.axes or fig).bbox for label in labels]
+    # A pixel beyond the frame does not show.
     outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
     touching = any(a.overlaps(b) for a, b in combinations([_widen(b, gap) for b in boxes], 2))
     if not outside and not touching:

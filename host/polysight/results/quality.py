@@ -87,8 +87,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
 class BoardImaging(msgspec.Struct, frozen=True, kw_only=True):
     """Aperture of one receiver and its response to a point in the middle of the image, for (x, y).
 
-    `masked` is the share of the tapered aperture without data, `loss_db` the loss of a point's sum due to it;
-    `frequencies` the number of samples of a position after the range gate.
+    `masked` is the share of the tapered aperture without data, `loss_db` how much weaker the sum of a point's echoes is
+    due to it; `frequencies` the number of samples of a position after the range gate.
     """
 
     positions: int = 0

@@ -1,4 +1,4 @@
-"""Validate a scan folder: compare every file with the manifest, and list all faults."""
+"""Validate a scan folder: compare every file with the manifest, whose lines are *facts*, and list all faults."""
 
 from __future__ import annotations
 
@@ -187,6 +187,7 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
         findings.append(_make_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
     elif f"{crc:08x}" != board.crc32:
         findings.append(_make_error(place, "differs from the committed data (CRC)", _COPY))
+    # The index says which byte ranges of the row are missing; a row without it misses none.
     index = path.with_suffix(".idx")
     findings += _check_packets(scan, board, path.with_suffix(PACKETS))
     place = str(index.relative_to(scan.path))

@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, decode_row
+from polysight.capture.dca1000 import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, decode_row
 from polysight.capture.network import _Header, _IoVec, _Message, bind_udp, enlarge_receive_buffer, kernel_drops
 from polysight.capture.receiver import take_priority
 from polysight.sync.chain import BoardSetup, synchronise_row
@@ -104,11 +104,13 @@ class Sender:
 
     def send(self, total: int, rate: float) -> float:
         """Send `total` packets at `rate` packets/s; return the seconds that it took."""
-        start = began = time.perf_counter()
+        start = time.perf_counter()
+        # Packet k is due at `first_due + k / rate`; a sender that is too late moves this schedule.
+        first_due = start
         sent = 0
         while sent < total:
-            began = max(began, time.perf_counter() - sent / rate - BEHIND_S)
-            due = min(total, int((time.perf_counter() - began) * rate) + 1)
+            first_due = max(first_due, time.perf_counter() - sent / rate - BEHIND_S)
+            due = min(total, int((time.perf_counter() - first_due) * rate) + 1)
             while sent < due:
                 position = self._next % PACKETS
                 if position == 0:
@@ -116,7 +118,7 @@ class Sender:
                 n = self._call(position, min(due - sent, PACKETS - position))
                 sent = sent + n
                 self._next = self._next + n
-            ahead = began + (sent / rate) - time.perf_counter()
+            ahead = first_due + (sent / rate) - time.perf_counter()
             if ahead > 0 and sent < total:
                 time.sleep(max(ahead, TURN_S))
         return time.perf_counter() - start
@@ -126,8 +128,8 @@ class Sender:
         # Linux takes at most 1024 messages a call.
         n = self._sendmmsg(self._socket.fileno(), ctypes.c_void_p(self._base + at * self._size), min(count, 1024), 0)
         if n < 0:
-            number_ = ctypes.get_errno()
-            raise OSError(number_, os.strerror(number_))
+            error_number = ctypes.get_errno()
+            raise OSError(error_number, os.strerror(error_number))
         return n
 
 
@@ -136,7 +138,7 @@ def send(rig_path: str, seed: str, card: str, host: str, port: str) -> None:
     # A real card is not starved by what else this machine does.
     take_priority(real_time=1)
     packets = make_packets(make_block(load_instrument(Path(rig_path)), int(seed)))
-    sender = Sender(packets, (card, 1024), (host, int(port)))
+    sender = Sender(packets, (card, CARD_SOURCE_PORT), (host, int(port)))
 
     def answer(line: str) -> dict[str, Any]:
         total, rate = line.split()
@@ -175,7 +177,10 @@ def count(host: str, port: str, buffer_bytes: str) -> None:
 def process(rig_path: str, row_file: str) -> None:
     """Process a row again and again; see above."""
     rig = load_instrument(Path(rig_path))
+    # No byte range of the recorded row is missing.
+    missing = ()
     setups = [BoardSetup.from_rig(rig, board) for board in rig.receivers]
+    # Whole bursts of 16 chirps; the file may hold less than a row.
     size = np.fromfile(row_file, dtype=np.uint8, count=350 * rig.burst.pulses * rig.frame_bytes).size
     frames = size // rig.frame_bytes // rig.burst.pulses * rig.burst.pulses
     done = 0
@@ -188,7 +193,7 @@ def process(rig_path: str, row_file: str) -> None:
     threading.Thread(target=answer_until_end, daemon=True).start()
     while not ended.is_set():
         payload = np.fromfile(row_file, dtype=np.uint8, count=frames * rig.frame_bytes)
-        synchronise_row(*decode_row(payload, (), frames, rig.chirp.samples), setups[done % len(setups)])
+        synchronise_row(*decode_row(payload, missing, frames, rig.chirp.samples), setups[done % len(setups)])
         done += 1
 
 

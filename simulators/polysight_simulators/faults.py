@@ -110,9 +110,10 @@ def read_faults(
     faults = {name: decode({**common, **board_tables.get(name, {})}, Faults, f"faults of {name}") for name in boards}
     for name, f in faults.items():
         for required, keys in OF_CONTROL.items():
-            if control not in (None, required) and (idle := [key for key in keys if getattr(f, key)]):
+            without_effect = [key for key in keys if getattr(f, key)]
+            if without_effect and control not in (None, required):
                 raise ConfigError(
-                    f"faults {idle} of {name}: the rig has radar.control = {control!r}",
+                    f"faults {without_effect} of {name}: the rig has radar.control = {control!r}",
                     f"they need {required!r}",
                     "leave them out, or change radar.control (--native makes it native)",
                     code=ErrorCode.VALUES_CONFLICT,

@@ -48,6 +48,7 @@ class Patch:
 
     def tangents(self) -> NDArray:
         """Orthonormal tangents as combinations of d_a and d_b: [2, 2, ...], row i the parameters' rates along i."""
+        # First fundamental form. The first tangent is d_a of unit length, the second is d_b without its part along it.
         aa = _dots(self.d_a, self.d_a)
         ab = _dots(self.d_a, self.d_b)
         bb = _dots(self.d_b, self.d_b)
@@ -59,10 +60,12 @@ class Patch:
     def curvature(self) -> NDArray:
         """Curvature in the basis of `tangents`, [2, 2, ...], 1 / m; positive where the surface bends away (convex)."""
         normal = self.normal
-        second = [[-_dots(normal, self.d_aa), -_dots(normal, self.d_ab)]]
-        second.append([second[0][1], -_dots(normal, self.d_bb)])
+        aa = -_dots(normal, self.d_aa)
+        ab = -_dots(normal, self.d_ab)
+        bb = -_dots(normal, self.d_bb)
+        second_form = np.array([[aa, ab], [ab, bb]])
         basis = self.tangents()
-        return np.einsum("ij...,jk...,lk...->il...", basis, np.array(second), basis)
+        return np.einsum("ij...,jk...,lk...->il...", basis, second_form, basis)
 
 
 def _dots(a: NDArray, b: NDArray) -> NDArray:
@@ -104,6 +107,7 @@ class Shape:
         """Return the surface in the rig frame at parameters a and b, of shapes that broadcast."""
         parts = self.local(np.asarray(a, float), np.asarray(b, float))
         turned = [np.einsum("ij,j...->i...", self.axes, part) for part in vars(parts).values()]
+        # The first part is the point; derivatives do not move.
         turned[0] = turned[0] + np.reshape(self.place_m, (3, *(1,) * (turned[0].ndim - 1)))
         return Patch(*turned)
 
@@ -112,6 +116,7 @@ class Shape:
         share = np.ones(np.broadcast(a, b).shape)
         for value, scale, size_m in zip((a, b), self.scale_m(), self.size_m, strict=True):
             inside_m = size_m / 2 - np.abs(value) * scale
+            # The cubic step from 0 to 1 without slope at its ends.
             phase = np.clip(inside_m / SOFT_EDGE_M + 0.5, 0, 1)
             share = share * phase**2 * (3 - 2 * phase)
         return share
@@ -137,6 +142,7 @@ class Shape:
             patch = self.evaluate(a, b)
             difference = patch.point - points
             gradient = np.stack([_dots(difference, patch.d_a), _dots(difference, patch.d_b)])
+            # Gauss and Newton's: without the second derivatives of the surface.
             hessian = np.array([
                 [_dots(patch.d_a, patch.d_a), _dots(patch.d_a, patch.d_b)],
                 [_dots(patch.d_a, patch.d_b), _dots(patch.d_b, patch.d_b)],

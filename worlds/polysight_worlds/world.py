@@ -203,7 +203,7 @@ def draw_nuisances(rng: Generator, names: str | Sequence[str] = "none", *, stren
 
 
 def draw_stack(rng: Generator, permittivity: complex) -> Stack:
-    """Draw a half space or, as often, a plate of 0.4 to 6 mm on a lossy holder."""
+    """Draw a half space or, as often, a plate of 0.4 to 6 mm on a lossy holder; ranges are chosen."""
     if rng.random() < 0.5:
         return Stack(below=permittivity)
     holder = rng.uniform(1.05, 2.5) - 1j * rng.uniform(0.01, 0.4)
@@ -231,7 +231,7 @@ def draw_world(
     `pieces` places get a plate: one of copper (`with_metal`), the others of drawn `materials` (default: Table 2).
     `with_table`: a wooden table stands behind them.
     A material is a permittivity, as half space or slab on a holder (`half_spaces`: never a slab), or a whole stack.
-    Sizes are 40 to 50 mm.
+    Sizes are 40 to 50 mm, in steps of 2 mm.
     """
     materials = dict(TABLE_2) if materials is None else materials
     places = nine_places(centre_m)

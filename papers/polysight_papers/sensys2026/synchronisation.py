@@ -84,6 +84,7 @@ def sync_scan(run: Run) -> SyncScan:
     "Before" is the first chirp of each position as the hardware trigger left it, mixed down by one frequency for the
     whole scan, so that the object lies in the range gate at all; "after" is the pipeline's.
     """
+    # Without a permittivity a plate is metal; the numbers are x and y of its centre, mm.
     plates = [plate("copper", None, 0.0, 0.0), plate("left", None, -60.0, 40.0), plate("right", None, 60.0, -40.0)]
     with simulate_scan("three metal plates", plates, run.config, seed=1200) as (source, _):
         rig = source.instrument
@@ -107,6 +108,7 @@ def sync_scan(run: Run) -> SyncScan:
                 raw, _ = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
                 if carrier is None:
                     carrier = float(np.median(synced.direct_hz)) / chirp.sample_rate_hz
+                # The first chirp of each burst, [rx, position, sample].
                 mixed = raw[:, :: rig.burst.pulses] * np.exp(-2j * np.pi * carrier * np.arange(chirp.samples))
                 # All samples of the chirp, where synchronised rows are decimated; and no estimate of the phase's turn
                 # from position to position, so that motion in the bursts stays as it is.
@@ -119,6 +121,7 @@ def sync_scan(run: Run) -> SyncScan:
                     a, b = chirp.linear_samples
                     before = _compute_range_profile(mixed[0, :, a:b], 1)
                     after = _compute_range_profile(synced.samples[0], FOLD)
+        # The first receiver is that of H; the other results of `image` are its footprint and a notice.
         pairs = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
         grid = builder_after.grid
     range_m = np.arange(_RANGE_BINS) / _RANGE_BINS * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
@@ -226,6 +229,7 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
     for i, (board, content) in enumerate(summary.items()):
         marker, colour = styles[i]
         stages = content["stages"]
+        # The two boards stand side by side at each stage.
         positions = np.array([list(STAGES).index(s) for s in stages]) + 0.12 * (2 * i - 1)
         values = [s[f"{quantity}_std"] for s in stages.values()]
         ax.plot(positions, values, marker, ms=7, color=colour, label=f"{board}, simulated")
@@ -293,8 +297,8 @@ def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.N
     swept = []
     example = np.zeros((1, 1, chirp.samples), np.complex64)
     for offset in OFFSETS_HZ:
-        disturbances = {"if_offset_hz": offset}
-        with simulate_scan("direct path", (), run.config, 900, grid=GRID, disturbances=disturbances) as (source, _):
+        scene = {"grid": GRID, "disturbances": {"if_offset_hz": offset}}
+        with simulate_scan("direct path", (), run.config, seed=900, **scene) as (source, _):
             rig = source.instrument
             data = source.read_row(rig.receivers[0].name, 0)
             rx = len(rig.antennas.rx_mm)
@@ -357,6 +361,7 @@ def fig9(run: Run) -> Item:
     if_hz, amplitude, example = _sweep_start_frequencies(run, chirp)
     fitted = fit_high_pass(if_hz, amplitude)
     programmed = high_pass(chirp)
+    # The sweep's own level is taken out: the geometric mean of its ratio to the fitted filter.
     amplitude = amplitude / np.exp(np.mean(np.log(amplitude / np.abs(fitted.response(if_hz)))))
 
     fig = new_figure(11.5, 4.2)

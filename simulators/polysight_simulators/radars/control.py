@@ -44,8 +44,8 @@ _INTERRUPT_BIT = 5
 _CHANNELS = "ABCD"
 # Duration of a pin command (FTDI AN_114).
 _PIN_S = 0.2e-6
-# Two clocks, the minimum before and between chip selects (ICD 3.2.4). The simulation requires twice that, a margin that
-# is chosen.
+# Two clocks at 10 MHz, the minimum before and between chip selects (TI's interface control document, 3.2.4). The
+# simulation requires twice that, a margin that is chosen.
 _CLOCKS_S = 0.2e-6
 # Channel, operation and size of a request.
 _HEAD = struct.Struct("<ccH")
@@ -90,7 +90,7 @@ class UsbChip:
             for pins in data:
                 self._board.reset(held=pins >> 6 & 0b11 != 0b11)
         else:
-            # USB delays each request.
+            # USB delays each request: a chip select that is high between two of them has been so for long enough.
             if name == "A" and self._pins & _SELECT:
                 self._high_s = float("inf")
             self._pending[name] += data
@@ -114,7 +114,7 @@ class UsbChip:
             raise DeviceError("no such USB device", "it was unplugged", "plug it in", code=ErrorCode.NO_ANSWER)
 
     def _transfer_spi(self, data: bytearray) -> int:
-        """Execute the first command of channel A; return its bytes, or 0 if it is incomplete."""
+        """Execute the first command of channel A; return its length in bytes, or 0 if it is incomplete."""
         code = data[0]
         if code in _BARE:
             self._fast = self._fast or code == _FAST_CLOCK
@@ -122,6 +122,7 @@ class UsbChip:
         if code == _SET_DIVISOR:
             if len(data) < 3:
                 return 0
+            # Two periods of the chip's clock make one of SPI; the divisor is sent less one (AN_108).
             self.spi_hz = (60e6 if self._fast else 12e6) / (2 * (1 + int.from_bytes(data[1:3], "little")))
             return 3
         if code == _SET_PINS:
@@ -130,6 +131,7 @@ class UsbChip:
             return self._refuse_code("A", code)
         if len(data) < 3:
             return 0
+        # The number of bytes is sent less one.
         count = 1 + int.from_bytes(data[1:3], "little")
         if code == _WRITE_BYTES and len(data) < 3 + count:
             return 0
@@ -149,7 +151,7 @@ class UsbChip:
         return 3 + count
 
     def _set_pins(self, data: bytearray) -> int:
-        """Set clock, data and chip select of channel A; return the command's bytes, or 0 if it is incomplete."""
+        """Set clock, data and chip select of channel A; return the command's length, or 0 if it is incomplete."""
         if len(data) < 3:
             return 0
         pins = data[1]
@@ -176,7 +178,7 @@ class UsbChip:
         return 3
 
     def _set_gpio(self, data: bytearray) -> int:
-        """Execute the first command of channel B; return its bytes, or 0 if it is incomplete."""
+        """Execute the first command of channel B; return its length in bytes, or 0 if it is incomplete."""
         code = data[0]
         if code in _BARE:
             return 1
@@ -192,7 +194,7 @@ class UsbChip:
         return self._refuse_code("B", code)
 
     def _refuse_code(self, name: str, code: int) -> int:
-        """Answer an unknown command as the chip does; return its one byte."""
+        """Answer an unknown command as the chip does; return its length in bytes, 1."""
         self.errors.append(f"unknown command 0x{code:02X} on channel {name}")
         self._answers[name] += bytes((0xFA, code))
         return 1

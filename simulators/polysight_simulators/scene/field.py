@@ -1,7 +1,8 @@
 """Object field: the object's echo at every stage position, computed fast and cached.
 
 TX and RX move together in a plane, so the echo depends only on the difference of plate and stage position:
-field(u) = integral A(v) g(v - u) dv, a convolution. It is computed in the spectral domain:
+field(u) = integral A(v) g(v - u) dv, a convolution of the reflecting amplitude A of the scene. It is computed in the
+spectral domain:
 
 * plates and points enter by their analytic Fourier transforms, so edges are exact at any position;
 * the kernel g is sampled finely enough for its phase gradient (per axis) and fades out beyond the scene;
@@ -72,6 +73,7 @@ def _fit_angle_series(
     # More orders than r(theta) needs anywhere.
     many = 16
     x = cheb_nodes(many)
+    # From values at the nodes to coefficients, [order, node].
     to_series = chebyshev.chebvander(x, many - 1).T * (2.0 / many)
     to_series[0] /= 2.0
     rows = [[reflect(p, f, centre + half * x) for f in nodes_hz] for p in scene.plates]
@@ -180,7 +182,7 @@ class _Plane:
     surfaces
         Facets of each plate.
     amplitudes
-        Factor of each point in the samples, less 1 / (r1 r2).
+        Factor of each point in the samples, without 1 / (r1 r2).
     """
 
     ant: optics.Antennas
@@ -261,9 +263,10 @@ class _Plane:
     def plate_maps(
         self, level: _Level, series: optics.Complex, f: float, m: int
     ) -> list[tuple[NDArray[np.complex64], optics.Complex]]:
-        """Return spectra with the phases of C_m, each with the series of its kernel in the local angle, [order].
+        """Return pairs of a spectrum [kappa_y, kappa_x] and the series [order] of its kernel in the local angle.
 
-        There is one for each order, or for each plate if there are fewer of them: as few as there can be kernels.
+        The plates' echo is the sum of spectrum times kernel over pairs; heights have the phases of C_m. There is a pair
+        for each order, or for each plate if there are fewer of them: as few as there can be kernels.
         """
         if not level.plates:
             return []
@@ -323,7 +326,7 @@ class _Plane:
 
 
 def _range(legs: list[tuple[optics.Real, optics.Real, optics.Real, optics.Real]]) -> tuple[float, float]:
-    """Return the smallest and largest dpath/dz over the kernel."""
+    """Return the smallest and largest dpath/dz over the kernel: twice the obliquity, the fourth of `legs`."""
     return 2 * min(float(leg[3].min()) for leg in legs), 2 * max(float(leg[3].max()) for leg in legs)
 
 
@@ -337,6 +340,7 @@ def compute(
     nodes_hz, centre = _choose_nodes(scene, levels, samples_hz)
     # Range of the local angle over all levels and channels.
     legs = [leg for _, level in levels for leg in level.legs]
+    # `legs` has the incidence as its third.
     low = min(leg[2].min() for leg in legs)
     high = max(leg[2].max() for leg in legs)
     reflect = optics.board_reflectivity(board, scene)
@@ -662,10 +666,10 @@ def build_field(
     if path.exists():
         try:
             with np.load(path, allow_pickle=False) as f:
-                sx = f["start_m"]
-                sy = f["step_m"]
+                start = f["start_m"]
+                step = f["step_m"]
                 return ObjectField(
-                    f["values"], (sx[0], sx[1]), (sy[0], sy[1]), f["nodes_hz"], float(f["centre_path_m"])
+                    f["values"], (start[0], start[1]), (step[0], step[1]), f["nodes_hz"], float(f["centre_path_m"])
                 )
         except (OSError, ValueError, KeyError) as e:
             raise DataError(

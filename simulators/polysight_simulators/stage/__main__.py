@@ -141,30 +141,32 @@ def serve(
     stage: PythonStage, port: SerialPort, wires: WireClient | None, time_scale: float, boot_ms: int, stop: Signal
 ) -> None:
     """Run the stage behind its port until `stop` is set. Raises DeviceError when the wires break."""
-    started = wall = time.monotonic_ns()
+    started = time.monotonic_ns()
+    advanced_to = started
     ticks = 0.0
-    boots_at = 0
+    boot_ends = 0
     running = False
     while not stop.is_set():
         port.wait(STEP_POLL_MS if stage.stepping else REST_POLL_MS)
         now = time.monotonic_ns()
         if stage.stepping:
-            leap = min(now - wall, LONGEST_LEAP_NS)
+            leap = min(now - advanced_to, LONGEST_LEAP_NS)
         else:
-            leap = now - wall
-        wall = now
+            leap = now - advanced_to
+        advanced_to = now
         ticks += leap * time_scale * TICK_HZ * 1e-9
         now_ms = (now - started) // NS_PER_MS
         # Opening the port resets the board; its boot loader ignores bytes until it ends.
         if port.was_opened():
-            boots_at = now + boot_ms * NS_PER_MS
+            boot_ends = now + boot_ms * NS_PER_MS
             running = False
         is_open = port.is_open
 
-        # Read bytes first, so that a late process does not detect a silent host.
+        # At rest the time advances before bytes are read, so that motion begins now. While the stage steps they are
+        # read first: otherwise a late process would find a host silent whose bytes wait.
         if not stage.stepping:
             stage.advance(int(ticks), now_ms)
-        if is_open and not running and now >= boots_at:
+        if is_open and not running and now >= boot_ends:
             port.flush()
             stage.reset(now_ms)
             running = True

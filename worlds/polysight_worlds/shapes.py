@@ -398,6 +398,7 @@ def find_specular(shape: Shape, tx_m: NDArray, rx_m: NDArray) -> tuple[NDArray, 
     scale = np.array(shape.scale_m())
     grid = shape.grid()
     coarse = shape.evaluate(*grid)
+    # All pairs of antennas and places of the grid: [3, 1, place] beside [3, n, 1].
     patch = Patch(*(part[:, None] for part in vars(coarse).values()))
     path = follow_path(patch, tx_m[:, :, None], rx_m[:, :, None])
     # The smallest slope of the path per metre on the surface.

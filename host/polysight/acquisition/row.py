@@ -236,7 +236,7 @@ class Take:
 
     @property
     def note(self) -> str:
-        """The Pi's remark on a completed row: that it was held during the sweep."""
+        """The Pi's remark on a completed row: that it was held on the way."""
         if self.finished is not None and self.all_pulses_sent:
             return self.finished.reason
         return ""

@@ -503,6 +503,7 @@ class IncrementalImager(RowSpectra):
         ramps = self.ramps(row_starts_m(self.aperture.offsets_m))
         out = []
         for index in range(rows):
+            # [k, component, ny] @ [k, ny, 1], then [k, channel, component] @ [k, component, 1]
             parts = xp.matmul(xp.conj(self._kernels[:, self._find_lags(index), :]).mT, lines)
             row_spectra = xp.matmul(xp.conj(self._components).mT, parts)[:, :, 0]
             out.append(self.transform_rows_adjoint(row_spectra.mT, ramps[index, :]))

@@ -524,6 +524,7 @@ class _Scene:
         segmentation = self.segmentation
         theta = np.asarray(self.optics.theta_rad, np.float64)
         raw = to_metal(images, reference, self.plane)
+        # H and V relative to metal, smoothed.
         rh = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
         rv = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
         background_rms = background(raw.h, raw.v, segmentation, images.usable)

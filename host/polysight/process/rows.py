@@ -334,6 +334,7 @@ class KeptSamples:
         if digests is None or not self._head:
             return None
         with self._lock:
+            # Another program may have added the line since the last reading.
             if self._read_kept_digests(row) != digests:
                 self._read_lines()
             if self._read_kept_digests(row) != digests:
@@ -357,6 +358,7 @@ class KeptSamples:
         required = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
         if not isinstance(head, dict) or any(head.get(key) != value for key, value in required.items()):
             return {}
+        # Images without sub-bands, 1, can be formed from samples with any.
         if self._bands not in (1, head.get("bands")) or not _is_valid_head(head):
             return {}
         return head

@@ -124,6 +124,7 @@ def sync_scan(run: Run) -> SyncScan:
         # The first receiver is that of H; the other results of `image` are its footprint and a notice.
         pairs = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
         grid = builder_after.grid
+    # At a path of c / hz_per_sample the IF is the sample rate, which cannot be told from 0.
     range_m = np.arange(_RANGE_BINS) / _RANGE_BINS * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
     bins = int((range_m < _SHOWN_M).sum())
     x = (grid.x_m[[0, -1]] - grid.x_m[[0, -1]].mean()) * 1e3

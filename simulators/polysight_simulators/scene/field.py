@@ -424,6 +424,7 @@ def _choose_nodes(
         inside = max(inside, 4 * depth)
     # Shapes extend beyond their fronts' heights; some 0.15 m on either side hold their specular points.
     depth_m = max((abs(p.height_mm) / 1e3 + 0.15 for p in scene.shapes), default=0.0)
+    # Both ends are extended alike, so that the spread is even about the centre: by `inside`, and by twice each depth.
     spread = longest_m - shortest_m + 2 * inside + 4 * depth_m
     centre = (longest_m + shortest_m) / 2
     # Time-bandwidth product plus a few: interpolation error of the Chebyshev series below 1e-6.
@@ -473,8 +474,9 @@ class _Kernels:
             shares = level.shares(oblique)
             paths_m.append(r1 + r2 - centre_m)
             fall.append([(lost if shares is None else lost * share).astype(np.float32) for share in shares or [1.0]])
-            place = (incidence - (low + high) / 2) / max((high - low) / 2, 1e-9)
-            polynomials = chebyshev.chebvander(place, orders - 1)
+            # The range of angles is -1 to 1 for the polynomials.
+            scaled_angle = (incidence - (low + high) / 2) / max((high - low) / 2, 1e-9)
+            polynomials = chebyshev.chebvander(scaled_angle, orders - 1)
             angle.append(np.moveaxis(oblique[..., None] * polynomials, -1, 0).astype(np.float32))
         return cls(level, paths_m, fall, np.stack(angle))
 

@@ -210,6 +210,21 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_plate_cut_off_from_a_larger_patch_is_told(seed):
+    """Six plates without gaps: four in a square, two in a row at its corner. The last one was lost without a word."""
+    size = 23
+    places = [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]
+    boxes = [(35 + size * i, 35 + size * j, 35 + size * (i + 1), 35 + size * (j + 1)) for i, j in places]
+    h, v = draw(seed, dict.fromkeys(boxes, (-6.0, 0.25)), strips=1.0, amplitude=0.05)
+    segmentation = segment(h, v, AXIS, AXIS)
+    x0, y0, x1, y1 = boxes[-1]
+    told = [patch.mask for patch in segmentation.patches] + list(segmentation.left_out)
+    # The background may be left out, too: a mask that is mostly of this plate counts.
+    of_plate = [mask for mask in told if mask[y0:y1, x0:x1].sum() > 0.4 * mask.sum()]
+    assert max((mask[y0:y1, x0:x1].mean() for mask in of_plate), default=0.0) > 0.5
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
     """Fringes over the scan shift the whole picture; each channel's copies have a place of their own."""
     plates = raster([0.0, -3.0, 0.0, -2.0, -1.0, 0.0], RATIOS[:6], 8)

@@ -140,7 +140,7 @@ class Segmentation:
     """Patches of an image.
 
     `labels` int32 [ny, nx]: patch number of each pixel, 0 for none. `left_out`: masks of bright regions, bool
-    [ny, nx] each, that do not stand out enough to be patches.
+    [ny, nx] each, that do not stand out enough to be patches, or that touch a larger patch.
     """
 
     labels: npt.NDArray[np.int32]
@@ -262,19 +262,21 @@ def segment(
     smooth_level = _remove_speckle(np.maximum(level, cfg.floor_db), usable, cfg, pixel_mm)
     # Smoothing the outline may have left too little of a region.
     least_pixels = SMALLEST_SHARE * cfg.smallest_mm**2 / pixel_mm**2
-    regions = [mask for mask in _find_regions(smooth_level, usable, cfg, pixel_mm) if mask.sum() >= least_pixels]
+    found = _find_regions(smooth_level, usable, cfg, pixel_mm)
+    regions = [(mask, parts) for mask, parts in found if mask.sum() >= least_pixels]
     least_db = _find_least_level_db(smooth_level, usable, cfg, pixel_mm)
     if np.isfinite(least_db):
         # Where plates fill a small image, dim ones are among the dark pixels beside metal: the gaps are the background.
-        gaps = level[_select_gaps(usable, regions, cfg.margin_mm / pixel_mm)]
+        gaps = level[_select_gaps(usable, [mask for mask, _ in regions], cfg.margin_mm / pixel_mm)]
         if gaps.size >= least_pixels:
             least_db = min(least_db, max(float(np.median(gaps)) + PLAIN_DB, cfg.dimmest_db))
     masks: list[Mask] = []
     left_out: list[Mask] = []
-    for mask in regions:
+    for mask, cut_off in regions:
         region_db = float(np.median(smooth_level[mask]))
         if region_db >= least_db:
             masks.append(mask)
+            left_out += [part for part in cut_off if float(np.median(smooth_level[part])) >= cfg.dimmest_db]
         elif region_db >= cfg.dimmest_db:
             left_out.append(mask)
     labels = np.zeros(h.shape, np.int32)
@@ -394,8 +396,10 @@ class _Growing:
         return min(self.masks, key=lambda step: abs(step[0] - edge_db))[1]
 
 
-def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[Mask]:
-    """Return the masks of all regions that stand out from what surrounds them, bright ones first.
+def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> list[tuple[Mask, list[Mask]]]:
+    """Return all regions that stand out from what surrounds them, bright ones first: mask, and parts cut off from it.
+
+    A part that is cut off touches the region and is narrower, but has the size of a plate.
 
     The threshold falls from the brightest level, and connected regions grow with it. A region is complete when its
     median lies `EDGE_DB` above the threshold (half of its own amplitude), or before it runs into another region or into
@@ -404,12 +408,13 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     opening_px = (cfg.smallest_mm / pixel_mm - 1) / 2
     skirt_px = max(1.0, cfg.margin_mm / pixel_mm)
     remaining = usable.copy()
-    regions: list[Mask] = []
+    regions: list[tuple[Mask, list[Mask]]] = []
     growing: list[_Growing] = []
 
     def take_region(mask: Mask) -> None:
         """Add a region, and remove its pixels and its skirt from the remaining ones."""
-        regions.append(_smooth_outline(mask))
+        outline = _smooth_outline(mask)
+        regions.append((outline, _find_components(_open_mask(mask & ~outline, opening_px))))
         window = _find_window(mask, int(skirt_px) + 1)
         remaining[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
 

@@ -194,7 +194,7 @@ def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
 def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
     """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials).
 
-    `left_out` bright regions of a plate's size do not stand out enough from the background to be patches.
+    `left_out` bright regions of a plate's size do not stand out enough to be patches, or touch a larger patch.
     """
     if patches == 0:
         return [reason(
@@ -216,8 +216,8 @@ def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -
             reason(
                 "good",
                 f"{left_out} region{'s' * (left_out > 1)} of a plate's size within 25 dB of the brightest: no patch",
-                "no brighter than the background scatters: sidelobes, clutter or very weak plates",
-                "draw a box where a plate lies (polysight label; process --labels)",
+                "no brighter than the background scatters (sidelobes, clutter, weak plates), or it touches a patch",
+                "lay plates apart; draw a box where a plate lies (polysight label; process --labels)",
                 0.5,
             )
         ]

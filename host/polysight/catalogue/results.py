@@ -607,8 +607,8 @@ def draw_comparison(comparison: Comparison, name: str) -> Picture:
     visible = np.isfinite(values)
     is_signed = name in ("permittivity", "loss")
     # The colours end at this percentile (chosen), so that few extreme pixels do not set them.
-    share = 95 if is_signed else 98
-    reach = max(percentile(np.abs(values), visible, share, 1.0), 1e-3)
+    percent = 95 if is_signed else 98
+    reach = max(percentile(np.abs(values), visible, percent, default=1.0), 1e-3)
     if name == "sigmas":
         reach = max(reach, 2 * SIGNIFICANT)
     limits = (-reach, reach) if is_signed else (0.0, reach)

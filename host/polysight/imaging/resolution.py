@@ -77,9 +77,9 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     limit = [limit_m(aperture, point, axis) for axis in (0, 1)]
     cuts = [_cut(aperture, weights, point, axis, limit[axis]) for axis in (0, 1)]
     wavelength_m = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
-    length = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
+    lengths_m = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
     distance = point[2] - aperture.offsets_m[..., 2].mean()
-    paper = [1e3 * distance * wavelength_m / n if n > 0 else np.inf for n in length]
+    paper = [1e3 * distance * wavelength_m / length_m if length_m > 0 else np.inf for length_m in lengths_m]
     widths = [1e3 * _measure_width(cut) * step for cut, step in cuts]
     sidelobes = [_measure_sidelobe_db(cut) for cut, _ in cuts]
     return PointResponse(

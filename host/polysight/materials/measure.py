@@ -27,7 +27,7 @@ from polysight_shared.findings import Finding
 
 AMPLITUDE_OF_BLOCKS = 0.85
 PHASE_OF_BLOCKS = 0.75
-"""Error of a plate's ln|V / H| and of its phase over the scatter of its pixels and the root of its independent places.
+"""Errors of a plate's ln|V / H| and of its phase, times the root of its independent places, over its pixels' scatter.
 
 Speckle averages out; edges, neighbours and ripple are correlated over 10 to 20 mm, `BLOCK_M`, and average as slowly.
 Errors of 2,500 plates of the independent generator are described best by 0.8 and 0.6; a little more is kept (chosen).
@@ -78,8 +78,8 @@ real plate of one material (acrylic, published rig) has 0.06 after the factor fo
 ODD_NOISE = 2.0
 """Size of V's noise in V / H, over its root mean square, that makes no pixel odd: 2 % of noise exceeds it."""
 NOISE_OF_HALVES = 22.0
-"""Difference of the halves' medians by noise in V / H, over its root mean square and the root of the pixels: three
-standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
+"""Difference of the halves' medians by noise in V / H, times the root of the pixels, over the noise's root mean square:
+three standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
 DIM_V = 0.12
 """|V| over |H| below which the phase between both is not judged; chosen."""
 LEAST_COHERENCE = 0.7

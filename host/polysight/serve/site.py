@@ -50,7 +50,7 @@ LINGER_S = 30.0
 # Reads at a time, of all folders and of one: chosen, so that one folder that hangs takes half of the threads at most.
 READERS = 4
 READERS_OF_ONE_FOLDER = 2
-# A folder's size is counted again after so long (chosen), at most.
+# A size that is asked for is counted again if its count is older (chosen).
 SIZE_AGE_S = 20.0
 STREAM_INTERVAL_S = 0.1
 # A page that receives nothing for some of these (chosen) reconnects.

@@ -153,17 +153,17 @@ def fit_high_pass(
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     measured = np.log(amplitude)
-    turns = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
+    phasors = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
 
     def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the deviations [value] of log amplitudes, then of phases if known, from those of a filter."""
         h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
         gain = measured - np.log(np.abs(h))
         deviation = gain - gain.mean()
-        if turns is None:
+        if phasors is None:
             return deviation
-        turn = turns * np.conj(h) / np.abs(h)
-        return np.concatenate([deviation, np.angle(turn * np.conj(turn.mean()))])
+        difference = phasors * np.conj(h) / np.abs(h)
+        return np.concatenate([deviation, np.angle(difference * np.conj(difference.mean()))])
 
     # Limits, starts and the loss are chosen.
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,22 @@ def test_a_dead_folder_stops_no_other_live_view(dead, view):
     dead.stop(site, "Watch")
     assert ask(view, "/api/state?scan=dead")[0] == 503
     wait_until_answered(view, "/api/state?scan=alive")
+
+
+@pytest.mark.parametrize("address", ["/api/program/doctor", "/api/probe?scan=dead&x=0&y=0"])
+def test_programs_and_libraries_of_a_drive_that_is_gone_hold_nobody_up(dead, view, monkeypatch, address):
+    def hang(*_: object) -> None:
+        dead.back.wait()
+
+    monkeypatch.setattr(reading.catalogue, "find_program", hang)
+    monkeypatch.setattr(site.Site, "libraries", hang)
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(ask, view, address)
+        try:
+            wait_until_answered(view, "/api/result?scan=alive")
+            assert waiting.result()[0] == 503
+        finally:
+            dead.back.set()
 
 
 def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):

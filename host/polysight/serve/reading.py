@@ -163,7 +163,7 @@ async def _send_program(site: Site, request: Request) -> Response:
     kind = request.path_params["kind"]
     if kind not in ("doctor", "train", "concentration"):
         return json_answer(None)
-    return json_answer(catalogue.find_program(site.logs, kind))
+    return json_answer(await site.read("", lambda: catalogue.find_program(site.logs, kind)))
 
 
 # --- the live view ---
@@ -260,8 +260,12 @@ async def _send_probe(site: Site, request: Request) -> Response:
     x_mm = _parse_number(request, "x")
     y_mm = _parse_number(request, "y")
     name = request.query_params.get("library", "")
-    library = site.libraries().get(name)
-    return json_answer(await _read_products(site, request, lambda folder: catalogue.probe(folder, x_mm, y_mm, library)))
+    # The libraries are read in the thread, too: their drive may be gone.
+    return json_answer(
+        await _read_products(
+            site, request, lambda folder: catalogue.probe(folder, x_mm, y_mm, site.libraries().get(name))
+        )
+    )
 
 
 async def _send_file(site: Site, request: Request) -> Response:

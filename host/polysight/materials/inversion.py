@@ -285,16 +285,16 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
     model = SceneLikelihood(measurements, prior, kinds)
     rng = np.random.default_rng(0)
     z, log_evidence, log_bare = sample_posterior(model, rng)
-    weights = np.ones(model.patch_count + 1)
+    weights = model.evidence.copy()
     if not prior.leakage_measured:
-        weights[1:] = WEIGHT_OF_KINDS
-        z, _ = _anneal(model, z, np.ones_like(weights), weights, rng)
+        weights[1:] *= WEIGHT_OF_KINDS
+        z, _ = _anneal(model, z, model.evidence, weights, rng)
     patches = []
     parts = model.log_likelihoods(z)
     for i in range(model.patch_count):
-        # A patch is measured without the evidence that it must be some material itself.
+        # A patch is measured without the evidence that it, or another of its material, must be some material.
         without_patch = weights.copy()
-        without_patch[i + 1] = 0.0
+        without_patch[1:] *= 1 - model.same[i]
         particles, _ = _anneal(model, z, weights, without_patch, rng, parts)
         patches.append(_estimate(model, particles, i, rng))
     return _solution(model, (z, log_evidence, log_bare), tuple(patches))

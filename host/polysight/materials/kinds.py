@@ -75,10 +75,9 @@ LEAST_LOSS_SPREAD = 0.02
 """Standard deviation of eps'' between specimens, in addition to that in proportion to eps''; chosen."""
 METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat. Chosen."""
-SAME_MATERIAL = 0.02
-"""Probability that two plates of a scene are of one material, before they are measured. Chosen: with 0.01 six foreign
-plates of one material still turned the boards; with 0.05 too few plates were left to tell the published picture's
-leakage."""
+SAME_MATERIAL = 0.005
+"""Probability that two plates of a scene are of one material, before they are measured. Chosen: more leaves too few
+plates to tell the published picture's leakage (its half widths exceed 20 % from 0.02 on)."""
 DENSITY_OF_OTHERS = 20.0
 """Density over t of a plate of another material: that of half spaces is 5 to 50 where most solids are."""
 SPECIMEN_STD = 0.01

@@ -68,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
     load = machine()["load_average"][0]
     print(f"two threads beside one: {wall:.2f} times as fast by the clock, {cpu:.2f} times the CPU (load {load})")
     seconds = {str(count): {"cpu_s": t.cpu, "wall_s": t.wall} for count, t in threads.items()}
+    # [] because these figures have no limits to judge.
     write(args.json, "scaling", [], sizes=lines, threads=seconds)
     return 0
 

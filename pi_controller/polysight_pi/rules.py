@@ -49,6 +49,7 @@ RULES = (
     Rule("Abort", "homing", "same", "stop"),
     Rule("Abort", "jogging", "same", "abort_jog"),
     Rule("Abort", "idle homed ready stopping ending fault", "same"),
+    # Only permitted here: the executor passes the burst to the trigger loop.
     Rule("Pulse", "idle homed fault", "same"),
     # Replies of the stage; ignored in all other states. `homed`, `moved`, `passed`: homing, jog or row came to its end.
     # `stopped`: the alarm that STOP latches. `stage lost`: no link, a reset, or another alarm.

@@ -66,6 +66,7 @@ def turn(axis: NDArray, angle_deg: float) -> NDArray:
 
 def find_mirror_point(tx: NDArray, rx: NDArray, plane_m: float) -> NDArray:
     """Point of the plane z = `plane_m` in which RX sees TX as in a mirror, [3], metres."""
+    # On the line to the other antenna, the mirror point divides as the two heights above the plane do.
     share = (plane_m - tx[2]) / (2 * plane_m - tx[2] - rx[2])
     return np.array([*(tx + share * (rx - tx))[:2], plane_m])
 
@@ -115,8 +116,8 @@ def build_rig(
 ) -> Rig:
     """Return the rig of three boards, each (position in metres, boresight).
 
-    At their mirror points, TX sends s and p in equal parts, H receives s and V receives p. `leakage`: the amplitudes of
-    p in H and of s in V, relative to the receiver's polarisation.
+    At its own mirror point H receives s, and V receives p; towards that of H, TX sends s and p in equal parts.
+    `leakage`: the amplitudes of p in H and of s in V, relative to the receiver's polarisation.
     """
 
     def aim(

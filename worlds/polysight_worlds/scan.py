@@ -114,9 +114,10 @@ class PlateEchoes:
         # A medium without layers reflects equally at all frequencies: one table is enough.
         table_frequencies_hz = rig.frequencies_hz if plate.stack.layers else rig.frequencies_hz[:1]
         self._tables = [ReflectionTable(plate.stack, f) for f in table_frequencies_hz]
-        self._terms: list[NDArray] = []
+        self._reflections: list[NDArray] = []
         main = self._responses[0]
         along_x, along_y = self._find_edges()
+        # How much the path changes across a facet, in x and y.
         self._steps_m = main.path_steps(along_x, along_y)
         self._phase = _PhaseSteps(main.path_m, rig.frequencies_hz)
         # Height differences change the path by c delta, with c = d path / d z: the mean of c goes into the mask, the
@@ -126,7 +127,8 @@ class PlateEchoes:
         self._rise_mean = float(np.sum(weight * main.gradient[2]))
         self._rise_deviation = main.gradient[2] - self._rise_mean
         bend_mean = float(np.sum(weight * main.curvature_z))
-        self._path_mean = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
+        # What the heights add to the path of each cell, to second order, with the means of c and of its derivative.
+        self._height_path_m = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
         k = 2 * np.pi * rig.frequencies_hz[-1] / LIGHT_M_PER_S
         rms_phase = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_deviation**2))
         # Twice the rms stands for the largest phase. The series has one term at least, and twelve at most (chosen).
@@ -137,7 +139,10 @@ class PlateEchoes:
             term *= 2 * rms_phase / self._orders
 
     def _list_points(self, plate: Plate) -> NDArray:
-        """Cell minus offset for all circular lags, [3, lags_y, lags_x], and z of the plate's reference height."""
+        """Cell minus offset for all circular lags, [3, lags_y, lags_x], and z of the plate's reference height.
+
+        A lag is the index of the offset minus that of the cell.
+        """
         rig = self._rig
         surface = self._surface
         offsets_x, offsets_y = rig.offsets_m()
@@ -154,12 +159,12 @@ class PlateEchoes:
 
     def _reflect(self, index: int) -> list[NDArray]:
         """Return the reflection of cells of each slope at frequency `index`."""
-        if not self._terms or len(self._tables) > 1:
-            self._terms = []
+        if not self._reflections or len(self._tables) > 1:
+            self._reflections = []
             for response in self._responses:
                 r_s, r_p = self._tables[index].look_up(response.cos_incidence)
-                self._terms.append(r_s * response.s_weight + r_p * response.p_weight)
-        return self._terms
+                self._reflections.append(r_s * response.s_weight + r_p * response.p_weight)
+        return self._reflections
 
     def add_echoes(self, data: NDArray, index: int) -> None:
         """Add the echoes at frequency `index` to complex `data` [rows, columns]."""
@@ -171,14 +176,14 @@ class PlateEchoes:
         area_m2 = float(np.linalg.norm(np.cross(*self._find_edges())))
         # Physical optics of a facet, see `optics.Response`.
         common = (1j * k / (4 * np.pi) * area_m2 * phase_integral).astype(np.complex64) * self._phase.phases(index)
-        terms = self._reflect(index)
-        kernel = (common * terms[0]).astype(np.complex64)
-        mask = self._brightness * surface.cover * np.exp(-1j * k * self._path_mean)
+        mean_reflection, *varied_reflections = self._reflect(index)
+        kernel = (common * mean_reflection).astype(np.complex64)
+        mask = self._brightness * surface.cover * np.exp(-1j * k * self._height_path_m)
         spectrum = self._multiply(mask, kernel)
         # Local slopes to first order: slope times the change of the kernel with it.
         if surface.local_slopes is not None:
-            for slope, varied in zip(surface.local_slopes, terms[1:], strict=True):
-                spectrum += self._multiply(mask * slope, common * (varied - terms[0]) / SLOPE_STEP)
+            for slope, varied in zip(surface.local_slopes, varied_reflections, strict=True):
+                spectrum += self._multiply(mask * slope, common * (varied - mean_reflection) / SLOPE_STEP)
         # Taylor series of exp(-jk (c - mean c) delta): each order multiplies by one factor of height and one of c.
         for order in range(1, self._orders):
             mask = mask * surface.height_m
@@ -199,7 +204,7 @@ def fast_length(length: int) -> int:
 def fft2(values: NDArray, shape: tuple[int, int] | None = None) -> NDArray:
     """Return the two-dimensional spectrum, padded to `shape`, in the precision of `values`."""
     rows, columns = shape or values.shape[-2:]
-    # The columns of the padding are zero, also of the spectrum along y.
+    # Along y first: padding adds columns of zeros, whose spectrum along y is zero and need not be computed.
     return np.asarray(fft.fft(fft.fft(values, rows, axis=-2), columns, axis=-1))
 
 
@@ -239,6 +244,7 @@ def record(rig: Rig, rx: Antenna, world: World, seed: int = 0) -> NDArray:
     """
     data = np.zeros((len(rig.frequencies_hz), rig.rows, rig.columns), np.complex64)
     for number, plate in enumerate(world.plates):
+        # The 2 keeps these numbers independent of others that are drawn with the same seed.
         rng = np.random.default_rng([seed, 2, number])
         echoes = PlateEchoes(rig, rx, plate, make_surface(plate, rig.step_m, rng))
         for index in range(len(rig.frequencies_hz)):

@@ -276,6 +276,7 @@ class RunningScan:
             faults = take.faults(self._instrument.burst.pulses)
             if number == last_take:
                 raise explain_incomplete_row(take, faults, self._scan, number - first_take + 1)
+            # Raises if the next take cannot begin without a person; homing is allowed only before the first row.
             check_between_rows(self._pi.status(), self._scan.scan_id, first=False)
             if take.silent_boards:
                 # A card that lost power has lost its configuration.
@@ -310,7 +311,7 @@ class RunningScan:
 
     @contextmanager
     def _exclude_time(self) -> Iterator[None]:
-        """Exclude the block from the row's duration, in which the wait for processing is included."""
+        """Exclude the block from the row's duration; the wait for processing is not excluded."""
         started_s = time.monotonic()
         try:
             yield
@@ -565,6 +566,7 @@ def resume_scan(
         check_same_scan(scan.instrument, rig_now, "the rig file given")
     with ExitStack() as stack:
         writer = stack.enter_context(scan.writer())
+        # Read it again under the writer's lock: another program may have written to it until then.
         scan.reload()
         withdrawn = _withdraw_damaged(scan, writer, progress)
         pi, rig, hello = _connect(stack, rig_now or scan.instrument, progress)

@@ -107,7 +107,7 @@ class ErrorDiscriminant(Model):
     angles_rad
         Incidence angles; empty if not known.
     level
-        float64 [materials, d]: mean of each material, relative to the expansion point of its features.
+        float64 [materials, d]: mean of each material, as a deviation from its anchor (`_set_anchors`).
     within, between, scan
         float64 [d, d]: covariances of e, of u by placement, and of g.
     spread
@@ -141,6 +141,7 @@ class ErrorDiscriminant(Model):
         scan = np.unique(samples.groups, return_inverse=True)[1][first]
         plate = samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
+        # Metal-like patches have no error of their own, and tell nothing of those of scans.
         informative = ~self._find_metal_like(samples.x, patch)
         if not informative.any():
             informative[:] = True
@@ -168,7 +169,8 @@ class ErrorDiscriminant(Model):
         self._fit_patches(residual[repeated] * np.sqrt(repeated.sum() / dof), material[repeated], plate[repeated], dof)
         patches_per_scan = max(informative.sum() / scans, 1.0)
         common = self._decorrelate_angles(_compute_covariance(offset[np.unique(scan[informative])], max(scans - 1, 1)))
-        # A scan's offset is a mean over its patches, whose own errors are in it.
+        # A scan's offset is a mean over its patches, whose own errors are in it. The added variance, far below any real
+        # one, keeps the matrix invertible.
         self.scan = _clip_eigenvalues(common - self.between / patches_per_scan) + 1e-8 * np.eye(width)
         self._set_thresholds(
             (mean - self.level[material])[repeated],
@@ -189,8 +191,8 @@ class ErrorDiscriminant(Model):
         """Material to permittivity of the half space with its ratio; without metals; empty if angles are not known."""
         if not len(self.angles_rad):
             return {}
+        # METAL_SPECIMENS is the largest |t - 1| of a metal. t is V / H relative to metal, at each angle.
         dielectric = (abs(self._anchor_t - 1) > METAL_SPECIMENS).all(axis=1)
-        # t is V / H relative to metal, at each angle.
         kinds = zip(self.names[dielectric], self._anchor_t[dielectric], strict=True)
         return {str(name): apparent_permittivity(t, self.angles_rad) for name, t in kinds}
 
@@ -224,7 +226,7 @@ class ErrorDiscriminant(Model):
         ids, patch = np.unique(patches, return_inverse=True)
         deviations = self._compute_deviations(x) - self.level
         mean = np.stack([deviations[patch == i].mean(axis=0) for i in range(ids.size)])
-        # The smallest patch's number, at most the library's usual one, stands for all patches.
+        # All patches count as having the smallest one's number of pixels, at most the library's usual number.
         pixels = float(min([self.pixels, *np.bincount(patch).tolist()]))
         patch_covariances = self._patch_covariances(pixels)
         informative = ~self._find_metal_like(x, patch)
@@ -272,6 +274,7 @@ class ErrorDiscriminant(Model):
 
     def _compute_specimen_effects(self) -> Real:
         """Return the effect F_m of specimens' deviations on the features of each material, [materials, features, 2]."""
+        # [materials, 3 * angles, 2], ordered as [materials, 2, angles, 3], as `_select_channels` takes them.
         anchor_effects = np.stack([effect(t, self.angles_rad) for t in self._anchor_t])
         effect_matrices = anchor_effects.reshape(*self._anchor_t.shape, 3, 2).transpose(0, 3, 1, 2)
         return self._select_channels(effect_matrices).swapaxes(1, 2)
@@ -289,10 +292,9 @@ class ErrorDiscriminant(Model):
         self._anchor_h, self._anchor_v, self._anchor_t = (
             np.stack([c[members].mean(axis=0) for members in of_material]) for c in (*logs, t)
         )
-        width = len(self._select_channels(np.zeros((1, 1, 3)))[0])
-        features = width * h.shape[1]
-        self._same_angle = np.arange(features)[:, None] // width == np.arange(features)[None] // width
-        self.level = np.zeros((self.names.size, features))
+        features_per_angle = self._select_channels(np.zeros((1, 3))).size
+        angle = np.arange(features_per_angle * h.shape[1]) // features_per_angle
+        self._same_angle = angle[:, None] == angle[None]
         phase = np.tile({"P": [0, 1], "H+V+P": [0, 0, 1]}.get(self.channels, [0]), h.shape[1])
         self._gain_and_phase = (phase[:, None] == phase[None]).astype(float)
 
@@ -303,7 +305,7 @@ class ErrorDiscriminant(Model):
         if self.channels == "V":
             return np.log(np.maximum(v, 1e-6))[:, None] - self._anchor_v
         log_h = np.log(np.maximum(h, 1e-6))[:, None] - self._anchor_h
-        # `relative` makes deviations of ln|H|, ln|V| and arg P of these of ln|H| and of t.
+        # `relative` converts deviations of ln|H| and of t to those of ln|H|, ln|V| and arg P.
         return self._select_channels(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
 
     def _select_channels(self, every: Real) -> Real:
@@ -332,8 +334,8 @@ class ErrorDiscriminant(Model):
         It includes the error of the material's mean, known from a limited number of placements and specimens.
         """
         placement_factor = (1 + 1 / self.placements)[:, None, None]
-        differ = self._effects * (self.spread * (1 + 1 / self.plates[:, None]))[:, None]
-        return self.within / pixels + self.between * placement_factor + differ @ self._effects.mT
+        scaled_effects = self._effects * (self.spread * (1 + 1 / self.plates[:, None]))[:, None]
+        return self.within / pixels + self.between * placement_factor + scaled_effects @ self._effects.mT
 
     def _compute_pixel_covariances(self) -> Real:
         """Return the covariance of one pixel about each material's mean with all errors, [materials, d, d]."""
@@ -358,13 +360,16 @@ class ErrorDiscriminant(Model):
             law = np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
-        def farthest(deviations: Real, index: npt.NDArray, covariances: Real) -> float:
+        def left_out_quantile(deviations: Real, index: npt.NDArray, covariances: Real) -> float:
+            """Return the squared distance that a share REJECTED of the library's own deviations exceeds."""
             d = deviations * left_out[index]
             distance2 = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[index], d)
             return float(np.quantile(distance2, 1 - REJECTED))
 
-        self.patch_level = max(law, farthest(patches, material, self._patch_covariances(self.pixels) + self.scan))
-        self.pixel_level = max(law, farthest(pixels, pixel_material, self._compute_pixel_covariances()))
+        self.patch_level = max(
+            law, left_out_quantile(patches, material, self._patch_covariances(self.pixels) + self.scan)
+        )
+        self.pixel_level = max(law, left_out_quantile(pixels, pixel_material, self._compute_pixel_covariances()))
 
 
 def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:

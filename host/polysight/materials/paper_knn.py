@@ -35,7 +35,7 @@ def paper_distance(
     if first.shape[1] % WIDTH:
         distance = np.abs(first[:, None, :] - second[None, :, :]).sum(axis=2)
     else:
-        # It takes 1/P in the place of P, and None for no distance of P.
+        # `channel_distances` takes 1/P in place of P. Without a weight of P it is spared the work: its distance is 0.
         channels = channel_distances(ratio_columns(first), ratio_columns(second), measure if p else None)
         distance = h * channels[0] + v * channels[1] + p * channels[2]
     if np.ndim(a) > 1 or np.ndim(b) > 1:

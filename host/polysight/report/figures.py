@@ -210,6 +210,7 @@ def draw_materials(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[sty
             ax.add_patch(
                 style.make_outline(patch, fill=False, edgecolor=style.REFUSED_COLOUR, hatch=style.HATCH, linewidth=0.0)
             )
+        # Results may lack the outline: a judged patch is then shown by its pixels alone, another by its box.
         if patch.outline_mm or patch.refused is not None:
             ax.add_patch(style.make_outline(patch, fill=False, edgecolor=style.INK, linewidth=0.9))
         name = style.patch_label(patch)
@@ -317,6 +318,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     _fill_patches(
         fig, error_axes, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|")
     )
+    # SIMULATED is written once, above the right map.
     style.style_axes(value_axes, "Permittivity ε′ ± standard error", simulated=False)
     style.style_axes(error_axes, "Relative error of ε", scan.stamped)
     for ax in (value_axes, error_axes):
@@ -340,7 +342,10 @@ def _fill_patches(
     texts: dict[int, str],
     scale: tuple[str, float, float, str],
 ) -> None:
-    """Fill patches in the colours of their values; others are grey, hatched if they were not judged.
+    """Fill patches in the colours of their values, and write their `texts` into them and their numbers at a corner.
+
+    Without a value the metal reference has the colour of metal and other patches are grey, hatched if they were not
+    judged; without a text "metal", "not judged" or a dash is written.
 
     `scale` is the colour map, the values at its ends, and the colour bar's label.
     """

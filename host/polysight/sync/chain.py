@@ -187,8 +187,8 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
     Parameters
     ----------
     frames
-        int16 [frame, sample, 2, rx] from `row_words` (fastest), or complex64 [rx, frame, sample] in ADC counts;
-        positions in order of recording, `setup.pulses` frames each (frames are single chirps here).
+        int16 [frame, sample, 2, rx] from `row_words`, or complex64 [rx, frame, sample] in ADC counts, which are
+        converted first; positions in order of recording, `setup.pulses` frames each (single chirps here).
     valid
         bool [frame]: frames received whole.
     setup
@@ -363,6 +363,7 @@ def errors(
 
     mean_amplitude = (relative_amplitude * good).sum(axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)
     amplitude_error = relative_amplitude / mean_amplitude - 1
+    # `aligned.error` has frequency and phase on its second axis; the masks leave [2, n] and [n].
     chirp_errors = np.array([*aligned.error[examined].swapaxes(0, 1)[:, good], amplitude_error[good]])
 
     with_several_chirps = examined[good.sum(axis=1) > 1]
@@ -395,6 +396,7 @@ def _reference_halves(
     frequency = referenced.frequency[positions] - aligned.centre[positions]
     # What removes the rest of the direct path's frequency (cycles a sample) and its phase, [position, block].
     turn = phasor(-frequency * FOLD, -np.angle(referenced.amplitude[positions]), blocks, (blocks - 1) / 2)
+    # Factors [position, 2] make each half the average of its chirps.
     scale = half_scale(aligned.good[positions].sum(axis=1))[..., None, None]
     return complex64(aligned.halves[positions] * (scale * (referenced.steering * turn[:, None])[:, None]))
 
@@ -429,6 +431,7 @@ def _estimate_object_errors(halves: NDArray[np.complex64], path: DirectPath) -> 
     echo = halves * back[:, :, None]
     echo -= np.abs(amplitude).astype(np.float32)[..., None, None]
     product = (echo[:, 0] * echo[:, 1].conj()).sum(axis=1)
+    # The product of the halves is a tone of their difference in frequency and phase; it is fitted to a few sums of it.
     edges = block_edges(n)
     tone = refine(np.add.reduceat(product, edges[:-1], axis=-1).astype(complex), block_times(edges) * FOLD, steps=2)
     # Amplitude of each half: its projection on the sum of both, in which its own energy and the product with the other
@@ -543,15 +546,16 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     rx = np.array(rx_positions_m(rig, board))
     direct_m = np.linalg.norm(rx - tx, axis=1)
     gate = _gate_echoes(sweep[a:b], _gate_m(rig, board, tx, rx))
-    absolute = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
-    conjugate, counted_from_tx = _find_sign_and_origin(cube, absolute, gate, (a, b))
+    # Removes the delay of each RX's direct path, if delays count from the transmitter.
+    undo_delay = np.exp(-2j * np.pi * np.outer(direct_m, sweep) / SPEED_OF_LIGHT_M_S)
+    conjugate, counted_from_tx = _find_sign_and_origin(cube, undo_delay, gate, (a, b))
     form = []
     if conjugate:
         cube = cube.conj()
         form.append("conjugated")
-    turn = np.ones_like(absolute)
+    turn = np.ones_like(undo_delay)
     if counted_from_tx:
-        turn = absolute
+        turn = undo_delay
         form.append("delays counted from the transmitter")
     cube = cube * turn[:, None]
 
@@ -561,8 +565,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
         phasors = mean / np.abs(mean)
-        # The phases of the RX agree once their lags behind the first (at the middle frequency) are removed, or as
-        # they are.
+        # If all RX are referenced to the first, each keeps its lag behind it: their phases agree only without the lags
+        # (at the middle frequency). Otherwise they agree as they are.
         if abs((phasors * lag[:, (a + b) // 2].conj()).sum()) > abs(phasors.sum()):
             turn = turn * lag.conj()
             form.append("all RX referenced to the direct path of one")
@@ -586,14 +590,14 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
 
 def _find_sign_and_origin(
     cube: NDArray[np.complexfloating],
-    absolute: NDArray[np.complex128],
+    undo_delay: NDArray[np.complex128],
     gate: NDArray[np.complex128],
     linear: tuple[int, int],
 ) -> tuple[bool, bool]:
     """Return two flags: the cube is conjugated, and its delays count from the transmitter.
 
-    `absolute` [rx, sample] removes the delay of the direct path, `gate` [path, sample] are echoes from the object. The
-    combination with the most power at the object is chosen; in doubt the simplest one.
+    `undo_delay` [rx, sample] removes the delay of the direct path, `gate` [path, sample] are echoes from the object.
+    The combination with the most power at the object is chosen; in doubt the simplest one.
     """
     a, b = linear
     readings = list(itertools.product((False, True), (False, True)))
@@ -601,7 +605,7 @@ def _find_sign_and_origin(
     for conjugate, counted_from_tx in readings:
         part = cube.conj() if conjugate else cube
         if counted_from_tx:
-            part = part * absolute[:, None]
+            part = part * undo_delay[:, None]
         part = part[..., a:b]
         power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
     if power[0] >= _PREFER_SIMPLE * max(power):
@@ -612,9 +616,9 @@ def _find_sign_and_origin(
 def _average_direct_path(
     part: NDArray[np.complexfloating], gate: NDArray[np.complex128]
 ) -> tuple[NDArray[np.complexfloating], float]:
-    """Return the mean direct path [rx] in samples [rx, position, sample], and its share of power.
+    """Return the mean direct path [rx] in samples [rx, position, sample], and the share of its power that is constant.
 
-    Generalised least squares, which suppresses the object.
+    Each position's direct path is estimated by generalised least squares, which suppress the object.
     """
     samples = part.shape[-1]
     covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(samples)
@@ -627,6 +631,7 @@ def _average_direct_path(
 
 def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[float, float]:
     """Return the smallest and largest excess path of echoes from the object plane."""
+    # Nine places along each axis; chosen.
     offsets_m = np.linspace(-1, 1, 9) * _SPREAD_M
     dx, dy = (m.ravel() for m in np.meshgrid(offsets_m, offsets_m))
     excess = excess_path_m(tx, rx, np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1))
@@ -634,7 +639,7 @@ def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[
 
 
 def _gate_echoes(sweep_hz: NDArray[np.floating], gate_m: tuple[float, float]) -> NDArray[np.complex128]:
-    """Return echoes of evenly spaced paths in the gate, [path, sample]."""
+    """Return echoes of evenly spaced paths in the gate (33, chosen), [path, sample]."""
     paths = np.linspace(*gate_m, 33)
     return np.exp(2j * np.pi * np.outer(paths, sweep_hz) / SPEED_OF_LIGHT_M_S)
 
@@ -663,19 +668,19 @@ def _reference_cube(
     zero_phase = np.zeros(centre.size)
     mixed = cube * phasor(-centre, zero_phase, samples, middle)
     halves = flatten(fold(mixed[..., a:b])).swapaxes(0, 1) / 2
-    first_chirp = valid[:, None]
+    only_chirp_good = valid[:, None]
     zeros = np.zeros((centre.size, 1))
     aligned = AlignedRow(
         halves=np.ascontiguousarray(np.stack([halves, halves], axis=1), np.complex64),
         centre=centre,
-        good=first_chirp,
+        good=only_chirp_good,
         frequency=zeros,
         phase=zeros,
         amplitude=zeros + 1,
         gain=zeros + 1,
         error=np.zeros((centre.size, 2, 1)),
         coherence=zeros + 1,
-        clipped=~first_chirp,
+        clipped=~only_chirp_good,
     )
     # A signal that is mixed down already has an IF of about zero (within 0.4 cycles per sample, chosen), of either
     # sign: it is searched for in the band of complex 2x.

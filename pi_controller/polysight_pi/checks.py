@@ -36,7 +36,7 @@ TRANSFERS = 5
 # Longest duration of a bit relative to the nominal one, as `MIN_PART` is the shortest: the system call adds some 100 us
 # to a transfer of 22 ms.
 MAX_PART = 1.05
-# Number of pairs of system calls (set the line, clear it) that are timed; chosen.
+# Number of pulses whose two system calls (set the line, clear it) are timed; chosen.
 PAIRS = 500
 # Pause between two pairs: the shortest period of the pulses.
 PAUSE_NS = 300_000
@@ -83,6 +83,7 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
         yield _check_real_time()
         yield from check_lines(instrument)
     yield attempt("stage", _check_stage, instrument)
+    # A rig file that keeps less space free than the journals usually need passes with that.
     yield attempt(
         "journal", _check_journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES)
     )
@@ -158,7 +159,7 @@ def _check_address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir
 
 
 def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MODULES) -> Iterator[Finding]:
-    """Check every line of [pi] and measure the pulse width on this computer; SYNC_IN stays low.
+    """Check the trigger line and the SYNC_IN line, and measure the pulse width on this computer; SYNC_IN stays low.
 
     `model` is the device tree's file with the computer's name, `modules` the folder of the kernel modules' parameters.
     """
@@ -206,7 +207,7 @@ def _check_spi(pi: Pi) -> str:
 
 
 def measure_width(instrument: Instrument) -> str | Finding:
-    """Time the system calls of a pulse, with SYNC_IN low. Raises DeviceError."""
+    """Time the system calls of a pulse; instead of setting SYNC_IN the first clears it, too. Raises DeviceError."""
     lines = GpiodLines(instrument.pi)
     widths_ns: list[int] = []
     try:

@@ -46,6 +46,7 @@ def reflect(stack: Stack, frequency_hz: ArrayLike, cos_incidence: ArrayLike) -> 
     permittivities = [1.0, *(eps for eps, _ in stack.layers), stack.below]
     # Vertical wave numbers over k0. The principal root of eps' - j eps'' decays downwards.
     kz = [np.sqrt(complex(eps) - (1 - cos_incidence**2) + 0j) for eps in permittivities]
+    # Exact for air: near grazing incidence the difference above loses digits.
     kz[0] = cos_incidence + 0j
     # Factor of the wave's phase and decay over each layer. Air and half space have none: their values do not matter.
     delays = [np.ones_like(kz[0])]

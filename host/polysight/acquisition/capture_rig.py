@@ -136,7 +136,7 @@ class CaptureRig:
         return {name: receiver.report() for name, receiver in self.receivers.items()}
 
     def statuses(self) -> dict[str, Status]:
-        """Return the status bits that each card reported since its record start."""
+        """Return the status bits that each card reported since its record start; they stay for the next call."""
         return {name: card.take_status() for name, card in self.cards.items()}
 
     def discard_before(self, time_ns: int) -> None:

@@ -120,6 +120,7 @@ def _is_pcap(file: Path) -> bool:
 
 def find_scan(file: Path) -> ScanFolder | None:
     """Return the scan that a row's file belongs to; None for any other file, or if the manifest cannot be read."""
+    # A row's file is SCAN/raw/BOARD/ROW.bin: its parents are BOARD, raw and SCAN.
     folders = file.resolve().parents
     if len(folders) < 3 or folders[1].name != "raw" or not (folders[2] / MANIFEST).is_file():
         return None
@@ -160,6 +161,7 @@ def inspect_file(
         from polysight.results import to_plain
 
         content = asdict(report)
+        # In JSON the fields of the layout stand beside the others, not in an object of their own.
         content |= content.pop("layout")
         print_json(to_plain(content))
     else:
@@ -186,6 +188,7 @@ def plot_profile(report: Report, path: Path) -> None:
     if not report.profile_db.size:
         raise DataError(f"{report.path}: no chirp to plot", "the recording holds no data", "record again")
     figure = Figure(figsize=(8.0, 4.5), layout="constrained")
+    # The canvas attaches itself to the figure, and draws without a display.
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for rx, profile in enumerate(report.rx_profile_db, 1):
@@ -216,9 +219,9 @@ def plot_profile(report: Report, path: Path) -> None:
 def inspect_placement(file: Path, as_json: bool) -> int:
     """Print how the packets of a row are placed; return 1 if the row was committed with other missing ranges.
 
-    A row whose frames were moved to their pulses is not compared, and gives 0. `file` is the row's file, or one of
-    those beside it. Raises DataError when a file is damaged, is not the one that the scan's manifest has committed,
-    or the packets were not kept.
+    A row whose frames were placed by the times of their pulses is not compared, and gives 0. `file` is the row's file,
+    or one of those beside it. Raises DataError when a file is damaged, is not the one that the scan's manifest has
+    committed, or the packets were not kept.
     """
     row = file.with_suffix(".bin")
     if scan := find_scan(row):
@@ -234,7 +237,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
                 "`polysight validate SCAN` says whether it is whole",
             )
     result = place_again(row)
-    # A row whose frames were moved to their pulses cannot be compared range by range.
+    # This placement is by byte counts: frames that were placed by their pulses lie elsewhere, with other ranges.
     same = result.by_pulses or result.missing_before == result.placed.missing
     if as_json:
         print_json({**result.placed.facts(), "committed_missing": result.missing_before, "same": same})

@@ -134,7 +134,7 @@ class PaperKnn(Model):
         count = min(w.neighbours, samples.names.size)
         self._knn = PaperKNeighborsClassifier(count, weight_h=w.h, weight_v=w.v, weight_p=w.p, measure=w.measure)
         self._knn.fit(ratio_columns(samples.x), samples.names)
-        self._materials, self._material = np.unique(samples.names, return_inverse=True)
+        self._materials, self._material_of_pixel = np.unique(samples.names, return_inverse=True)
         self._samples = samples
         self._distributions = None
         return self
@@ -147,9 +147,10 @@ class PaperKnn(Model):
         return self._distributions
 
     def by_scan(self, x: Real, patches: npt.NDArray) -> NamedScan:
-        """Name patches by the majority of their pixels; unknown if they are far from that material's distribution.
+        """Name the pixels and patches of one scan, patches by the majority of their pixels.
 
-        `x` features [n, columns], `patches` patch number [n].
+        `x` features [n, columns], `patches` patch number [n]. A patch's distance is at least that to its material's
+        distribution: beyond 1 its name does not hold, and the caller calls it unknown.
         """
         voted = majority(*self.by_pixel(x), patches)
         distances = self.distributions.by_scan(x, patches).distances
@@ -162,7 +163,7 @@ class PaperKnn(Model):
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Return each pixel's name [n], and its mean distance to its neighbours over the material's threshold [n]."""
         distance, nearest = self._knn.kneighbors(ratio_columns(x))
-        votes = count_votes(self._material[nearest], self._materials.size)
+        votes = count_votes(self._material_of_pixel[nearest], self._materials.size)
         names = self._materials[votes.argmax(axis=1)]
         thresholds = np.array([self.thresholds.get(str(name), np.inf) for name in names])
         return names, distance.mean(axis=1) / thresholds
@@ -213,7 +214,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     judge = _LeftOut.prepare(few, same_scan, min(neighbours, int((~same_scan).sum(axis=1).min())))
     grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
     tried: list[tuple[float, float, Weights]] = []
-    alone: dict[str, float] = {}
+    p_alone: dict[str, float] = {}
     for measure in MEASURES:
         distances = channel_distances(few.x, few.x, measure)
         # Each channel is scaled by its usual distance, so that the grid's weights compare channels.
@@ -226,12 +227,12 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
             evenness = -abs(np.log(max(wh, 0.1))) - abs(np.log(max(wv, 0.1)))
             tried.append((accuracy, evenness, w))
             if wh == wv == 0:
-                alone[measure] = accuracy
+                p_alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
     accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
     distances = channel_distances(few.x, few.x, weights.measure)
     by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
-    by_channel["p"] = alone[weights.measure]
+    by_channel["p"] = p_alone[weights.measure]
     return Fit(weights, accuracy, by_channel, _compute_thresholds(combine(distances, weights), neighbours, few))
 
 
@@ -263,7 +264,7 @@ class _LeftOut:
     def accuracy(self, distance: Real) -> float:
         """Return the pixel accuracy for distances [n, n], mean over the materials of two or more scans."""
         to_other_scans = np.where(self.same_scan, np.inf, distance)
-        # As `find_neighbours` but unsorted: votes need no order.
+        # The nearest in any order: votes need none.
         nearest = np.argpartition(to_other_scans, self.voters - 1, axis=1)[:, : self.voters]
         count = np.bincount(self.classes)
         voted = count_votes(self.classes[nearest], count.size).argmax(axis=1)
@@ -323,7 +324,8 @@ class Classifier:
     library
         Reference patches with the fitted model.
     weights
-        Weights of the paper's KNN; they select that model, and replace the library's own weights.
+        Weights of the paper's KNN; they select that model, and replace the library's own weights, but not its
+        thresholds: give weights of the same scale.
     model
         A key of `MODELS` or `SHORT`; default: the library's model.
     angles_deg

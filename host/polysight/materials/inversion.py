@@ -10,9 +10,9 @@ Relative to metal, a patch of true inverse ratio t = r_p / r_s = 1 / P is measur
 * r_s, r_p: reflection coefficients, which follow from t and the angle of incidence by Eq. 2, 3 (POLySIGHT paper).
 * kappa: brightness of the patch relative to an ideal one (thickness, roughness, illumination).
 
-A plate that rises by w across the plane of incidence turns this plane. Both waves then meet an s axis that is turned by
-d = w sin(theta). To first order H receives (1 - d) r_s - d r_p, and V (1 + d) r_p + d r_s. So the plate's a is smaller
-by d, its b larger by d, and G across is 4 sin(theta), plus the effect of boards that see the plate from other points.
+A plate that rises by w across the plane of incidence turns the s axis of both waves by d = w sin(theta). To first order
+H receives (1 - d) r_s - d r_p, and V (1 + d) r_p + d r_s. So its a is smaller by d, its b larger by d. G across is
+4 sin(theta): 2 by these amplitudes, 2 as the metal's (1 + a) / (1 + b) stays; plus that of boards at different places.
 
 The *common errors* of a scene are a, b, rho, c, G, the turn d / w, the error of the angle, the metal's brightness, the
 usual size of ln kappa, whether the mount has moved, and the share of the library's materials. Their posterior is
@@ -353,7 +353,7 @@ class SceneLikelihood:
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in measurements], np.float64)
         self.densities = None if kinds is None or not measurements else self._densities(kinds)
         self.same = probability_of_same(measurements)
-        # Plates of one material say together what one says: six of a foreign one would else turn the boards.
+        # Plates of one material count as one: else six of a material that no library has would shift the leakage.
         self.evidence = np.append(1.0, 1 / self.same.sum(axis=1))
         self.dispersions = tuple(s.dispersion for s in measurements)
         self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
@@ -656,7 +656,7 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
     covariance *= float(np.quantile(distance2, 0.95)) / CHI2_95
     shares = _shares_of_sources(model, z, i, value)
-    # Student's t: normal errors whose variance is drawn, too.
+    # Student's t: the variance of normal errors is drawn, too; not from `rng`, so that other patches keep their draws.
     scale = OWN_SCALE * np.sqrt(OWN_FREEDOM / np.random.default_rng(i).chisquare(OWN_FREEDOM, noise.shape[:2]))
     drawn_t = t + scale * (noise[..., 0] + 1j * noise[..., 1])
     difference = split_complex(permittivity_from_ratio(drawn_t, angles) - value)

@@ -1,8 +1,9 @@
 """The process of the pages: access checks, static pages, running scans, and commands to them.
 
 It reads no scan: all other requests are forwarded to the reading process (`Reader`), which has a low priority. A
-command goes into the scan's control folder, in a thread of its own; with `door`, that process answers commands by the
-same route, and nothing here can hold them up. The number of connections has one limit (`ConnectionLimit`).
+command goes into the scan's control folder, in a thread of its own. If a process of its own accepts the connections
+(`door.py`), it also answers commands, by the same route: nothing here can hold them up. The number of connections has
+one limit (`ConnectionLimit`).
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def make_app(front: Front) -> Starlette:
 
 
 def make_command_app(front: Front) -> Starlette:
-    """Build the application of the door: commands to scans."""
+    """Build the application of the door, the process that accepts connections: commands to scans."""
     return _guard_application([command_route(front)], front.access)
 
 
@@ -243,7 +244,8 @@ def stage_routes(stage: StageControl) -> list[Route]:
 
 
 async def run_in_own_thread(work: Callable[[], T]) -> T:
-    """Run something that may wait for a drive in a thread of its own: no other request can have taken it."""
+    """Run something that may have to wait for a drive, in a new thread."""
+    # A limit for this call alone: threads of anyio's common limit may all hang in other requests.
     one_thread = anyio.CapacityLimiter(1)
     return await anyio.to_thread.run_sync(work, abandon_on_cancel=True, limiter=one_thread)
 

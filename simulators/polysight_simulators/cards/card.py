@@ -388,12 +388,13 @@ class CardEndpoint:
         if self._faults.mute:
             self.counts["requests_unanswered"] += 1
             return
-        reply, *further_replies = self.card.command(datagram, self.wire_s())
+        # The reply; behind that of a record stop come the short last packet and the status.
+        reply, *last_of_record = self.card.command(datagram, self.wire_s())
         if isinstance(reply, dca1000.Message):
             self.counts["replies"] += 1
             for _ in range(2 if self._twin else 1):
                 self.sender.reply(reply.payload)
-        self.emit(further_replies)
+        self.emit(last_of_record)
 
     def emit(self, outputs: Sequence[dca1000.Output]) -> None:
         """Send the card's output through the faults of the network."""
@@ -401,6 +402,7 @@ class CardEndpoint:
             if isinstance(output, dca1000.Packets):
                 self._emit_packets(output)
                 continue
+            # The status that ends a record: packets that a fault held back arrive before it.
             if not self.card.recording:
                 for rows in self._network_faults.drain():
                     self.sender.put_packets(rows)

@@ -1,6 +1,7 @@
 """Commands on saved products: materials, report, permittivity through layers, concentration, classify.
 
-Each prints the verdict first, and no patches if it is `none`.
+Each prints the verdict first, and no patches if it is `none`. JSON lists the patches even then, as the products do:
+without names and permittivities.
 """
 
 from __future__ import annotations
@@ -115,7 +116,8 @@ def permittivity(
 ) -> int:
     """Print the permittivity of patches, as a half space or as the unknown layer of a stack; return the exit status.
 
-    Without a result (verdict `none`) no permittivity is printed, and the exit status is that of NoResult.
+    Without a result (verdict `none`) the products hold no permittivity, JSON has patches without one, and the exit
+    status is that of NoResult.
 
     `folder` holds the products, or is the scan folder that holds them. `stack` are layers from the radars' side, one of
     them unknown (empty: half spaces alone), `number` is one patch (None: all). The chirp is the one of the products, as
@@ -263,7 +265,8 @@ def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: f
 def materials(data: Sequence[Path], as_json: bool) -> int:
     """Print names and permittivities of the patches of processed scans; return the exit status.
 
-    The status is that of NoResult if one of the scans has no result (verdict `none`); its patches are not printed.
+    The status is that of NoResult if one of the scans has no result (verdict `none`); its patches are not printed, but
+    in JSON, without names.
 
     Raises
     ------
@@ -353,6 +356,7 @@ def report(folder: Path) -> int:
             read_products(folder, REPORT)
         from polysight.jobs.process import process
 
+        # It prints the verdict and the report's path.
         status = process(folder, folder / "products")
         new = find_products(folder, REPORT)
         if status or new is None:

@@ -1,5 +1,7 @@
-"""POST requests of the reading process: plan, doctor, scans, labels, notes, processing; `front` has checked the token.
+"""POST requests of the reading process: plan, doctor, scans, labels, notes, processing.
 
+Browsers reach the process of the pages (`front`), which forwards to the reading process all requests but those for
+static pages and running scans; it has checked the token of each.
 Each is a command of `polysight` as well; what takes long runs as that command, in a process of its own. `Site.rig` is a
 lock: it is held from the check that the rig is free until a program uses it.
 """
@@ -186,6 +188,7 @@ def command_routes(site: Site) -> list[Route]:
         async def endpoint(request: Request) -> Response:
             body = decode_body(await request.body(), kind)
             name = site.name(request)
+            # Commands use a scan's folder like reads: in a thread, with a time limit.
             return json_answer(await site.read_scan(request, lambda folder: work(site, Named(name, folder), body)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
@@ -251,7 +254,7 @@ def start_scan(site: Site, body: StartRequest) -> None:
         _check_free(site)
         path = _write_files(folder, rig, body)
         if body.plan == PlanRequest():
-            # Paths in it are relative to its place.
+            # Nothing differs from the rig file: it is used itself, at its place, where its relative paths begin.
             path = site.config.absolute()
         words += ["--config", path]
         if body.notes or body.tags:
@@ -269,6 +272,7 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     if not body.name:
         raise ConfigError("the scan has no name", "`name` is empty", "give it one", code=ErrorCode.KEY_MISSING)
     rig = body.plan.apply(site.config)
+    # Raises if there is no such library.
     _list_processing_options(site, body.library, body.metal)
     folder = site.scans.folder(body.name, new=True)
     if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
@@ -280,7 +284,7 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
 
 
 def _start_again(site: Site, scan: Named, body: Body) -> None:
-    """Start a scan once more that could not start; its request is checked as at first, wherever its file is from."""
+    """Start a scan once more that could not start; its saved request is checked as if it came from the page."""
     del body
     start_scan(site, read_request(scan.folder, scan.name))
 
@@ -356,7 +360,10 @@ def _check_free(site: Site) -> None:
 
 
 def _is_starting(site: Site, s: Summary) -> bool:
-    """True if the scan is listed as not begun, or as killed, but its program runs: no sign of life of it came yet."""
+    """True if the program of a scan runs, but has not yet given a sign of life.
+
+    Such a scan is listed as `begun` (a folder without rows), or when it is resumed still as `lost`.
+    """
     if s.state in ("begun", "lost"):
         program = find_program(site.scans.root / s.name, "scan")
     else:

@@ -205,7 +205,10 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
 
 
 class PagesServer(EndingServer):
-    """The server of the pages: its connections come from `door`, each with a new `protocol`, and it ends with it."""
+    """The server of the pages, which ends when the door is gone.
+
+    Its connections come over the socket `door`; each gets a new object of the class `protocol`.
+    """
 
     def __init__(self, config: uvicorn.Config, door: socket.socket, protocol: Any) -> None:
         super().__init__(config)

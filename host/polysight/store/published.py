@@ -143,8 +143,8 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
             raw, _find_ranges(silent, PACKET_BYTES, raw.size), int(silent.sum()), no_packets, np.zeros(0), PACKET_BYTES
         )
     full_size = int(log.size.max())
-    first = _find_first_sequence(log, shape, full_size, raw if zero_filled else None)
-    start = (log.sequence - first) * full_size
+    row_begin = _find_first_sequence(log, shape, full_size, raw if zero_filled else None)
+    start = (log.sequence - row_begin) * full_size
     end = int(start[-1] + log.size[-1])
     if end > _MAX_ROWS * (shape.bytes + raw.size):
         raise DataError(
@@ -207,8 +207,10 @@ def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     return np.append(~np.any(words, axis=1), np.array(tail, bool))
 
 
-def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled: NDArray[np.uint8] | None) -> int:
-    """Return the sequence number of the row's first packet, which may be lost; `full`: payload of a full packet, bytes.
+def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zeroed_raw: NDArray[np.uint8] | None) -> int:
+    """Return the sequence number of the row's first packet, which may be lost.
+
+    `full` is the payload of a full packet, bytes, `zeroed_raw` the file's bytes if it is zero-filled, otherwise None.
 
     With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
     counted back from a short last packet if no position is missing and the packet is as short as that of a complete row
@@ -216,20 +218,20 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zero_filled
     but the numbers fit a record from 1, it is 1, or 0 if that packet arrived: cards count from 1, a log may from 0.
     """
     expected = -(-shape.bytes // full)
-    first = int(log.sequence[0])
+    first_arrived = int(log.sequence[0])
     last = int(log.sequence[-1])
-    begin = first
+    begin = first_arrived
     last_size = int(log.size[-1])
     ends_complete = last_size < full and last_size == shape.bytes - (expected - 1) * full
-    if zero_filled is not None:
-        silent_packets = _find_silent(zero_filled, full)
+    if zeroed_raw is not None:
+        silent_packets = _find_silent(zeroed_raw, full)
         # Index of the first packet that is not silent: so many are before it.
         begin -= int(np.argmin(np.append(silent_packets, False)))
     elif ends_complete and _find_pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
-        begin = min(first, last - expected + 1)
+        begin = min(first_arrived, last - expected + 1)
     fits_from_1 = last <= expected
     if begin not in (0, 1) and fits_from_1:
-        return min(first, 1)
+        return min(first_arrived, 1)
     return begin
 
 
@@ -446,6 +448,7 @@ class PublishedScan(_Published):
         positions = None
         if bursts is not None:
             other_bursts = self._list_other_bursts(board_name, row)
+            # Missing positions make a measured period longer, never shorter: the smallest one counts.
             periods = [p for p in (self._period_s, *map(period_s, (bursts, *other_bursts))) if p]
             positions = find_positions(bursts, other_bursts, shape.positions, min(periods, default=None))
         if bursts is None or positions is None:
@@ -542,6 +545,7 @@ class PublishedCubes(_Published):
         """
         file = self.path / f"{board_name}{SYNCED}"
         try:
+            # Two threads must not parse heads of files at the same time.
             with HEADER_LOCK:
                 cube = np.load(file, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError) as e:

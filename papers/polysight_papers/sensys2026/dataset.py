@@ -229,7 +229,10 @@ def _correlate(a: np.ndarray, b: np.ndarray) -> float:
 def _rename_entries(
     entries_by_source: Mapping[str, list[materials.Entry]], given: Mapping[str, int], notices: list[str]
 ) -> tuple[dict[str, int], dict[str, materials.Library]]:
-    """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices."""
+    """Rename the entries as in Table 2; entries of unknown names are skipped and listed in the notices.
+
+    Returns the row of each name (`AuthorsData.meaning`), and a library of the renamed entries for each source.
+    """
     rows = find_rows(((e.name, e.thickness_mm) for entries in entries_by_source.values() for e in entries), given)
     titles = {m.number: m.name for m in table2()}
     sources = {}

@@ -29,8 +29,8 @@ from polysight_simulators.radars.cores import (
     ones_sum,
 )
 
-# Value of the three sense-on-power pins for functional mode: of the bits, in the order of the USB chip's pins
-# (`control.py`), only the last is set.
+# Levels of the three sense-on-power lines for functional mode. The bits are in the order in which the USB chip's pins
+# drive them (`control.py`): only the highest is set.
 FUNCTIONAL = 4
 # Delays of an answer, and of its data after the interrupt. Chosen: real timing is not known.
 ANSWER_S = 1e-4
@@ -356,6 +356,7 @@ class RadarBoard:
                 blocks += struct.pack("<HH", block, len(data) + 4) + data
             body = body[size:]
         self._busy_until = self.now() + delay
+        # A message of the host asks for one sub-block at most (docs/spec/mmwavelink.md, "Answers").
         sub_blocks = int(bool(blocks))
         if error:
             number = 0

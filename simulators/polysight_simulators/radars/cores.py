@@ -31,8 +31,8 @@ EVENT = 3
 FAULT_DATA = bytes.fromhex("05000000800000fe") + bytes(16) + b"\xff" * 6 + bytes(2)
 OLD_UP_EMPTY = bytes.fromhex("00000000ff7c0c000000000000000000")
 OLD_UP_WRITTEN = bytes.fromhex("10aa0500") + bytes(16)
-# Duration of the power-up in 5 ns, the first word of the event: that of the board whose flash is written. The boot
-# status and the failed self-tests follow.
+# Duration of the power-up in units of 5 ns, that of OLD_UP_WRITTEN. It is the first word of a power-up's event; the
+# boot status and the failed self-tests follow.
 POWER_UP_TIME = 0x5AA10
 
 
@@ -248,7 +248,7 @@ class Cores:
         self.rf_up = False
         self.calibrated = False
         self.crc32_events = False
-        # Negative: without end.
+        # Frames that SYNC_IN will still start; negative: without end.
         self.frames_left = 0
         # Frames are started and wait for SYNC_IN, or run without end by a software trigger.
         self.armed = False
@@ -357,6 +357,7 @@ class Cores:
 
     def _store_profile_or_chirps(self, number: int, data: bytes) -> int:
         """Store a profile (0..3), or chirps (0..511) of one (ICD tables 5.24, 5.26); return an error number."""
+        # Of chirps: the first, the last and their profile. Data of a profile begin with its number, too.
         first, last, profile = struct.unpack_from("<3H", data)
         if number == PROFILE:
             if first > 3:
@@ -397,10 +398,10 @@ class Cores:
         if number == SAVE:
             if not self.calibrated:
                 return WRONG_STATE, b""
-            calibration_data = (
-                struct.pack("<2I8xh", self.passes, self.passes, 41)
-                + bytes((self.die * 31 + n) & 0xFF for n in range(654))
-            )[:672]
+            # Status bits, eight bytes of nothing, temperature, and any bytes that differ from board to board; chosen.
+            head = struct.pack("<2I8xh", self.passes, self.passes, 41)
+            rest = range(CHUNKS * CHUNK_BYTES - len(head))
+            calibration_data = head + bytes((self.die * 31 + n) & 0xFF for n in rest)
             return 0, struct.pack("<2H", CHUNKS, part) + calibration_data[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
         self._restored[part] = data[4:]
         if len(self._restored) == CHUNKS:

@@ -180,10 +180,13 @@ class Executor:
         return time.monotonic() - self._turned_s
 
     def host_alive(self, scan_id: str, owner: str) -> m.Accepted | m.Refused:
-        """Answer `Alive`, a heartbeat of the run's host. From any thread; does not wait for the executor."""
+        """Answer `Alive`, a heartbeat of the run's host or of a jog's. From any thread; does not wait for the executor.
+
+        `scan_id` is "" for a jog outside of a run.
+        """
         run = self._run
-        jogs = self._machine.note_jog_alive(owner)
-        if not scan_id and jogs:
+        has_jog = self._machine.note_jog_alive(owner)
+        if not scan_id and has_jog:
             return self._accept()
         if run is None or run.scan_id != scan_id:
             return make_refusal(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
@@ -411,6 +414,7 @@ class Executor:
         check_jog(command, stage)
         place_mm = machine.find_place_mm(command.axis)
         steps_away = abs(round(place_mm * stage.steps_per_mm) - round(command.from_mm * stage.steps_per_mm))
+        # It was executed already, and has moved the axis away from its start.
         if steps_away and command == machine.last_jog:
             return self._accept()
         _require(not steps_away, f"{command.axis} is at {place_mm:.3f} mm, not at {command.from_mm:.3f} mm")
@@ -447,7 +451,8 @@ class Executor:
                 "wait for that scan's end, or stop it there",
             )
         if self._machine.row is not None:
-            # The host that started the row is gone, or begins its run again: nothing of the row is committed.
+            # The host that started the row is gone, or begins its run again: nothing of the row is committed. An abort
+            # never ends a row at once; when it has ended, `_end_row` executes the request.
             self._after_row = request
             self._machine.happen("Abort", f"run {run.scan_id} was begun again")
         return self._machine.row is not None

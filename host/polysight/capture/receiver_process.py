@@ -119,6 +119,7 @@ class Receiver:
             ready = dict(poll.poll())
             if self._socket is not None and self._socket.fileno() in ready and self._row is not None:
                 self._receive()
+                # A pause, which a request ends.
                 requests.poll(_GATHER_MS)
             if self._connection.fileno() in ready:
                 try:

@@ -154,6 +154,7 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     """Return the mean stage offsets of all rows, metres [row, column, 3], columns from the smallest x."""
     plan = plan_raster(rig.grid)
     offsets = np.zeros((plan.rows, plan.columns, 3))
+    # Rows run to and fro: the first two give x of either direction.
     along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
     for row in plan:
         offsets[row.index, :, 0] = along[row.direction]
@@ -347,9 +348,10 @@ class StageWindow:
         in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX
         ends_px = np.where(touching, np.where(in_light, mask_ends_px, [-np.inf, np.inf]), seen_px)
         for _ in range(ROUNDS):
-            # A plate that rises is seen like a level one at another place; the image of its end is not where it ends.
-            at_level = moved_px * slope
-            image = self.level_image(ends_px + at_level, columns_px + at_level)
+            # A rising plate reflects towards the antennas at other stage positions than a level one: as a level one
+            # that lies `at_level_px` further along. There its image is computed.
+            at_level_px = moved_px * slope
+            image = self.level_image(ends_px + at_level_px, columns_px + at_level_px)
             # Its angle is the mean phase step between pixels that the level plate seems to have.
             product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
             slope = slope_per_rad * (step_rad - float(np.angle(product)))

@@ -123,7 +123,8 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     """
     if (out / REPORT).exists():
         return
-    # These images differ by less than 1e-6 from those that `make_products` puts in their place.
+    # Of a scan that is running: the sums over its rows, which are at hand. The images by which `make_products` replaces
+    # these differ by less than 1e-6 of the peak, unless missing positions are filled (`sparse`).
     images = pipeline.form_images(from_sums=True)
     with making_products(out, pipeline.source.scan_id) as new:
         scan = collect_imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
@@ -366,6 +367,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
     source = open_source(data, config, dropped=True)
     out.mkdir(parents=True, exist_ok=True)
+    # The range gate has to keep the echoes of every plane searched: of the sweep, and of plates up to `PLANE_REACH_M`.
     pipeline = process_rows(source, data, Settings(depth_range_mm=max(depth_mm, 1e3 * PLANE_REACH_M)))
     builder = pipeline.images
     say("images, and the plane of the plates")

@@ -269,7 +269,7 @@ def patch_coordinates(scan: ProcessedScan) -> dict[str, Any]:
 
 
 def _make_figure_variables(patches: Sequence[PatchFigures]) -> dict[str, Any]:
-    """Return a variable on dimension `patch` for each figure declared as one, and angles in radians too.
+    """Return a variable on dimension `patch` for each figure declared to be a variable, and angles in radians too.
 
     Optional figures that no patch has are left out.
     """
@@ -315,7 +315,7 @@ def full_dataset(scan: ProcessedScan) -> xarray.Dataset:
     The attribute `instrument` is the rig file as JSON.
     """
     dataset = image_dataset(scan)
-    if scan.metal_referenced:
+    if scan.materials is not None:
         patches = patch_dataset(scan)
         dataset = dataset.assign_coords(patches.coords).assign(patches.data_vars).assign_attrs(patches.attrs)
     if scan.facts.instrument:

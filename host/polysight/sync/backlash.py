@@ -72,6 +72,8 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     inner = [r for r in sorted(rows) if r - 1 in rows and r + 1 in rows]
     if len(inner) < _GROUPS:
         return None
+    # `_compute_spectrum` continues each row by its mirror image: spectra have twice its length, and the window of the
+    # least squares is 0 on the image.
     k = 2 * np.pi * np.fft.fftfreq(2 * plan.columns, plan.step_x_mm)
     # A burst's middle lies so far beyond the planned position, in the direction of motion.
     travel_mm = mean_burst_travel_mm(rig.burst, rig.stage)

@@ -105,6 +105,7 @@ def _check_wires(instrument: Instrument, wires: Path) -> str:
 
 def _check_real_time() -> Finding:
     """Request the same real-time rights as the service, so that pulse widths are measured with them."""
+    # Process and thread may be refused the same right: it is named once.
     refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
         do = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"

@@ -480,6 +480,7 @@ class SimulatedCard:
         wait_for_receiver: bool = True,
     ) -> None:
         self.board = board
+        # One line of the Pi feeds the SYNC_IN of all boards.
         self.line = rig.pi.sync_out[0]
         self._source = source
         self._clock_s = clock_s

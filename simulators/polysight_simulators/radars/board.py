@@ -199,6 +199,7 @@ class RadarBoard:
     def ready_for_triggers(self) -> bool:
         """True if a pulse would start a frame now."""
         self._deliver()
+        # Negative: frames without end.
         return self.cores.armed and self.cores.frames_left != 0
 
     def trigger(self, pulse_s: float | None = None) -> bool:
@@ -216,6 +217,7 @@ class RadarBoard:
         else:
             time_s = pulse_s
         period = cores.period_s()
+        # 1 ns for the rounding of times.
         too_soon = abs(time_s - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False

@@ -15,6 +15,7 @@ from polysight_pi.lines import (
     GpiodLines,
     SpiDevice,
     TriggerInput,
+    check_wiring,
     find_chip,
     load_gpiod,
     open_lines,
@@ -165,6 +166,10 @@ def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MOD
     `model` is the device tree's file with the computer's name, `modules` the folder of the kernel modules' parameters.
     """
     pi = instrument.pi
+    wiring = attempt("wiring", check_wiring, pi)
+    if wiring.level != "ok":
+        yield wiring
+        return
     chip = attempt("GPIO chip", _check_chip, pi)
     yield chip
     if chip.level == "ok":

@@ -70,12 +70,8 @@ _SPI_REASONS = {
 }
 
 
-def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
-    """Open the rig's lines on GPIO, or on the simulated wires of the hub at `wires`.
-
-    Raises ConfigError or DeviceError if they cannot be opened.
-    """
-    pi = instrument.pi
+def check_wiring(pi: Pi) -> str:
+    """Return how the SYNC_IN pulses are wired. Raises ConfigError for wirings of earlier rig files."""
     if pi.wiring == "gpiomem" or len(pi.sync_out) > 1:
         raise ConfigError(
             f'wiring = "{pi.wiring}" with sync_out = {list(pi.sync_out)} is no longer supported',
@@ -83,6 +79,16 @@ def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
             'use wiring = "spi", or "fanout", with a clock buffer behind one line (docs/how-to/wiring.md)',
             code=ErrorCode.VALUE_INVALID,
         )
+    return f'wiring = "{pi.wiring}"'
+
+
+def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
+    """Open the rig's lines on GPIO, or on the simulated wires of the hub at `wires`.
+
+    Raises ConfigError or DeviceError if they cannot be opened.
+    """
+    pi = instrument.pi
+    check_wiring(pi)
     by_spi = pi.wiring == "spi"
     if wires is not None:
         return SpiWireLines(wires, pi) if by_spi else WireLines(wires, pi)

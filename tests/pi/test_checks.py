@@ -105,6 +105,13 @@ def test_line_release(rig_with, tmp_path):
         assert levels_with(pi_4) == [level]
 
 
+@pytest.mark.parametrize("settings", [{"wiring": "gpiomem"}, {"sync_out": (22, 23)}])
+def test_a_wiring_that_the_service_refuses_is_an_error(rig_with, tmp_path, settings):
+    findings = list(check_lines(rig_with(**settings), tmp_path / "model", tmp_path))
+    assert [(f.level, f.where) for f in findings] == [("error", "wiring")]
+    assert "no longer supported" in findings[0].what
+
+
 def test_one_pulse_too_long_refuses_a_line_without_a_one_shot():
     assert "measured now" in str(judge_widths([3_000] * 1000, one_shot=False))
     finding = judge_widths([3_000] * 999 + [4_001], one_shot=False)

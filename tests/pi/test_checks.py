@@ -105,7 +105,7 @@ def test_line_release(rig_with, tmp_path):
         assert levels_with(pi_4) == [level]
 
 
-@pytest.mark.parametrize("settings", [{"wiring": "gpiomem"}, {"sync_out": (22, 23)}])
+@pytest.mark.parametrize("settings", [{"wiring": "gpiomem"}, {"wiring": "lines", "sync_out": (22, 23)}])
 def test_a_wiring_that_the_service_refuses_is_an_error(rig_with, tmp_path, settings):
     findings = list(check_lines(rig_with(**settings), tmp_path / "model", tmp_path))
     assert [(f.level, f.where) for f in findings] == [("error", "wiring")]

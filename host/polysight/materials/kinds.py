@@ -42,8 +42,8 @@ LITERATURE_SHARE = 0.4
 space. Chosen, as are the shares of metal and of thin plates: a larger share draws uncertain names to it."""
 METAL_SHARE = 0.1
 """Share of metal in these thick plates; chosen."""
-SHEET_SHARE = 0.25
-"""Share of thin plates, which reflect at both faces, in patches of no kind of the library. Chosen: with 0.15 thin wood
+SHEET_SHARE = 0.27
+"""Share of thin plates, which reflect at both faces, in patches of no kind of the library. Chosen: with 0.25 thin wood
 of the published picture was named as a laminate; with 0.3 a lossy half space counted as possibly thin."""
 SHEET_REAL = (1.5, 8.0)
 SHEET_LOSS_TANGENT = (1e-3, 0.2)

@@ -285,10 +285,10 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
     model = SceneLikelihood(measurements, prior, kinds)
     rng = np.random.default_rng(0)
     z, log_evidence, log_bare = sample_posterior(model, rng)
-    weights = model.evidence.copy()
+    weights = model.weights.copy()
     if not prior.leakage_measured:
         weights[1:] *= WEIGHT_OF_KINDS
-        z, _ = _anneal(model, z, model.evidence, weights, rng)
+        z, _ = _anneal(model, z, model.weights, weights, rng)
     patches = []
     parts = model.log_likelihoods(z)
     for i in range(model.patch_count):
@@ -306,13 +306,13 @@ def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[
     The cases that the mount has moved or not, and that the metal is painted or not, are sampled separately and weighted
     by their evidence. In one common sample, few particles or none would be of a case with a small prior that fits.
     """
-    no_evidence = np.zeros_like(model.evidence)
+    no_evidence = np.zeros_like(model.weights)
     samples = []
     log_weights: list[float] = []
     log_bare = -np.inf
     for hypothesis, probability in model.hypotheses():
         prior_particles = rng.standard_normal((PARTICLES, model.width))
-        z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, model.evidence, rng)
+        z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, model.weights, rng)
         samples.append(hypothesis.within(model.prior, z))
         log_weights.append(float(np.log(probability) + log_evidence))
         if hypothesis.prior.painted == 0:
@@ -332,7 +332,7 @@ class SceneLikelihood:
     Arrays [patch]: `measured` V / H, `rise` [patch, 2] and `theta` as in `PatchMeasurement`; `bright`: True if |H| is
     used; `log_level`: ln |H|; `own` [patch, 2, 2]: covariance of t by a patch's own errors; `own_variance`: that of
     each part of V / H; `densities`: of t by kinds, or None; `log_layer_odds`: ln odds of layers by the sweep;
-    `evidence` [1 + patch]: weights of the log likelihoods; `same` [patch, patch]: probability of the same material.
+    `weights` [1 + patch]: of the log likelihoods; `same` [patch, patch]: probability of the same material.
     """
 
     width = WIDTH
@@ -354,7 +354,7 @@ class SceneLikelihood:
         self.densities = None if kinds is None or not measurements else self._densities(kinds)
         self.same = probability_of_same(measurements)
         # Plates of one material count as one: else six of a material that no library has would shift the leakage.
-        self.evidence = np.append(1.0, 1 / self.same.sum(axis=1))
+        self.weights = np.append(1.0, 1 / self.same.sum(axis=1))
         self.dispersions = tuple(s.dispersion for s in measurements)
         self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
 

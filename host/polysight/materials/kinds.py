@@ -209,9 +209,9 @@ def probability_of_same(measurements: Sequence[PatchMeasurement]) -> Real:
     reference, which hardly change the difference.
     """
     inverse_ratios = np.array([m.inverse_ratio for m in measurements], np.complex128)
-    own = np.array([m.covariance for m in measurements], np.float64).reshape(-1, 2, 2)
-    specimens = np.square(SPECIMEN_STD * np.abs(inverse_ratios))[:, None, None] * np.eye(2)
-    covariance = own + specimens
+    of_errors = np.array([m.covariance for m in measurements], np.float64).reshape(-1, 2, 2)
+    of_specimens = np.square(SPECIMEN_STD * np.abs(inverse_ratios))[:, None, None] * np.eye(2)
+    covariance = of_errors + of_specimens
     inverse = np.linalg.inv(covariance[:, None] + covariance)
     difference = split_complex(inverse_ratios[:, None] - inverse_ratios)
     distance2 = np.einsum("...i,...ij,...j->...", difference, inverse, difference)

@@ -100,14 +100,14 @@ class Chain:
         self.path = path
 
     def reduce(self, xp: Any = np, device: Any = None) -> Any:
-        """Read the cube [rx, row, column, sample], copy it to the device and return it through the range gate."""
+        """Copy the cube [rx, row, column, sample] to the device; return gated samples [rx, frequency, row, column]."""
         matrix = self.gate.matrix.astype(np.complex64)
         # Samples outside the linear part have weight 0.
         used = np.flatnonzero(np.abs(matrix).max(axis=0))
         linear = slice(int(used[0]), int(used[-1]) + 1)
-        maps = xp.asarray(np.ascontiguousarray(matrix[:, linear].T), device=device)
+        weights = xp.asarray(np.ascontiguousarray(matrix[:, linear].T), device=device)
         cube = xp.asarray(np.load(self.path), device=device)
-        return xp.permute_dims(xp.matmul(cube[:, :, :, linear], maps), (0, 3, 1, 2))
+        return xp.permute_dims(xp.matmul(cube[:, :, :, linear], weights), (0, 3, 1, 2))
 
     def image(self, samples: Any, xp: Any = np, device: Any = None) -> Any:
         """Return the image [ny, nx] of reduced samples, with kernels kept from before where there are any."""
@@ -115,7 +115,7 @@ class Chain:
 
 
 def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> dict[str, Any]:
-    """Return the settings of the authors' imager for this rig: range spectra of `bins` points, every range bin.
+    """Return the settings of the authors' imager for this rig, with range spectra zero-padded to `bins` points.
 
     Keys and the numbers of antennas (TX 4, RX 7 to 10 of 21) are theirs; RH is their name of the board that receives H.
     """
@@ -147,7 +147,7 @@ def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> 
                 "idx_adc_start": first,
                 "idx_adc_end": last,
                 "ref_idx_aligned": 0,
-                # Spectra of the first 32 range bins of a chirp, which hold the scene, with so many points for each bin.
+                # Only the first 32 range bins of a chirp, which hold the scene, with so many points for each bin.
                 "idx_fft_start_zoom": 0,
                 "idx_fft_end_zoom": 32,
                 "fs_zoom": chirp.samples,
@@ -155,6 +155,7 @@ def authors_settings(rig: Instrument, board: Board, folder: Path, bins: int) -> 
             },
             "sar_focuse_center": [float(grid.x_m.mean()), float(grid.y_m.mean()), float(grid.z_m)],
             "masked_matched_filter": True,
+            # All of these points.
             "num_fft_bin": -1,
             "idx_bin_offset": 0,
             "remove_avesig": False,
@@ -278,7 +279,7 @@ class Figures:
         return cls(library.name, seconds, from_samples(), from_cube(), exact_images[0])
 
     def differences(self, cpu: Figures) -> dict[str, float]:
-        """Return the largest differences of images, of the peak."""
+        """Return the largest differences of images, as shares of the peak."""
         differences = {
             "image beside NumPy's": worst(self.from_samples, cpu.from_samples),
             "image of the cube beside NumPy's": worst(self.from_cube, cpu.from_cube),

@@ -61,7 +61,8 @@ _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONUNBU
 def _set_native_control(table: dict[str, Any], if_offset_hz: float) -> None:
     """Set native radar control in the rig file's table: an entry for each board, and a start offset of the receivers.
 
-    A start offset in the rig file stays. The board's address follows in `move_to_free_subnet`.
+    A start offset in the rig file stays; if that and `if_offset_hz` are 0, it is the published rig's. The board's
+    address follows in `move_to_free_subnet`.
     """
     names = [board["name"] for board in table["boards"]]
     # A simulated board's USB serial number is its name.
@@ -86,15 +87,15 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     override breaks a rule, DeviceError if no loopback subnet is free.
     """
     disturbed_rig = rig
-    offset_hz = _NATIVE_OFFSET_HZ
+    if_offset_hz = 0.0
     if scene is not None:
         disturbed_rig = apply_scene(rig, scene)
-        offset_hz = scene.disturbances.if_offset_hz
+        if_offset_hz = scene.disturbances.if_offset_hz
     table: dict[str, Any] = to_builtins(disturbed_rig)
     if native:
-        _set_native_control(table, offset_hz)
-    elif table["radar"]["control"] != "native" and scene is not None:
-        _apply_if_offset(table, scene.disturbances.if_offset_hz)
+        _set_native_control(table, if_offset_hz)
+    elif table["radar"]["control"] != "native":
+        _apply_if_offset(table, if_offset_hz)
     if table["radar"]["control"] == "native" and not table["radar"]["firmware"]:
         # The boards start with an empty flash.
         table["radar"]["firmware"] = str(folder / IMAGE_FILE)

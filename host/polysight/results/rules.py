@@ -2,7 +2,7 @@
 
 A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. All limits are
 constants of this module, chosen where no source is given. The last argument of `reason` is the finding's weight, which
-orders the findings of one level, largest first.
+orders the findings of one level, largest first. P is H / V relative to metal.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from polysight.results.verdict import Coverage, is_known, reason
 from polysight_shared.findings import Finding
 
 FEW_POSITIONS = 0.5
-"""Share of absent or masked positions above which there is no result."""
+"""Share of positions that are absent, masked or without a direct path, above which there is no result."""
 SOME_POSITIONS = 0.005
 """Share of masked, reconstructed or clipped positions above which the result needs care."""
 SOME_CHIRPS = 0.05
@@ -56,7 +56,7 @@ scenes of the independent generator it is 0.009 at most, above 0.025 in nine of 
 FRINGES_CARE = 0.5
 """Probability of fringes above which they are told: undisturbed scenes have less than 0.01."""
 MOVED_CARE = 0.9
-"""Probability that boards have turned above which it is told: it is as likely as not beforehand. With 0.8 two of eight
+"""Probability that boards have turned above which it is told; its prior is a half. With 0.8 two of eight
 undisturbed scenes of another author's generator were told it (0.81 and 0.87)."""
 RELIEF_CARE_RAD = 0.035
 """Scatter of the phase of H inside plates above which they are uneven; flat ones have up to 0.005, tilted ones 0.03."""
@@ -151,7 +151,7 @@ def judge_left_out_chirps(board: str, clipped: float, disturbed: float, position
 
 def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
     """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
-    if found_share < FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
+    if 1 - found_share > FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
         return [reason(
             "none", f"{board}: the direct path is missing ({100 * found_share:.0f} % of the positions have one)",
             "without it no position is synchronised, and the images are meaningless",
@@ -300,11 +300,14 @@ def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list
     )]  # fmt: skip
 
 
-def judge_leakage(measured: bool, determined: bool, relative_error: float) -> list[Finding]:
-    """Judge leakage that was not measured; `relative_error` is its median effect on the permittivities."""
+def judge_leakage(measured: bool, estimated: bool, relative_error: float) -> list[Finding]:
+    """Judge leakage that was not measured, only `estimated` from the scene or neither.
+
+    `relative_error` is its median effect on the permittivities.
+    """
     if measured or relative_error < LEAKAGE_SHARE:
         return []
-    source = "estimated from the scene" if determined else "never measured; its prior is used"
+    source = "estimated from the scene" if estimated else "never measured; its prior is used"
     if is_known(relative_error):
         share = f"{100 * relative_error:.0f} %"
     else:
@@ -449,8 +452,8 @@ def judge_background(relative_std: float) -> list[Finding]:
 def judge_flatness(ripple: tuple[float, float], relief_rad: float, is_boxed: bool = False) -> list[Finding]:
     """Judge how well flat plates fit: usual scatter of ln|V / H| and of its phase inside them, and their relief.
 
-    A flat plate has one V / H, and a phase of H that is a plane. `is_boxed`: the plates' boxes were given; ones that
-    reach to 3 mm from the edges show the ripple of these.
+    A flat plate has one V / H, and a phase of H that is a plane. `is_boxed`: the plates' boxes were given; boxes
+    that reach within 3 mm of the plates' edges add the edges' ripple.
     """
     if is_known(relief_rad) and relief_rad > RELIEF_CARE_RAD:
         return [reason(

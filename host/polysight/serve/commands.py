@@ -83,7 +83,7 @@ class PlanRequest(Body, frozen=True):
 
 
 class StartRequest(Body, frozen=True):
-    """A new scan: its name, its plan, and how it is processed."""
+    """A new scan: its name, its plan, and how it is processed; `keep_incomplete`: keep rows with gaps, masked."""
 
     name: Text = ""
     plan: PlanRequest = PlanRequest()
@@ -101,7 +101,7 @@ class ScanName(Body, frozen=True):
 
 
 class ResumeRequest(Body, frozen=True):
-    """An interrupted scan to resume."""
+    """An interrupted scan to resume; `keep_incomplete` as of :class:`StartRequest`."""
 
     keep_incomplete: bool = False
     library: Text = ""

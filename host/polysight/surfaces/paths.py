@@ -88,7 +88,8 @@ class _Search:
         zero = np.zeros((slope.shape[0], 3))
         points = locate(path.ravel(), slope, zero, board.tx_m, board.middle_m)
         _, back, *_ = unit_legs(points, zero, board.tx_m, board.middle_m)
-        # An RX that is nearer to the point by back . lever has so much less path.
+        # `back` are unit vectors from the board's middle to the points, `lever` the places of the RX from that middle:
+        # an RX is nearer to a point by back . lever, and has so much less path.
         lead = np.exp(1j * fit.middle * (back @ fit.lever.T))
         # Places behind the stage or far away (limits chosen) are no surfaces of the scene.
         lead[(points[:, 2] < 0.2) | (points[:, 2] > 1.5)] = 0
@@ -212,7 +213,7 @@ def _refine(
         # Without iterations the path of the joint fit stays, and only the amplitude is measured.
         better = maximise(fit, add_up(fit, alone, values), part.valid, part.offsets, values, iterations=0)
         # The other echoes make an echo's amplitude and path less certain.
-        better.rest = better.rest * widening[:, index, 0]
+        better.amplitude_std = better.amplitude_std * widening[:, index, 0]
         better.std = better.std * widening[:, index, 1:]
         rows = np.flatnonzero(np.isin(windows_of_rank, members))[is_separate]
         for field in fields(Maximum):
@@ -335,5 +336,5 @@ def _measure_windows(fit: BoardFit, windows: Windows, values: Array) -> Echoes:
     measured = maximise(
         fit, add_up(fit, windows, first_values), windows.valid, windows.offsets, first_values, iterations=0
     )
-    measured.rest = measured.rest * widening
+    measured.amplitude_std = measured.amplitude_std * widening
     return make_echoes(fit, windows, measured)

@@ -246,13 +246,13 @@ class Maximum:
     """Result of :func:`maximise`, one echo per window.
 
     `values` [window, 6]: the path (`find_basis`); `std` [window, 6]: their standard deviations. `amplitude` [window]:
-    in the phase of the matched filter, without that of the path; `rest` [window]: standard deviation of either part of
-    it. `share` and `band_rise` [window] are as of :class:`Echoes`.
+    in the phase of the matched filter, without that of the path; `amplitude_std` [window]: standard deviation of either
+    part of it. `share` and `band_rise` [window] are as of :class:`Echoes`.
     """
 
     values: Array
     amplitude: NDArray[np.complex128]
-    rest: Array
+    amplitude_std: Array
     std: Array
     share: Array
     band_rise: Array
@@ -321,7 +321,7 @@ def maximise(
         values=values,
         amplitude=amplitude,
         # At an offset zero beside the window's centre, the plane's value is less certain than the mean.
-        rest=np.sqrt(noise * np.maximum(1, count * plane_inverse[:, 0, 0])),
+        amplitude_std=np.sqrt(noise * np.maximum(1, count * plane_inverse[:, 0, 0])),
         std=std,
         share=share,
         band_rise=band_rise,
@@ -340,7 +340,7 @@ def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
         slope=slope,
         bend=bend,
         amplitude=turned.conj(),
-        amplitude_std=maximum.rest,
+        amplitude_std=maximum.amplitude_std,
         path_std_m=maximum.std[:, 0],
         slope_std=maximum.std[:, 1:3],
         share=maximum.share,

@@ -122,7 +122,7 @@ def sync_scan(run: Run) -> SyncScan:
                     before = _compute_range_profile(mixed[0, :, a:b], 1)
                     after = _compute_range_profile(synced.samples[0], FOLD)
         # The first receiver is that of H; the other results of `image` are its footprint and a notice.
-        pairs = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
+        images = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
         grid = builder_after.grid
     # At a path of c / hz_per_sample the IF is the sample rate, which cannot be told from 0.
     range_m = np.arange(_RANGE_BINS) / _RANGE_BINS * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
@@ -131,7 +131,7 @@ def sync_scan(run: Run) -> SyncScan:
     y = (grid.y_m[[0, -1]] - grid.y_m[[0, -1]].mean()) * 1e3
     return SyncScan(
         reports,
-        (pairs[0], pairs[1]),
+        (images[0], images[1]),
         (before[:, :bins], after[:, :bins]),
         range_m[:bins],
         (float(x[0]), float(x[1]), float(y[0]), float(y[1])),
@@ -194,13 +194,13 @@ def fig12(run: Run) -> Item:
 
 def fig15(run: Run) -> Item:
     """Standard deviation of frequency, phase and amplitude after each stage, and the Cramer-Rao bounds."""
-    printed = published_values()
-    limits = {"frequency_hz": printed["frequency_std_hz"], "phase_rad": printed["phase_std_rad"]}
+    paper = published_values()
+    published = {"frequency_hz": paper["frequency_std_hz"], "phase_rad": paper["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
     fig = new_figure(11.5, 4.4)
     chirps = " and ".join(f"{c['chirps']} chirps of {b}" for b, c in summary.items())
     for ax, quantity, unit in zip(fig.subplots(1, 3), QUANTITIES, UNITS, strict=True):
-        _draw_stages(ax, summary, quantity, limits.get(quantity))
+        _draw_stages(ax, summary, quantity, published.get(quantity))
         style_axes(ax, unit, "", f"standard deviation of {unit}")
         ax.set_xticks(range(len(STAGES)), list(STAGES), fontsize=8)
         ax.legend(fontsize=7.5, frameon=False)
@@ -214,14 +214,14 @@ def fig15(run: Run) -> Item:
             f" {chirps}. Its stages are not quite these; its two published numbers stand beside the last one, which is"
             " measured on the echo of the object.",
         ),
-        (Table("Standard deviation after each stage", head, _tabulate_stages(summary, limits)),),
+        (Table("Standard deviation after each stage", head, _tabulate_stages(summary, published)),),
         {"stages": Picture(fig, "Errors after each stage, on a logarithmic axis, with the bounds of one tone.")},
         summary,
     )
 
 
-def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: float | None) -> None:
-    """Draw the standard deviation of a quantity after each stage, its bounds, and the published value `limit`, if any.
+def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, published: float | None) -> None:
+    """Draw the standard deviation of a quantity after each stage, its bounds, and the published value, if any.
 
     `summary`: by board, as of `SyncReport.summary`; two boards.
     """
@@ -238,8 +238,8 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
         bound = [(x, s[key]) for x, s in zip(positions, stages.values(), strict=True) if key in s]
         ax.plot(*zip(*bound, strict=True), "_", ms=16, mew=1.6, color=INK, label=None if i else "Cramér-Rao bound")
     ax.set_yscale("log")
-    if limit is not None:
-        ax.axhline(limit, color=PALETTE[2], ls="--", lw=1.2, label=f"published, all stages: {limit:g}")
+    if published is not None:
+        ax.axhline(published, color=PALETTE[2], ls="--", lw=1.2, label=f"published, all stages: {published:g}")
         ax.yaxis.set_minor_formatter(NullFormatter())
     else:
         ax.yaxis.set_major_formatter("{x:g}")
@@ -249,13 +249,13 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, limit: flo
     ax.margins(y=0.25)
 
 
-def _tabulate_stages(summary: Mapping[str, Any], limits: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
+def _tabulate_stages(summary: Mapping[str, Any], published: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
     """Return table lines for each board and stage, with the published values beside the last stage."""
     rows = []
     for board, content in summary.items():
         for name, s in content["stages"].items():
             # The published values hold for the last stage, and the amplitude has none: its cell is cut off.
-            printed = [f"{limits[q]:g}" if name == "referenced" and q in limits else "" for q in QUANTITIES]
+            printed = [f"{published[q]:g}" if name == "referenced" and q in published else "" for q in QUANTITIES]
             simulated = [f"{s[f'{q}_std']:.4g}" for q in QUANTITIES]
             cells = [x for pair in zip(simulated, printed, strict=True) for x in pair]
             rows.append((f"{board}, {name}: {STAGES[name]}", *cells[:-1]))
@@ -291,9 +291,9 @@ def skirt_db(
 
 
 def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray, Complex]:
-    """Simulate the direct path alone at all start frequencies; return IF (Hz) and amplitude of each chirp, both [n].
+    """Simulate the direct path alone at all start frequencies; return IF (Hz) and amplitude [n] of the chirps in band.
 
-    The third result is the chirps of the usual one, [rx, chirp, sample].
+    The third result is all chirps of the usual start frequency, [rx, chirp, sample].
     """
     swept = []
     example = np.zeros((1, 1, chirp.samples), np.complex64)
@@ -345,7 +345,7 @@ def _draw_skirts(ax: Axes, chirps: Complex, chirp: Chirp) -> dict[str, float]:
 
 
 def _draw_filter(ax: Axes, if_hz: npt.NDArray, amplitude: npt.NDArray, fitted: HighPass, programmed: HighPass) -> None:
-    """Draw amplitude against IF without the fitted filter's gain, and both filters."""
+    """Draw the sweep's amplitude, scaled to the fitted filter's gain, against IF, and both filters' gains."""
     grid_hz = np.linspace(if_hz.min(), if_hz.max(), 300)
     ax.plot(if_hz / 1e6, 20 * np.log10(amplitude), ".", ms=3, color=PALETTE[1], label="sweep, simulated")
     for model, colour, style, name in ((fitted, INK, "-", "fitted"), (programmed, PALETTE[6], "--", "programmed")):

@@ -148,7 +148,7 @@ class EmulatedUno:
         self.run(round(ms * HZ / 1000))
 
     def settle(self, pty_bytes: int = 0) -> None:
-        """Run until the serial line was idle for 4 ms, or 2 s beyond what it has to send.
+        """Run until the serial line was idle for 4 ms; at most 2 s longer than the bytes now queued on it take.
 
         `pty_bytes`: total number of bytes that were written to the pseudo terminal, which are waited for first.
         """

@@ -51,11 +51,11 @@ def _sum(
     unit = np.float32(1)
     half = np.float32(0.5)
     pi = np.float32(math.pi)
-    dz_t = (z - tx[2]) ** 2
+    dz2_t = (z - tx[2]) ** 2
     for begin in range(0, offset_x.size, BLOCK):
         count = min(BLOCK, offset_x.size - begin)
         for r in range(rx.shape[0]):
-            dz_r = (z - rx[r, 2]) ** 2
+            dz2_r = (z - rx[r, 2]) ** 2
             real_part = real[r, begin * bins :]
             imaginary_part = imag[r, begin * bins :]
             u = offset_x[begin : begin + count]
@@ -66,8 +66,8 @@ def _sum(
                     for p in range(count):
                         dx = x[j] - u[p]
                         dy = y[i] - v[p]
-                        to_tx = np.sqrt((dx - tx[0]) ** 2 + (dy - tx[1]) ** 2 + dz_t)
-                        d = to_tx + np.sqrt((dx - rx[r, 0]) ** 2 + (dy - rx[r, 1]) ** 2 + dz_r) - direct[r]
+                        to_tx = np.sqrt((dx - tx[0]) ** 2 + (dy - tx[1]) ** 2 + dz2_t)
+                        d = to_tx + np.sqrt((dx - rx[r, 0]) ** 2 + (dy - rx[r, 1]) ** 2 + dz2_r) - direct[r]
                         place = (d - first_m) * bins_per_m
                         low = np.int32(place)
                         w = place - np.float32(low)

@@ -33,7 +33,7 @@ OF_THE_PAGE = ("offline", "server_frozen")
 WORDS: dict[str, Any] = {
     "folder": "scans/one", "safe": "1 of 3 rows are safe.", "asker": "the page", "row": 1, "take": 2,
     "what": "RV: no data.", "why": "The cable is out", "do": "Put it in", "now": "Row 1 is being scanned.",
-    "gaps": "Every row is safe.",
+    "all_safe": "Every row is safe.",
 }  # fmt: skip
 
 

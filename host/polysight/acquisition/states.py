@@ -1,7 +1,7 @@
 """The states of a scan as people read them: the one table that page, list, terminal and `polysight ask` speak from.
 
 Each state has a colour, words, the buttons that may be pressed, and phrases that are never shown with it. Words in
-braces are filled in: `{folder}`, `{safe}` (rows that are safe), `{gaps}` (that all are, and how many with gaps),
+braces are filled in: `{folder}`, `{safe}` (rows that are safe), `{all_safe}` (that all are, and how many with gaps),
 `{asker}` (who pressed the button), `{now}` (the row being scanned), and what the state is about. `{since}` is filled in
 by the page, as the time since the status's `since_s`.
 """
@@ -105,16 +105,17 @@ _TABLE = (
     State("homing_again", "good", "Homing the stage again", detail="Every row is recorded; this measures lost steps.",
           press=("abort",), never=("Rows begin", _RESULT)),
     State("finishing", "good", "The scan is finishing", detail="Every row is recorded.", never=("Rows begin", _RESULT)),
-    State("materials", "wait", "Materials are being computed", detail="{gaps} The result comes when this has ended.",
-          never=(_RESULT, "not processed")),
-    State("finished", "done", "The scan is finished", detail="{gaps} It was not processed.",
+    State("materials", "wait", "Materials are being computed",
+          detail="{all_safe} The result comes when this has ended.", never=(_RESULT, "not processed")),
+    State("finished", "done", "The scan is finished", detail="{all_safe} It was not processed.",
           press=("process", "repeat"), never=(_RESULT,)),
     State("unprocessed", "bad", "Every row is safe, but processing failed", detail="{what}", why="{why}", do="{do}",
           press=("process", "repeat"), never=(_WELL, _RESULT)),
-    State("result_good", "done", "The scan is finished", detail="{gaps}", press=("repeat",), never=("not processed",)),
-    State("result_care", "warn", "Finished: use the result with care", detail="{gaps}", press=("repeat",),
+    State("result_good", "done", "The scan is finished", detail="{all_safe}", press=("repeat",),
           never=("not processed",)),
-    State("result_none", "bad", "Finished without a result", detail="{gaps}", press=("repeat",),
+    State("result_care", "warn", "Finished: use the result with care", detail="{all_safe}", press=("repeat",),
+          never=("not processed",)),
+    State("result_none", "bad", "Finished without a result", detail="{all_safe}", press=("repeat",),
           never=("not processed",)),
     State("processing", "wait", "Processing again",
           detail="What is shown is the earlier result, until this has ended."),

@@ -100,7 +100,7 @@ class LifeSigns:
     life
         What the scan program wrote last; None where there is nothing.
     alive, killed
-        True if it gives signs of life; if its process is gone without having said so.
+        True if it wrote of late or, without `life`, the manifest grew; if its process is gone without having said so.
     alive_s
         Time of the last sign of life of a program that is not alive.
     pi_silent_s, pi_limit_s
@@ -458,7 +458,7 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
         all_safe = f"Every row is safe; {rows_with_gaps} are kept with gaps, masked."
     program = inputs.program
     if not _may_have_result(inputs, history):
-        return say("materials", gaps=all_safe)
+        return say("materials", all_safe=all_safe)
     if program is not None and program.running and cut_fraction(program.started_utc) > cut_fraction(ended.ended_utc):
         if program.kind == "process":
             return say("processing")
@@ -481,16 +481,16 @@ def cut_fraction(iso_time: str) -> str:
     return iso_time[:ISO_SECONDS_CHARACTERS]
 
 
-def _judge_result(inputs: Inputs, gaps: str) -> Status:
+def _judge_result(inputs: Inputs, all_safe: str) -> Status:
     """Return the status of a scan whose rows are all recorded."""
     if inputs.verdict is not None:
-        return say(f"result_{inputs.verdict.level}", gaps=gaps)
+        return say(f"result_{inputs.verdict.level}", all_safe=all_safe)
     if inputs.signs.killed:
         do = f"`polysight process {quote(inputs.folder)} --out {quote(f'{inputs.folder}/products')}`"
         return say("unprocessed", what="Its program was killed while it computed materials.", why="", do=do)
     if inputs.failure is not None:
         return say_finding("unprocessed", inputs.failure)
-    return say("finished", gaps=gaps)
+    return say("finished", all_safe=all_safe)
 
 
 def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
@@ -510,7 +510,7 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
 
 
 def _connects(inputs: Inputs, history: ScanHistory) -> bool:
-    """True if the program that a page started does not take commands yet: it has given no sign of life of its own."""
+    """True if the program that a page started does not take commands yet: it has written no sign of life of its own."""
     signs = inputs.signs
     program = inputs.program
     if program is None or program.kind != "scan" or not program.running:

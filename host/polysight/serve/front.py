@@ -383,7 +383,7 @@ async def _relay_answer(connection: h11.Connection, reader: asyncio.StreamReader
 
 
 class ConnectionLimit:
-    """The most connections at a time. When there are more, one without a request is closed: the longest unread one.
+    """The most connections at a time. When there are more, one without a request is closed: the longest silent one.
 
     Each step takes the same time however many there are. Nothing is measured in seconds: a process that is busy must
     not take its own delay for a client's. A connection of which bytes wait to be read is not closed.

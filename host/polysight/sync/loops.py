@@ -605,7 +605,7 @@ class Library:
         """Align positions into the fields of an `offsets.AlignedRow`; parameters as in `offsets.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
-        # Sample rate, reach, sign, corners in Hz. Without corners reach has no effect; at this one all is finite.
+        # Of `Equaliser`: sample rate, reach, sign, corners in Hz. Without corners no reach but 0 has an effect.
         filters = [1.0, 1 / 8 / FOLD, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]

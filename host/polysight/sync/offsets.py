@@ -113,7 +113,7 @@ class AlignedRow(NamedTuple):
         float64 [position, chirp]: gain of the filter compensation at the chirp's centre.
     error
         float64 [position, 2, chirp]: frequency (cycles per sample) and phase (rad) error of a chirp after alignment:
-        half the difference between two halves of the RX; zero where not good.
+        half the difference between two halves of the RX, less its mean over good chirps; zero where not good.
     coherence
         float64 [position, chirp]: normalised correlation with the average, 0..1.
     clipped
@@ -293,15 +293,15 @@ def _align_round(
     good = _find_coherent(coherence, usable)
     frequency = centre[:, None] + first.frequency
     taps = _find_taps(equaliser, frequency)
-    start = np.angle(first.amplitude * taps.sum(axis=-1))
-    reduced = loops.reduce_chirps(words, frequency, complex64(taps * cis(-start)[..., None]), linear)
+    first_phase = np.angle(first.amplitude * taps.sum(axis=-1))
+    reduced = loops.reduce_chirps(words, frequency, complex64(taps * cis(-first_phase)[..., None]), linear)
     # Second pass: each chirp against the sum of the others. Energies of parts of a chirp are [position, part].
     tone, own_energy, sum_energy, half_difference, residual_energy = loops.against_others(reduced, good)
     n = good.sum(axis=1)
     disturbed = is_complete & _find_disturbed(residual_energy, sum_energy / np.maximum(n, 1)[:, None] ** 2, usable)
     level = np.maximum(sum_energy.sum(axis=1) / np.maximum(n, 1) ** 2, 1e-30)[:, None]
     other_chirps = n[:, None] - good
-    # Relative to the mean of the others; a single chirp is the mean itself.
+    # Product with the mean of the others, over the energy of the mean of all; a single chirp is the mean itself.
     amplitude = np.where(other_chirps > 0, np.abs(tone.amplitude) / np.maximum(other_chirps, 1) / level, 1.0)
     # The difference from the mean of all chirps is smaller than that from the mean of the others.
     share = other_chirps / np.maximum(n, 1)[:, None]
@@ -317,7 +317,7 @@ def _align_round(
         centre=centre,
         good=good,
         frequency=first.frequency + correction,
-        phase=np.angle(cis(start + shift)),
+        phase=np.angle(cis(first_phase + shift)),
         amplitude=amplitude,
         gain=np.abs(taps.sum(axis=-1)),
         error=_subtract_mean(half_difference / 2, good).swapaxes(0, 1),
@@ -524,18 +524,18 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
     grid = np.linspace(-3, 3, 25) * _SPREAD_M
     dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
-    weight = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
+    amplitude = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
     points = np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1)
     excess = excess_path_m(tx, rx, points)
     echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
-    echoes *= (weight / np.linalg.norm(weight))[:, None, None]
+    echoes *= (amplitude / np.linalg.norm(amplitude))[:, None, None]
     n_rx = len(rx)
     n = middles.size
     all_rx = echoes.reshape(len(points), n_rx * n)
     # A gain error is that of an RX: it adds echo power between samples of the same RX, none between two.
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
-    mirror_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
-    clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(mirror_m, _CLUTTER_M, 8 * n), middles))
+    nearest_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
+    clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(nearest_m, _CLUTTER_M, 8 * n), middles))
     clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
     covariance = (all_rx.T @ all_rx.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)
     covariance = (covariance + _NOISE / FOLD * np.eye(n_rx * n)).astype(np.complex128)
@@ -624,17 +624,17 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     in_passband = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
     strength = np.abs(amplitude)
     chirps = np.maximum(good_chirps, 1)
-    # All chirps of a row have the same noise; `noise` is the power in an averaged sample of one RX.
+    # All chirps of a row have the same noise; `averaged_noise` is the power in an averaged sample of one RX.
     floor = _find_middle((floor * chirps)[usable]) / chirps if usable.any() else floor
-    noise = floor / (np.abs(path.beam) ** 2).sum()
-    present = strength**2 > _PRESENT * noise * (np.abs(path.estimator[0]) ** 2).sum()
+    averaged_noise = floor / (np.abs(path.beam) ** 2).sum()
+    present = strength**2 > _PRESENT * averaged_noise * (np.abs(path.estimator[0]) ** 2).sum()
     is_found = usable & in_passband & present & (np.abs(step) < 0.02 / (b - a))
     if is_found.any():
         is_found &= strength > _LOST * _find_middle(strength[is_found])
 
     samples[:, ~is_found] = 0
-    # The averages of the halves, of k and l of the K good chirps, differ by 1 / k + 1 / l of a chirp's noise power, the
-    # sum of `scale` over K. `half_difference` is the difference's energy in all RX and blocks, after decimation.
+    # Noise of one chirp: averages of the halves, of k and l of the K good chirps, differ by 1 / k + 1 / l of its power,
+    # the sum of `scale` over K. `half_difference` is the difference's energy in all RX and blocks, after decimation.
     two = good_chirps > 1
     noise_power = np.full(len(two), np.nan)
     chirp_noise = half_difference * chirps / (len(path.beam) * n) / decimator().noise
@@ -666,7 +666,7 @@ def _try_second_peaks(
     """Use the second peak where ln of the amplitude is an outlier in its row; changes `removed` in place.
 
     `remove` repeats the estimate of given positions from given frequencies. An outlier is beyond `_OUTLIER` standard
-    deviations, estimated from the median absolute deviation of the row. The second peak has to be nearer and within.
+    deviations from the row's median; the amplitude of the second peak has to be nearer to the median, and no outlier.
     """
     level = np.log(np.maximum(np.abs(removed.estimate[:, 0]), 1e-30))
     if not usable.any():

@@ -149,7 +149,7 @@ class Executor:
         self._ended = False
         # The exception that ended the thread.
         self.crash: BaseException | None = None
-        self._thread = threading.Thread(target=self._live, name="executor", daemon=True)
+        self._thread = threading.Thread(target=self._run_turns, name="executor", daemon=True)
         self._refresh_replies()
 
     # --- for other threads ------------------------------------------------------------------------------------------
@@ -220,7 +220,8 @@ class Executor:
 
     # --- the thread -------------------------------------------------------------------------------------------------
 
-    def _live(self) -> None:
+    def _run_turns(self) -> None:
+        """Run the thread: turn after turn until it is to end. An exception that ends it is kept in `crash`."""
         try:
             while not self._ended:
                 self._turn()
@@ -438,7 +439,7 @@ class Executor:
         self._loop.send(spec)
 
     def _postpone(self, request: Request, run: m.BeginRun) -> bool:
-        """Check a run; return True if a row has to be aborted before it can begin. Raises RefusedError."""
+        """Check a run; if a row runs, abort it, keep the request for its end and return True. Raises RefusedError."""
         check_run(run, self._machine.stage.config)
         self._loop.check(read_burst(run))
         active = self._run

@@ -184,13 +184,13 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
     times_s = np.array(rig.burst.chirp_times_s)
     # Motion of the stage from the middle of the burst to each chirp, in positions.
     shift_positions = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
-    turns = np.linspace(0, _BAND, 91)
-    loss = np.cos(2 * np.pi * np.outer(turns, shift_positions)).mean(axis=1)
+    frequencies = np.linspace(0, _BAND, 91)
+    loss = np.cos(2 * np.pi * np.outer(frequencies, shift_positions)).mean(axis=1)
     filters = np.zeros((REACH + 1, REACH + 1))
     filters[0, 0] = 1
     for reach in range(1, REACH + 1):
         # The sum of the taps is one, so that constants keep their amplitude.
-        basis = 2 * np.cos(2 * np.pi * np.outer(turns, np.arange(1, reach + 1))) - 2
+        basis = 2 * np.cos(2 * np.pi * np.outer(frequencies, np.arange(1, reach + 1))) - 2
         side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
         filters[reach, 0] = 1 - 2 * side.sum()
         filters[reach, 1 : reach + 1] = side
@@ -265,7 +265,7 @@ def choose_imager(aperture: geometry.Aperture) -> tuple[Imager, str | None]:
 
 
 def mirror_samples(antennas: geometry.Antennas, z_m: float, chirp: Chirp) -> NDArray[np.complex128]:
-    """Return the referenced samples of a mirror, [rx, sample]; amplitude relative to a direct path of one metre."""
+    """Return a mirror's samples [rx, sample]: phase relative to the direct path, amplitude to a path of one metre."""
     path = antennas.mirror_m(z_m)
     phase = 2j * np.pi * np.outer(path - antennas.direct_m, sample_frequencies_hz(chirp)) / SPEED_OF_LIGHT_M_S
     return (np.exp(phase) / path[:, None]).astype(np.complex128)
@@ -429,7 +429,7 @@ class BoardSamples:
         forward: slice = slice(None),
     ) -> None:
         """Replace a row in the samples and the live image; `forward` brings `offsets_m` into the order of columns."""
-        self._show(index, -1)
+        self._add_to_live_image(index, -1)
         self._cube[:, :, index], self._direct[:, index], self.valid[index] = row
         if offsets_m is not None:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
@@ -441,7 +441,7 @@ class BoardSamples:
         self._stale.add(index)
         self._image = None
         self._slope = None
-        self._show(index, 1)
+        self._add_to_live_image(index, 1)
 
     def _apply_gate(self, samples: NDArray[np.complex64], sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Apply the range gate to a row; return samples and the direct path, [rx, frequency + 1, position]."""
@@ -502,7 +502,7 @@ class BoardSamples:
         self._invalidate()
 
     def fill(self, samples: NDArray[np.complex64]) -> None:
-        """Put samples, [rx, frequency, row, column] divided by the gains, at all positions that are not valid."""
+        """Fill all positions that are not valid with calibrated samples (as of :meth:`calibrate_samples`)."""
         missing = ~self.valid
         gains = self.rx_calibration()
         self._cube[:, :, missing] = samples[:, :, missing] * gains.astype(np.complex64)[:, None, None]
@@ -517,7 +517,7 @@ class BoardSamples:
         self._slope = None
         self._stale = set(range(len(self.valid)))
 
-    def _show(self, index: int, sign: int) -> None:
+    def _add_to_live_image(self, index: int, sign: int) -> None:
         """Add a row to the live image, or subtract it (`sign` -1)."""
         weights = sign * self._compute_row_weights(index)
         if self._live is None or not weights.any():
@@ -638,13 +638,13 @@ class BoardSamples:
             change = (slope / image - of_mirror) / variance * sweep_per_m
         return np.where(np.isfinite(change), change, complex(np.nan, np.nan)).astype(np.complex64)
 
-    def mirror_image(self, height_m: float) -> Image:
-        """Return the footprint of a mirror `height_m` behind the rig file's plane, complex64 [ny, nx]."""
-        return self._make_constant_image(self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m))
+    def mirror_image(self, behind_m: float) -> Image:
+        """Return the footprint of a mirror `behind_m` behind the rig file's plane, complex64 [ny, nx]."""
+        return self._make_constant_image(self._reduce_mirror(float(np.mean(self._grid.z_m)) + behind_m))
 
-    def mirror_slope(self, height_m: float) -> Image:
+    def mirror_slope(self, behind_m: float) -> Image:
         """Return the derivative of :meth:`mirror_image` by range, see :meth:`range_slope`."""
-        echo = self._mirror_samples(float(np.mean(self._grid.z_m)) + height_m)
+        echo = self._reduce_mirror(float(np.mean(self._grid.z_m)) + behind_m)
         return self._make_constant_image(echo * self._compute_range_slope_factors())
 
     def _make_constant_image(self, echo: NDArray[np.complexfloating], grid: geometry.ImageGrid | None = None) -> Image:
@@ -660,10 +660,10 @@ class BoardSamples:
 
     def _mirror(self, grid: geometry.ImageGrid | None) -> NDArray[np.complex128]:
         """Return the samples of a mirror on the plane of the pixels after the range gate, [rx, frequency]."""
-        return self.mirror if grid is None else self._mirror_samples(float(np.mean(grid.z_m)))
+        return self.mirror if grid is None else self._reduce_mirror(float(np.mean(grid.z_m)))
 
-    def _mirror_samples(self, z_m: float) -> NDArray[np.complex128]:
-        """Return the samples of a mirror on the plane at `z_m`, [rx, frequency]."""
+    def _reduce_mirror(self, z_m: float) -> NDArray[np.complex128]:
+        """Return the samples of a mirror on the plane at `z_m` after the range gate, [rx, frequency]."""
         return mirror_reduced(self._antennas, z_m, self._chirp, self._reduction)
 
     def _choose_imager(self, grid: geometry.ImageGrid | None) -> tuple[Imager, str | None]:

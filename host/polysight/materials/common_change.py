@@ -79,7 +79,7 @@ TWO_SIDED_95 = 1.96
 """Standard deviations on both sides of a normal distribution's mean that hold 95 %."""
 # Halvings of the range in which the width of an interval is searched: to 1e-7 of it.
 _BISECTIONS = 24
-USUAL_RIPPLE = 2.0
+WEIGHT_OF_USUAL = 2.0
 """Weight of the scene's usual squared slope, in the mean with the three squared slopes of a plate; chosen."""
 
 
@@ -162,7 +162,7 @@ def estimate_common_change(
         drift=(real.drift + 1j * imag.drift)[0],
         drift_std=(real.drift_std + 1j * imag.drift_std)[0],
         ripple=RIPPLE_M * _estimate_own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
-        fringes=float(sum(w for w, (size, _, _, _) in zip(weight, smooth_fields.shared, strict=True) if size > 0)),
+        fringes=float(sum(w for w, (fringe, _, _, _) in zip(weight, smooth_fields.shared, strict=True) if fringe > 0)),
         drifts=float(sum(w for w, (_, _, _, stable) in zip(weight, smooth_fields.shared, strict=True) if not stable)),
     )
 
@@ -172,7 +172,7 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
 
     `remaining` are the slopes without those by common causes, and `noises` their standard deviations: each a pair (real
     part, imaginary part) of arrays [2, plate] along x and y. A disturbance is taken as equally strong in both
-    directions and both parts, so that their squares are averaged.
+    directions and both parts, so that their squares are averaged, with `WEIGHT_OF_USUAL` those usual in the scene.
     The slope of the real part along y is left out. H and V see different places along y, so an uneven plate changes
     their brightness ratio there. This change is antisymmetric about the plate's middle and no error of the median.
     """
@@ -185,7 +185,7 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
     )
     # Plates at the border, whose slopes tell nothing, get the usual size.
     excess = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
-    return np.sqrt((USUAL_RIPPLE * usual + excess) / (USUAL_RIPPLE + len(slopes)))
+    return np.sqrt((WEIGHT_OF_USUAL * usual + excess) / (WEIGHT_OF_USUAL + len(slopes)))
 
 
 def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
@@ -271,9 +271,9 @@ class _Fields:
         shared = []
         prior = []
         cases = itertools.product(FRINGES.items(), FRINGE_LENGTHS_M, COMMON_SLOPES.items(), (True, False))
-        for (size, share), length_m, (common, share_of_common), stable in cases:
-            shared.append((size, length_m, common, stable))
-            prior.append(share * share_of_common * (STABLE if stable else 1 - STABLE))
+        for (fringe, fringe_prior), fringe_m, (common, common_prior), stable in cases:
+            shared.append((fringe, fringe_m, common, stable))
+            prior.append(fringe_prior * common_prior * (STABLE if stable else 1 - STABLE))
         return cls(
             drifts=[_Field.along((0, 1), length_m, places_m, origin_m) for length_m in DRIFT_LENGTHS_M],
             fringes={length_m: _Field.along((1, 1), length_m, places_m, origin_m) for length_m in FRINGE_LENGTHS_M},
@@ -303,7 +303,7 @@ class _Fields:
         # One slope that all plates share along x, and an independent one along y.
         shared_slope = np.kron(np.eye(2), np.ones((count, count)))
         of_common_causes = common**2 * shared_slope + fringe**2 * fringes.of_slopes
-        own_slopes, share = _estimate_own_variances(count)
+        own_slopes, own_slopes_prior = _list_own_variances(count)
         cases = []
         for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
             explained = of_common_causes + drift**2 * field.of_slopes
@@ -317,7 +317,7 @@ class _Fields:
             variance_of_drift = drift**2 * field.of_itself
             case = _Explained(
                 # Prior of the case, and the normal distribution of the slopes with the covariance `total`.
-                log_evidence=np.log(share / len(DRIFTS[stable]))
+                log_evidence=np.log(own_slopes_prior / len(DRIFTS[stable]))
                 - 0.5 * answer @ measured
                 + 0.5 * np.linalg.slogdet(inverse)[1],
                 mean=answer @ of_all.T,
@@ -330,20 +330,20 @@ class _Fields:
         return _Explained.average_over(cases)
 
 
-def _estimate_own_variances(count: int) -> tuple[Real, Real]:
+def _list_own_variances(count: int) -> tuple[Real, Real]:
     """Return variances of the plates' own slopes, [case, 2 plate] (x before y), and the prior probability of each case.
 
     A case is a pair of `OWN_SLOPES`, one along x and one along y.
     """
     variances = []
-    shares = []
+    priors = []
     for along_x, along_y in itertools.product(OWN_SLOPES, OWN_SLOPES):
         variances.append(np.repeat([along_x**2, along_y**2], count))
-        share = (1 - ALIKE_BOTH_WAYS) / len(OWN_SLOPES) ** 2
+        prior = (1 - ALIKE_BOTH_WAYS) / len(OWN_SLOPES) ** 2
         if along_x == along_y:
-            share += ALIKE_BOTH_WAYS / len(OWN_SLOPES)
-        shares.append(share)
-    return np.array(variances), np.array(shares)
+            prior += ALIKE_BOTH_WAYS / len(OWN_SLOPES)
+        priors.append(prior)
+    return np.array(variances), np.array(priors)
 
 
 def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:

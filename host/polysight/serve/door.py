@@ -77,12 +77,12 @@ class Door:
             client.setblocking(False)
             if not self._look(client):
                 self._silent[client] = None
-                self._loop.add_reader(client, self._wake, client)
+                self._loop.add_reader(client, self._handle_silent, client)
                 if len(self._silent) > MOST_SILENT:
                     self._drop_silent()
 
-    def _wake(self, client: socket.socket) -> None:
-        """Handle a silent connection that has sent something or was closed."""
+    def _handle_silent(self, client: socket.socket) -> None:
+        """Handle a silent connection by what it has sent; close it if that is still nothing."""
         del self._silent[client]
         self._loop.remove_reader(client)
         if not self._look(client):
@@ -91,7 +91,7 @@ class Door:
     def _drop_silent(self) -> None:
         """Close the connection that is silent for longest, unless its first bytes have come meanwhile."""
         if self._silent:
-            self._wake(next(iter(self._silent)))
+            self._handle_silent(next(iter(self._silent)))
 
     def _look(self, client: socket.socket) -> bool:
         """Give a connection to who answers it; False if nothing can be read from it yet."""

@@ -80,7 +80,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
     window = np.pad(np.hanning(plan.columns + 2)[1:-1], (0, plan.columns))
 
     def compute_row_spectrum(r: int, shift_mm: float) -> NDArray[np.complex128]:
-        """Return the spectrum of a row at its planned positions, odd rows shifted back by `shift_mm`."""
+        """Return the spectrum of a row at its planned positions; odd rows were recorded `shift_mm` beyond."""
         direction = plan.row(r).direction
         backlash_mm = shift_mm if r % 2 else 0.0
         return _compute_spectrum(rows[r][:, ::direction], k, direction * travel_mm + backlash_mm)
@@ -126,8 +126,9 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
 
 
 def _compute_spectrum(row: NDArray[np.complex64], k: NDArray[np.floating], shift_mm: float) -> NDArray[np.complex128]:
-    """Return the spectrum of a row along x, [rx, 2 position], shifted back by `shift_mm` to the planned positions.
+    """Return the spectrum along x of a row at its planned positions, [rx, 2 position].
 
-    The row is continued by its mirror image to avoid a jump at its ends. `k` is in radians per millimetre.
+    It was recorded `shift_mm` beyond them (along +x). The row is continued by its mirror image to avoid a jump at its
+    ends. `k` is in radians per millimetre.
     """
     return np.fft.fft(np.concatenate([row, row[:, ::-1]], axis=-1), axis=-1) * np.exp(-1j * k * shift_mm)

@@ -219,24 +219,22 @@ def authors_fig18(judge: Judgements) -> Item:
     for source, task, samples in judge.list_tasks(TASKS):
         name, _, two_angles = task.partition(", ")
         paper = published_percent(task) / 100
-        published_h = None
-        if not two_angles:
-            published_h = printed[name]["h_percent"] / 100
+        published_h = None if two_angles else printed[name]["h_percent"] / 100
         several = select_repeated(samples)
         knn_mixed, knn_apart = judge.score(source, task, PAPER)
-        best_mixed, best_apart = judge.score(source, task, DISCRIMINANT)
+        discriminant_mixed, discriminant_apart = judge.score(source, task, DISCRIMINANT)
         h_mixed, h_apart = judge.score(source, task, PAPER, "H")
-        scores = (knn_mixed, knn_apart, best_mixed, best_apart)
+        scores = (knn_mixed, knn_apart, discriminant_mixed, discriminant_apart)
         if several is None:
             split = OPTIMISTIC
             material_count = 0
             h = h_mixed
-            best = best_mixed
+            discriminant = discriminant_mixed
         else:
             split = LEFT_OUT
             material_count = np.unique(several.names).size
             h = h_apart
-            best = best_apart
+            discriminant = discriminant_apart
         rows.append(
             (
                 f"{np.unique(samples.names).size} {task}",
@@ -247,7 +245,7 @@ def authors_fig18(judge: Judgements) -> Item:
                 percent(paper),
                 *(_share(s) for s in scores),
                 # Of patches; the figure's third panel counts their pixels.
-                "–" if best_apart is None else percent(best_apart.patches),
+                "–" if discriminant_apart is None else percent(discriminant_apart.patches),
                 str(material_count),
             )
         )
@@ -256,11 +254,11 @@ def authors_fig18(judge: Judgements) -> Item:
             "scores": [None if s is None else asdict(s) for s in (*scores, h_mixed, h_apart)],
             "judged_with_scans_left_out": material_count,
         }
-        if h is None or best is None:
+        if h is None or discriminant is None:
             continue
         key = f"{task}-{source}".replace(", ", "-").replace(" ", "-").replace("/", "")
         caption = f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
-        pictures[key] = Picture(_draw_confusion(h, best), caption)
+        pictures[key] = Picture(_draw_confusion(h, discriminant), caption)
     return Item(
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
@@ -271,14 +269,16 @@ def authors_fig18(judge: Judgements) -> Item:
     )
 
 
-def _draw_confusion(h_only: Score, best: Score) -> Figure:
+def _draw_confusion(knn: Score, discriminant: Score) -> Figure:
     """Draw the confusion of the paper's KNN by H beside the discriminant's, by pixels and by patches."""
+    by_pixel = percent(discriminant.pixels)
+    by_patch = percent(discriminant.by_patch)
     panels = [
-        (h_only, h_only.confusion, f"H alone: {percent(h_only.pixels)}\n{PAPER}"),
-        (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
-        (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
+        (knn, knn.confusion, f"H alone: {percent(knn.pixels)}\n{PAPER}"),
+        (discriminant, discriminant.confusion, f"H, V and P, pixels alone: {by_pixel}\n{DISCRIMINANT}"),
+        (discriminant, discriminant.patch_confusion, f"H, V and P, by patch: {by_patch}\n{DISCRIMINANT}"),
     ]
-    return confusion_figure([m for m in table2() if m.name in best.names], panels)
+    return confusion_figure([m for m in table2() if m.name in discriminant.names], panels)
 
 
 def authors_fig20(judge: Judgements) -> Item:
@@ -294,16 +294,15 @@ def authors_fig20(judge: Judgements) -> Item:
         tasks_of_source = [(t, x) for s, t, x in judged_tasks if s == source]
         means: dict[str, tuple[float, float | None]] = {}
         for channel in CHANNELS:
-            pairs = [judge.score(source, t, PAPER, channel) for t, _ in tasks_of_source]
+            scores = [judge.score(source, t, PAPER, channel) for t, _ in tasks_of_source]
             weight = [np.unique(x.names).size for _, x in tasks_of_source]
-            mixed = float(np.average([p[0].pixels for p in pairs], weights=weight))
-            scores_without_scan = [(p[1], len(p[1].names)) for p in pairs if p[1] is not None]
-            if scores_without_scan:
+            mixed = float(np.average([by_pixel.pixels for by_pixel, _ in scores], weights=weight))
+            scores_apart = [apart for _, apart in scores if apart is not None]
+            held_out_accuracy = None
+            if scores_apart:
                 held_out_accuracy = float(
-                    np.average([s.pixels for s, _ in scores_without_scan], weights=[n for _, n in scores_without_scan])
+                    np.average([s.pixels for s in scores_apart], weights=[len(s.names) for s in scores_apart])
                 )
-            else:
-                held_out_accuracy = None
             means[channel] = (mixed, held_out_accuracy)
             rows.append(
                 (
@@ -312,7 +311,7 @@ def authors_fig20(judge: Judgements) -> Item:
                     f"{printed[channel]:.2f} %",
                     percent(mixed),
                     percent(held_out_accuracy),
-                    ", ".join(f"{t} {_share(p[1])}" for (t, _), p in zip(tasks_of_source, pairs, strict=True)),
+                    ", ".join(f"{t} {_share(s)}" for (t, _), (_, s) in zip(tasks_of_source, scores, strict=True)),
                 )
             )
             content[f"{channel}, {source}"] = {

@@ -72,7 +72,7 @@ def recorded_rows(rig: Instrument, scene: Scene, count: int = DISTINCT) -> dict[
     for row in itertools.islice(plan, first, first + count):
         x, y = row_offsets_mm(radar, row)
         for name, board_rows in rows.items():
-            board_rows.append(radar.chirps(name, x, y, first_pulse=row.index * len(x)))
+            board_rows.append(radar.chirps(name, x, y, first_chirp=row.index * len(x)))
     return rows
 
 

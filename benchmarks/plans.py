@@ -64,7 +64,7 @@ def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilde
         setup = BoardSetup.from_rig(rig, board)
         for row in plan:
             x, y = row_offsets_mm(radar, row)
-            payload = radar.chirps(board.name, x, y, first_pulse=row.index * len(x)).view(np.uint8).ravel()
+            payload = radar.chirps(board.name, x, y, first_chirp=row.index * len(x)).view(np.uint8).ravel()
             # All bytes are there: no gaps.
             frames, valid = row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
             synced = synchronise_row(frames, valid, setup)

@@ -11,7 +11,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import decode_scene
 from polysight_simulators.scene.optics import antennas, field_exact
 from polysight_simulators.scene.radar import SimulatedRig, high_pass, power_on, sample_frequencies_hz, sync_delay_s
-from polysight_simulators.scene.scene_file import pulse_uniform
+from polysight_simulators.scene.scene_file import draw_uniform
 
 RIG = published_rig()
 GRID = {"columns": 9, "rows": 6, "step_x_mm": 10.0, "step_y_mm": 10.0}
@@ -77,7 +77,7 @@ def test_pulses_do_not_depend_on_the_batch() -> None:
     parts = [batched_radar.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
     # A rounding of float32
     assert np.abs(all_chirps.astype(int) - np.concatenate(parts)).max() <= 1
-    late = default_radar().chirps("RH", x[40:], y[40:], first_pulse=40)
+    late = default_radar().chirps("RH", x[40:], y[40:], first_chirp=40)
     assert np.abs(all_chirps[40:].astype(int) - late).max() <= 1
 
 
@@ -91,12 +91,12 @@ def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
 
 
 def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> None:
-    u = pulse_uniform(1234, np.arange(100_000))
+    u = draw_uniform(1234, np.arange(100_000))
     assert abs(u.mean() - 0.5) < 0.005
     assert abs(u.var() - 1 / 12) < 0.002
     assert abs(np.corrcoef(u[:-1], u[1:])[0, 1]) < 0.02
-    assert pulse_uniform(1234, np.array([777]))[0] == u[777]
-    assert not np.any(pulse_uniform(1235, np.arange(1000)) == u[:1000])
+    assert draw_uniform(1234, np.array([777]))[0] == u[777]
+    assert not np.any(draw_uniform(1235, np.arange(1000)) == u[:1000])
 
 
 # --- one disturbance at a time ---------------------------------------------------------------------------------------

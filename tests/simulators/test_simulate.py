@@ -44,7 +44,7 @@ def test_rows_contain_the_radars_bytes_at_true_positions(folder: Path) -> None:
     assert np.isclose(x[0], 20.0 - RIG.stage.speed_mm_s * FIRST_PULSE_DELAY_S)
     assert np.allclose(np.diff(x.reshape(5, 16), axis=1), -0.03)
     assert np.allclose(np.diff(x.reshape(5, 16)[:, 0]), -10.0)
-    expected = radar.chirps("RV", x, y, first_pulse=len(x))
+    expected = radar.chirps("RV", x, y, first_chirp=len(x))
     raw = (folder / "raw" / "RV" / "0001.bin").read_bytes()
     assert len(raw) == 5 * 16 * 4096
     assert np.array_equal(np.frombuffer(raw, "<i2").reshape(expected.shape), expected)

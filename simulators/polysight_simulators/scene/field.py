@@ -444,15 +444,15 @@ class _Kernels:
         Plates and points of similar height.
     paths_m
         float64 [rx, y, x]: paths over the kernel, less the one whose phase is removed.
-    fall
-        float32 [rx, m][y, x]: what spherical waves lose, faded at the borders, by share of dpath/dz.
+    spreading
+        float32 [rx, m][y, x]: 1 / (r1 r2) of spherical waves, faded at the borders, times each share l_m of dpath/dz.
     angle
         float32 [rx, order, y, x]: obliquity times the Chebyshev polynomials of the local angle.
     """
 
     level: _Level
     paths_m: list[optics.Real]
-    fall: list[list[NDArray[np.float32]]]
+    spreading: list[list[NDArray[np.float32]]]
     angle: NDArray[np.float32]
 
     @classmethod
@@ -467,18 +467,18 @@ class _Kernels:
         fade = np.outer(plane.y.fade, plane.x.fade)
         low, high = theta
         paths_m = []
-        fall = []
+        spreading = []
         angle = []
         for r1, r2, incidence, oblique in level.legs:
-            lost = fade / (r1 * r2)
+            faded = fade / (r1 * r2)
             shares = level.shares(oblique)
             paths_m.append(r1 + r2 - centre_m)
-            fall.append([(lost if shares is None else lost * share).astype(np.float32) for share in shares or [1.0]])
+            spreading.append([(faded * share).astype(np.float32) for share in shares or [1.0]])
             # The range of angles is -1 to 1 for the polynomials.
             scaled_angle = (incidence - (low + high) / 2) / max((high - low) / 2, 1e-9)
             polynomials = chebyshev.chebvander(scaled_angle, orders - 1)
             angle.append(np.moveaxis(oblique[..., None] * polynomials, -1, 0).astype(np.float32))
-        return cls(level, paths_m, fall, np.stack(angle))
+        return cls(level, paths_m, spreading, np.stack(angle))
 
     def add_spectra(self, total: NDArray[np.complex64], plane: _Plane, series: optics.Complex, f: float) -> None:
         """Add the level's spectra at one frequency to `total` [rx, kappa_y, kappa_x]; series [plate, order]."""
@@ -487,7 +487,7 @@ class _Kernels:
             maps = plane.plate_maps(self.level, series, f, m)
             point_map = plane.point_map(self.level, f, m)
             for r, wave in enumerate(waves):
-                base = wave * self.fall[r][m]
+                base = wave * self.spreading[r][m]
                 for plate_map, orders in maps:
                     total[r] += plate_map * _transform_back(base * _add_orders(orders, self.angle[r]))
                 if point_map is not None:

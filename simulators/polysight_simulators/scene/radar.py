@@ -30,8 +30,8 @@ from polysight_simulators.scene.scene_file import (
     Disturbances,
     Scene,
     apply_scene,
-    pulse_normal,
-    pulse_uniform,
+    draw_normal,
+    draw_uniform,
     stream_key,
 )
 
@@ -44,7 +44,7 @@ def sync_delay_s(d: Disturbances, seed: int, board: Board, pulses: NDArray[np.in
 
     It is a fixed latency, the board's own skew, and the wait for the board's clock to sample the edge, drawn by pulse.
     """
-    jitter = pulse_uniform(stream_key(seed, "sync", board.name), pulses)
+    jitter = draw_uniform(stream_key(seed, "sync", board.name), pulses)
     return 1e-9 * (d.sync_latency_ns + getattr(d.sync_skew_ns, board.role) + d.sync_uncertainty_ns * jitter)
 
 
@@ -137,16 +137,16 @@ def power_on(rig: Instrument, scene: Scene, board: Board, seed: int) -> Receiver
     return Receiver(board, chirp, gains.astype(np.complex64), phase - phase[0], error)
 
 
-def echo_drift(rig: Instrument, d: Disturbances, board: Board, pulses: NDArray[np.int64]) -> NDArray[np.complex64]:
+def echo_drift(rig: Instrument, d: Disturbances, board: Board, chirps: NDArray[np.int64]) -> NDArray[np.complex64]:
     """Return the factor of a board's echo by chirp [n]: V drifts linearly over the scan, with a factor of 1 halfway.
 
-    `pulses` [n] are numbers of chirps, 0 at the scan's first one.
+    `chirps` [n] are their numbers, 0 at the scan's first one.
     """
     if board.role != "receive_v":
-        return np.ones(len(pulses), np.complex64)
+        return np.ones(len(chirps), np.complex64)
     share, degrees = d.hv_drift
-    scan_pulses = rig.grid.columns * rig.grid.rows * rig.burst.chirps_a_position
-    passed = pulses / scan_pulses - 0.5
+    chirps_of_scan = rig.grid.columns * rig.grid.rows * rig.burst.chirps_a_position
+    passed = chirps / chirps_of_scan - 0.5
     return ((1 + share * passed) * np.exp(1j * np.radians(degrees) * passed)).astype(np.complex64)
 
 
@@ -236,7 +236,7 @@ class SimulatedRig:
     scene
         Plates, points and disturbances.
     seed
-        Seed of gains, timing, phases and noise; None: the scene's. The same seed gives the same data for the same pulse
+        Seed of gains, timing, phases and noise; None: the scene's. The same seed gives the same data for the same chirp
         numbers in any batches.
     cache_dir
         Folder that caches object fields between runs; None: no cache.
@@ -255,7 +255,7 @@ class SimulatedRig:
         self.seed = scene.seed if seed is None else seed
         self._cache_dir = cache_dir
         self._boards: dict[str, _ReceivingBoard] = {}
-        self._next_pulse = {b.name: 0 for b in rig.boards}
+        self._next_chirp = {b.name: 0 for b in rig.boards}
         self.clipped = {b.name: 0 for b in rig.boards}
         self.outside = {b.name: 0 for b in rig.boards}
 
@@ -270,7 +270,7 @@ class SimulatedRig:
         board_name: str,
         x_mm: NDArray[np.floating],
         y_mm: NDArray[np.floating],
-        first_pulse: int | None = None,
+        first_chirp: int | None = None,
     ) -> NDArray[np.int16]:
         """Return frames of one chirp each, as the board sends them to its card.
 
@@ -280,7 +280,7 @@ class SimulatedRig:
             Name of the board.
         x_mm, y_mm
             True stage offset during each chirp, millimetres from the middle of the grid, [n].
-        first_pulse
+        first_chirp
             Number of the first chirp since power-up (`burst.chirps` for each SYNC_IN pulse before it), which determines
             timing, phase and noise. None: continue after this board's last call.
 
@@ -294,7 +294,7 @@ class SimulatedRig:
             if the rig has no such board.
         """
         d = self.scene.disturbances
-        signal = self.signals(board_name, x_mm, y_mm, first_pulse)
+        signal = self.signals(board_name, x_mm, y_mm, first_chirp)
         n, rx, samples = signal.shape
         out = np.empty((n, samples, 2 * rx), dtype=np.int16)
         scale = np.float32(_FULL_SCALE / d.adc_full_scale)
@@ -314,25 +314,25 @@ class SimulatedRig:
         board_name: str,
         x_mm: NDArray[np.floating],
         y_mm: NDArray[np.floating],
-        first_pulse: int | None = None,
+        first_chirp: int | None = None,
     ) -> NDArray[np.complex64]:
         """Return :meth:`chirps` before the ADC: complex64 [n, rx, sample], direct path of RX1 about 1, with noise."""
         board = self.rig.by_name(board_name)
         x_mm, y_mm = np.broadcast_arrays(np.asarray(x_mm, np.float64), np.asarray(y_mm, np.float64))
-        if first_pulse is None:
-            first = self._next_pulse[board_name]
+        if first_chirp is None:
+            first = self._next_chirp[board_name]
         else:
-            first = first_pulse
-        self._next_pulse[board_name] = first + len(x_mm)
+            first = first_chirp
+        self._next_chirp[board_name] = first + len(x_mm)
         out = np.empty((len(x_mm), len(self.rig.antennas.rx_mm), self.rig.chirp.samples), dtype=np.complex64)
         for start in range(0, len(x_mm), _BATCH):
             batch = slice(start, min(start + _BATCH, len(x_mm)))
-            pulses = np.arange(first + batch.start, first + batch.stop, dtype=np.int64)
-            self._fill_with_noise(board, pulses, out[batch])
+            chirps = np.arange(first + batch.start, first + batch.stop, dtype=np.int64)
+            self._fill_with_noise(board, chirps, out[batch])
             if board.role == "transmit":
                 out[batch] += self._simulate_own_leakage()
             else:
-                self._add_received(board, x_mm[batch] / 1e3, y_mm[batch] / 1e3, pulses, out[batch])
+                self._add_received(board, x_mm[batch] / 1e3, y_mm[batch] / 1e3, chirps, out[batch])
         return out
 
     def burst_mm(self, direction: int) -> NDArray[np.floating]:
@@ -362,21 +362,21 @@ class SimulatedRig:
         board: Board,
         x_m: NDArray[np.floating],
         y_m: NDArray[np.floating],
-        pulses: NDArray[np.int64],
+        chirps: NDArray[np.int64],
         out: NDArray[np.complex64],
     ) -> None:
         """Add direct path and echoes to `out`, [chirp, rx, sample].
 
-        `x_m`, `y_m` are stage offsets from the middle of the grid, `pulses` chirp numbers since power-up; [chirp].
+        `x_m`, `y_m` are stage offsets from the middle of the grid, `chirps` their numbers since power-up; [chirp].
         """
         d = self.scene.disturbances
         simulated = self._make_receiving_board(board.name)
         chirp = self.rig.chirp
         # One SYNC_IN pulse starts several chirps, which share its delay.
-        triggers = pulses // self.rig.burst.chirps
-        delay = sync_delay_s(d, self.seed, board, triggers) - sync_delay_s(d, self.seed, self.rig.transmitter, triggers)
+        pulses = chirps // self.rig.burst.chirps
+        delay = sync_delay_s(d, self.seed, board, pulses) - sync_delay_s(d, self.seed, self.rig.transmitter, pulses)
         if d.random_phase:
-            turns = pulse_uniform(stream_key(self.seed, "phase", board.name), pulses)
+            turns = draw_uniform(stream_key(self.seed, "phase", board.name), chirps)
         else:
             turns = 0.0 * delay
         factor, shift = compute_chirp_factors(simulated.receiver, delay, 2 * np.pi * turns, d.hpf)
@@ -385,7 +385,7 @@ class SimulatedRig:
         # [chirp, rx, node]: the field at the frequencies at which it was computed.
         nodes = np.zeros((len(x_m), *simulated.direct.shape[1:2], simulated.expand.shape[1]), dtype=np.complex64)
         if inside.any():
-            gains = echo_drift(self.rig, d, board, pulses[inside])[:, None] * simulated.receiver.gains
+            gains = echo_drift(self.rig, d, board, chirps[inside])[:, None] * simulated.receiver.gains
             nodes[inside] = simulated.field.interpolate(x_m[inside], y_m[inside]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
         # [chirp, 2, rx, sample]
@@ -400,13 +400,13 @@ class SimulatedRig:
         out += ideal[:, 0]
         out += ideal[:, 1]
 
-    def _fill_with_noise(self, board: Board, pulses: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
+    def _fill_with_noise(self, board: Board, chirps: NDArray[np.int64], out: NDArray[np.complex64]) -> None:
         """Fill `out` with receiver noise: each channel has the same signal-to-noise ratio for any gain."""
         snr_db = self.scene.disturbances.direct_snr_db
         if snr_db is None:
             out[...] = 0
             return
-        pulse_normal(stream_key(self.seed, "noise", board.name), int(pulses[0]), out.view(np.float32))
+        draw_normal(stream_key(self.seed, "noise", board.name), int(chirps[0]), out.view(np.float32))
         sigma = np.sqrt(0.5 * 10 ** (-snr_db / 10))
         if board.role == "transmit":
             out *= np.float32(sigma)
@@ -434,11 +434,11 @@ class SignalSource(Protocol):
     """Source of frames."""
 
     def chirps(
-        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
+        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_chirp: int | None = None
     ) -> NDArray[np.int16]:
         """Return frames of one chirp each, int16 [n, samples, 8], for stage offsets x_mm [n], y_mm [n].
 
-        `first_pulse` is the number of the first chirp since power-up. The eight values of a sample are I of
+        `first_chirp` is the number of the first chirp since power-up. The eight values of a sample are I of
         RX1..RX4, then Q of RX1..RX4.
         """
         ...
@@ -468,13 +468,13 @@ class PatternSource:
         self._next = dict.fromkeys(self._board, 0)
 
     def chirps(
-        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_pulse: int | None = None
+        self, board_name: str, x_mm: NDArray[np.float64], y_mm: NDArray[np.float64], first_chirp: int | None = None
     ) -> NDArray[np.int16]:
-        """Return the frames of len(x_mm) chirps from number `first_pulse` on; None: continue after the last call."""
+        """Return the frames of len(x_mm) chirps from number `first_chirp` on; None: continue after the last call."""
         del y_mm
-        if first_pulse is None:
+        if first_chirp is None:
             first = self._next[board_name]
         else:
-            first = first_pulse
+            first = first_chirp
         self._next[board_name] = first + len(x_mm)
         return pattern_frames(self._board[board_name], first, len(x_mm), self._samples)

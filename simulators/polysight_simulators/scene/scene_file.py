@@ -35,16 +35,16 @@ def stream_key(seed: int, *words: str) -> int:
     return int(state[0])
 
 
-def pulse_uniform(key: int, pulses: NDArray[np.int64]) -> NDArray[np.floating]:
-    """Return a uniform number in [0, 1) per pulse, independent of order and batch (splitmix64: Steele et al. 2014)."""
-    z = (pulses.astype(_U64) + _U64(1)) * _U64(0x9E3779B97F4A7C15) + _U64(key)
+def draw_uniform(key: int, events: NDArray[np.int64]) -> NDArray[np.floating]:
+    """Return a uniform number in [0, 1) per event, independent of order and batch (splitmix64: Steele et al. 2014)."""
+    z = (events.astype(_U64) + _U64(1)) * _U64(0x9E3779B97F4A7C15) + _U64(key)
     z = (z ^ (z >> _U64(30))) * _U64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> _U64(27))) * _U64(0x94D049BB133111EB)
     return ((z ^ (z >> _U64(31))) >> _U64(11)).astype(np.float64) * 2.0**-53
 
 
-def pulse_normal(key: int, first: int, out: NDArray[np.float32]) -> None:
-    """Fill out[i] with standard normal numbers of pulse `first` + i, independent of the batch.
+def draw_normal(key: int, first: int, out: NDArray[np.float32]) -> None:
+    """Fill out[i] with standard normal numbers of event `first` + i, independent of the batch.
 
     Sixteen bits of a counter-based generator select one of 65536 equally likely values: seven times faster than the
     continuous distribution, and equal after the ADC. The largest is 4.3; the variance is 1.

@@ -64,7 +64,7 @@ class RunningRow(_Motion):
     edges: EdgeTimes
     # True once the stage has accepted the row: statuses before that belong to the motion before.
     is_underway: bool = False
-    # True if the stage's state machine stays in the state `fault` after the row.
+    # True if the state of the Pi after the row is `fault`, not `ready` or `homed`.
     lasting: bool = False
     # Points that the stage has passed, by its own count.
     points: int = 0

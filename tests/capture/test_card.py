@@ -308,7 +308,7 @@ def test_second_cards_are_told_of_every_board(rig, cards, monkeypatch):
     names = [board.name for board in rig.boards]
     cards(*names, **dict.fromkeys(names, Faults(twin=True)))
     monkeypatch.setattr(card, "_TWIN_S", HANG_S)
-    assert [survey.silent for survey in survey_cards(rig)] == ["card"] * 3
+    assert [survey.failed_hop for survey in survey_cards(rig)] == ["card"] * 3
 
 
 def test_mac_addresses_of_cards_are_read_from_the_kernel(tmp_path):

@@ -32,8 +32,8 @@ def simulate_echoes(
 
     Phases rise with the path and have that of `path_m` removed. The mirror on the object plane has the amplitude
     1 / path in H and in V. `shapes` and `rig`: tables of the scene file and the rig file; `role`: "receive_h" or
-    "receive_v"; `leakage`: of p into H and of s into V, as waves; `offsets_m` [n, 2]. `centre_m`: the image's
-    centre on the object plane.
+    "receive_v"; `leakage`: amplitudes of p in H and of s in V, relative to the receiver's polarisation; `offsets_m`
+    [n, 2]. `centre_m`: the image's centre on the object plane.
     """
     nominal = read_rig(rig)
     boards = read_boards(rig, leakage)

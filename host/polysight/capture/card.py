@@ -444,7 +444,7 @@ class CardSurvey:
         return all(hop.level != "error" for hop in self.hops)
 
     @property
-    def silent(self) -> str:
+    def failed_hop(self) -> str:
         """The first hop with an error; "" if none has."""
         return next((hop.where for hop in self.hops if hop.level == "error"), "")
 

@@ -69,7 +69,7 @@ def _describe_survey(survey: CardSurvey) -> dict[str, object]:
     return {
         **{key: getattr(board, key) for key in keys},
         "ok": survey.ok,
-        "silent_hop": survey.silent,
+        "silent_hop": survey.failed_hop,
         "fpga_version": survey.version,
         "hops": [_describe_hop(hop) for hop in survey.hops],
     }

@@ -567,7 +567,7 @@ def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
 
 
 def _list_kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
-    """Return what the patches may be: the library's materials at the library's angle, if there is one, and others."""
+    """Return what the patches may be: kinds of the library if it has one angle, else those of the literature alone."""
     if classifier is None or len(classifier.kinds) != 1:
         return Kinds(literature(), theta_rad, with_sheets=True)
     return classifier.kinds[0]
@@ -603,7 +603,7 @@ def _name_patches(
 def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64], classifier: Classifier) -> PatchName:
     """Name a half space by its permittivity and the covariance [2, 2] of its (real, imaginary).
 
-    The library and the literature share the expectation: nothing else of the scene says how common its materials are.
+    A material of the library and one of none are as likely a priori: no other patches say how common they are.
     """
     kinds = classifier.kinds[0]
     inverse = complex(inverse_ratio(permittivity, kinds.theta_rad))

@@ -319,13 +319,13 @@ def run(args: argparse.Namespace) -> int:
         tones = {snr: one_tone(snr, trials=30_000 // few) for snr in TONE_SNR_DB}
         pairs = {b.name: two_tones(rig, b, BINS, TWO_TONE_SNR_DB, trials=6000 // few) for b in rig.receivers}
         images = {b.name: image_error(rig, b) for b in rig.receivers}
-    lines = [*_measure_alignment(aligned), *_measure_tone(tones, pairs), _image_line(images)]
+    lines = [*_alignment_lines(aligned), *_tone_lines(tones, pairs), _image_line(images)]
     show("accuracy, simulated signals of known truth", lines, args.quick)
     write(args.json, "accuracy", lines, alignment=[asdict(a) for a in aligned], one_tone=tones, two_tones=pairs)
     return 0
 
 
-def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
+def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
     """Return the lines of the table about alignment; as in all lines, two limits follow the value: required, aim."""
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
@@ -355,7 +355,7 @@ def _measure_alignment(aligned: Sequence[Alignment]) -> list[Line]:
     ]
 
 
-def _measure_tone(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
+def _tone_lines(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
     """Return the lines about tones: results of `one_tone` by ratio in dB, and of `two_tones` by board."""
     return [
         Line(

@@ -60,15 +60,15 @@ class ShapeScene:
         normals = np.zeros((len(points_m), 3))
         for shape in self.shapes:
             # `a` and `b` are the surface's parameters.
-            projected, a, b = shape.project(points_m)
+            distance, a, b = shape.project(points_m)
             facing = shape.evaluate(a, b).normal.T
             # The back of a body is no surface that antennas see.
             is_seen = facing[:, 2] < 0
             if len(self.shapes) > 1:
                 # The surface of a piece goes on beyond its edges, through other pieces.
                 is_seen &= shape.cover(a, b) > 0
-            nearer = is_seen & (np.abs(projected) < np.abs(distances))
-            distances = np.where(nearer, projected, distances)
+            nearer = is_seen & (np.abs(distance) < np.abs(distances))
+            distances = np.where(nearer, distance, distances)
             normals = np.where(nearer[:, None], facing, normals)
         return distances, normals
 

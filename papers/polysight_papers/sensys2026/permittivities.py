@@ -257,9 +257,9 @@ def fig17(run: item.Run) -> item.Item:
     pixels: dict[str, list[Complex]] = {name: [] for name in true}
     centres = []
     for i in range(count):
-        box_places = places(i)
-        plates = [plate("copper", None, *box_places[0])]
-        plates += [plate(name, eps, *xy) for (name, eps), xy in zip(true.items(), box_places[1:], strict=True)]
+        plate_centres = places(i)
+        plates = [plate("copper", None, *plate_centres[0])]
+        plates += [plate(name, eps, *xy) for (name, eps), xy in zip(true.items(), plate_centres[1:], strict=True)]
         with simulate_scan(f"placement {i + 1}", plates, run.config, seed=1700 + i) as (source, truth):
             result = process_scan(source, truth).result
         for patch in result.patches:
@@ -267,7 +267,7 @@ def fig17(run: item.Run) -> item.Item:
                 inside = patch.patch.interior & np.isfinite(result.p)
                 theta = np.broadcast_to(result.theta_rad, result.p.shape)[inside]
                 pixels[patch.truth.name].append(permittivity_from_ratio(result.p[inside], theta))
-        centres.append(dict(zip(("copper", *true), box_places, strict=True)))
+        centres.append(dict(zip(("copper", *true), plate_centres, strict=True)))
     return _make_fig17_item(true, pixels, centres)
 
 

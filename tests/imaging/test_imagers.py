@@ -133,6 +133,23 @@ def test_kernels_computed_again_give_the_same_image(aperture):
     np.testing.assert_array_equal(SpectralImager(a).image(samples), warm)
 
 
+def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
+    """Memory of transforms is used again, and imagers of one geometry share kernels and the last constant echo."""
+    rng = np.random.default_rng(8)
+    a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
+    samples = [_noise(rng, a.shape) for _ in range(2)]
+    echoes = [_noise(rng, a.shape[:2]) for _ in range(2)]
+    weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
+    alone = []
+    for y, echo in zip(samples, echoes, strict=True):
+        forget()
+        alone.append((SpectralImager(a).image(y.copy()), SpectralImager(a).constant(echo, weights)))
+    imagers = SpectralImager(a), SpectralImager(a)
+    kept = [(imagers[i].image(samples[i]), imagers[i].constant(echoes[i], weights)) for i in (0, 1, 0, 1)]
+    for i, got in enumerate(kept):
+        np.testing.assert_array_equal(got, alone[i % 2])
+
+
 def test_another_geometry_gets_other_kernels(aperture):
     rng = np.random.default_rng(7)
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)

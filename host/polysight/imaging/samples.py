@@ -55,8 +55,8 @@ _BAND = 0.45
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
-# Positions per matrix product: larger ones are slower by half (OpenBLAS)
-_CHUNK = 120
+# Multiplications of a matrix product: for more, OpenBLAS copies both matrices first, a fifth slower with AVX-512
+_PRODUCT = 1_000_000
 # Columns of such a product come in whole groups of so many: 22 take an eighth longer than 24 (OpenBLAS, AVX2)
 _COLUMNS = 8
 
@@ -337,13 +337,10 @@ class BoardSamples:
         self._direct = np.zeros((rx, *shape), np.complex64)
         # True for positions with data, [row, column].
         self.valid = np.zeros(shape, bool)
-        regular = geometry.find_irregularity(self.aperture) is None
         # Imager of all rows; None if the aperture is irregular, or before it is needed.
         self._final: SpectralImager | None = None
         # Spectra of the rows along x, for the final image
         self._spectra = np.zeros(0, np.complex64)
-        # A weighted row, padded with zeros to a period
-        self._padded = np.zeros(0, np.complex64)
         # Rows whose spectra are out of date
         self._stale = set(range(shape[0]))
         # Image of the rows so far, once it was formed
@@ -353,7 +350,7 @@ class BoardSamples:
         # True if a row was recorded at other places than planned, so that the live image cannot use its spectra.
         self._moved = False
         self._live = None
-        if live and regular:
+        if live and geometry.find_irregularity(self.aperture) is None:
             self._live = IncrementalImager(self.aperture, self.mirror)
             # Compute kernels now instead of after the last row
             self._prepare()
@@ -411,7 +408,7 @@ class BoardSamples:
             reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
         reduced = reduced[..., forward]
         valid = row.valid[forward]
-        self._put(index, ReducedRow(reduced[:, :-1] * valid, reduced[:, -1] * valid, valid), offsets_m, forward)
+        self._put(index, ReducedRow(reduced[:, :-1], reduced[:, -1], valid), offsets_m, forward)
 
     def put(self, index: int, row: ReducedRow) -> None:
         """Add a row from :meth:`read_reduced`, reduced by the same range gate."""
@@ -430,7 +427,10 @@ class BoardSamples:
     ) -> None:
         """Replace a row in the samples and the live image; `forward` brings `offsets_m` into the order of columns."""
         self._add_to_live_image(index, -1)
-        self._cube[:, :, index], self._direct[:, index], self.valid[index] = row
+        mask = row.valid.astype(np.complex64)
+        np.multiply(row.samples, mask, out=self._cube[:, :, index])
+        np.multiply(row.direct, mask, out=self._direct[:, index])
+        self.valid[index] = row.valid
         if offsets_m is not None:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
             self._final = None
@@ -453,8 +453,9 @@ class BoardSamples:
         used, maps = self._maps[sweep_hz.size]
         pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used]
         gated = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
-        for first in range(0, pairs.shape[1], _CHUNK):
-            part = slice(first, first + _CHUNK)
+        step = _PRODUCT // maps.size
+        for first in range(0, pairs.shape[1], step):
+            part = slice(first, first + step)
             np.matmul(pairs[:, part], maps, out=gated[:, part])
         count = self._reduction.frequencies_hz.size + 1
         return gated.view(np.complex64)[..., :count].mT
@@ -465,15 +466,13 @@ class BoardSamples:
             # The same slack as the live imager, so that both share their spectra.
             self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
             self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
-            self._padded = np.zeros((*self._cube.shape[:2], self._final.period), np.complex64)
             self._stale = set(range(len(self.valid)))
 
     def _compute_row_spectra(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
         """Return the spectra of a row, [rx, frequency, k]; row by row, so that results are bit-exact in any order."""
         if index in self._stale:
-            row = self._padded[..., : self.taper.shape[1]]
-            np.multiply(self._cube[:, :, index], self._compute_row_weights(index), out=row)
-            self._spectra[:, :, index] = imager.spectra_of_row(self._padded, index)
+            weights = self._compute_row_weights(index)
+            imager.put_spectra_of_row(self._cube[:, :, index], weights, index, self._spectra[:, :, index])
             self._stale.remove(index)
         return self._spectra[:, :, index]
 
@@ -519,9 +518,9 @@ class BoardSamples:
 
     def _add_to_live_image(self, index: int, sign: int) -> None:
         """Add a row to the live image, or subtract it (`sign` -1)."""
-        weights = sign * self._compute_row_weights(index)
-        if self._live is None or not weights.any():
+        if self._live is None or not self._compute_row_weights(index).any():
             return
+        weights = sign * self._compute_row_weights(index)
         if self._final is not None and not self._moved:
             spectra_of_weights = self._final.spectra_of_row(weights.astype(np.complex64), index)
             self._live.add_spectra(index, sign * self._compute_row_spectra(self._final, index), spectra_of_weights)

@@ -13,6 +13,7 @@ spectra of the kernels along x are computed here and cached in memory, for one a
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -23,7 +24,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.geometry import Aperture, column_step_m, excess_path_m, fft_module, pitch_y_m, row_starts_m, turn
+from polysight.imaging.geometry import (
+    Aperture,
+    column_step_m,
+    excess_path_m,
+    pitch_y_m,
+    row_starts_m,
+    transform_in_place,
+    turn,
+)
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Length of the cross-fade relative to the kernel's length in x, and its smallest length in columns. Chosen: a shorter
@@ -44,6 +53,8 @@ SLACK_M = 2e-3
 _LEFT_OUT = 6e-6
 # Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
 _CHUNK = 8
+# Complex numbers in a cache line
+_LINE = 8
 
 
 @dataclass(frozen=True)
@@ -183,6 +194,12 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
     return np.arange(round(filled.min()), round(filled.max()) + 1)
 
 
+def _list_runs(bins: NDArray[np.intp]) -> list[tuple[slice, slice]]:
+    """Return the runs of consecutive numbers in `bins`: their places, and the numbers."""
+    ends = [0, *(np.flatnonzero(np.diff(bins) != 1) + 1), bins.size]
+    return [(slice(a, b), slice(int(bins[a]), int(bins[a]) + b - a)) for a, b in itertools.pairwise(ends)]
+
+
 def _find_fast_length(n: int) -> int:
     """Return the smallest fast transform length of at least `n`."""
     return int(scipy.fft.next_fast_len(n) or n)
@@ -215,8 +232,12 @@ def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
     """Return the cache key of a lattice."""
     a = aperture.antennas
     grid = aperture.grid
-    numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, aperture.offsets_m, grid.x_m, grid.y_m)
-    return ("lattice", slack_m, float(grid.z_m), grid.pixel_m, *(n.tobytes() for n in numbers))
+    offsets = aperture.offsets_m
+    # Positions of a regular aperture: starts and spacing of its rows are enough, and a thousandth of the bytes.
+    numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, row_starts_m(offsets), offsets[:, 0, 1], grid.x_m, grid.y_m)
+    heights = float(grid.z_m), float(offsets[0, 0, 2])
+    sizes = offsets.shape[1], column_step_m(offsets), grid.pixel_m
+    return ("lattice", slack_m, *heights, *sizes, *(n.tobytes() for n in numbers))
 
 
 def kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tuple[Any, ...]:
@@ -233,28 +254,29 @@ def kernel_key(aperture: Aperture, lattice: Lattice, xp: Any, device: Any) -> tu
     )
 
 
-def spectra_along_x(aperture: Aperture, lattice: Lattice, xp: Any = np, device: Any = None) -> Any:
+def spectra_along_x(aperture: Aperture, lattice: Lattice, lines: int, xp: Any = np, device: Any = None) -> Any:
     """Return kernels `exp(-j 2 pi f d / c)` of `pixel - position` along x: complex64 [rx * frequency, lag y, k].
 
-    One distance map per RX; a constant phase step leads from one frequency to the next.
+    One distance map per RX; a constant phase step leads from one frequency to the next. Lags are followed by zeros up
+    to the number of `lines`.
     """
-    fft = fft_module(xp)
     n = lattice.size_x
     f = aperture.frequencies_hz
     fade = n - lattice.exact_x
     x = lattice.first_lag_m[0] + xp.arange(-fade, n, dtype=xp.float64, device=device) * lattice.pitch_x_m
     y = lattice.first_lag_m[1] + xp.arange(lattice.lags_y, dtype=xp.float64, device=device) * lattice.pitch_y_m
     step = float(f[-1] - f[0]) / max(1, f.size - 1)
-    band = xp.asarray(lattice.band % n, device=device)
-    size = (len(aperture.antennas.rx_m) * f.size, lattice.lags_y, lattice.band.size)
-    spectra = xp.empty(size, dtype=xp.complex64, device=device)
+    runs = _list_runs(lattice.band % n)
+    size = (len(aperture.antennas.rx_m) * f.size, lines, lattice.band.size)
+    spectra = xp.zeros(size, dtype=xp.complex64, device=device)
     for rx, delay in enumerate(delays_s(aperture, x, y, xp, device)):
         kernel = turn(xp, delay * float(f[0]), xp.float32, xp.complex64)
         phase_step = turn(xp, delay * step, xp.float32, xp.complex64)
         for m in range(f.size):
-            spectrum = fft.fft(cross_fade(xp, kernel, n), axis=1)
-            spectra[rx * f.size + m, :, :] = xp.take(spectrum, band, axis=1)
-            kernel = kernel * phase_step
+            spectrum = transform_in_place(xp, cross_fade(xp, kernel, n), axis=1)
+            for in_band, bins in runs:
+                spectra[rx * f.size + m, : lattice.lags_y, in_band] = spectrum[:, bins]
+            kernel *= phase_step
     return spectra
 
 
@@ -275,24 +297,27 @@ class RowSpectra:
         self.aperture = aperture
         self.xp = xp
         self.device = device
-        self.lattice: Lattice = get_cached(lattice_key(aperture, slack_m), lambda: lattice(aperture, slack_m))
-        self._fft = fft_module(xp)
+        key = lattice_key(aperture, slack_m)
+        self.lattice: Lattice = get_cached(key, lambda: lattice(aperture, slack_m))
         # Columns of a transform of rows; its spectrum repeats, so that each bin of the band is one of it.
         self.period = self.lattice.size_x // self.lattice.stride_x
-        self._band_bins = self.put(self.lattice.band % self.period)
+        self._runs = _list_runs(self.lattice.band % self.period)
         self._origin = float(row_starts_m(aperture.offsets_m).min())
-        lags_m = aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
-        wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, lags_m)) / self.lattice.size_x
         # Inverse transform along x at the pixels only, [k, nx].
-        self._to_pixels = self.put(wave.astype(np.complex64))
+        self._to_pixels = get_cached(("pixels", xp.__name__, str(device), *key), self._compute_waves_at_pixels)
+
+    def _compute_waves_at_pixels(self) -> Any:
+        lags_m = self.aperture.grid.x_m - self._origin - self.lattice.first_lag_m[0]
+        wave = np.exp(2j * np.pi * np.outer(self.lattice.wavenumbers, lags_m)) / self.lattice.size_x
+        return self.put(wave.astype(np.complex64))
 
     def put(self, array: Any) -> Any:
         """Copy a numpy array to the imager's device."""
         return self.xp.asarray(array, device=self.device)
 
-    def kernels(self) -> Any:
-        """Return the kernels, complex64 [rx * frequency, lag y, k]."""
-        return spectra_along_x(self.aperture, self.lattice, self.xp, self.device)
+    def kernels(self, lines: int) -> Any:
+        """Return the kernels with zeros up to so many lines, complex64 [rx * frequency, lag y, k]."""
+        return spectra_along_x(self.aperture, self.lattice, lines, self.xp, self.device)
 
     def key(self, *more: Any) -> tuple[Any, ...]:
         """Return the cache key of an array made from the kernels."""
@@ -305,8 +330,18 @@ class RowSpectra:
 
     def transform_rows(self, rows: Any, ramps: Any) -> Any:
         """Return the spectra of rows [..., row, column] in the kernel's band, [..., row, k]."""
-        spectra = self._fft.fft(rows, n=self.period, axis=-1)
-        return self.xp.take(spectra, self._band_bins, axis=-1) * ramps
+        xp = self.xp
+        padded = xp.zeros((*rows.shape[:-1], self.period), dtype=xp.complex64, device=self.device)
+        padded[..., : rows.shape[-1]] = rows
+        spectra = xp.empty((*rows.shape[:-1], self.lattice.band.size), dtype=xp.complex64, device=self.device)
+        self.transform_padded(padded, ramps, spectra)
+        return spectra
+
+    def transform_padded(self, padded: Any, ramps: Any, spectra: Any) -> None:
+        """Write :meth:`transform_rows` of rows padded with zeros to a period to `spectra`; may overwrite the rows."""
+        whole = transform_in_place(self.xp, padded, axis=-1)
+        for in_band, bins in self._runs:
+            spectra[..., in_band] = whole[..., bins] * ramps[..., in_band]
 
     def transform_rows_adjoint(self, spectra: Any, ramps: Any) -> Any:
         """Apply the adjoint of :meth:`transform_rows`."""
@@ -317,7 +352,7 @@ class RowSpectra:
         # The band back at its bins of the kernel's period; bins a period of the rows apart are one bin of theirs.
         spectrum = xp.roll(xp.concat([spectra * xp.conj(ramps), padding], axis=-1), int(self.lattice.band[0]), axis=-1)
         folded = xp.sum(xp.reshape(spectrum, (*spectra.shape[:-1], self.lattice.stride_x, self.period)), axis=-2)
-        return self._fft.ifft(folded, axis=-1)[..., :columns] * self.period
+        return transform_in_place(xp, folded, axis=-1, inverse=True)[..., :columns] * self.period
 
     def evaluate_pixels_adjoint(self, image: Any) -> Any:
         """Apply the adjoint of :meth:`evaluate_pixels`: [..., ny, nx] to [..., ny, k]."""
@@ -333,40 +368,59 @@ class SpectralImager(RowSpectra):
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         super().__init__(aperture, xp, device, slack_m)
-        self._ramps = self.ramps(row_starts_m(aperture.offsets_m))
-        # The last constant echo, and its kernel
-        self._echo: Any = None
+        key = (xp.__name__, str(device), *lattice_key(aperture, slack_m))
+        self._ramps = get_cached(("ramps", *key), lambda: self.ramps(row_starts_m(aperture.offsets_m)))
         sizes = self.lattice
+        # The last constant echo and its kernel, of all imagers with the same kernels; empty before the first.
+        self._echoes: list[tuple[Any, Any]] = get_cached(self.key("echo", sizes.size_y), list)
         rows = aperture.offsets_m.shape[0]
         lines = aperture.grid.shape[0]
         # Lattice row of the first row of pixels.
         self._first_pixel_row = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
-        # Rows are padded with zeros below.
-        self._padded_lines = self.xp.zeros((count, sizes.band.size), dtype=self.xp.complex64, device=device)
+        # A row of all channels, padded with zeros to a period.
+        channels = math.prod(aperture.shape[:2])
+        self._padded_row = self.xp.zeros((channels, self.period), dtype=self.xp.complex64, device=device)
+        # Rows are padded with zeros below. An odd number of cache lines apart, or they would all use the same places of
+        # the cache (transforms took 1.6 times as long).
+        pitch = _LINE * (-(-sizes.band.size // _LINE) | 1)
+        padded_lines = self.xp.zeros((count, pitch), dtype=self.xp.complex64, device=device)
+        self._padded_lines = padded_lines[:, : sizes.band.size]
         # Spectrum along y: rows are `row_stride` pitches apart, so that theirs repeats as often in that of the lattice.
         self._repeat = self.put(np.arange(sizes.size_y) % count)
         # Lattice rows of positions, and of pixels.
         self._rows = self.put(np.arange(rows) * sizes.row_stride)
         self._pixel_rows = self.put(self._first_pixel_row + np.arange(lines) * sizes.pixel_stride)
         self._kernels = get_cached(
-            self.key("2d", self.lattice.size_y), lambda: self._fft.fft(self.kernels(), n=self.lattice.size_y, axis=-2)
+            self.key("2d", sizes.size_y), lambda: transform_in_place(xp, self.kernels(sizes.size_y), axis=-2)
         )
 
     def image(self, samples: Any) -> Any:
         """Return the matched filter of samples [rx, frequency, row, column], complex64 [ny, nx]."""
+        xp = self.xp
         rx, m, rows, columns = self.aperture.shape
-        channels = self.xp.reshape(samples, (rx * m, rows, columns))
-        total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+        channels = xp.reshape(samples, (rx * m, rows, columns))
+        total = xp.zeros(self._kernels.shape[1:], dtype=xp.complex64, device=self.device)
+        padded = xp.zeros((rows, self.period), dtype=xp.complex64, device=self.device)
+        spectra = xp.empty((rows, total.shape[1]), dtype=xp.complex64, device=self.device)
         for c in range(rx * m):
-            total += self._kernels[c, :, :] * self._transform_along_y(
-                self.transform_rows(channels[c, :, :], self._ramps)
-            )
+            padded[:, :columns] = channels[c, :, :]
+            padded[:, columns:] = 0
+            self.transform_padded(padded, self._ramps, spectra)
+            self._add_channel(total, c, spectra)
         return self._invert_transform(total)
 
     def spectra_of_row(self, samples: Any, index: int) -> Any:
         """Return the spectra [..., k] of a row [..., column] for :meth:`image_of_spectra`."""
         return self.transform_rows(samples, self._ramps[index, :])
+
+    def put_spectra_of_row(self, samples: Any, weights: Any, index: int, spectra: Any) -> None:
+        """Write :meth:`spectra_of_row` of samples [rx, frequency, column] times weights [column] to `spectra`."""
+        columns = samples.shape[-1]
+        row = self.xp.reshape(self._padded_row, (*samples.shape[:-1], self.period))
+        row[..., :columns] = samples * weights
+        row[..., columns:] = 0
+        self.transform_padded(row, self._ramps[index, :], spectra)
 
     def image_of_spectra(self, spectra: Any, factors: Any) -> Any:
         """Return :meth:`image` of rows transformed along x [rx, frequency, row, k], with a factor per RX."""
@@ -375,18 +429,21 @@ class SpectralImager(RowSpectra):
         for r in range(rx):
             part = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
             for c in range(m):
-                part += self._kernels[r * m + c, :, :] * self._transform_along_y(spectra[r, c, :, :])
-            total += part * factors[r]
+                self._add_channel(part, r * m + c, spectra[r, c, :, :])
+            part *= factors[r]
+            total += part
         return self._invert_transform(total)
 
     def constant(self, echo: Any, weights: Any) -> Any:
         """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
         xp = self.xp
         echo = self.xp.asarray(echo, dtype=self.xp.complex64)
-        if self._echo is None or not bool(xp.all(self._echo[0] == echo)):
-            self._echo = (echo, xp.tensordot(xp.reshape(echo, (-1,)), self._kernels, axes=1))
+        last = self._echoes[0] if self._echoes else None
+        if last is None or not bool(xp.all(last[0] == echo)):
+            last = (echo, xp.tensordot(xp.reshape(echo, (-1,)), self._kernels, axes=1))
+            self._echoes[:] = [last]
         weight_spectra = self._transform_along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
-        return self._invert_transform(self._echo[1] * weight_spectra)
+        return self._invert_transform(last[1] * weight_spectra)
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
@@ -396,24 +453,31 @@ class SpectralImager(RowSpectra):
         padded = xp.zeros((sizes.size_y, lines.shape[-1]), dtype=xp.complex64, device=self.device)
         end = self._first_pixel_row + sizes.pixel_stride * lines.shape[0]
         padded[self._first_pixel_row : end : sizes.pixel_stride, :] = lines
-        spectrum = self._fft.fft(padded, axis=0)
+        spectrum = transform_in_place(xp, padded, axis=0)
         rows = []
         for c in range(self._kernels.shape[0]):
-            product = self._fft.ifft(xp.conj(self._kernels[c, :, :]) * spectrum, axis=0)
+            product = transform_in_place(xp, xp.conj(self._kernels[c, :, :]) * spectrum, axis=0, inverse=True)
             rows.append(self.transform_rows_adjoint(xp.take(product, self._rows, axis=0), self._ramps))
         return xp.reshape(xp.stack(rows), self.aperture.shape)
 
+    def _add_channel(self, total: Any, channel: int, lines: Any) -> None:
+        """Add the spectra of a channel's rows [row, k], times its kernel, to `total` [ky, k]."""
+        spectrum = self._transform_along_y(lines)
+        spectrum *= self._kernels[channel, :, :]
+        total += spectrum
+
     def _transform_along_y(self, lines: Any) -> Any:
-        """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k]."""
+        """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k], in memory used again."""
         self._padded_lines[: lines.shape[0], :] = lines
-        spectrum = self._fft.fft(self._padded_lines, axis=0)
+        self._padded_lines[lines.shape[0] :, :] = 0
+        spectrum = transform_in_place(self.xp, self._padded_lines, axis=0)
         if self.lattice.row_stride == 1:
             return spectrum
         return self.xp.take(spectrum, self._repeat, axis=0)
 
     def _invert_transform(self, total: Any) -> Any:
-        """Return the pixels [ny, nx] of a spectrum on the lattice [ky, k]."""
-        lines = self.xp.take(self._fft.ifft(total, axis=0), self._pixel_rows, axis=0)
+        """Return the pixels [ny, nx] of a spectrum on the lattice [ky, k], which may be overwritten."""
+        lines = self.xp.take(transform_in_place(self.xp, total, axis=0, inverse=True), self._pixel_rows, axis=0)
         return self.evaluate_pixels(lines)
 
 
@@ -537,7 +601,7 @@ class IncrementalImager(RowSpectra):
         channels = math.prod(self.aperture.shape[:2])
         by_k = xp.empty((lattice.band.size, lattice.lags_y, channels), dtype=xp.complex64, device=self.device)
         # The kernels are stored contiguously by k, so that products are fast.
-        by_k[...] = xp.permute_dims(self.kernels(), (2, 1, 0))
+        by_k[...] = xp.permute_dims(self.kernels(lattice.lags_y), (2, 1, 0))
         powers = []
         bases = []
         for first in range(0, by_k.shape[0], _CHUNK):

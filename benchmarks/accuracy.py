@@ -22,8 +22,9 @@ from polysight.capture.dca1000 import raw_words
 from polysight.imaging import ImageBuilder, backproject
 from polysight.imaging.geometry import Antennas, row_offsets_m
 from polysight.imaging.samples import reduction, scene_gate_m
+from polysight.sync.direct_path import prepare
 from polysight.sync.loops import estimate_tone
-from polysight.sync.offsets import align_row, prepare, reference
+from polysight.sync.offsets import align_row, reference
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import plan_raster

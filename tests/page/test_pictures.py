@@ -13,7 +13,7 @@ from tests.support.rigs import published_rig
 from polysight.catalogue import PHASE, colour_bar, draw
 from polysight.imaging import Images
 from polysight.page.watch import range_profile_db
-from polysight.sync.chain import SyncedRow
+from polysight.sync import SyncedRow
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 NY = 8

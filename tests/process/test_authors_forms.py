@@ -13,7 +13,7 @@ from tests.support.rigs import published_rig
 from polysight.cli.main import main
 from polysight.store.open import open_source
 from polysight.store.published import PublishedCubes
-from polysight.sync.chain import detect_form
+from polysight.sync.cubes import detect_form
 from polysight_shared.config import Image
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.tables import to_builtins

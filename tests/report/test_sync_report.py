@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polysight.report.sync_report import SyncReport, write_sync_report
-from polysight.sync.chain import PUBLISHED_STD, STAGES, SyncedRow
+from polysight.sync import PUBLISHED_STD, STAGES, SyncedRow
 
 SCALES = {"received": (8e4, 1.8, 0.1), "aligned": (80.0, 0.013, 0.01), "averaged": (20.0, 0.003, 0.003)}
 

@@ -8,7 +8,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.sync import BoardSetup, synchronise_row
-from polysight.sync.chain import CubeForm
+from polysight.sync.cubes import CubeForm
 from polysight.sync.high_pass_filter import high_pass
 from polysight.sync.loops import estimate_tone
 from polysight_shared.error_codes import ErrorCode

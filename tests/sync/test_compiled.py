@@ -16,6 +16,7 @@ import pytest
 from tests.support import arm64
 
 from polysight.sync import build, loops as sync_loops, offsets
+from polysight.sync.direct_path import prepare
 from polysight.sync.high_pass_filter import Equaliser, HighPass, high_pass
 from polysight.sync.offsets import AlignedRow, align_in_numpy, align_pieces, align_row
 
@@ -204,7 +205,7 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     words, valid = counts(frames.transpose(2, 0, 1, 3)), np.ones((37, 4), bool)
     valid[11] = False
     aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, make_equaliser(rig))
-    path = offsets.prepare(rig, board)
+    path = prepare(rig, board)
     expected = offsets.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
     got = offsets.reference(aligned, path, rig.chirp, loops)
     np.testing.assert_array_equal(got.found, expected.found)

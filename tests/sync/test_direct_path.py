@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from polysight.sync import loops
-from polysight.sync.chain import CubeForm
-from polysight.sync.decimate import FOLD
-from polysight.sync.offsets import prepare, reference, whole_blocks
+from polysight.sync.cubes import CubeForm
+from polysight.sync.decimate import FOLD, whole_blocks
+from polysight.sync.direct_path import prepare
+from polysight.sync.offsets import reference
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

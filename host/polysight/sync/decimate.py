@@ -39,6 +39,12 @@ _SCENE = 6 / 192
 _SMALL = 0.08
 
 
+def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
+    """Return the linear samples that fill whole blocks of `FOLD`; estimates count time from their middle."""
+    a, b = linear
+    return a, b - (b - a) % FOLD
+
+
 class Decimator(NamedTuple):
     """Taps of both filters.
 

@@ -36,18 +36,16 @@ second of the two strongest peaks is tried. Nothing is smoothed.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from polysight.sync import high_pass_filter as hpf, loops
-from polysight.sync.decimate import FOLD, decimator
+from polysight.sync.decimate import FOLD, decimator, whole_blocks
 from polysight.sync.loops import Library, NumpyLoops, Real, Removed, Tone, cis, complex64
-from polysight_shared.config import Board, Chirp, Instrument
-from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from polysight_shared.units import SPEED_OF_LIGHT_M_S
+from polysight_shared.config import Chirp
 
 # Burst alignment: reference chirps tried per position; chosen.
 _REFERENCES = 4
@@ -64,18 +62,8 @@ _ROUNDS = 4
 _LEAST_LIMIT = 1024
 _AT_LIMIT = 32
 
-# Direct path: size of the search FFT, over decimated samples; chosen.
-_FFT = 256
-# Standard deviation in x and y of the echoes' origin, around the mirror point; chosen.
-_SPREAD_M = 0.1
-# Relative gain and phase differences of the RX that the nulls tolerate; chosen.
-_GAIN_SPREAD = 0.3
-# Noise power of a sample relative to an echo as strong as the direct path; chosen.
-_NOISE = 1e-2
-# Clutter behind the object: largest excess path, and its total power relative to the direct path. With this power in R
-# the estimate holds a sixth of the clutter's power that it holds without it, and 0.5 % more noise.
-_CLUTTER_M = 1.5
-_CLUTTER_POWER = 4e-3
+SEARCH_FFT = 256
+"""Size of the FFT that searches the direct path, over decimated samples; chosen."""
 # Gauss-Newton steps to the direct path's frequency. In noise the last one stays large: no direct path is found.
 _STEPS = 3
 # If the strongest peak has a second one of this relative amplitude (chosen) below it, nearer by the object's distance
@@ -88,6 +76,8 @@ _OUTLIER = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
 _PRESENT = 30.0
 
+Errors = dict[str, NDArray[np.float64]]
+"""Error samples after each stage of synchronisation, float64 [3, n]: frequency, phase, relative amplitude."""
 Loops = Library | type[NumpyLoops]
 """Loops that find the direct path."""
 
@@ -220,8 +210,8 @@ def align_in_numpy(
     words = np.ascontiguousarray(words)
     for i in range(0, len(valid), loops.CHUNK):
         rows = slice(i, i + loops.CHUNK)
-        for field, values in zip(into, _align(words[rows], valid[rows], linear, equaliser, full_scale), strict=True):
-            field[rows] = values
+        for target, values in zip(into, _align(words[rows], valid[rows], linear, equaliser, full_scale), strict=True):
+            target[rows] = values
 
 
 def _empty_row(bursts: tuple[int, ...], words: tuple[int, ...], blocks: int) -> AlignedRow:
@@ -261,8 +251,8 @@ def _align(
         redone, still_disturbed = _align_round(words[todo], usable[todo], clipped[todo], linear, equaliser)
         disturbed[:] = False
         disturbed[todo] = still_disturbed
-        for field, values in zip(row, redone, strict=True):
-            field[todo] = values
+        for target, values in zip(row, redone, strict=True):
+            target[todo] = values
     return row
 
 
@@ -351,12 +341,6 @@ def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_]) -
     middle = np.maximum(usable.sum(axis=1, keepdims=True) - 1, 0) // 2
     median = np.take_along_axis(rising, np.broadcast_to(middle, (*middle.shape[:2], *values.shape[2:])), axis=1)
     return np.where(np.isfinite(median), median, 0.0).squeeze(1).astype(np.float64)
-
-
-def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
-    """Return the linear samples that fill whole blocks of `FOLD`; estimates count time from their middle."""
-    a, b = linear
-    return a, b - (b - a) % FOLD
 
 
 def _refer_to_one(
@@ -493,12 +477,69 @@ class Referenced(NamedTuple):
     steering: NDArray[np.complex64]
 
 
-def excess_path_m(
-    tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], points_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return `|v - tx| + |v - rx| - |tx - rx|`, metres, [rx, point], for rx [rx, 3] and points [point, 3]."""
-    path = np.linalg.norm(points_m - tx_m, axis=-1) + np.linalg.norm(points_m[None] - rx_m[:, None], axis=-1)
-    return path - np.linalg.norm(rx_m - tx_m, axis=-1)[:, None]
+@dataclass(frozen=True)
+class SyncedRow:
+    """A row of a board with every position referenced to its direct path.
+
+    Attributes
+    ----------
+    samples
+        complex64 [rx, position, sample]: an echo of excess path d is `a exp(+j 2 pi f d / c)`; zero where not valid.
+    sweep_hz
+        float64 [sample]: transmit frequency f of each. Raw chirps have one sample for every four (`decimate.py`), cubes
+        of other programs all of them.
+    valid
+        bool [position].
+    chirps
+        int [position]: chirps in each average.
+    direct_hz, direct_amplitude
+        float64 [position]: IF and amplitude (ADC counts) of the direct path. Of cubes in their units: of one that came
+        referenced the IF is 0, of one without its direct path the amplitude is what :func:`detect_form` made up.
+    noise
+        float64 [position]: noise power of a sample of one channel of one chirp (ADC counts squared), NaN with fewer
+        than two good chirps; None: unknown.
+    turn
+        float64 [position]: phase change, radians, of the whole signal (direct path and echoes) from one position to
+        the next. Burst alignment removes it within a burst, see `imaging.samples.undo_burst_motion`. None: not aligned.
+    chirps_clipped, chirps_disturbed
+        Received chirps that were left out because the receiver clipped, or because they differ from the others of their
+        burst (interference, silence).
+    positions_clipped
+        Positions without data because all their received chirps were clipped.
+    errors
+        Error samples of the row after each stage (`errors`), {stage: float64 [3, n]}.
+    """
+
+    samples: NDArray[np.complex64]
+    sweep_hz: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    chirps: NDArray[np.int64]
+    direct_hz: NDArray[np.float64]
+    direct_amplitude: NDArray[np.float64]
+    errors: Errors = field(default_factory=dict)
+    noise: NDArray[np.float64] | None = None
+    turn: NDArray[np.float64] | None = None
+    chirps_clipped: int = 0
+    chirps_disturbed: int = 0
+    positions_clipped: int = 0
+
+    @property
+    def stages(self) -> dict[str, tuple[float, float, float]]:
+        """Standard deviations of frequency (Hz), phase (rad) and relative amplitude after each stage."""
+        return {name: _spread(values) for name, values in self.errors.items() if values.size}
+
+    def through(self, weights: NDArray[np.complex64]) -> NDArray[np.complex64]:
+        """Return the echo of the row, complex64 [rx, position], in order of recording.
+
+        `weights` [sample] are those of :func:`polysight.sync.backlash.object_filter`.
+        """
+        return (self.samples @ weights) * self.valid
+
+
+def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the RMS of errors [3, n]."""
+    f, p, a = np.sqrt((values**2).mean(axis=1))
+    return float(f), float(p), float(a)
 
 
 def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
@@ -512,64 +553,9 @@ def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
     return sample_frequencies_hz(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
 
 
-def prepare(rig: Instrument, board: Board) -> DirectPath:
-    """Return steering, search beam and estimators of a board, from geometry alone."""
-    chirp = rig.chirp
-    tx = np.array(tx_position_m(rig))
-    rx = np.array(rx_positions_m(rig, board))
-    sweep = sample_frequencies_hz(chirp)
-    middles = block_frequencies_hz(chirp)
-    direct = np.linalg.norm(rx - tx, axis=-1)
-    lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
-    # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
-    grid = np.linspace(-3, 3, 25) * _SPREAD_M
-    dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
-    amplitude = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
-    points = np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1)
-    excess = excess_path_m(tx, rx, points)
-    echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
-    echoes *= (amplitude / np.linalg.norm(amplitude))[:, None, None]
-    n_rx = len(rx)
-    n = middles.size
-    all_rx = echoes.reshape(len(points), n_rx * n)
-    # A gain error is that of an RX: it adds echo power between samples of the same RX, none between two.
-    same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
-    nearest_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
-    clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(nearest_m, _CLUTTER_M, 8 * n), middles))
-    clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
-    covariance = (all_rx.T @ all_rx.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)
-    covariance = (covariance + _NOISE / FOLD * np.eye(n_rx * n)).astype(np.complex128)
-    time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
-    model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
-    samples_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
-    centre = echoes[:, :, n // 2]
-    spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
-    beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
-    beam = complex64(beam / beam.sum())
-    folded_steering = cis(-2 * np.pi * middles * lag_s)
-    bins_per_m = chirp.hz_per_sample * FOLD * _FFT / SPEED_OF_LIGHT_M_S
-    return DirectPath(
-        steering=cis(-2 * np.pi * sweep * lag_s),
-        folded_steering=folded_steering,
-        estimator=_invert_model(model[:, :2], covariance),
-        drift_estimator=_invert_model(model, covariance),
-        half_estimators=np.stack([_invert_model(model[s, :2], covariance[np.ix_(s, s)]) for s in samples_of_half]),
-        beam=beam,
-        search_weights=complex64(beam[:, None] * folded_steering * _make_window(n)),
-        object_bins=(float(excess.min() * bins_per_m), float(excess.max() * bins_per_m)),
-        sweep_hz=middles,
-    )
-
-
-def _make_window(blocks: int) -> NDArray[np.float32]:
+def search_window(blocks: int) -> NDArray[np.float32]:
     """Return the search's window [block]: a Hann window without zeros at its ends."""
     return np.hanning(blocks + 2)[1:-1].astype(np.float32)
-
-
-def _invert_model(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return `(G^H R^-1 G)^-1 G^H R^-1` for a model G [sample, parameter] and a covariance R."""
-    whitened = np.asarray(scipy.linalg.solve(covariance, model, assume_a="pos"), np.complex128)
-    return np.linalg.solve(model.conj().T @ whitened, whitened.conj().T).astype(np.complex128)
 
 
 def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:
@@ -580,7 +566,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     aligned
         Aligned averages of a row. Positions without a good chirp are not found.
     path
-        From :func:`prepare`.
+        From :func:`polysight.sync.direct_path.prepare`.
     chirp
         The chirp the samples were taken with.
     by
@@ -589,14 +575,14 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     a, b = whole_blocks(chirp.linear_samples)
     n = (b - a) // FOLD
     # The compiled search has room for as many blocks as its transform.
-    is_supported = len(path.beam) == loops.RX and n <= _FFT
+    is_supported = len(path.beam) == loops.RX and n <= SEARCH_FFT
     run = by or (loops.library() if is_supported else None) or NumpyLoops
     good_chirps = aligned.good.sum(axis=1)
     usable = good_chirps > 0
     first = run.find(
         halves=aligned.halves,
         weights=path.search_weights,
-        size=_FFT,
+        size=SEARCH_FFT,
         object_bins=(int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)),
         comparable=_COMPARABLE,
         steering=path.folded_steering,
@@ -604,7 +590,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         steps=_STEPS,
     )
     # From the median bin, for tones fill few bins; the median power of noise is ln 2 of its mean.
-    floor = first.median**2 / np.log(2) / (_make_window(n) ** 2).sum()
+    floor = first.median**2 / np.log(2) / (search_window(n) ** 2).sum()
     drifts = _divide(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
     steering = complex64(path.folded_steering * cis(-0.5 * drift * ((np.arange(n) - (n - 1) / 2) * FOLD) ** 2))

@@ -75,7 +75,7 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
     pipeline = Pipeline(ScanFolder.load(folder))
     for row in pipeline.source.rows():
         pipeline.add_row(row)
-    boards = list(pipeline.images.boards.values())
+    boards = list(pipeline.builder.boards.values())
     valid = [b.valid.copy() for b in boards]
     full_images = [b.image()[0] for b in boards]
     weights = [b.weights for b in boards]

@@ -57,7 +57,7 @@ class Ours:
 
     def __init__(self, rig: Instrument, files: dict[str, Path]) -> None:
         self._pipeline = Pipeline(RepeatedRows(rig, {name: [path] for name, path in files.items()}))
-        self._pipeline.images = cast(ImageBuilder, _NoImage())
+        self._pipeline.builder = cast(ImageBuilder, _NoImage())
 
     def row(self) -> tuple[float, float]:
         """Process a row of all boards; return CPU seconds of all steps but the direct path, and of the direct path.

@@ -32,9 +32,9 @@ class Pipeline:
         self.synchroniser = sync.RowSynchroniser(source, rig, filters)
         self.quality = process.Quality(rig, source, self.calibration.list_sources())
         self.samples = process.KeptSamples(source, rig, filters, self.quality, settings, live=live, samples=samples)
-        self.images = self.samples.images
+        self.builder = self.samples.builder
         self.sub_bands = self.samples.sub_bands
-        self.rig = self.images.rig
+        self.rig = self.builder.rig
         # Images of a mirrored scan are transposed, so that x runs from TX to RX: the rig follows them.
         if source.mirrored:
             self.rig = store.mirror_rig(self.rig)
@@ -47,14 +47,14 @@ class Pipeline:
 
     def synchronise_row(self, row: int) -> dict[str, sync.SyncedRow]:
         """Read, synchronise and reduce one row of every board for the images; return the synchronised rows."""
-        return process.map_boards(self.quality.boards, lambda b: self._synchronise(b, row), parallel=self.images.live)
+        return process.map_boards(self.quality.boards, lambda b: self._synchronise(b, row), parallel=self.builder.live)
 
     def _synchronise(self, board: str, row: int) -> sync.SyncedRow:
         with self.quality.measure_time("read and synchronise"):
             recorded = self.source.read_row(board, row)
             synced, frames_whole = self.synchroniser.synchronise(board, recorded)
         with self.quality.measure_time("reduce"):
-            self.images.add_row(board, row, synced)
+            self.builder.add_row(board, row, synced)
             self.sub_bands.add_row(board, row, synced)
         self.quality.boards[board].add(row, recorded, frames_whole, synced)
         return synced
@@ -66,7 +66,7 @@ class Pipeline:
             self.sub_bands = self.samples.fill_missing()
         with self.quality.measure_time("image"):
             if from_sums:
-                images = self.images.current()
+                images = self.builder.current()
             else:
                 images = self.samples.filled.finish()
         self.quality.note(**self.synchroniser.recording_facts())
@@ -126,7 +126,7 @@ class Pipeline:
         images = self.form_images()
         process.save_images(out, process.collect_imaged_scan(out, self.source, self.rig, images, self.quality))
         progress("point response")
-        self.quality.note_imaging(self.images, images)
+        self.quality.note_imaging(self.builder, images)
         progress("materials")
         findings = self.examine(images, plates)
         progress("figures and report")

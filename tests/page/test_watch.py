@@ -41,7 +41,7 @@ def truth(finished):
     pipeline = Pipeline(scan, live=True)
     for row in scan.rows():
         pipeline.add_row(row)
-    return scan, pipeline, draw(pipeline.images.current())
+    return scan, pipeline, draw(pipeline.builder.current())
 
 
 def test_each_content_that_differs_is_a_new_version():

@@ -217,7 +217,7 @@ def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, kept:
     assert cube.shape[:2] == (17, 4)
     assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
     assert [line["row"] for line in lines] == list(range(17))
-    np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), from_raw.images.boards["RH"]._cube)
+    np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), from_raw.builder.boards["RH"]._cube)
 
 
 @pytest.mark.parametrize(

@@ -654,7 +654,7 @@ class Processing:
         for row in self.pipeline.samples.processable(self.source, self.folder):
             self.pipeline.add_row(row)
         images = self.pipeline.form_images()
-        self.pipeline.quality.note_imaging(self.pipeline.images, images)
+        self.pipeline.quality.note_imaging(self.pipeline.builder, images)
         return images
 
     @cached_property

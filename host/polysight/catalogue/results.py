@@ -336,8 +336,8 @@ def _focus_profile(folder: Path, x_m: float, y_m: float) -> tuple[FocusedProfile
     if pipeline is None:
         return None, "no samples were kept of this scan: `polysight process` makes them"
     shifts = np.linspace(-PROFILE_REACH_M, PROFILE_REACH_M, PROFILE_POINTS)
-    point = np.array([x_m, y_m, float(np.mean(pipeline.images.grid.z_m))])
-    levels = {name: np.abs(board.range_profile(point, shifts)) for name, board in pipeline.images.boards.items()}
+    point = np.array([x_m, y_m, float(np.mean(pipeline.builder.grid.z_m))])
+    levels = {name: np.abs(board.range_profile(point, shifts)) for name, board in pipeline.builder.boards.items()}
     highest = max(float(level.max()) for level in levels.values()) or 1.0
     boards = {}
     for name, level in levels.items():

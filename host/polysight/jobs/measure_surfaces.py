@@ -31,7 +31,7 @@ CALIBRATED_PLACE_STD_M = 3e-4
 
 def take_samples(pipeline: Pipeline) -> tuple[surfaces.Samples, surfaces.Samples]:
     """Return the samples of H and V that a pipeline holds, x from TX to RX."""
-    h, v = (take_board_samples(board, pipeline.source.mirrored) for board in pipeline.images.boards.values())
+    h, v = (take_board_samples(board, pipeline.source.mirrored) for board in pipeline.builder.boards.values())
     return h, v
 
 
@@ -84,7 +84,7 @@ def see_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
     """Find the specular points in the rows that a pipeline holds."""
     h, v = take_samples(pipeline)
     # The range gate of the images counts from the direct path, that of `see_points` from zero path.
-    low, high = pipeline.images.gate_m
+    low, high = pipeline.builder.gate_m
     direct_m = float(h.direct_m.mean())
     return surfaces.see_points(h, v, optics, (low + direct_m, high + direct_m))
 

@@ -76,7 +76,7 @@ def process_rows(source: Source, data: Path, settings: Settings = DEFAULT) -> Pi
 
 def pixel_axes(pipeline: Pipeline) -> Axes:
     """Return the pixel centres of the images, x and y in metres, ascending."""
-    grid = pipeline.images.grid
+    grid = pipeline.builder.grid
     # A scan recorded column by column is processed with x and y exchanged.
     if pipeline.source.mirrored:
         return grid.y_m, grid.x_m
@@ -137,8 +137,8 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
 def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
     """Write all products, replacing those in `out`; show the current step on stderr.
 
-    If the given metal turns out not to be metal, the images alone are written, unless `out` holds a report; the error
-    says where they are. Raises PolysightError.
+    If no materials can be found (the given metal is none, a board has no signal), the images alone are written, unless
+    `out` holds a report; the error says where they are. Raises PolysightError.
     """
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
         # The rows were added before `out` was locked: `drop-raw` may have run in between.
@@ -200,7 +200,7 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
     pipeline, images = form_scan_images(folder, Settings(config=path_text(config), bands=bands))
     mirrored = pipeline.source.mirrored
     parts = tuple(make_plane_reference(pipeline, band) for band in pipeline.sub_bands.finish(mirrored))
-    dispersion = pipeline.images.disperse()
+    dispersion = pipeline.builder.disperse()
     reference = make_plane_reference(pipeline, images).add_dispersion(
         dispersion.transpose() if mirrored else dispersion
     )
@@ -323,7 +323,7 @@ class LiveProcessing:
 
 
 def _check_dropped(pipeline: Pipeline, out: Path) -> None:
-    """Keep the mark of products whose raw data was dropped. Raises DataError if the new ones have fewer rows."""
+    """Note dropped raw data as the products in `out` do. Raises DataError if the new ones have fewer rows."""
     if not isinstance(pipeline.source, ScanFolder) or not (mark := raw_dropped(out)):
         return
     pipeline.source.reload()
@@ -349,7 +349,7 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
         require_raw(source)
     pipeline = process_rows(source, data, settings)
     images = pipeline.form_images()
-    pipeline.quality.note_imaging(pipeline.images, images)
+    pipeline.quality.note_imaging(pipeline.builder, images)
     with making_products(out, source.scan_id) as new:
         save_images(new, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality))
     print_lines((*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}"))
@@ -369,20 +369,19 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     out.mkdir(parents=True, exist_ok=True)
     # The range gate has to keep the echoes of every plane searched: of the sweep, and of plates up to `PLANE_REACH_M`.
     pipeline = process_rows(source, data, Settings(depth_range_mm=max(depth_mm, 1e3 * PLANE_REACH_M)))
-    builder = pipeline.images
     say("images, and the plane of the plates")
     images = pipeline.form_images()
     pipeline.place_plane(images, move=False)
     plates_plane = pipeline.plane
     say("the plane at which the image is sharpest")
-    sharpest = focus_sweep(builder, depth_m=depth_mm / 1e3)
+    sharpest = focus_sweep(pipeline.builder, depth_m=depth_mm / 1e3)
     if plates_plane.known:
         depth_m = plates_plane.offset_m
     else:
         depth_m = sharpest.depth_mm / 1e3
-    grid = builder.grid
+    grid = pipeline.builder.grid
     # The image of H in the rig file's plane and in the one that was found, without footprint and notice.
-    board = builder.boards[source.instrument.receivers[0].name]
+    board = pipeline.builder.boards[source.instrument.receivers[0].name]
     pictures = (board.image()[0], board.image(replace(grid, z_m=grid.z_m + depth_m))[0])
     # A scan recorded column by column is processed as that of a mirrored rig.
     if source.mirrored:

@@ -188,7 +188,7 @@ class RowViewer:
                 sync = sync._replace(snr_db=-20 * math.log10(scatter))
             self._sync.setdefault(name, {})[row] = sync
         if draws or time.monotonic() - self._drawn_at > PICTURE_INTERVAL_S:
-            self._publish(draw(pipeline.images.current()), self._compute_profile(pipeline, row))
+            self._publish(draw(pipeline.builder.current()), self._compute_profile(pipeline, row))
             self._drawn_at = time.monotonic()
 
     def _compute_profile(self, pipeline: Pipeline, row: int) -> Profile:

@@ -206,10 +206,10 @@ class KeptSamples:
         self._head = self._read_head()
         viewed = view.apply_to(rig, source.mirrored)
         gate = self._gate_m(rig, find_needed_gate_m(viewed, depth_m), find_needed_gate_m(rig, PLANE_REACH_M))
-        self.images = ImageBuilder(viewed, live=live, gate_m=gate)
+        self.builder = ImageBuilder(viewed, live=live, gate_m=gate)
         self.sub_bands = SubBandImages(viewed, self._bands, gate)
-        self.filled = self.images
-        self._builders = {"samples": self.images}
+        self.filled = self.builder
+        self._builders = {"samples": self.builder}
         self._builders |= {f"band_{k}": builder for k, builder in enumerate(self.sub_bands.builders)}
         # Rows without the sub-bands of those on disk are not added to them.
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
@@ -264,7 +264,7 @@ class KeptSamples:
     def fill_missing(self) -> SubBandImages:
         """Reconstruct missing positions from the rows so far: set `filled`, and return the images of sub-bands."""
         with self._quality.measure_time("reconstruct missing positions"):
-            self.filled, errors = fill_missing(self.images)
+            self.filled, errors = fill_missing(self.builder)
             sub_bands = fill_sub_bands(self.sub_bands)
         self._quality.note_filled(errors)
         return sub_bands

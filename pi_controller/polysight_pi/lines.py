@@ -504,9 +504,9 @@ class WireLines:
             return None
         self._flush()
         rose_ns: list[int] = []
-        widths_ns: list[int] = [0]
+        widths_ns: list[int] = []
         deadline = time.monotonic() + SIMULATED_LOOK_BACK_S
-        while len(widths_ns) <= sent and (left_s := deadline - time.monotonic()) > 0:
+        while len(widths_ns) < sent and (left_s := deadline - time.monotonic()) > 0:
             message = self._client.receive(left_s)
             if not isinstance(message, WireEdge):
                 continue
@@ -516,7 +516,7 @@ class WireLines:
                 rose_ns.append(message.t_ns)
             elif message.line == self._return and rose_ns:
                 widths_ns.append(message.t_ns - rose_ns[-1])
-        return Seen(len(rose_ns), max(widths_ns))
+        return Seen(len(rose_ns), max(widths_ns, default=0))
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
         """Send a pulse, starting now; return its times."""

@@ -441,7 +441,7 @@ class StageDriver:
         self.port = config.port
         self._news = news
         # The link; None before `connect`.
-        self._open: StageLink | None = None
+        self._open_link: StageLink | None = None
         self.x_mm = 0.0
         self.y_mm = 0.0
         self.firmware = ""
@@ -451,10 +451,10 @@ class StageDriver:
 
         Raises StageLostError if there is no answer, or if the stage's steps per mm differ from the rig file's.
         """
-        if self._open is not None and not self._open.lost:
+        if self._open_link is not None and not self._open_link.lost:
             return
         self.close()
-        self._open = link = StageLink(
+        self._open_link = link = StageLink(
             self.port,
             self.config.baud,
             self._news,
@@ -476,9 +476,9 @@ class StageDriver:
     @property
     def link(self) -> StageLink:
         """The open link. Raises StageLostError if there is none."""
-        if self._open is None:
+        if self._open_link is None:
             raise StageLostError(f"stage at {self.port} is not connected", "its port was lost", "polysight-pi home")
-        return self._open
+        return self._open_link
 
     def clear(self, stop: bool = False) -> None:
         """Clear a latched alarm once the stage is at rest; with `stop`, send STOP until it is.
@@ -552,8 +552,8 @@ class StageDriver:
 
     def slow_down_polling(self) -> None:
         """Ask for the status less often: the stage does not move."""
-        if self._open is not None:
-            self._open.ask_status_every(IDLE_STATUS_S)
+        if self._open_link is not None:
+            self._open_link.ask_status_every(IDLE_STATUS_S)
 
     def note_position(self, reply: Reply) -> None:
         """Store x and y of a status or done reply; a missing or impossible position is ignored."""
@@ -568,8 +568,8 @@ class StageDriver:
 
     def close(self) -> None:
         """Close the port."""
-        link = self._open
-        self._open = None
+        link = self._open_link
+        self._open_link = None
         if link is not None:
             link.close()
 

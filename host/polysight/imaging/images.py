@@ -147,7 +147,7 @@ class Illumination:
         return slopes[0], slopes[1]
 
     def _estimate_slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
-        """Return the rise of a plate along x (`along` 0) or y (1) from its mean phase step per pixel, radians."""
+        """Return a plate's rise along x (`along` 0) or y (1), see :meth:`rise`, from its mean phase step per pixel."""
         slope_per_rad = 1 / (self.pixel_m[along] * float(self.steepness_rad_m.mean()))
         slope = slope_per_rad * step_rad
         inside_px = np.flatnonzero(mask.any(axis=along))

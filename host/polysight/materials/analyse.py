@@ -116,7 +116,8 @@ class Optics:
         """Return the optics of a rig under the chosen incidence angles, with this standard deviation of the angle.
 
         Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero, and
-        `leakage_prior` is the size of both its parts. `channels_known`: amplitudes are relative to the direct path.
+        `leakage_prior` is the size of both its parts. The mount may have moved since a measurement (`MOVED`).
+        `channels_known`: amplitudes are relative to the direct path.
         """
         p = rig.polarimetry
         leakage = (0j, 0j)
@@ -474,9 +475,7 @@ class SceneScatter:
 
     def usual_background(self, measured: Sequence[PatchMeasurement]) -> float:
         """Return the median of :meth:`background_in` over patches; 0 without any."""
-        if measured:
-            return float(np.median([self.background_in(m) for m in measured]))
-        return 0.0
+        return float(np.median([self.background_in(m) for m in measured])) if measured else 0.0
 
 
 @dataclass(frozen=True)
@@ -586,9 +585,9 @@ def _name_patches(
             continue
         interior = patch.interior
         if classifier.model == PAPER:
-            # The paper's classifier compares pixels, which get the corrections of their patch.
-            error = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
-            pixels_p = p[interior].astype(np.complex128) / error
+            # The paper's classifier compares pixels: their V / H gets the correction of their patch.
+            correction = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
+            pixels_p = p[interior].astype(np.complex128) / correction
             pixels = pixel_features(np.abs(h[interior]), np.abs(v[interior]), pixels_p)
             (name,) = classifier.scan([pixels])
         else:

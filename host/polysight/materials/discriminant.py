@@ -267,7 +267,7 @@ class ErrorDiscriminant(Model):
         self.spread, placement = fit_spread(
             residual, material, plate, self._effects, total, gains_alike=self.channels == "H+V+P"
         )
-        placement = self._decorrelate_angles(placement) * self._gain_and_phase
+        placement = self._decorrelate_angles(placement) * self._both_gains_or_phases
         placement = (1 - shrink) * placement + shrink * np.diag(np.diag(placement))
         # The added variance, far below any real one, keeps the matrix invertible.
         self.between = _clip_eigenvalues(placement - self.within / self.pixels) + 1e-8 * np.eye(width)
@@ -296,7 +296,7 @@ class ErrorDiscriminant(Model):
         angle = np.arange(features_per_angle * h.shape[1]) // features_per_angle
         self._same_angle = angle[:, None] == angle[None]
         phase = np.tile({"P": [0, 1], "H+V+P": [0, 0, 1]}.get(self.channels, [0]), h.shape[1])
-        self._gain_and_phase = (phase[:, None] == phase[None]).astype(float)
+        self._both_gains_or_phases = (phase[:, None] == phase[None]).astype(float)
 
     def _compute_deviations(self, x: Real) -> Real:
         """Return the deviations from every material's anchor, [n, materials, features]."""

@@ -118,21 +118,21 @@ class MetalEvidence:
     culprit: int | None = None
 
     @property
-    def needed(self) -> float:
-        """Smallest `metal` with which a patch that nobody declared counts as metal; infinite without other patches."""
+    def needed_score(self) -> float:
+        """Least `compared_score` with which a patch that nobody declared counts as metal; inf without other patches."""
         if self.others == 0:
             return np.inf
         return LEAST_SCORE * float(np.sqrt(self.others))
 
     @property
-    def metal(self) -> float:
-        """Score to compare with `needed`: for bare metal, or for metal that may be painted minus `PAINT_SCORE`."""
+    def compared_score(self) -> float:
+        """Score to compare with `needed_score`: of bare metal, or of metal that may be painted minus `PAINT_SCORE`."""
         return max(self.bare, self.score - PAINT_SCORE)
 
     @property
     def sure(self) -> bool:
         """True if the patch is certainly metal. The margin is for very lossy dielectrics (wet, conducting)."""
-        return self.enough and self.metal >= self.needed + SURE_MARGIN
+        return self.enough and self.compared_score >= self.needed_score + SURE_MARGIN
 
     @property
     def against(self) -> bool:
@@ -149,7 +149,7 @@ class MetalEvidence:
     def enough(self) -> bool:
         """True if a patch that nobody declared counts as metal: enough score, and V / H not below `DOUBTFUL_V_DB`."""
         doubtful = self.channel_ratio_db is not None and self.channel_ratio_db < DOUBTFUL_V_DB
-        return self.metal >= self.needed and not doubtful
+        return self.compared_score >= self.needed_score and not doubtful
 
 
 def log_evidence_of_dielectric(

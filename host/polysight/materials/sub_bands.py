@@ -133,9 +133,9 @@ def band_rows(
 
 
 def _estimate_common_std(result: MaterialsResult, interior: Mask) -> float:
-    """Return the standard error of a patch's V / H, each part, in all its sub-bands alike; NaN if not known.
+    """Return the error, by scatter over the plate, that V / H of all its sub-bands have in common; NaN if not known.
 
-    It is that of what scatters over the plate.
+    It is the standard deviation of each part.
     """
     images = result.calibrated
     scatter = measure_scatter(interior, result.h, result.v, images.x_m, images.y_m)

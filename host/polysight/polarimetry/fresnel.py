@@ -295,10 +295,10 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
         grid = np.meshgrid(row, column, indexing="ij")
-        deviation_px = scipy.ndimage.map_coordinates(deviation_sum, grid, order=1, mode="constant")
-        weight_px = scipy.ndimage.map_coordinates(weight_sum, grid, order=1, mode="constant")
-        is_lit = weight_px > 1e-3 * float(weight.sum())
-        total += float(specular) + np.where(is_lit, deviation_px / np.where(is_lit, weight_px, 1.0), 0.0)
+        pixel_deviation = scipy.ndimage.map_coordinates(deviation_sum, grid, order=1, mode="constant")
+        pixel_weight = scipy.ndimage.map_coordinates(weight_sum, grid, order=1, mode="constant")
+        is_lit = pixel_weight > 1e-3 * float(weight.sum())
+        total += float(specular) + np.where(is_lit, pixel_deviation / np.where(is_lit, pixel_weight, 1.0), 0.0)
     return total / len(rig.receivers)
 
 

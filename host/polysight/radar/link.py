@@ -149,7 +149,7 @@ class Link:
         )
 
     def _detect_restart(self) -> None:
-        """Raise UnexpectedRestartError if a power-up event follows the refusal of a command."""
+        """Read messages after the refusal of a command: `_keep` raises UnexpectedRestartError for a power-up event."""
         deadline = self._clock.now() + _RESTART_EVENT_S
         while self._clock.now() < deadline:
             self._read_messages()

@@ -339,7 +339,7 @@ class BoardSamples:
         self.valid = np.zeros(shape, bool)
         # Imager of all rows; None if the aperture is irregular, or before it is needed.
         self._final: SpectralImager | None = None
-        # Spectra of the rows along x, for the final image
+        # Spectra of the rows along x, for the final image of a live scan
         self._spectra = np.zeros(0, np.complex64)
         # Rows whose spectra are out of date
         self._stale = set(range(shape[0]))
@@ -455,8 +455,7 @@ class BoardSamples:
         gated = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
         step = _PRODUCT // maps.size
         for first in range(0, pairs.shape[1], step):
-            part = slice(first, first + step)
-            np.matmul(pairs[:, part], maps, out=gated[:, part])
+            np.matmul(pairs[:, first : first + step], maps, out=gated[:, first : first + step])
         count = self._reduction.frequencies_hz.size + 1
         return gated.view(np.complex64)[..., :count].mT
 
@@ -465,14 +464,15 @@ class BoardSamples:
         if self._final is None and geometry.find_irregularity(self.aperture) is None:
             # The same slack as the live imager, so that both share their spectra.
             self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
-            self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
-            self._stale = set(range(len(self.valid)))
+            if self._live is not None:
+                self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
+                self._stale = set(range(len(self.valid)))
 
     def _compute_row_spectra(self, imager: SpectralImager, index: int) -> NDArray[np.complex64]:
         """Return the spectra of a row, [rx, frequency, k]; row by row, so that results are bit-exact in any order."""
         if index in self._stale:
-            weights = self._compute_row_weights(index)
-            imager.put_spectra_of_row(self._cube[:, :, index], weights, index, self._spectra[:, :, index])
+            row = self._cube[:, :, index] * self._compute_row_weights(index)
+            self._spectra[:, :, index] = imager.spectra_of_row(row, index)
             self._stale.remove(index)
         return self._spectra[:, :, index]
 
@@ -562,19 +562,20 @@ class BoardSamples:
         return self._image
 
     def _form_images(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image, str | None]:
-        """Form :meth:`image`; on the rig file's pixels from spectra of the rows, which are kept."""
+        """Form :meth:`image`; of a live scan from the spectra of its rows, which are kept."""
         gains = (1 / self.rx_calibration()).astype(np.complex64)
-        notice = None
         if grid is None:
             self._prepare()
-        if grid is None and self._final is not None:
-            for index in range(len(self.valid)):
-                self._compute_row_spectra(self._final, index)
-            imager: Imager = self._final
-            image: Any = self._final.image_of_spectra(self._spectra, gains)
-        else:
-            imager, notice = self._choose_imager(grid)
+        imager, notice = self._choose_imager(grid)
+        image: Any
+        if not isinstance(imager, SpectralImager):
             image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
+        elif imager is self._final and self._live is not None:
+            for index in range(len(self.valid)):
+                self._compute_row_spectra(imager, index)
+            image = imager.image_of_spectra(self._spectra, gains)
+        else:
+            image = imager.weighted_image(self._cube, self.weights, gains)
         footprint: Any = imager.constant(self._mirror(grid).astype(np.complex64), self.weights) / self.count
         return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
 

@@ -378,9 +378,6 @@ class SpectralImager(RowSpectra):
         # Lattice row of the first row of pixels.
         self._first_pixel_row = sizes.row_stride * (rows - 1)
         count = sizes.size_y // sizes.row_stride
-        # A row of all channels, padded with zeros to a period.
-        channels = math.prod(aperture.shape[:2])
-        self._padded_row = self.xp.zeros((channels, self.period), dtype=self.xp.complex64, device=device)
         # Rows are padded with zeros below. An odd number of cache lines apart, or they would all use the same places of
         # the cache (transforms took 1.6 times as long).
         pitch = _LINE * (-(-sizes.band.size // _LINE) | 1)
@@ -397,39 +394,45 @@ class SpectralImager(RowSpectra):
 
     def image(self, samples: Any) -> Any:
         """Return the matched filter of samples [rx, frequency, row, column], complex64 [ny, nx]."""
+        return self.weighted_image(samples, 1.0, [1.0] * self.aperture.shape[0])
+
+    def weighted_image(self, samples: Any, weights: Any, factors: Any) -> Any:
+        """Return :meth:`image` of samples times weights [row, column] (or one number) and a factor per RX."""
         xp = self.xp
-        rx, m, rows, columns = self.aperture.shape
-        channels = xp.reshape(samples, (rx * m, rows, columns))
-        total = xp.zeros(self._kernels.shape[1:], dtype=xp.complex64, device=self.device)
+        rows, columns = self.aperture.shape[2:]
         padded = xp.zeros((rows, self.period), dtype=xp.complex64, device=self.device)
-        spectra = xp.empty((rows, total.shape[1]), dtype=xp.complex64, device=self.device)
-        for c in range(rx * m):
-            padded[:, :columns] = channels[c, :, :]
+
+        def put_spectra(r: int, c: int) -> None:
+            padded[:, :columns] = samples[r, c, :, :] * weights
             padded[:, columns:] = 0
-            self.transform_padded(padded, self._ramps, spectra)
-            self._add_channel(total, c, spectra)
-        return self._invert_transform(total)
+            self.transform_padded(padded, self._ramps, self._padded_lines[:rows, :])
+
+        return self._sum_channels(put_spectra, factors)
 
     def spectra_of_row(self, samples: Any, index: int) -> Any:
         """Return the spectra [..., k] of a row [..., column] for :meth:`image_of_spectra`."""
         return self.transform_rows(samples, self._ramps[index, :])
 
-    def put_spectra_of_row(self, samples: Any, weights: Any, index: int, spectra: Any) -> None:
-        """Write :meth:`spectra_of_row` of samples [rx, frequency, column] times weights [column] to `spectra`."""
-        columns = samples.shape[-1]
-        row = self.xp.reshape(self._padded_row, (*samples.shape[:-1], self.period))
-        row[..., :columns] = samples * weights
-        row[..., columns:] = 0
-        self.transform_padded(row, self._ramps[index, :], spectra)
-
     def image_of_spectra(self, spectra: Any, factors: Any) -> Any:
         """Return :meth:`image` of rows transformed along x [rx, frequency, row, k], with a factor per RX."""
+
+        def put_spectra(r: int, c: int) -> None:
+            self._padded_lines[: spectra.shape[2], :] = spectra[r, c, :, :]
+
+        return self._sum_channels(put_spectra, factors)
+
+    def _sum_channels(self, put_spectra: Callable[[int, int], None], factors: Any) -> Any:
+        """Return the image of all channels: `put_spectra` writes rows of an RX and frequency to the padded lines."""
         rx, m = self.aperture.shape[:2]
-        total = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+        shape = self._kernels.shape[1:]
+        total = self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device)
         for r in range(rx):
-            part = self.xp.zeros(self._kernels.shape[1:], dtype=self.xp.complex64, device=self.device)
+            part = self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device)
             for c in range(m):
-                self._add_channel(part, r * m + c, spectra[r, c, :, :])
+                put_spectra(r, c)
+                spectrum = self._transform_along_y()
+                spectrum *= self._kernels[r * m + c, :, :]
+                part += spectrum
             part *= factors[r]
             total += part
         return self._invert_transform(total)
@@ -442,8 +445,9 @@ class SpectralImager(RowSpectra):
         if last is None or not bool(xp.all(last[0] == echo)):
             last = (echo, xp.tensordot(xp.reshape(echo, (-1,)), self._kernels, axes=1))
             self._echoes[:] = [last]
-        weight_spectra = self._transform_along_y(self.transform_rows(xp.astype(weights, xp.complex64), self._ramps))
-        return self._invert_transform(last[1] * weight_spectra)
+        spectra = self.transform_rows(xp.astype(weights, xp.complex64), self._ramps)
+        self._padded_lines[: spectra.shape[0], :] = spectra
+        return self._invert_transform(last[1] * self._transform_along_y())
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
@@ -460,16 +464,9 @@ class SpectralImager(RowSpectra):
             rows.append(self.transform_rows_adjoint(xp.take(product, self._rows, axis=0), self._ramps))
         return xp.reshape(xp.stack(rows), self.aperture.shape)
 
-    def _add_channel(self, total: Any, channel: int, lines: Any) -> None:
-        """Add the spectra of a channel's rows [row, k], times its kernel, to `total` [ky, k]."""
-        spectrum = self._transform_along_y(lines)
-        spectrum *= self._kernels[channel, :, :]
-        total += spectrum
-
-    def _transform_along_y(self, lines: Any) -> Any:
-        """Return the 2-D spectrum on the lattice [ky, k] of the rows' spectra [row, k], in memory used again."""
-        self._padded_lines[: lines.shape[0], :] = lines
-        self._padded_lines[lines.shape[0] :, :] = 0
+    def _transform_along_y(self) -> Any:
+        """Return the 2-D spectrum on the lattice [ky, k] of the rows in the padded lines, which it may overwrite."""
+        self._padded_lines[self.aperture.shape[2] :, :] = 0
         spectrum = transform_in_place(self.xp, self._padded_lines, axis=0)
         if self.lattice.row_stride == 1:
             return spectrum

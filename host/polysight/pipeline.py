@@ -78,8 +78,7 @@ class Pipeline:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
         with self.quality.measure_time("plane"):
             masks = materials.find_interiors(images)
-            swapped = self.source.mirrored
-            self.plane, images = imaging.move_to_plane(self.samples.filled, images, masks, swapped, move)
+            self.plane, images = imaging.move_to_plane(self.samples.filled, images, masks, self.source.mirrored, move)
         return images
 
     def find_materials(
@@ -92,13 +91,14 @@ class Pipeline:
         with self.quality.measure_time("materials"):
             rig = self.plane.apply_to_rig(self.rig)
             angle_std = self.plane.incidence_std_rad(self.rig)
-            incidence = polarimetry.incidence_choice(rig, images.x_m, images.y_m, self.settings.incidence)
+            axes = images.x_m, images.y_m
+            incidence = polarimetry.incidence_choice(rig, *axes, self.settings.incidence, images.raised_m)
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
             result = materials.analyse(images, optics, known_scene, classifier)
             metal_plane = None if known_scene is None else known_scene.plane  # of a plate scanned separately
             self.quality.note_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):
-            band_images = self.sub_bands.finish(self.source.mirrored, self.plane.moved_m)
+            band_images = self.sub_bands.finish(self.source.mirrored, self.plane.form_images)
             if band_images:
                 result = materials.add_bands(result, self.sub_bands.bands, band_images, optics, metal_plane)
         return result

@@ -141,6 +141,24 @@ def test_a_shifted_plane_is_found_and_reported(examine, shift_mm):
     assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
 
 
+@pytest.mark.parametrize(
+    "heights_mm",
+    [{"wood": -12.0, "rubber": -18.0}, {"wood": -6.0, "rubber": -4.0}, {"acrylic": -7.0, "ceramic": -22.0, "wood": -9.0}],
+    ids=lambda heights: " ".join(f"{height:.0f}" for height in heights.values()),
+)
+def test_plates_of_other_heights_are_no_tilt_and_keep_their_permittivities(examine, heights_mm):
+    # 12 mm nearer to the radars the angle of incidence is larger by 0.7 degrees.
+    scene = world(disturbances={"leakage_measured": 0.003})
+    plates = tuple(msgspec.structs.replace(p, height_mm=heights_mm.get(p.name, 0.0)) for p in scene.plates)
+    findings, true = examine(msgspec.structs.replace(scene, plates=plates))
+    raised = findings.plane.to_dict()["raised_mm"]
+    assert sorted(raised) == pytest.approx(sorted(heights_mm.values()), abs=0.5)
+    np.testing.assert_allclose(np.degrees(findings.plane.tilt_rad), 0, atol=0.2)
+    assert findings.verdict.level == "good"
+    assert distances(findings, true).max() < 14.0
+    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+
+
 def test_a_tilted_plane_is_found(examine):
     findings, true = examine(world(plane_tilt_deg=[0.8, -0.6], disturbances={"leakage_measured": 0.003}))
     np.testing.assert_allclose(np.degrees(findings.plane.tilt_rad), [0.8, -0.6], atol=0.2)

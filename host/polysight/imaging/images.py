@@ -30,7 +30,7 @@ filters. They do not depend on settings that cancel:
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib import import_module
 
@@ -264,6 +264,8 @@ class Images:
         Illumination of the plane by both channels, to correct tilted plates.
     dispersion
         Change over the sweep; None where it was not formed.
+    raised_m
+        float64 [ny, nx]: how far behind the images' plane each pixel was imaged (negative: nearer); None: nowhere.
     rx_gains
         Board name to complex128 [rx]: gain of each RX, measured by the direct path. It was divided out.
     notices
@@ -283,6 +285,7 @@ class Images:
     v_raw: Image | None = None
     illumination: Illumination | None = None
     dispersion: Dispersion | None = None
+    raised_m: NDArray[np.float64] | None = None
     rx_gains: Mapping[str, NDArray[np.complex128]] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
 
@@ -589,12 +592,11 @@ class SubBandImages:
         for builder in self.builders:
             builder.add_row(board_name, row_index, row)
 
-    def finish(self, transposed: bool = False, offset_m: float = 0.0) -> tuple[Images, ...]:
-        """Form the images of every sub-band from the rows so far, lowest frequency first.
-
-        `transposed`: swap x and y. `offset_m`: as in :meth:`ImageBuilder.finish`.
-        """
-        band_images = (builder.finish(offset_m) for builder in self.builders)
+    def finish(
+        self, transposed: bool = False, form: Callable[[ImageBuilder], Images] = ImageBuilder.finish
+    ) -> tuple[Images, ...]:
+        """Form the images of every sub-band with `form`, lowest frequency first; `transposed`: swap x and y."""
+        band_images = map(form, self.builders)
         return tuple(images.transpose() if transposed else images for images in band_images)
 
 

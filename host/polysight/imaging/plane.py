@@ -17,7 +17,8 @@ two ways:
 Both ways compare the echo with that of a mirror on the rig file's plane, seen from the same positions. So aperture,
 taper (weights of the positions) and masked positions have no influence. The image of that mirror is the *footprint*.
 
-One plane is fitted to all plates; the height of each plate is returned, too.
+One plane is fitted to most plates. Plates whose height by range is another, blocks of other thickness, are *raised*:
+each is imaged on a plane of its own, because at another distance it is seen at another angle.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.images import ImageBuilder, Images
+from polysight.imaging.images import Dispersion, ImageBuilder, Images
 from polysight.imaging.resolution import limit_m
 from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
@@ -75,6 +76,20 @@ _PHASE_FITS_RAD = 0.5
 _PHASE_STD_M = 5e-5
 """Standard deviation of a height by phase, due to roughness and to the phase of the reflection (some degrees for lossy
 plates); chosen."""
+RAISED_M = 1.5e-3
+"""Least distance of a plate by range from the plane of the others, beside three standard deviations, for a plane of its
+own. It turns the angle by 1.5 mrad, as much as the error of the angle. Thin plates seem to lie up to a millimetre
+deeper, because their rear face echoes, too. Chosen."""
+_BOARDS_AGREE_M = 3e-3
+"""Largest difference of a raised plate's heights by range in H and in V, beside three standard deviations; chosen. A
+liquid behind glass changes over the sweep, differently in H and V: its two heights are 35 mm apart."""
+_LEVEL_STD_M = 5e-4
+"""Standard deviation of the heights of plates of one plane, beside that by range; chosen."""
+_LEVEL_STDS = 3.0
+"""Distance from the plane, in standard deviations, beyond which a plate does not count for the plane; chosen."""
+_RAISED_REACH_M = 0.012
+"""A raised plate's own plane replaces the images up to this far around its inside, but no nearer to another plate:
+over its edges, which `find_interiors` has left out; chosen."""
 
 
 @dataclass(frozen=True)
@@ -218,6 +233,17 @@ def _interpolate_stack(
 
 
 @dataclass(frozen=True)
+class RaisedPlate:
+    """A plate that does not lie on the plane of the others.
+
+    `height_m` is its height. `region` bool [ny, nx], on the builder's grid, is where its own plane replaces the images.
+    """
+
+    height_m: float
+    region: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class PlaneEstimate:
     """Plane of the plates relative to the rig file's plane.
 
@@ -229,11 +255,13 @@ class PlaneEstimate:
     tilt_rad, tilt_std_rad
         Tilt of the plane along x and along y, radians (positive where z grows), and their standard deviations.
     heights_m
-        float64 [patch]: height of each patch, by phase if `by_phase`, otherwise by range; NaN if undetermined.
+        float64 [patch]: height of each patch, by range, or by phase if `by_phase` and not raised; NaN if undetermined.
     by_phase
-        True if the plates' phases fit one plane that agrees with the ranges: then it is the estimate.
+        True if the phases of plates that are not raised fit one plane that agrees with the ranges: it is the estimate.
     plates
         Number of patches with a height by range; 0 if the plane is not known.
+    raised
+        Plates that lie on other planes.
     """
 
     offset_m: float
@@ -243,6 +271,7 @@ class PlaneEstimate:
     heights_m: NDArray[np.float64]
     by_phase: bool
     plates: int
+    raised: tuple[RaisedPlate, ...] = ()
 
     @property
     def known(self) -> bool:
@@ -266,6 +295,22 @@ class PlaneEstimate:
         distance = rig.geometry.object_distance_mm + 1e3 * self.offset_m
         return msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=distance))
 
+    def form_images(self, builder: ImageBuilder) -> Images:
+        """Form the images on this plane, and those of each raised plate on its own, around it."""
+        images = builder.finish(self.moved_m)
+        for plate in self.raised:
+            images = _replace_region(images, builder.finish(plate.height_m), plate, self.moved_m)
+        return images
+
+    def form_dispersion(self, builder: ImageBuilder) -> Dispersion:
+        """Form the dispersion on this plane, and that of each raised plate on its own, around it."""
+        dispersion = builder.disperse(self.moved_m)
+        for plate in self.raised:
+            own = builder.disperse(plate.height_m)
+            h = np.where(plate.region, own.h, dispersion.h)
+            dispersion = replace(dispersion, h=h, v=np.where(plate.region, own.v, dispersion.v))
+        return dispersion
+
     def incidence_std_rad(self, rig: Instrument) -> float:
         """Return the standard deviation of the incidence angle theta, radians.
 
@@ -280,7 +325,8 @@ class PlaneEstimate:
 
     def transpose(self) -> PlaneEstimate:
         """Return the estimate with x and y swapped."""
-        return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1])
+        raised = tuple(replace(plate, region=np.ascontiguousarray(plate.region.T)) for plate in self.raised)
+        return replace(self, tilt_rad=self.tilt_rad[::-1], tilt_std_rad=self.tilt_std_rad[::-1], raised=raised)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for quality.json; millimetres and degrees."""
@@ -294,6 +340,7 @@ class PlaneEstimate:
             "tilt_std_deg": [round(float(np.degrees(t)), 4) for t in self.tilt_std_rad],
             "by": "phase" if self.by_phase else "range",
             "plates": self.plates,
+            "raised_mm": [round(1e3 * (plate.height_m - self.offset_m), 2) for plate in self.raised],
         }
 
 
@@ -337,26 +384,19 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     for place, mask in zip(places, masks, strict=True):
         if mask.any():
             place[:] = x[mask.any(axis=0)].mean(), y[mask.any(axis=1)].mean()
-    plane, covariance = _fit_plane(places[determined], heights[determined], np.hypot(stds[determined], _MIN_STD_M))
-    # H: its reflection r_s has nearly the same phase for all plates.
-    board_h = next(iter(builder.boards.values()))
-    phase_heights, rad_per_m = _estimate_heights_by_phase(board_h, masks, places, plane)
-    # A plane has three unknowns: only with four plates can their phases contradict it.
-    with_phase = determined & np.isfinite(phase_heights)
+    level_stds = np.hypot(stds, _LEVEL_STD_M)
+    is_level = determined & (np.abs(heights - _fit_most(places, heights, level_stds)) <= _LEVEL_STDS * level_stds)
+    plane, covariance = _fit_plane(places[is_level], heights[is_level], np.hypot(stds[is_level], _MIN_STD_M))
     by_phase = False
-    if with_phase.sum() >= 4:
-        phase_stds = np.full(int(with_phase.sum()), _PHASE_STD_M)
-        phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds)
-        residual = phase_heights[with_phase] - _evaluate_plane(phase_plane, places[with_phase])
-        on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
-        # Thin sheets have a phase of reflection of their own: the plane is accepted only if it agrees with the ranges.
-        tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]
-        agrees_with_ranges = bool((np.abs(phase_plane - plane) < tolerance).all())
-        if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_RISE_BY_PHASE:
-            plane = phase_plane
-            covariance = phase_covariance
-            heights = phase_heights
-            by_phase = True
+    from_phases = _fit_plane_by_phase(builder, masks, places, is_level, (plane, covariance))
+    if from_phases is not None:
+        by_phase = True
+        plane, covariance, phase_heights = from_phases
+        heights = np.where(is_level & np.isfinite(phase_heights), phase_heights, heights)
+    apart_m = np.abs(heights - _evaluate_plane(plane, places))
+    apart_of_boards_m = np.ptp([of_board for of_board, _ in ranges], axis=0)
+    boards_agree = apart_of_boards_m <= _BOARDS_AGREE_M + 3 * np.linalg.norm([std for _, std in ranges], axis=0)
+    is_raised = determined & ~is_level & (apart_m > np.maximum(RAISED_M, 3 * stds)) & boards_agree
     std = np.sqrt(np.diag(covariance))
     return PlaneEstimate(
         offset_m=float(plane[0]),
@@ -366,7 +406,38 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         heights_m=np.asarray(heights, np.float64),
         by_phase=by_phase,
         plates=int(determined.sum()),
+        raised=_mark_raised(masks, heights, is_raised, grid.pixel_m),
     )
+
+
+def _mark_raised(
+    masks: Sequence[NDArray[np.bool_]], heights: NDArray[np.float64], is_raised: NDArray[np.bool_], pixel_m: float
+) -> tuple[RaisedPlate, ...]:
+    """Return the raised plates with their regions: pixels that are nearest to their insides, and not too far."""
+    if not is_raised.any():
+        return ()
+    numbers = np.zeros(masks[0].shape, np.intp)
+    for i, mask in enumerate(masks):
+        numbers[mask] = i + 1
+    distance_px, nearest = scipy.ndimage.distance_transform_edt(numbers == 0, return_indices=True)
+    owner = np.where(distance_px * pixel_m <= _RAISED_REACH_M, numbers[tuple(nearest)], 0)
+    return tuple(RaisedPlate(float(heights[i]), owner == i + 1) for i in np.flatnonzero(is_raised))
+
+
+def _replace_region(images: Images, own: Images, plate: RaisedPlate, plane_m: float) -> Images:
+    """Return the images with those of a raised plate's own plane in its region; `plane_m`: height of the others."""
+    region = plate.region
+    replaced = {
+        name: np.where(region, getattr(own, name), getattr(images, name)) for name in ("h", "v", "h_raw", "v_raw")
+    }
+    illumination = images.illumination
+    if illumination is not None and own.illumination is not None:
+        footprints = np.where(region, own.illumination.footprints, illumination.footprints)
+        illumination = replace(illumination, footprints=footprints)
+    raised_m = np.zeros(region.shape) if images.raised_m is None else images.raised_m
+    raised_m = np.where(region, plate.height_m - plane_m, raised_m)
+    valid = np.where(region, own.valid, images.valid)
+    return replace(images, **replaced, valid=valid, illumination=illumination, raised_m=raised_m)
 
 
 def move_to_plane(
@@ -374,8 +445,8 @@ def move_to_plane(
 ) -> tuple[PlaneEstimate, Images]:
     """Estimate the plane of patches; return it, and the images on it.
 
-    Images are formed again if the plane differs enough from the rig file's (`PlaneEstimate.worth_moving`). With `move`
-    they get their dispersion, too.
+    Images are formed again if the plane differs enough from the rig file's (`PlaneEstimate.worth_moving`), or if plates
+    are raised. With `move` they get their dispersion, too.
 
     Parameters
     ----------
@@ -391,11 +462,11 @@ def move_to_plane(
     plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
     if not move:
         return plane, images
-    if plane.worth_moving:
-        images = builder.finish(plane.offset_m)
+    if plane.worth_moving or plane.raised:
+        images = plane.form_images(builder)
         if transposed:
             images = images.transpose()
-    dispersion = builder.disperse(plane.moved_m)
+    dispersion = plane.form_dispersion(builder)
     if transposed:
         dispersion = dispersion.transpose()
     return plane, replace(images, dispersion=dispersion)
@@ -443,8 +514,11 @@ def _estimate_heights_by_phase(
     masks: Sequence[NDArray[np.bool_]],
     places: NDArray[np.float64],
     plane: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], float]:
     """Return the heights by phase [patch], metres, NaN where pixels are not coherent; and the radians per metre.
+
+    Only patches of `chosen` [patch] get a height.
 
     The multiple of the ambiguity of each height is the one with which all heights fit a plane best, near `plane` [3]
     (height and rise along x and y, by range). `places` [patch, 2] are the middles of the patches, metres. `board` is
@@ -458,7 +532,7 @@ def _estimate_heights_by_phase(
         # The reflection r_s of a plate is nearly real and negative: the minus turns its phase to about zero.
         against_mirror = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
         coherence = abs(against_mirror.sum()) / max(float(np.abs(against_mirror).sum()), 1e-300)
-        if mask.any() and coherence > _COHERENT:
+        if chosen[i] and mask.any() and coherence > _COHERENT:
             phases[i] = np.angle(against_mirror.sum())
             # Change of a mirror's phase with its height, radians per metre.
             rates.append(float(np.angle(np.vdot(footprint[mask], moved_image[mask]))) / _STEP_M)
@@ -488,6 +562,60 @@ def _estimate_heights_by_phase(
     best_heights = np.full(len(masks), np.nan)
     best_heights[with_phase] = lifted[int(np.argmin(chi2))]
     return best_heights, rad_per_m
+
+
+def _fit_plane_by_phase(
+    builder: ImageBuilder,
+    masks: Sequence[NDArray[np.bool_]],
+    places: NDArray[np.float64],
+    is_level: NDArray[np.bool_],
+    by_range: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None:
+    """Fit a plane to the phases of the plates that are not raised; None if they fit none that agrees with the ranges.
+
+    Returns the plane [3], its covariance [3, 3] and the heights by phase [patch]. `by_range` are plane and covariance
+    by range.
+    """
+    plane, covariance = by_range
+    # H: its reflection r_s has nearly the same phase for all plates.
+    board_h = next(iter(builder.boards.values()))
+    phase_heights, rad_per_m = _estimate_heights_by_phase(board_h, masks, places, plane, is_level)
+    with_phase = np.isfinite(phase_heights)
+    # A plane has three unknowns: only with four plates can their phases contradict it.
+    if with_phase.sum() < 4:
+        return None
+    phase_stds = np.full(int(with_phase.sum()), _PHASE_STD_M)
+    phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds)
+    residual = phase_heights[with_phase] - _evaluate_plane(phase_plane, places[with_phase])
+    on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
+    # Thin sheets have a phase of reflection of their own: the plane is accepted only if it agrees with the ranges.
+    tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]
+    agrees_with_ranges = bool((np.abs(phase_plane - plane) < tolerance).all())
+    if on_one_plane and agrees_with_ranges and float(np.hypot(*phase_plane[1:])) < _MAX_RISE_BY_PHASE:
+        return phase_plane, phase_covariance, phase_heights
+    return None
+
+
+def _fit_most(
+    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the heights at all places [patch] of the plane on which most plates lie.
+
+    Of planes through each plate, with tilts up to two standard deviations of the prior, the one with the least cost:
+    squared distances in standard deviations, up to `_LEVEL_STDS` (MSAC; Torr and Zisserman, CVIU 78, 2000). Heights
+    that are NaN do not count.
+    """
+    known = np.isfinite(heights)
+    tilts = np.linspace(-2, 2, 33) * _TILT_PRIOR_RAD
+    slopes = np.stack(np.meshgrid(tilts, tilts), axis=-1).reshape(-1, 2)
+    rises = slopes @ places.T
+    # [plate of the plane, tilt, plate]: the distance of each plate from the plane through another.
+    levels = (heights - rises)[:, known]
+    distance = levels[:, None] - levels[:, :, None]
+    cost = np.minimum((distance / stds[known]) ** 2, _LEVEL_STDS**2).sum(axis=-1)
+    cost += (np.sum(slopes**2, axis=1) / _TILT_PRIOR_RAD**2)[:, None]
+    tilt, plate = np.unravel_index(np.argmin(cost), cost.shape)
+    return rises[tilt] + levels[tilt, plate]
 
 
 def _fit_plane(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise, correct_tilt
+from polysight.imaging import MAX_RISE, Image, Images, Rise, correct_tilt
 from polysight.materials.classify import PAPER, Classifier
 from polysight.materials.common_change import CommonChange, estimate_common_change
 from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, RigPrior, invert
@@ -58,7 +58,7 @@ from polysight.materials.metal import (
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.phase_sign import join_signs, mirror_phases
-from polysight.materials.result import LEVEL, MaterialsResult, PatchResult, Tilts, pixel_features
+from polysight.materials.result import LEVEL, MAX_BEND, MaterialsResult, PatchResult, Tilts, pixel_features
 from polysight.materials.segment import (
     Box,
     Patch,
@@ -173,38 +173,16 @@ def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None
     if images.illumination is None:
         return images, LEVEL
     if tilts is None:
-        tilts = _estimate_tilts(images, images.illumination, segmentation)
+        tilts = Tilts.estimate(images, images.illumination, segmentation)
     risen_patches = [p for p in segmentation.patches if p.label in tilts.rises]
     masks = [p.mask for p in risen_patches]
     rises = [tilts.rises[p.label] for p in risen_patches]
     return correct_tilt(images, masks, rises), tilts
 
 
-def _estimate_tilts(images: Images, illumination: Illumination, segmentation: Segmentation) -> Tilts:
-    """Estimate the rise of each patch from its phase; patches that are steeper than what is modelled are marked."""
-    rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in segmentation.patches}
-    bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in segmentation.patches}
-    steep = frozenset(
-        label
-        for label, rise in rises.items()
-        if max(map(abs, rise)) > MAX_RISE or max(map(abs, bends[label])) > MAX_BEND
-    )
-    usable_rises = {label: (_limit_rise(x), _limit_rise(y)) for label, (x, y) in rises.items()}
-    return Tilts(usable_rises, illumination.across, steep)
-
-
-def _limit_rise(rise: float) -> float:
-    """Return a rise, 0 if it is not known or steeper than what is modelled."""
-    return rise if abs(rise) < MAX_RISE else 0.0
-
-
 BEHIND_PATCH = 0.6
 """Background in a plate over that beside the plates: of tables in scenes of the independent generator. It is less than
 1: what changes plates and metal alike cancels in their ratio, and a table is brightest at its own edges."""
-MAX_BEND = 3.5
-"""Curvature above which a patch is no flat plate, 1 / m. Flat plates that are uneven by 0.25 mm have up to 1.4 in drawn
-scenes and ripple of the published picture up to 3; sheets bent to a radius of 150 mm have 5.6, spheres of 100 mm 6 to
-10."""
 STEEP = Finding(
     "error",
     "tilted or curved beyond what is modelled",
@@ -225,6 +203,10 @@ UNEVEN_AT_END = 0.01
 ANGLE_BY_APART = 1.0
 """Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
 by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
+RAISED_RAD_PER_M = 1.1
+"""Error of the phase of V / H per metre between the planes of a plate and of the metal: an error d of the difference
+between the angles of both boards changes it by 2 k sin(theta) d; 0.4 mrad: places of boards are wrong by about half a
+millimetre where the images of H and V lie on each other (chosen)."""
 FILLED = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material; chosen."""
 POSSIBLE_SIGN = 0.05
@@ -352,6 +334,8 @@ class SceneScatter:
         Error of each part of the metal's ln(V / H) by its uneven pixels and by the end of the aperture.
     behind
         Usual mean of H and of V over a place of a plate's size without a plate, relative to metal.
+    raised_std
+        Number of a patch that was imaged on a plane of its own to the error of the phase of its V / H by that.
     """
 
     scatter: Mapping[int, Scatter]
@@ -366,6 +350,7 @@ class SceneScatter:
     halo: Halo = NO_HALO
     metal_std: float = 0.0
     behind: tuple[float, float] = (0.0, 0.0)
+    raised_std: Mapping[int, float] = field(default_factory=dict)
 
     @classmethod
     def collect(
@@ -405,6 +390,7 @@ class SceneScatter:
             border=border, tilts=tilts, lit_evenly=evenly, metal_rise=metal_rise, halo=halo,
             metal_std=float(np.hypot(uneven, metal_at_end)),
             behind=background_mean(raw.h, raw.v, segmentation, images.usable),
+            raised_std={} if plane is not None else _raised_errors(images, judged, reference.mask),
         )  # fmt: skip
 
     @property
@@ -447,7 +433,7 @@ class SceneScatter:
         at_end = self.border.get(patch.label, (0.0, 0.0))
         local_std = (
             float(np.hypot(self.metal_spread or 0.0, at_end[0])),
-            float(np.hypot(self.metal_spread or 0.0, at_end[1])),
+            float(np.hypot(np.hypot(self.metal_spread or 0.0, at_end[1]), self.raised_std.get(patch.label, 0.0))),
         )
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
@@ -615,6 +601,15 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
         library_share=0.5,
     )
     return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict
+
+
+def _raised_errors(images: Images, patches: Sequence[Patch], metal: npt.NDArray[np.bool_]) -> dict[int, float]:
+    """Return patch number to the error of the phase of V / H, as the patch and the metal lie on different planes."""
+    if images.raised_m is None or not metal.any():
+        return {}
+    of_metal = float(np.median(images.raised_m[metal]))
+    inside = {p.label: images.raised_m[p.interior] for p in patches if p.interior.any()}
+    return {label: RAISED_RAD_PER_M * abs(float(np.median(of_patch)) - of_metal) for label, of_patch in inside.items()}
 
 
 def _mean_angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:

@@ -341,7 +341,7 @@ class IncidenceChoice:
             pixel = np.degrees(self.pixel_rad[valid])
         else:
             pixel = np.degrees(self.pixel_rad).ravel()
-        single_angle = float(np.degrees(self.one_rad.flat[0]))
+        single_angle = float(np.degrees(np.median(self.one_rad)))
         return IncidenceAngles(
             used="one number for the image" if self.choice == "one" else "by pixel",
             one_deg=round(single_angle, 4),
@@ -350,7 +350,18 @@ class IncidenceChoice:
         )
 
 
-def incidence_choice(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike, choice: Incidence) -> IncidenceChoice:
-    """Compute both kinds of incidence angles; `choice` is the one to use."""
+def incidence_choice(
+    rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayLike, choice: Incidence, raised_m: Real | None = None
+) -> IncidenceChoice:
+    """Compute both kinds of incidence angles; `choice` is the one to use.
+
+    Pixels were imaged on planes that lie `raised_m` [ny, nx] behind the rig's object plane; None: on it. All antennas
+    are nearly as far from it as the rig's `object_distance_mm` z, so that z tan(theta) is the same on each plane.
+    """
     pixel_rad = effective_incidence_map(rig, x_m, y_m)
-    return IncidenceChoice(choice, np.full(pixel_rad.shape, specular_incidence_rad(rig)), pixel_rad)
+    one_rad = np.full(pixel_rad.shape, specular_incidence_rad(rig))
+    if raised_m is not None:
+        distance_m = rig.geometry.object_distance_mm / 1e3
+        nearer = distance_m / (distance_m + raised_m)
+        one_rad, pixel_rad = (np.arctan(nearer * np.tan(angle)) for angle in (one_rad, pixel_rad))
+    return IncidenceChoice(choice, one_rad, pixel_rad)

@@ -552,6 +552,8 @@ class PlaneError(msgspec.Struct, frozen=True, kw_only=True):
     tilt_std_deg: Pair | UnsetType = UNSET
     by: str | UnsetType = UNSET
     plates: int | UnsetType = UNSET
+    # Distances behind this plane of the plates that were imaged on planes of their own.
+    raised_mm: list[float] | UnsetType = UNSET
 
 
 class MetalScore(msgspec.Struct, frozen=True, kw_only=True):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -9,8 +11,8 @@ from numpy.typing import NDArray
 from polysight.sync.decimate import FOLD
 from polysight.sync.loops import cis, complex64
 from polysight.sync.offsets import SEARCH_FFT, DirectPath, block_frequencies_hz, sample_frequencies_hz, search_window
-from polysight_shared.config import Board, Instrument
-from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
+from polysight_shared.config import Board, Chirp, Instrument
+from polysight_shared.geometry import Vector, rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Standard deviation in x and y of the echoes' origin, around the mirror point; chosen.
@@ -34,10 +36,15 @@ def excess_path_m(
 
 
 def prepare(rig: Instrument, board: Board) -> DirectPath:
-    """Return steering, search beam and estimators of a board, from geometry alone."""
-    chirp = rig.chirp
-    tx = np.array(tx_position_m(rig))
-    rx = np.array(rx_positions_m(rig, board))
+    """Return steering, search beam and estimators of a board, from geometry alone; not to be written to."""
+    return _prepare(rig.chirp, tx_position_m(rig), rx_positions_m(rig, board), specular_midpoint_m(rig, board))
+
+
+# All scans of a rig have the same few boards; each takes 10 ms.
+@lru_cache(8)
+def _prepare(chirp: Chirp, tx_m: Vector, rx_m: tuple[Vector, ...], specular_m: Vector) -> DirectPath:
+    tx = np.array(tx_m)
+    rx = np.array(rx_m)
     sweep = sample_frequencies_hz(chirp)
     middles = block_frequencies_hz(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
@@ -46,7 +53,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     grid = np.linspace(-3, 3, 25) * _SPREAD_M
     dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
     amplitude = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))
-    points = np.array(specular_midpoint_m(rig, board)) + np.stack([dx, dy, 0 * dx], axis=1)
+    points = np.array(specular_m) + np.stack([dx, dy, 0 * dx], axis=1)
     excess = excess_path_m(tx, rx, points)
     echoes = np.exp(2j * np.pi * middles * excess.T[:, :, None] / SPEED_OF_LIGHT_M_S)
     echoes *= (amplitude / np.linalg.norm(amplitude))[:, None, None]
@@ -55,7 +62,7 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
     all_rx = echoes.reshape(len(points), n_rx * n)
     # A gain error is that of an RX: it adds echo power between samples of the same RX, none between two.
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
-    nearest_m = excess_path_m(tx, rx, np.array([specular_midpoint_m(rig, board)])).min()
+    nearest_m = excess_path_m(tx, rx, np.array([specular_m])).min()
     clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(nearest_m, _CLUTTER_M, 8 * n), middles))
     clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
     covariance = (all_rx.T @ all_rx.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)

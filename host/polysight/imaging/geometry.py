@@ -274,8 +274,8 @@ def namespace(array: Any) -> Any:
 def transform_in_place(xp: Any, array: Any, axis: int, inverse: bool = False) -> Any:
     """Return the Fourier transform of complex64 along an axis; it may be in the memory of `array`.
 
-    SciPy's, for NumPy, keep single precision. In new memory they take up to three times as long (published grid), for
-    the system clears its pages.
+    SciPy's, for NumPy, keep single precision. In new memory they may take three times as long (published grid): the
+    system clears its pages, unless the allocator has kept them.
     """
     transforms = scipy.fft if xp is np else xp.fft
     transform = transforms.ifft if inverse else transforms.fft

@@ -143,7 +143,11 @@ def test_a_shifted_plane_is_found_and_reported(examine, shift_mm):
 
 @pytest.mark.parametrize(
     "heights_mm",
-    [{"wood": -12.0, "rubber": -18.0}, {"wood": -6.0, "rubber": -4.0}, {"acrylic": -7.0, "ceramic": -22.0, "wood": -9.0}],
+    [
+        {"wood": -12.0, "rubber": -18.0},
+        {"wood": -6.0, "rubber": -4.0},
+        {"acrylic": -7.0, "ceramic": -22.0, "wood": -9.0},
+    ],
     ids=lambda heights: " ".join(f"{height:.0f}" for height in heights.values()),
 )
 def test_plates_of_other_heights_are_no_tilt_and_keep_their_permittivities(examine, heights_mm):

@@ -36,6 +36,10 @@ Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 UNKNOWN = "unknown"
+LOOK_ALIKES = 1.4
+"""Odds that a patch is of no kind of the library over those by the share and the densities of kinds (`Kinds`):
+materials are more alike than a smooth density says. Chosen: in 616 scenes of an independent generator, half of whose
+plates no library has, 82 % of the names said at 0.8 to 0.95 were right without it, and 87 % with it."""
 INCLUSIONS = 0.05
 """Share of a patch's pixels that may be of any material of the library (chosen); the prior of the others is the patch's
 probabilities."""
@@ -150,6 +154,7 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
     weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
     library_shares = [evidence.library_share for evidence in scan_evidence]
     library_share = float(np.mean(library_shares)) if first.in_library.any() else 0.0
+    library_share = library_share / (library_share + LOOK_ALIKES * (1 - library_share))
     weight = weight * np.where(first.in_library, library_share, 1 - library_share)
     drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
     by_dispersion = _weigh_dispersion(kinds, scan_evidence)

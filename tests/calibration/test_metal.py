@@ -156,6 +156,13 @@ def test_a_scan_without_metal_is_refused(tmp_path, make_rig, scan_of):
     assert not (tmp_path / "c").exists()
 
 
+def test_a_plastic_sheet_is_no_metal_plate(tmp_path, make_rig, scan_of):
+    sheet = {k: v for k, v in PLATE.items() if k != "metal"} | {"name": "acrylic", "permittivity": [4.0, 0.4]}
+    folder = scan_of(tmp_path / "sheet", make_rig(**SMALL), plates=[sheet])
+    with refused(ErrorCode.NO_DATA, "no metal"):
+        load_reference(folder)
+
+
 def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
     """The rig file is the same, but the active positions are not."""
     reference = load_reference(plate)

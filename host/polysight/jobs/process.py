@@ -19,7 +19,7 @@ from polysight.data import find_packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
 from polysight.jobs.measure_surfaces import add_surfaces, has_steep_patch
 from polysight.jobs.output import count_steps, current_step, name_scan, print_lines, say
-from polysight.materials import Plates, find_truth, read_labels, read_truth
+from polysight.materials import WEAK_V_DB, Plates, find_truth, read_labels, read_truth
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import (
@@ -179,8 +179,17 @@ def _no_pixel_error(pipeline: Pipeline, data: Path | None = None) -> DataError:
 
 
 def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
-    """Make a reference from images of a metal plate. Raises DataError if they show none."""
+    """Make a reference from images of a metal plate. Raises DataError if they show none, or a plate of no metal."""
     reference = plane_reference(images.level(images.valid), name=pipeline.source.scan_id)
+    level_db = 20 * float(np.log10(np.median(np.abs(reference.v[reference.valid] / reference.h[reference.valid]))))
+    if pipeline.synchroniser.direct_path_known and level_db < WEAK_V_DB:
+        raise DataError(
+            f"the reference scan {pipeline.source.scan_id} shows no metal",
+            f"V is {-level_db:.0f} dB weaker than H, relative to the direct path: so reflect plastics, glass and water;"
+            " metal reflects both alike",
+            "scan a bare metal plate that covers the plane",
+            code=ErrorCode.NO_DATA,
+        )
     return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 

@@ -20,8 +20,8 @@ from benchmarks.measure import Line, add_arguments, one_core, show, write
 from benchmarks.published import Synchroniser
 from polysight.capture.dca1000 import raw_words
 from polysight.imaging import ImageBuilder, backproject
-from polysight.imaging.geometry import Antennas, row_offsets_m
-from polysight.imaging.samples import reduction, scene_gate_m
+from polysight.imaging.geometry import Antennas, row_offsets_m, scene_gate_m
+from polysight.imaging.samples import reduction
 from polysight.sync.direct_path import prepare
 from polysight.sync.loops import estimate_tone
 from polysight.sync.offsets import align_row, reference

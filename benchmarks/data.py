@@ -17,8 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m
-from polysight.imaging.samples import scene_gate_m
+from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m, scene_gate_m
 from polysight.store.source import RowData, allocate_pages
 from polysight.sync import SyncedRow, sample_frequencies_hz
 from polysight_shared.config import Board, Instrument, load_instrument

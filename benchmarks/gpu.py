@@ -26,8 +26,8 @@ from benchmarks.image import Image, worst
 from benchmarks.measure import add_arguments as add_common, count_repeats, one_core, write
 from polysight.imaging import spectral
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m
-from polysight.imaging.samples import reduction, scene_gate_m
+from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m, scene_gate_m
+from polysight.imaging.samples import reduction
 from polysight.imaging.spectral import SpectralImager
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, tx_position_m

@@ -21,8 +21,8 @@ from benchmarks.data import as_synced, published_scene, temporary, write_point_c
 from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
 from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder, spectral
-from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m
-from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
+from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m, scene_gate_m
+from polysight.imaging.samples import choose_imager, reduction
 from polysight.imaging.spectral import IncrementalImager
 from polysight.store.source import allocate_pages
 from polysight_shared.config import Board, Instrument

@@ -7,8 +7,8 @@ import pytest
 
 from polysight.imaging import image_grid
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, scan_offsets_m
-from polysight.imaging.samples import choose_imager, reduction, scene_gate_m
+from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, scan_offsets_m, scene_gate_m
+from polysight.imaging.samples import choose_imager, reduction
 from polysight.imaging.spectral import KEEP_BYTES, IncrementalImager, SpectralImager, forget, get_cached
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

@@ -10,9 +10,9 @@ import scipy.signal
 from tests.support.refusals import refused
 
 from polysight.imaging import UNKNOWN_PLANE, ImageBuilder, Images, backproject, image_grid, move_to_plane, plane
-from polysight.imaging.geometry import Antennas, find_ends, row_offsets_m
+from polysight.imaging.geometry import Antennas, find_ends, row_offsets_m, scene_gate_m
 from polysight.imaging.images import Dispersion
-from polysight.imaging.samples import mirror_samples, reduction, scene_gate_m
+from polysight.imaging.samples import mirror_samples, reduction
 from polysight.materials.layers import Spectrum
 from polysight.polarimetry import multilayer
 from polysight.sync import BoardSetup, synchronise_row

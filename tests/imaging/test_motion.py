@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.imaging.samples import REACH, burst_filters, undo_burst_motion
+from polysight.imaging.geometry import REACH, burst_filters, undo_burst_motion
 
 COUNT = 61
 MIDDLE = slice(REACH, -REACH)

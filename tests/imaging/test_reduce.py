@@ -5,8 +5,8 @@ import pytest
 import scipy.signal
 from hypothesis import given, strategies as st
 
-from polysight.imaging.geometry import Antennas, image_grid
-from polysight.imaging.samples import reduction, scene_gate_m
+from polysight.imaging.geometry import Antennas, image_grid, scene_gate_m
+from polysight.imaging.samples import reduction
 from polysight.sync import block_frequencies_hz, decimation
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S as C

@@ -16,9 +16,11 @@ from polysight.imaging.geometry import (
     Antennas as Antennas,
     Aperture as Aperture,
     ImageGrid as ImageGrid,
+    find_needed_gate_m as find_needed_gate_m,
     image_grid as image_grid,
     row_offsets_m as row_offsets_m,
     scan_offsets_m as scan_offsets_m,
+    scene_gate_m as scene_gate_m,
     window_weights as window_weights,
 )
 from polysight.imaging.images import (
@@ -37,7 +39,6 @@ from polysight.imaging.images import (
     SubBandImages as SubBandImages,
     View as View,
     correct_tilt as correct_tilt,
-    find_needed_gate_m as find_needed_gate_m,
     illumination_geometry as illumination_geometry,
     sub_bands as sub_bands,
 )
@@ -61,7 +62,6 @@ from polysight.imaging.samples import (
     BoardSamples as BoardSamples,
     ReducedRow as ReducedRow,
     reduction as reduction,
-    scene_gate_m as scene_gate_m,
 )
 from polysight.imaging.sparse import (
     fill_missing as fill_missing,

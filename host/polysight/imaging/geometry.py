@@ -4,8 +4,8 @@
 plate, more positions see the plate from one side than from the other, and the phase of its image rises although the
 plate is level, as if it were tilted by up to 0.8 degrees on a narrow scan.
 
-With it: checks of regularity, windows, and functions of the array API (namespace, transforms, device), so that imagers
-run on NumPy, PyTorch and CuPy.
+With it: checks of regularity, windows, the motion of the stage in a burst, and functions of the array API (namespace,
+transforms, device), so that imagers run on NumPy, PyTorch and CuPy.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from polysight_shared.config import Board, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
-from polysight_shared.raster import Row, mean_burst_travel_mm, plan_raster
+from polysight_shared.raster import RasterPlan, Row, mean_burst_travel_mm, plan_raster
 
 ROUNDS = 2
 END_STEP = 0.7
@@ -37,6 +37,10 @@ SAME_END_PX = 5.0
 _SAME_M = 1e-6
 # The lattice in y (of rows and pixels, `pitch_y_m`) may be finer than the pixels by this factor at most (chosen).
 _FINER = 4
+# Taps of the filter against the motion in a burst: positions to either side (chosen).
+REACH = 4
+# Largest frequency of the filter, cycles per position; chosen, 0.5 is the limit of the sampling.
+_BAND = 0.45
 Window = str | tuple[Any, ...]
 """Window as for scipy.signal.get_window; "boxcar" for none."""
 
@@ -161,6 +165,29 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     return offsets
 
 
+def scene_gate_m(
+    antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
+) -> tuple[float, float]:
+    """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
+    # 2 mm of room (chosen) for the travel of the stage within a burst. The largest excess path is at a corner; the
+    # smallest is flat at its place, so that 41 points per axis (chosen) find it closely.
+    half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3
+    half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
+    dx, dy = np.meshgrid(
+        np.linspace(grid.x_m[0] - half_x, grid.x_m[-1] + half_x, 41),
+        np.linspace(grid.y_m[0] - half_y, grid.y_m[-1] + half_y, 41),
+    )
+    planes = (float(np.min(grid.z_m)) - depth_m, float(np.max(grid.z_m)) + depth_m)
+    excess = np.stack([a.excess_m(dx, dy, z) for a in antennas for z in planes])
+    return float(excess.min()), float(excess.max())
+
+
+def find_needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
+    """Return the smallest and largest excess path in a rig's image, with planes `depth_m` nearer and farther."""
+    antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
+    return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
+
+
 @dataclass(frozen=True)
 class Aperture:
     """Geometry of one board's measurement of a scene.
@@ -230,6 +257,58 @@ def pitch_y_m(aperture: Aperture) -> float | None:
         if np.abs(cells - np.round(cells)).max() * pitch < _SAME_M:
             return pitch
     return None
+
+
+def burst_filters(rig: Instrument) -> NDArray[np.float32]:
+    """Return inverse filters of the motion in a burst with 0, 1, .. `REACH` taps per side, float32 [reach, REACH + 1].
+
+    The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
+    """
+    times_s = np.array(rig.burst.chirp_times_s)
+    # Motion of the stage from the middle of the burst to each chirp, in positions.
+    shift_positions = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
+    frequencies = np.linspace(0, _BAND, 91)
+    loss = np.cos(2 * np.pi * np.outer(frequencies, shift_positions)).mean(axis=1)
+    filters = np.zeros((REACH + 1, REACH + 1))
+    filters[0, 0] = 1
+    for reach in range(1, REACH + 1):
+        # The sum of the taps is one, so that constants keep their amplitude.
+        basis = 2 * np.cos(2 * np.pi * np.outer(frequencies, np.arange(1, reach + 1))) - 2
+        side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
+        filters[reach, 0] = 1 - 2 * side.sum()
+        filters[reach, 1 : reach + 1] = side
+    return filters.astype(np.float32)
+
+
+def undo_burst_motion(
+    samples: NDArray[np.complex64], valid: NDArray[np.bool_], turn: NDArray[np.float64], filters: NDArray[np.float32]
+) -> NDArray[np.complex64]:
+    """Compensate the motion of the stage during each burst of a row.
+
+    Parameters
+    ----------
+    samples
+        complex64 [..., position].
+    valid
+        bool [position]: the filter uses as many neighbours as are valid on both sides; none at the row's ends.
+    turn
+        float64 [position]: centre of the filter's band, radians per position.
+    filters
+        From :func:`burst_filters`.
+    """
+    count = valid.size
+    reach = np.zeros(valid.size, int)
+    for i in range(1, min(REACH, (count - 1) // 2) + 1):
+        has_valid_neighbours = np.zeros(count, bool)
+        has_valid_neighbours[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
+        reach += has_valid_neighbours & (reach == i - 1)
+    taps = filters[reach]
+    filtered = samples * taps[:, 0]
+    for i in range(1, int(reach.max(initial=0)) + 1):
+        side = (taps[:, i] * np.exp(1j * i * turn)).astype(np.complex64)
+        filtered[..., :-i] += side[:-i].conj() * samples[..., i:]
+        filtered[..., i:] += side[i:] * samples[..., :-i]
+    return filtered
 
 
 def window_weights(name: Window, n: int) -> NDArray[np.float64]:

@@ -39,8 +39,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from polysight.imaging import geometry
 from polysight.imaging.geometry import Antennas, StageWindow, Window, image_grid, scan_offsets_m, window_weights
-from polysight.imaging.samples import BoardSamples, reduction, scene_gate_m
+from polysight.imaging.samples import BoardSamples, reduction
 from polysight.sync import HighPass, SyncedRow, high_pass
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
@@ -267,7 +268,7 @@ class Images:
     raised_m
         float64 [ny, nx]: how far behind the images' plane each pixel was imaged (negative: nearer); None: nowhere.
     rx_gains
-        Board name to complex128 [rx]: gain of each RX, measured by the direct path. It was divided out.
+        Board name to complex128 [rx]: gain of each RX, measured by the direct path. It was divided out. NaN: not used.
     notices
         Notices for the user, for example of slow imaging.
     """
@@ -392,12 +393,6 @@ class View:
 AS_IN_RIG_FILE = View()
 
 
-def find_needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
-    """Return the smallest and largest excess path in a rig's image, with planes `depth_m` nearer and farther."""
-    antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
-    return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
-
-
 class ImageBuilder:
     """Collects rows in any order and forms images of the rows so far.
 
@@ -436,7 +431,7 @@ class ImageBuilder:
             import_module("scipy.ndimage")
         plan = plan_raster(rig.grid)
         antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
-        self.gate_m = find_needed_gate_m(rig, depth_m) if gate_m is None else gate_m
+        self.gate_m = geometry.find_needed_gate_m(rig, depth_m) if gate_m is None else gate_m
         self.taper = TAPERS[rig.image.apodisation] if taper is None else taper
         weights_y = window_weights(self.taper, plan.rows)
         weights = np.outer(weights_y, window_weights(self.taper, plan.columns)).astype(np.float32)

@@ -204,8 +204,8 @@ def board_facts(board: BoardSamples) -> BoardImaging:
     masked = 1 - float(weights.sum() / board.taper.sum())
     facts = BoardImaging(
         positions=int(board.valid.size),
-        masked_positions=int(board.valid.size - board.valid.sum()),
-        rows_without_data=int((~board.valid.any(axis=1)).sum()),
+        masked_positions=int(board.valid.size - board.usable.sum()),
+        rows_without_data=int((~board.usable.any(axis=1)).sum()),
         masked=round(masked, 6),
         frequencies=board.aperture.frequencies_hz.size,
     )

@@ -38,7 +38,7 @@ from polysight.sync import FOLD, SyncedRow, decimation, sample_frequencies_hz
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
-from polysight_shared.raster import RasterPlan, plan_raster
+from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # `Reduction.maps` is fitted to echoes from so much before the direct path to so much behind the gate, and at least so
@@ -48,10 +48,6 @@ _PASSED_M = 1.0
 _ECHO = 30.0
 # Noise power of a sample relative to echoes from the gate, for the estimate of the direct path (chosen).
 _NOISE = 1e-3
-# Taps of the filter against the motion in a burst: positions to either side (chosen).
-REACH = 4
-# Largest frequency of the filter, cycles per position; chosen, 0.5 is the limit of the sampling.
-_BAND = 0.45
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
@@ -114,23 +110,6 @@ class Reduction:
         return solution.T.astype(np.complex128)
 
 
-def scene_gate_m(
-    antennas: tuple[geometry.Antennas, ...], plan: RasterPlan, grid: geometry.ImageGrid, depth_m: float = 0.0
-) -> tuple[float, float]:
-    """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
-    # 2 mm of room (chosen) for the travel of the stage within a burst. The largest excess path is at a corner; the
-    # smallest is flat at its place, so that 41 points per axis (chosen) find it closely.
-    half_x = ((plan.columns - 1) / 2 * plan.step_x_mm + 2) / 1e3
-    half_y = (plan.rows - 1) / 2 * plan.step_y_mm / 1e3
-    dx, dy = np.meshgrid(
-        np.linspace(grid.x_m[0] - half_x, grid.x_m[-1] + half_x, 41),
-        np.linspace(grid.y_m[0] - half_y, grid.y_m[-1] + half_y, 41),
-    )
-    planes = (float(np.min(grid.z_m)) - depth_m, float(np.max(grid.z_m)) + depth_m)
-    excess = np.stack([a.excess_m(dx, dy, z) for a in antennas for z in planes])
-    return float(excess.min()), float(excess.max())
-
-
 @lru_cache(maxsize=8)
 def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window = "hann", extra: int = 6) -> Reduction:
     """Return the linear maps of a range gate.
@@ -174,58 +153,6 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     from_few = np.linalg.lstsq(wave, np.exp(2j * np.pi * np.outer(delay_s, sweep)), rcond=1e-9)[0].T
     model = (matrix[:, a:b] @ from_few).astype(np.complex128)
     return Reduction(frequencies, matrix, direct_of_all, model, gate_m, sample_frequencies_hz(chirp))
-
-
-def burst_filters(rig: Instrument) -> NDArray[np.float32]:
-    """Return inverse filters of the motion in a burst with 0, 1, .. `REACH` taps per side, float32 [reach, REACH + 1].
-
-    The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
-    """
-    times_s = np.array(rig.burst.chirp_times_s)
-    # Motion of the stage from the middle of the burst to each chirp, in positions.
-    shift_positions = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
-    frequencies = np.linspace(0, _BAND, 91)
-    loss = np.cos(2 * np.pi * np.outer(frequencies, shift_positions)).mean(axis=1)
-    filters = np.zeros((REACH + 1, REACH + 1))
-    filters[0, 0] = 1
-    for reach in range(1, REACH + 1):
-        # The sum of the taps is one, so that constants keep their amplitude.
-        basis = 2 * np.cos(2 * np.pi * np.outer(frequencies, np.arange(1, reach + 1))) - 2
-        side = np.linalg.lstsq(basis, 1 / loss - 1, rcond=None)[0]
-        filters[reach, 0] = 1 - 2 * side.sum()
-        filters[reach, 1 : reach + 1] = side
-    return filters.astype(np.float32)
-
-
-def undo_burst_motion(
-    samples: NDArray[np.complex64], valid: NDArray[np.bool_], turn: NDArray[np.float64], filters: NDArray[np.float32]
-) -> NDArray[np.complex64]:
-    """Compensate the motion of the stage during each burst of a row.
-
-    Parameters
-    ----------
-    samples
-        complex64 [..., position].
-    valid
-        bool [position]: the filter uses as many neighbours as are valid on both sides; none at the row's ends.
-    turn
-        float64 [position]: centre of the filter's band, radians per position.
-    filters
-        From :func:`burst_filters`.
-    """
-    count = valid.size
-    reach = np.zeros(valid.size, int)
-    for i in range(1, min(REACH, (count - 1) // 2) + 1):
-        has_valid_neighbours = np.zeros(count, bool)
-        has_valid_neighbours[i : count - i] = valid[: count - 2 * i] & valid[2 * i :] & valid[i : count - i]
-        reach += has_valid_neighbours & (reach == i - 1)
-    taps = filters[reach]
-    filtered = samples * taps[:, 0]
-    for i in range(1, int(reach.max(initial=0)) + 1):
-        side = (taps[:, i] * np.exp(1j * i * turn)).astype(np.complex64)
-        filtered[..., :-i] += side[:-i].conj() * samples[..., i:]
-        filtered[..., i:] += side[i:] * samples[..., :-i]
-    return filtered
 
 
 class Imager(Protocol):
@@ -322,7 +249,7 @@ class BoardSamples:
         self._reduction = reduction
         # Maps for pairs of real numbers and the samples they use, by the row's number of samples.
         self._maps: dict[int, tuple[slice, NDArray[np.float32]]] = {}
-        self._filters = burst_filters(rig)
+        self._filters = geometry.burst_filters(rig)
         self._antennas = geometry.Antennas.from_rig(rig, board)
         self._chirp = rig.chirp
         # Samples of an ideal mirror on the rig file's plane after the range gate, [rx, frequency].
@@ -335,6 +262,8 @@ class BoardSamples:
         # Reduced samples [rx, frequency, row, column] and the direct path [rx, row, column], as received.
         self._cube = np.zeros((rx, reduction.frequencies_hz.size, *shape), np.complex64)
         self._direct = np.zeros((rx, *shape), np.complex64)
+        # Rows in which each RX gave a signal, [rx, row]; where not, its samples are zero in the whole row.
+        self.has_rx = np.zeros((rx, shape[0]), bool)
         # True for positions with data, [row, column].
         self.valid = np.zeros(shape, bool)
         # Imager of all rows; None if the aperture is irregular, or before it is needed.
@@ -367,17 +296,48 @@ class BoardSamples:
 
     @property
     def weights(self) -> NDArray[np.float32]:
-        """Taper of each position, 0 where not valid, float32 [row, column]."""
-        return self.taper * self.valid
+        """Taper of each position, 0 where not usable, float32 [row, column]."""
+        return self.taper * self.usable
+
+    @property
+    def used_rx(self) -> NDArray[np.bool_]:
+        """RX that the image is made of, bool [rx]: those with a signal in the most rows.
+
+        Another one's rows would give part of the aperture more weight, and plates a halo.
+        """
+        rows = self.has_rx.sum(axis=1)
+        return np.asarray(rows == rows.max())
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Positions in the image, bool [row, column]: valid ones, but not in rows in which a used RX is dead."""
+        dead = self.has_rx.any(axis=0) & np.any(~self.has_rx[self.used_rx], axis=0)
+        return self.valid & ~dead[:, None]
+
+    def _rx_factors(self) -> NDArray[np.complex64]:
+        """Return 1 / gain of each RX in each row, [rx, row]; 0 if the RX is not used, or the row is not.
+
+        If an RX dies within the scan, the others' gains change: samples are referenced to the mean of the live RX.
+        """
+        rows_used = self.usable.any(axis=1)
+        direct = (self._direct * self.valid).sum(axis=2, dtype=np.complex128)
+        factors = np.zeros(direct.shape, np.complex64)
+        for has_rx in np.unique(self.has_rx[:, rows_used], axis=1).T:
+            rows = rows_used & (self.has_rx == has_rx[:, None]).all(axis=0)
+            gains = direct[:, rows].sum(axis=1) / self.valid[rows].sum() * self._antennas.direct_m
+            # Samples without any direct path are as they should be.
+            gains[gains == 0] = 1
+            factors[:, rows] = (self.used_rx / gains)[:, None]
+        return factors
 
     def _compute_row_weights(self, index: int) -> NDArray[np.float32]:
-        """Return one row of :attr:`weights`, [column]."""
+        """Return one row of the taper, 0 where not valid, [column]."""
         return self.taper[index] * self.valid[index]
 
     @property
     def count(self) -> np.float32:
         """Divisor of a sum over positions and RX."""
-        return np.float32((self.weights.sum() or 1.0) * len(self._antennas.rx_m))
+        return np.float32((self.weights.sum() or 1.0) * self.used_rx.sum())
 
     def add_row(self, index: int, row: SyncedRow, offsets_m: NDArray[np.float64] | None = None) -> None:
         """Add a row; a row added again replaces the earlier one.
@@ -405,7 +365,7 @@ class BoardSamples:
         forward = slice(None, None, self._plan.row(index).direction)
         reduced = self._apply_gate(row.samples, row.sweep_hz)
         if row.turn is not None:
-            reduced = undo_burst_motion(reduced, row.valid, row.turn, self._filters)
+            reduced = geometry.undo_burst_motion(reduced, row.valid, row.turn, self._filters)
         reduced = reduced[..., forward]
         valid = row.valid[forward]
         self._put(index, ReducedRow(reduced[:, :-1], reduced[:, -1], valid), offsets_m, forward)
@@ -438,6 +398,10 @@ class BoardSamples:
             deviation = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
             if deviation > SLACK_M or geometry.find_irregularity(self.aperture) is not None:
                 self._live = None
+        self.has_rx[:, index] = row.samples.any(axis=(1, 2))
+        if not self.has_rx[:, index].all() and row.valid.any():
+            # Running sums hold the constant echo of all RX.
+            self._live = None
         self._stale.add(index)
         self._image = None
         self._slope = None
@@ -486,7 +450,8 @@ class BoardSamples:
         rows, columns = steps
         self._cube[:, :, ::rows, ::columns] = coarse._cube
         self._direct[:, ::rows, ::columns] = coarse._direct
-        self.valid[::rows, ::columns] = coarse.valid
+        self.valid[::rows, ::columns] = coarse.usable
+        self.has_rx[:, ::rows] = coarse.has_rx
         # Positions between are evenly spaced; a row between two has the shift of the one before.
         count_y = len(self.valid)
         count_x = len(self.valid[0])
@@ -501,11 +466,12 @@ class BoardSamples:
         self._invalidate()
 
     def fill(self, samples: NDArray[np.complex64]) -> None:
-        """Fill all positions that are not valid with calibrated samples (as of :meth:`calibrate_samples`)."""
-        missing = ~self.valid
-        gains = self.rx_calibration()
-        self._cube[:, :, missing] = samples[:, :, missing] * gains.astype(np.complex64)[:, None, None]
-        self._direct[:, missing] = (gains / self._antennas.direct_m)[:, None]
+        """Fill all positions that are not usable with calibrated samples (as of :meth:`calibrate_samples`)."""
+        gains = np.where(self.used_rx, self.rx_calibration(), 0).astype(np.complex64)
+        filled = np.where(self.usable, self.calibrate_samples(), samples)
+        self._cube = filled * gains[:, None, None, None]
+        self._direct[:] = (gains / self._antennas.direct_m)[:, None, None]
+        self.has_rx[:] = self.used_rx[:, None]
         self.valid[:] = True
         self._invalidate()
 
@@ -529,14 +495,17 @@ class BoardSamples:
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
     def rx_calibration(self) -> NDArray[np.complex128]:
-        """Return the complex gain of each RX, [rx]: mean direct path of valid positions times its length; 1 if none."""
-        total = (self._direct * self.valid).sum(axis=(1, 2), dtype=np.complex128)
-        gain = total / max(1, int(self.valid.sum())) * self._antennas.direct_m
-        return np.where(gain == 0, 1, gain)
+        """Return the complex gain of each RX, [rx]: mean direct path of valid positions times its length; 1 if none.
+
+        NaN for an RX that is not used.
+        """
+        total = (self._direct * self.usable).sum(axis=(1, 2), dtype=np.complex128)
+        gain = total / max(1, int(self.usable.sum())) * self._antennas.direct_m
+        return np.where(self.used_rx, np.where(gain == 0, 1, gain), np.nan)
 
     def calibrate_samples(self) -> NDArray[np.complex64]:
         """Return the samples divided by the gain of each RX, not weighted, [rx, frequency, row, column]."""
-        return self._cube * (1 / self.rx_calibration()).astype(np.complex64)[:, None, None, None]
+        return self._cube * self._rx_factors()[:, None, :, None]
 
     def current(self) -> tuple[Image, Image, str | None]:
         """Return :meth:`image` from running sums if there are any: fast, and equal within 1e-6 of the peak."""
@@ -563,21 +532,24 @@ class BoardSamples:
 
     def _form_images(self, grid: geometry.ImageGrid | None) -> tuple[Image, Image, str | None]:
         """Form :meth:`image`; of a live scan from the spectra of its rows, which are kept."""
-        gains = (1 / self.rx_calibration()).astype(np.complex64)
+        factors = self._rx_factors()
         if grid is None:
             self._prepare()
         imager, notice = self._choose_imager(grid)
         image: Any
         if not isinstance(imager, SpectralImager):
-            image = imager.image(self._cube * (gains[:, None, None, None] * self.weights))
+            image = imager.image(self._cube * (factors[:, None, :, None] * self.weights))
         elif imager is self._final and self._live is not None:
             for index in range(len(self.valid)):
                 self._compute_row_spectra(imager, index)
-            image = imager.image_of_spectra(self._spectra, gains)
+            image = imager.image_of_spectra(self._spectra, (1 / self.rx_calibration()).astype(np.complex64))
         else:
-            image = imager.weighted_image(self._cube, self.weights, gains)
-        footprint: Any = imager.constant(self._mirror(grid).astype(np.complex64), self.weights) / self.count
-        return (image / self.count).astype(np.complex64), footprint.astype(np.complex64), notice
+            image = np.zeros(imager.aperture.grid.shape, np.complex64)
+            # All rows at once, unless an RX dies within the scan.
+            for column in np.unique(factors[:, factors.any(axis=0)], axis=1).T:
+                rows = (factors == column[:, None]).all(axis=0)
+                image += imager.weighted_image(self._cube, self.weights * rows[:, None], column)
+        return (image / self.count).astype(np.complex64), self._image_constant(imager, self._mirror(grid)), notice
 
     def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:
         """Return the matched filter for paths longer by `shifts_m` than that of a point, complex64 [shift].
@@ -589,10 +561,9 @@ class BoardSamples:
         weights = (self.weights / self.count).ravel()
         excess = self._antennas.excess_m(relative_m[:, 0], relative_m[:, 1], relative_m[:, 2])
         f = self._reduction.frequencies_hz
-        gains = 1 / self.rx_calibration()
-        cube = self._cube.reshape(*self._cube.shape[:2], -1) * weights
+        cube = self.calibrate_samples().reshape(*self._cube.shape[:2], -1) * weights
         phasor = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * f[None, :, None] * excess[:, None, :])
-        focused = (gains[:, None] * (cube * phasor).sum(axis=-1)).sum(axis=0)
+        focused = (cube * phasor).sum(axis=(0, -1))
         return (np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(shifts_m, f)) @ focused).astype(np.complex64)
 
     def range_slope(self, grid: geometry.ImageGrid | None = None) -> tuple[Image, Image]:
@@ -611,8 +582,8 @@ class BoardSamples:
         """Form :meth:`range_slope`."""
         imager, _ = self._choose_imager(grid)
         factors = self._compute_range_slope_factors()
-        gains = (1 / self.rx_calibration()).astype(np.complex64)
-        image: Any = imager.image(self._cube * (gains[:, None, None, None] * factors[:, None, None] * self.weights))
+        gains = self._rx_factors()[:, None, :, None]
+        image: Any = imager.image(self._cube * (gains * factors[:, None, None] * self.weights))
         return (image / self.count).astype(np.complex64), self._make_constant_image(self._mirror(grid) * factors, grid)
 
     def dispersion(self, grid: geometry.ImageGrid | None = None) -> Image:
@@ -649,8 +620,11 @@ class BoardSamples:
 
     def _make_constant_image(self, echo: NDArray[np.complexfloating], grid: geometry.ImageGrid | None = None) -> Image:
         """Return the image of an echo [rx, frequency] that every valid position has, as a mean."""
-        imager, _ = self._choose_imager(grid)
-        image: Any = imager.constant(echo.astype(np.complex64), self.weights)
+        return self._image_constant(self._choose_imager(grid)[0], echo)
+
+    def _image_constant(self, imager: Imager, echo: NDArray[np.complexfloating]) -> Image:
+        """Return the image of an echo [rx, frequency] at every usable position, as a mean over these and the RX."""
+        image: Any = imager.constant((echo * self.used_rx[:, None]).astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
 
     def _compute_range_slope_factors(self) -> NDArray[np.complex64]:

@@ -100,7 +100,8 @@ def reconstruct(
         complex64 [ny, nx]: image to start from; None: empty.
     """
     model = _Model(board)
-    weights = board.weights
+    # [rx, 1, row, column]: a dead RX has no weight.
+    weights = board.weights * board.used_rx[:, None, None, None]
     if selected is not None:
         weights = weights * selected
     # The squares of these weigh the squared misfit.
@@ -232,7 +233,7 @@ def _fill(board: BoardSamples, iterations: int) -> ReconstructedPositions:
     error = None
     if tested.any():
         misfit = model.samples(first.image) - samples
-        weights = board.taper * tested
+        weights = board.taper * tested * board.used_rx[:, None, None, None]
         error = _measure_image(model, misfit, weights) / _measure_image(model, samples, weights)
     last = reconstruct(board, max(1, iterations // 2), start=first.image)
     board.fill(model.samples(last.image))
@@ -263,6 +264,6 @@ def _choose_test_positions(recorded: Mask) -> Mask:
 
 
 def _measure_image(model: _Model, samples: NDArray[np.complexfloating], weights: NDArray[Any]) -> float:
-    """Return the norm of the image of samples [rx, frequency, row, column] under weights [row, column]; never 0."""
+    """Return the norm of the image of samples [rx, frequency, row, column] under weights [..., row, column]; not 0."""
     image = model.imager.image((samples * weights).astype(np.complex64))
     return float(np.linalg.norm(image)) or 1e-30

@@ -38,14 +38,16 @@ def take_samples(pipeline: Pipeline) -> tuple[surfaces.Samples, surfaces.Samples
 def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Samples:
     """Return the samples of one board; a scan recorded by columns is held mirrored in x = y."""
     antennas = board.aperture.antennas
+    used = board.used_rx
     samples = surfaces.Samples(
-        cube=board.calibrate_samples(),
-        valid=board.valid,
+        cube=board.calibrate_samples()[used],
+        valid=board.usable,
         offsets_m=board.aperture.offsets_m,
         frequencies_hz=board.aperture.frequencies_hz,
         tx_m=antennas.tx_m,
-        rx_m=antennas.rx_m,
+        rx_m=antennas.rx_m[used],
         model=board.model,
+        board_middle_m=antennas.rx_m.mean(axis=0),
     )
     if not is_mirrored:
         return samples
@@ -58,6 +60,7 @@ def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Sampl
         offsets_m=np.swapaxes(samples.offsets_m, 0, 1)[..., swap],
         tx_m=samples.tx_m[swap],
         rx_m=samples.rx_m[:, swap],
+        board_middle_m=antennas.rx_m.mean(axis=0)[swap],
     )
 
 

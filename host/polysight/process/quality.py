@@ -71,6 +71,8 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     chirps_clipped, chirps_disturbed, positions_clipped
         Chirps left out because the receiver clipped or because they differ from the rest of their burst, and positions
         of which all chirps clipped; 0 in files of earlier releases, which did not look for them.
+    dead_rx
+        RX without a signal, counted from 1.
     """
 
     frames_expected: Count
@@ -84,6 +86,7 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     chirps_clipped: Count = 0
     chirps_disturbed: Count = 0
     positions_clipped: Count = 0
+    dead_rx: list[Count] = []
 
     @property
     def residuals(self) -> dict[str, tuple[float, float, float]]:
@@ -141,6 +144,7 @@ class BoardRows:
             chirps_clipped=synced.chirps_clipped,
             chirps_disturbed=synced.chirps_disturbed,
             positions_clipped=synced.positions_clipped,
+            dead_rx=synced.dead_rx,
         )
         direct_hz = np.where(synced.valid, synced.direct_hz, np.nan)
         echo = synced.through(self._filters[synced.sweep_hz.size])
@@ -170,6 +174,13 @@ class BoardRows:
     def frames_received(self) -> int:
         """Number of frames that were received whole."""
         return sum(r.frames_received for r in self.figures.values())
+
+    @property
+    def dead_rx(self) -> dict[int, list[int]]:
+        """RX without a signal, counted from 1, to the rows in which they gave none."""
+        figures = self.figures
+        numbers = sorted({rx for r in figures.values() for rx in r.dead_rx})
+        return {rx: [row for row, r in figures.items() if rx in r.dead_rx] for rx in numbers}
 
     @property
     def direct_snr_db(self) -> float | None:
@@ -213,6 +224,7 @@ class BoardRows:
             chirps_clipped=sum(r.chirps_clipped for r in figures.values()),
             chirps_disturbed=sum(r.chirps_disturbed for r in figures.values()),
             positions_clipped=sum(r.positions_clipped for r in figures.values()),
+            dead_rx=self.dead_rx,
             direct_path_hz=_find_frequency_range(direct),
             direct_path_snr_db=snr,
             stage_backlash_mm=shift,
@@ -399,6 +411,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         share_of_received = _divide(share_with_path, received, default=1.0)
         missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
         missing += _report_disturbances(name, list(board.figures.values()))
+        missing += rules.judge_dead_rx(name, board.dead_rx, len(board.rows))
     recorded = rules.judge_recording(coverage, _divide(masked, positions, default=1.0))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + rules.judge_reconstruction(filled)

@@ -152,12 +152,19 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def rx_gains(images: Images) -> dict[str, list[RxGain]]:
-    """Return gain and phase of each RX relative to its board's first, by board, as divided out of the images."""
+    """Return gain and phase of each RX relative to its board's first, by board, as divided out of the images.
+
+    None for a dead RX; the first one with a signal stands for a dead first one.
+    """
     gains = {}
     for board, values in images.rx_gains.items():
-        relative = values / values[0]
+        has_gain = np.isfinite(values)
+        relative = values / values[np.argmax(has_gain)]
         gains[board] = [
-            RxGain(gain_db=float(20 * np.log10(abs(g))), phase_deg=float(np.degrees(np.angle(g)))) for g in relative
+            RxGain(gain_db=float(20 * np.log10(abs(g))), phase_deg=float(np.degrees(np.angle(g))))
+            if has
+            else RxGain(None, None)
+            for g, has in zip(relative, has_gain, strict=True)
         ]
     return gains
 

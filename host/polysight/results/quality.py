@@ -52,6 +52,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
         Received chirps left out: clipped by the receiver; unlike the others of their burst (another radar, silence).
     positions_clipped
         Masked positions of which all chirps were clipped.
+    dead_rx
+        RX that gave no signal, counted from 1, to the rows; they were left out of the images there.
     masked_columns
         Row to half-open ranges [start, stop) of masked columns.
     rows_recorded
@@ -73,6 +75,7 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
     chirps_clipped: int = 0
     chirps_disturbed: int = 0
     positions_clipped: int = 0
+    dead_rx: dict[int, list[int]] = {}
     direct_path_hz: FrequencyRange | UnsetType = UNSET
     # In one sample of one chirp; None where the noise is unknown.
     direct_path_snr_db: float | None = None

@@ -149,6 +149,23 @@ def judge_left_out_chirps(board: str, clipped: float, disturbed: float, position
     return reasons
 
 
+def judge_dead_rx(board: str, dead: Mapping[int, Sequence[int]], rows: int) -> list[Finding]:
+    """Judge a board's RX without a signal: number to the rows, of its recorded `rows`, in which it gave none."""
+    reasons = []
+    for dead_rows in dict.fromkeys(tuple(value) for value in dead.values()):
+        names = [f"RX{rx}" for rx, value in dead.items() if tuple(value) == dead_rows]
+        some = ""
+        if len(dead_rows) < rows:
+            some = f" in {len(dead_rows)} of {rows} rows, first in row {dead_rows[0]}"
+        reasons.append(reason(
+            "care", f"{' and '.join(names)} of {board} {'gives' if len(names) == 1 else 'give'} no signal{some}",
+            "noise only, zeros or less than a hundredth of the others' power: its antenna, mixer or connection is dead;"
+            " the whole image is made of the board's other RX",
+            "the results hold, with more noise; `polysight doctor` shows each RX: reset the board, or replace it", 3.2,
+        ))  # fmt: skip
+    return reasons
+
+
 def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
     """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
     if 1 - found_share > FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):

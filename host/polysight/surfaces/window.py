@@ -47,6 +47,8 @@ class Samples:
         Antennas at stage offset zero, [3] and [rx, 3].
     model
         complex [frequency, frequency]: effect of the range gate on an echo; None: none.
+    board_middle_m
+        Mean place of all RX of the board, if `rx_m` are only some of them; None: they are all.
     """
 
     cube: NDArray[np.complexfloating]
@@ -56,11 +58,12 @@ class Samples:
     tx_m: Array
     rx_m: Array
     model: NDArray[np.complex128] | None = None
+    board_middle_m: Array | None = None
 
     @property
     def middle_m(self) -> Array:
-        """Mean place of the RX [3], metres: echoes are given as if received there."""
-        return self.rx_m.mean(axis=0)
+        """Mean place of the board's RX [3], metres: echoes are given as if received there."""
+        return self.rx_m.mean(axis=0) if self.board_middle_m is None else self.board_middle_m
 
     @property
     def direct_m(self) -> Array:
@@ -160,7 +163,7 @@ class BoardFit:
     omega
         float64 [frequency]: rates of phase over path, 2 pi f / c, radians per metre.
     lever
-        float64 [rx, 3]: places of the RX relative to their mean, metres.
+        float64 [rx, 3]: places of the RX relative to the mean of the board's, metres.
     model, gain, weights
         Effect of the range gate on an echo, [frequency, frequency] (identity without a gate); the sum over the
         frequencies of the factors that it leaves of an echo; the share of each frequency in this sum, [frequency].

@@ -13,7 +13,7 @@ Aligned chirps are decimated: `FOLD` (4) samples become a *block*. Words are a c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -27,15 +27,15 @@ from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf, loops
 from polysight.sync.cubes import CubeForm, detect_form
 from polysight.sync.decimate import FOLD
-from polysight.sync.direct_path import prepare
+from polysight.sync.direct_path import DirectPath, prepare
 from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, complex64, phasor, refine, signal_energy
 from polysight.sync.offsets import (
     AlignedRow,
-    DirectPath,
     Errors,
     Referenced,
     SyncedRow,
     align_pieces,
+    find_dead_rx,
     half_scale,
     reference,
 )
@@ -114,34 +114,43 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
         if the frames are not whole bursts of the configured chirp.
     """
     words = raw_words(frames) if np.iscomplexobj(frames) else frames
-    return synchronise_pieces([words], valid, setup)
+    return synchronise_pieces(lambda: [words], valid, setup)
 
 
-def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bool_], setup: BoardSetup) -> SyncedRow:
-    """Synchronise a row given in pieces of whole bursts, int16 words as of :func:`synchronise_row`.
+def synchronise_pieces(
+    read: Callable[[], Iterable[NDArray[np.int16]]], valid: NDArray[np.bool_], setup: BoardSetup
+) -> SyncedRow:
+    """Synchronise a row that `read` returns in pieces of whole bursts, int16 words as of :func:`synchronise_row`.
 
-    A piece is not used any more when the next one is asked for, so that pieces may share memory.
+    A piece is not used any more when the next one is asked for, so that pieces may share memory. If an RX is dead, the
+    row is read again, and synchronised as if this RX sent zeros.
     """
     if valid.size % setup.pulses:
         raise _mismatch_error(valid.size, setup.path.steering.shape, setup)
     received = valid.reshape(-1, setup.pulses)
-    aligned = align_pieces(
-        _group_bursts(pieces, valid.size, setup),
-        received,
-        setup.chirp.linear_samples,
-        setup.equaliser,
-        _FULL_SCALE,
-    )
-    synchronised = reference(aligned, setup.path, setup.chirp)
+
+    def align(dead: NDArray[np.bool_] | None = None) -> AlignedRow:
+        bursts = _group_bursts(read(), valid.size, setup, dead)
+        return align_pieces(bursts, received, setup.chirp.linear_samples, setup.equaliser, _FULL_SCALE)
+
+    path = setup.path
+    aligned = align()
+    # The halves of a burst; a burst of one chirp has no second half.
+    halves = aligned.halves.swapaxes(0, 2)
+    dead = find_dead_rx(halves[:, 0], halves[:, min(1, setup.pulses - 1)])
+    if dead.any():
+        path = path.without_rx(dead)
+        aligned = align(dead)
+    synchronised = reference(aligned, path, setup.chirp)
     rate = setup.chirp.sample_rate_hz
     return SyncedRow(
         samples=synchronised.samples,
-        sweep_hz=setup.path.sweep_hz,
+        sweep_hz=path.sweep_hz,
         valid=synchronised.found,
         chirps=aligned.good.sum(axis=1),
         direct_hz=synchronised.frequency * rate,
         direct_amplitude=np.abs(synchronised.amplitude),
-        errors=errors(aligned, synchronised, setup.path, rate, setup.examined),
+        errors=errors(aligned, synchronised, path, rate, setup.examined),
         noise=synchronised.noise,
         turn=_turn_along(synchronised.samples),
         chirps_clipped=int(aligned.clipped.sum()),
@@ -150,11 +159,22 @@ def synchronise_pieces(pieces: Iterable[NDArray[np.int16]], valid: NDArray[np.bo
     )
 
 
-def _group_bursts(pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup) -> Iterator[NDArray[np.int16]]:
-    """Return pieces [frame, sample, 2, rx] as bursts [position, chirp, sample, 2, rx]; check that they are whole."""
+def _group_bursts(
+    pieces: Iterable[NDArray[np.int16]], frames: int, setup: BoardSetup, dead: NDArray[np.bool_] | None
+) -> Iterator[NDArray[np.int16]]:
+    """Return pieces [frame, sample, 2, rx] as bursts [position, chirp, sample, 2, rx]; check that they are whole.
+
+    Words of `dead` RX are replaced by zeros, and those of RX that are stuck, whose words do not change in a chirp: a
+    constant is a tone in all chirps.
+    """
     for words in pieces:
         chirps, samples, _, rx = words.shape
         frames -= chirps
+        silent = (words[:1] == words[:1, :1]).all(axis=(0, 1, 2))
+        if dead is not None:
+            silent |= dead
+        if silent.any() and not silent.all():
+            words = words * ~silent
         if (rx, samples) != setup.path.steering.shape or chirps % setup.pulses or frames < 0:
             raise _mismatch_error(chirps, (rx, samples), setup)
         yield words.reshape(-1, setup.pulses, samples, 2, rx)
@@ -217,7 +237,7 @@ class RowSynchroniser:
             return synced, int(synced.valid.sum())
         # Chirps count as frames here, in `frames_expected` too.
         valid = valid_frames(recorded.missing, recorded.frames_expected, rig.frame_bytes // rig.burst.chirps)
-        return synchronise_pieces(self._words(recorded), valid, self.setups[board]), int(valid.sum())
+        return synchronise_pieces(lambda: self._words(recorded), valid, self.setups[board]), int(valid.sum())
 
     def _words(self, recorded: RowData) -> Iterator[NDArray[np.int16]]:
         """Iterate over the words of a row, [chirp, sample, 2, rx], some positions at a time."""
@@ -317,7 +337,7 @@ def _reference_halves(
 
 def _estimate_direct_path_errors(mean: NDArray[np.complex64], path: DirectPath) -> NDArray[np.float64]:
     """Return the errors of the direct path [3, n] in averages [rx, position, block], from two halves of the RX."""
-    halves = [_estimate(mean[h::2].swapaxes(0, 1), path.half_estimators[h]) for h in (0, 1)]
+    halves = [_estimate(mean.swapaxes(0, 1), estimator) for estimator in path.half_estimators]
     amplitude = np.array([amplitude for amplitude, _ in halves])
     w = [w for _, w in halves]
     amplitude_size = np.abs(amplitude)

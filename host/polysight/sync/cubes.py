@@ -18,9 +18,9 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.sync.decimate import flatten, fold, whole_blocks
-from polysight.sync.direct_path import excess_path_m, prepare
+from polysight.sync.direct_path import DirectPath, excess_path_m, prepare
 from polysight.sync.loops import phasor
-from polysight.sync.offsets import AlignedRow, DirectPath, SyncedRow, reference, sample_frequencies_hz
+from polysight.sync.offsets import AlignedRow, SyncedRow, find_dead_rx, reference, sample_frequencies_hz
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -81,12 +81,20 @@ class CubeForm:
         if self.conjugate:
             cube = cube.conj()
         samples = cube * self.turn[:, None]
+        hz = np.zeros(valid.size)
+        amplitude = hz
+        turned, has_data = samples, valid
+        if self.path is not None:
+            samples, valid, hz, amplitude = _reference_cube(turned, has_data, self.path, self.chirp)
+        # Neighbouring positions hold nearly the same signals.
+        dead = find_dead_rx(samples[:, :-1], samples[:, 1:])
+        if self.path is not None and dead.any():
+            path = self.path.without_rx(dead)
+            samples, valid, hz, amplitude = _reference_cube(turned, has_data, path, self.chirp)
         samples += self.constant[:, None, None]
         samples[:, ~valid] = 0
-        if self.path is not None:
-            samples, valid, hz, amplitude = _reference_cube(samples, valid, self.path, self.chirp)
-        else:
-            hz = np.zeros(valid.size)
+        samples[dead] = 0
+        if self.path is None:
             amplitude = np.abs(samples.mean(axis=(0, 2))).astype(np.float64)
         return SyncedRow(
             samples=samples,
@@ -156,10 +164,9 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     mean, coherent = _average_direct_path(cube[..., a:b], gate)
     if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
-        phasors = mean / np.abs(mean)
         # If all RX are referenced to the first, each keeps its lag behind it: their phases agree only without the lags
         # (at the middle frequency). Otherwise they agree as they are.
-        if abs((phasors * lag[:, (a + b) // 2].conj()).sum()) > abs(phasors.sum()):
+        if abs((mean * lag[:, (a + b) // 2].conj()).sum()) > abs(mean.sum()):
             turn = turn * lag.conj()
             form.append("all RX referenced to the direct path of one")
         else:
@@ -218,7 +225,7 @@ def _average_direct_path(
     # Complex [rx, position].
     direct = part @ (weights / weights.sum())
     mean = direct.mean(axis=1)
-    return mean, float(np.mean(np.abs(mean) ** 2 / np.mean(np.abs(direct) ** 2, axis=1)))
+    return mean, float(np.sum(np.abs(mean) ** 2) / np.sum(np.mean(np.abs(direct) ** 2, axis=1)))
 
 
 def _gate_m(rig: Instrument, board: Board, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> tuple[float, float]:

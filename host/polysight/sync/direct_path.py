@@ -1,8 +1,13 @@
-"""Direct path of a board from geometry alone: its phases at the RX, and the estimators of `offsets.reference`."""
+"""Direct path of a board from geometry alone: its phases at the RX, and the estimators of `offsets.reference`.
+
+The estimators suppress the object with all RX together: one that gives no signal leaves the object in the estimate.
+`offsets.find_dead_rx` finds such RX, and `DirectPath.without_rx` leaves them out.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -10,7 +15,7 @@ from numpy.typing import NDArray
 
 from polysight.sync.decimate import FOLD
 from polysight.sync.loops import cis, complex64
-from polysight.sync.offsets import SEARCH_FFT, DirectPath, block_frequencies_hz, sample_frequencies_hz, search_window
+from polysight.sync.offsets import SEARCH_FFT, block_frequencies_hz, sample_frequencies_hz, search_window
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import Vector, rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -25,6 +30,49 @@ _NOISE = 1e-2
 # the estimate holds a sixth of the clutter's power that it holds without it, and 0.5 % more noise.
 _CLUTTER_M = 1.5
 _CLUTTER_POWER = 4e-3
+
+
+class DirectPath(NamedTuple):
+    """Steering and estimators for a board's direct path, from geometry alone; fixed for a scan.
+
+    Attributes
+    ----------
+    steering
+        complex64 [rx, sample]: `exp(-j 2 pi f(t) (tau_r - tau_0))`, after which all RX share the direct path's tone.
+    folded_steering
+        complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
+    estimator
+        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered samples at w near 0.
+    drift_estimator
+        complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
+    half_estimators
+        complex128 [2, 2, rx * block]: A and A w from every other RX alone; 0 for the rest.
+    beam
+        complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
+    search_weights
+        complex64 [rx, block]: beam, steering and window of the search.
+    object_bins
+        IF of the nearest and of the farthest echo minus that of the direct path, in bins of the search FFT.
+    sweep_hz
+        float64 [block]: transmit frequency at the middle of each block.
+    geometry
+        Chirp, places of TX and RX, and the specular point between them, metres.
+    """
+
+    steering: NDArray[np.complex64]
+    folded_steering: NDArray[np.complex64]
+    estimator: NDArray[np.complex128]
+    drift_estimator: NDArray[np.complex128]
+    half_estimators: NDArray[np.complex128]
+    beam: NDArray[np.complex64]
+    search_weights: NDArray[np.complex64]
+    object_bins: tuple[float, float]
+    sweep_hz: NDArray[np.float64]
+    geometry: tuple[Chirp, Vector, tuple[Vector, ...], Vector]
+
+    def without_rx(self, dead: NDArray[np.bool_]) -> DirectPath:
+        """Return the same without the `dead` RX [rx], for which everything is 0."""
+        return _prepare(*self.geometry, tuple(np.flatnonzero(dead).tolist()))
 
 
 def excess_path_m(
@@ -42,9 +90,12 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
 
 # All scans of a rig have the same few boards; each takes 10 ms.
 @lru_cache(8)
-def _prepare(chirp: Chirp, tx_m: Vector, rx_m: tuple[Vector, ...], specular_m: Vector) -> DirectPath:
+def _prepare(
+    chirp: Chirp, tx_m: Vector, rx_m: tuple[Vector, ...], specular_m: Vector, dead: tuple[int, ...] = ()
+) -> DirectPath:
     tx = np.array(tx_m)
-    rx = np.array(rx_m)
+    is_live = ~np.isin(np.arange(len(rx_m)), dead)
+    rx = np.array(rx_m)[is_live]
     sweep = sample_frequencies_hz(chirp)
     middles = block_frequencies_hz(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
@@ -70,6 +121,11 @@ def _prepare(chirp: Chirp, tx_m: Vector, rx_m: tuple[Vector, ...], specular_m: V
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
     samples_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
+    half_estimators = np.zeros((2, 2, n_rx * n), complex)
+    # A single RX has no second half: the errors of the direct path are not known then.
+    for h in range(min(2, n_rx)):
+        s = samples_of_half[h]
+        half_estimators[h][:, s] = _invert_model(model[s, :2], covariance[np.ix_(s, s)])
     centre = echoes[:, :, n // 2]
     spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
     beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
@@ -77,16 +133,27 @@ def _prepare(chirp: Chirp, tx_m: Vector, rx_m: tuple[Vector, ...], specular_m: V
     folded_steering = cis(-2 * np.pi * middles * lag_s)
     bins_per_m = chirp.hz_per_sample * FOLD * SEARCH_FFT / SPEED_OF_LIGHT_M_S
     return DirectPath(
-        steering=cis(-2 * np.pi * sweep * lag_s),
-        folded_steering=folded_steering,
-        estimator=_invert_model(model[:, :2], covariance),
-        drift_estimator=_invert_model(model, covariance),
-        half_estimators=np.stack([_invert_model(model[s, :2], covariance[np.ix_(s, s)]) for s in samples_of_half]),
-        beam=beam,
-        search_weights=complex64(beam[:, None] * folded_steering * search_window(n)),
+        steering=_spread(cis(-2 * np.pi * sweep * lag_s), is_live),
+        folded_steering=_spread(folded_steering, is_live),
+        estimator=_spread(_invert_model(model[:, :2], covariance), is_live, n),
+        drift_estimator=_spread(_invert_model(model, covariance), is_live, n),
+        half_estimators=_spread(half_estimators, is_live, n),
+        beam=_spread(beam, is_live),
+        search_weights=_spread(complex64(beam[:, None] * folded_steering * search_window(n)), is_live),
         object_bins=(float(excess.min() * bins_per_m), float(excess.max() * bins_per_m)),
         sweep_hz=middles,
+        geometry=(chirp, tx_m, rx_m, specular_m),
     )
+
+
+def _spread(of_live: NDArray[Any], is_live: NDArray[np.bool_], blocks: int = 0) -> NDArray[Any]:
+    """Return values of live RX for all RX, 0 for the others: [rx, ...], or [..., rx * block] if `blocks` is given."""
+    if blocks:
+        by_rx = np.moveaxis(of_live.reshape(*of_live.shape[:-1], -1, blocks), -2, 0)
+        return np.moveaxis(_spread(by_rx, is_live), 0, -2).reshape(*of_live.shape[:-1], -1)
+    of_all = np.zeros((is_live.size, *of_live.shape[1:]), of_live.dtype)
+    of_all[is_live] = of_live
+    return of_all
 
 
 def _invert_model(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:

@@ -37,7 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,9 @@ from polysight.sync import high_pass_filter as hpf, loops
 from polysight.sync.decimate import FOLD, decimator, whole_blocks
 from polysight.sync.loops import Library, NumpyLoops, Real, Removed, Tone, cis, complex64
 from polysight_shared.config import Chirp
+
+if TYPE_CHECKING:
+    from polysight.sync.direct_path import DirectPath
 
 # Burst alignment: reference chirps tried per position; chosen.
 _REFERENCES = 4
@@ -75,6 +78,13 @@ _LOST = 0.3
 _OUTLIER = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
 _PRESENT = 30.0
+
+# An RX is dead if its power is this part (-23 dB, chosen) of the strongest one's, without its noise.
+_DEAD = 0.005
+# The strongest RX tells nothing about others if a smaller part of its power is signal, and not noise; chosen.
+_SIGNAL = 0.3
+# About so many positions are judged together; chosen.
+_JUDGED = 16
 
 Errors = dict[str, NDArray[np.float64]]
 """Error samples after each stage of synchronisation, float64 [3, n]: frequency, phase, relative amplitude."""
@@ -410,42 +420,6 @@ def _subtract_mean(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDAr
     return (values - mean[..., None]) * good
 
 
-class DirectPath(NamedTuple):
-    """Steering and estimators for a board's direct path, from geometry alone; fixed for a scan.
-
-    Attributes
-    ----------
-    steering
-        complex64 [rx, sample]: `exp(-j 2 pi f(t) (tau_r - tau_0))`, after which all RX share the direct path's tone.
-    folded_steering
-        complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
-    estimator
-        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered samples at w near 0.
-    drift_estimator
-        complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
-    half_estimators
-        complex128 [2, 2, rx / 2 * block]: A and A w from every other RX alone.
-    beam
-        complex64 [rx]: weights of the steered RX for the search, sum 1, with low gain towards the object.
-    search_weights
-        complex64 [rx, block]: beam, steering and window of the search.
-    object_bins
-        IF of the nearest and of the farthest echo minus that of the direct path, in bins of the search FFT.
-    sweep_hz
-        float64 [block]: transmit frequency at the middle of each block.
-    """
-
-    steering: NDArray[np.complex64]
-    folded_steering: NDArray[np.complex64]
-    estimator: NDArray[np.complex128]
-    drift_estimator: NDArray[np.complex128]
-    half_estimators: NDArray[np.complex128]
-    beam: NDArray[np.complex64]
-    search_weights: NDArray[np.complex64]
-    object_bins: tuple[float, float]
-    sweep_hz: NDArray[np.float64]
-
-
 class Referenced(NamedTuple):
     """Samples referenced to the direct path.
 
@@ -484,7 +458,8 @@ class SyncedRow:
     Attributes
     ----------
     samples
-        complex64 [rx, position, sample]: an echo of excess path d is `a exp(+j 2 pi f d / c)`; zero where not valid.
+        complex64 [rx, position, sample]: an echo of excess path d is `a exp(+j 2 pi f d / c)`; zero where not valid,
+        and of a dead RX (`find_dead_rx`).
     sweep_hz
         float64 [sample]: transmit frequency f of each. Raw chirps have one sample for every four (`decimate.py`), cubes
         of other programs all of them.
@@ -500,7 +475,7 @@ class SyncedRow:
         than two good chirps; None: unknown.
     turn
         float64 [position]: phase change, radians, of the whole signal (direct path and echoes) from one position to
-        the next. Burst alignment removes it within a burst, see `imaging.samples.undo_burst_motion`. None: not aligned.
+        the next. Burst alignment removes it within a burst, see `imaging.geometry`. None: not aligned.
     chirps_clipped, chirps_disturbed
         Received chirps that were left out because the receiver clipped, or because they differ from the others of their
         burst (interference, silence).
@@ -522,6 +497,12 @@ class SyncedRow:
     chirps_clipped: int = 0
     chirps_disturbed: int = 0
     positions_clipped: int = 0
+
+    @property
+    def dead_rx(self) -> list[int]:
+        """RX that gave no signal in this row, counted from 1; none if no position is valid."""
+        has_signal = np.array([rx.any() for rx in self.samples])
+        return (np.flatnonzero(~has_signal & has_signal.any()) + 1).tolist()
 
     @property
     def stages(self) -> dict[str, tuple[float, float, float]]:
@@ -623,7 +604,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     # the sum of `scale` over K. `half_difference` is the difference's energy in all RX and blocks, after decimation.
     two = good_chirps > 1
     noise_power = np.full(len(two), np.nan)
-    chirp_noise = half_difference * chirps / (len(path.beam) * n) / decimator().noise
+    chirp_noise = half_difference * chirps / (np.count_nonzero(path.beam) * n) / decimator().noise
     noise_power[two] = chirp_noise[two] / scale[two].sum(axis=1)
     return Referenced(
         samples=samples,
@@ -634,6 +615,25 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         noise=noise_power,
         steering=steering,
     )
+
+
+def find_dead_rx(signal: NDArray[np.complexfloating], again: NDArray[np.complexfloating]) -> NDArray[np.bool_]:
+    """Find the RX that receive noise or nothing in some part of a row while another one receives a signal, bool [rx].
+
+    `signal` and `again` [rx, position, sample] hold the same signals, up to a phase of each position, with independent
+    noise. The power of an RX without its noise is the part of their product that is in phase in all RX.
+    """
+    product = np.vecdot(signal, again)
+    total = product.sum(axis=0)
+    if not total.any():
+        return np.zeros(len(product), bool)
+    in_phase = np.real(product * np.exp(-1j * np.angle(total)))
+    power = np.sqrt(np.vecdot(signal, signal).real * np.vecdot(again, again).real)
+    parts = np.linspace(0, total.size, max(2, total.size // _JUDGED + 1)).astype(int)[:-1]
+    in_phase, power = (np.add.reduceat(values, parts, axis=1) for values in (in_phase, power))
+    strongest = in_phase.max(axis=0)
+    has_signal = strongest > _SIGNAL * power[in_phase.argmax(axis=0), np.arange(len(parts))]
+    return ((in_phase < _DEAD * strongest) & has_signal).any(axis=1)
 
 
 def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:

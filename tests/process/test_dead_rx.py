@@ -1,0 +1,243 @@
+"""An RX without a signal is left out of synchronisation and images, and the verdict says so and nothing false."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from benchmarks.coverage import Cubes
+from tests.support.pipelines import make_pipeline
+from tests.support.rigs import published_rig
+
+from polysight.imaging import Images
+from polysight.materials import match_truth, truth_plates
+from polysight.pipeline import Pipeline
+from polysight.process import Findings
+from polysight.store import CubeRow, RowData, ScanFolder, Source
+from polysight.store.source import split_pieces
+from polysight_simulators.scene import decode_scene, simulate
+from polysight_simulators.scene.simulated_scan import truth
+
+PLATES = {
+    "ceramic": ([-62.0, 32.0], [4.75, 2.43]), "acrylic": ([0.0, 34.0], [4.0, 0.4]), "PET": ([62.0, 32.0], [3.78, 0.7]),
+    "wood": ([-62.0, -32.0], [2.61, 0.01]), "rubber": ([62.0, -32.0], [5.06, 1.11]),
+}  # fmt: skip
+SCENE: dict[str, Any] = {
+    "name": "small", "seed": 5, "burst": {"pulses": 4}, "image": {"columns": 110, "rows": 86},
+    "grid": {"columns": 43, "rows": 41, "step_x_mm": 10.0, "step_y_mm": 6.0},
+    "plates": [
+        {"name": "metal", "centre_mm": [0.0, -34.0], "size_mm": [46.0, 46.0], "metal": True},
+        *({"name": n, "centre_mm": at, "size_mm": [46.0, 46.0], "permittivity": e} for n, (at, e) in PLATES.items()),
+    ],
+}  # fmt: skip
+ROWS = SCENE["grid"]["rows"]
+# Changes the words of a row in place: board, row, int16 [chirp, sample, 2, rx].
+Mangle = Callable[[str, int, np.ndarray], None]
+
+
+class Mangled:
+    """A source whose words or cubes are changed while they are read."""
+
+    def __init__(self, source: Any, mangle: Mangle) -> None:
+        self._source = source
+        self._mangle = mangle
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def read_row(self, board: str, row: int) -> RowData | CubeRow:
+        recorded = self._source.read_row(board, row)
+        if isinstance(recorded, CubeRow):
+            cube = recorded.cube.copy()
+            self._mangle(board, row, cube.transpose(1, 2, 0)[:, :, None])
+            return replace(recorded, cube=cube)
+        chirp = self.instrument.chirp
+        words = recorded.payload.copy().view(np.int16).reshape(-1, chirp.samples, 2, 4)
+        self._mangle(board, row, words)
+        return replace(recorded, pieces=split_pieces(words.reshape(-1).view(np.uint8)))
+
+
+def noise_of(row: int, words: np.ndarray, rms: float) -> np.ndarray:
+    rng = np.random.default_rng(row)
+    if np.iscomplexobj(words):
+        return rms * (rng.standard_normal(words.shape[:-1]) + 1j * rng.standard_normal(words.shape[:-1]))
+    return np.rint(rng.normal(0, rms, words.shape[:-1])).astype(np.int16)
+
+
+def kill(board: str, *rx: int, rms: float = 6.0, rows: range = range(1000), value: int | None = None) -> Mangle:
+    """Give RX, counted from 1, of a board noise or a constant `value` instead of their signal in some rows."""
+
+    def mangle(name: str, row: int, words: np.ndarray) -> None:
+        if name == board and row in rows:
+            for k in rx:
+                words[..., k - 1] = noise_of(100 * row + k, words, rms) if value is None else value
+
+    return mangle
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> ScanFolder:
+    folder = tmp_path_factory.mktemp("rx") / "scan"
+    return ScanFolder.load(simulate(published_rig(), decode_scene(SCENE, "test"), folder))
+
+
+@pytest.fixture(scope="module")
+def process(source) -> Callable[..., tuple[Pipeline, Images, Findings]]:
+    """`process(mangle)`: pipeline, images and findings of the scan with changed words."""
+    done: dict[Any, tuple[Pipeline, Images, Findings]] = {}
+
+    def make(mangle: Mangle | None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
+        pipeline = make_pipeline(Mangled(of, mangle) if mangle else of)  # type: ignore[arg-type]
+        images = pipeline.form_images()
+        return pipeline, images, pipeline.examine(images)
+
+    def cached(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
+        if mangle is not None:
+            return make(mangle, of)
+        if of not in done:
+            done[of] = make(None, of)
+        return done[of]
+
+    return cached
+
+
+def permittivities(findings: Findings) -> dict[int, complex]:
+    return {r.patch.label: r.permittivity.value for r in findings.analysis.patches if r.permittivity.value is not None}
+
+
+def distances(source: Any, findings: Findings) -> list[float]:
+    """Squared distances of the true permittivities in the regions."""
+    scene = decode_scene(SCENE, "test")
+    plates = truth_plates(truth(source.instrument, scene, scene.seed))
+    true = match_truth([r.patch for r in findings.analysis.patches], plates)
+    out = []
+    for r in findings.analysis.patches:
+        e = r.permittivity
+        plate = true.get(r.patch.label)
+        if e.value is not None and plate is not None and plate.permittivity is not None:
+            d = e.value - plate.permittivity
+            out.append(float(np.array([d.real, d.imag]) @ np.linalg.solve(np.array(e.covariance), [d.real, d.imag])))
+    return out
+
+
+def about_rx(findings: Findings) -> list[str]:
+    return [r.what for r in findings.verdict.reasons if "RX" in r.what]
+
+
+def other_reasons(findings: Findings) -> set[str]:
+    """Reasons but those about an RX, without their numbers."""
+    return {"".join(c for c in r.what if not c.isdigit()) for r in findings.verdict.reasons if "RX" not in r.what}
+
+
+@pytest.mark.parametrize(("board", "rx"), [("RV", 3), ("RH", 1)])
+def test_noise_instead_of_an_rx_is_told_and_changes_nothing_else(source, process, board, rx):
+    _, healthy_images, healthy = process()
+    pipeline, images, findings = process(kill(board, rx))
+    assert findings.verdict.level == "care"
+    (told,) = about_rx(findings)
+    assert f"RX{rx} of {board}" in told
+    assert other_reasons(findings) <= other_reasons(healthy)
+    assert len(distances(source, findings)) == len(PLATES)
+    assert max(distances(source, findings)) < 9
+    assert pipeline.quality.result().boards[board].dead_rx == {rx: list(range(ROWS))}
+    both = images.valid & healthy_images.valid
+    for one, other in ((images.h, healthy_images.h), (images.v, healthy_images.v)):
+        cosine = abs(np.vdot(one[both], other[both])) / np.linalg.norm(one[both]) / np.linalg.norm(other[both])
+        assert cosine > 0.995
+
+
+@pytest.mark.parametrize("how", [{"rms": 60.0}, {"value": 0}, {"value": 1000}, {"value": 32767}], ids=str)
+def test_whatever_a_dead_rx_sends_the_result_is_the_same(process, how):
+    _, expected, _ = process(kill("RV", 2))
+    _, images, _ = process(kill("RV", 2, **how))
+    np.testing.assert_allclose(images.v, expected.v, atol=1e-6 * np.abs(expected.v).max())
+    np.testing.assert_array_equal(images.h, expected.h)
+
+
+def test_the_images_are_those_of_a_rig_without_the_rx(source, process):
+    """RX3 of both boards is dead, against a rig with three RX whose cards sent no other words."""
+
+    class Three(Mangled):
+        def __init__(self) -> None:
+            super().__init__(source, lambda *_: None)
+            rig = source.instrument
+            rx_mm = tuple(at for k, at in enumerate(rig.antennas.rx_mm) if k != 2)
+            self.instrument = msgspec.structs.replace(rig, antennas=msgspec.structs.replace(rig.antennas, rx_mm=rx_mm))
+
+        def read_row(self, board: str, row: int) -> RowData | CubeRow:
+            recorded = source.read_row(board, row)
+            words = recorded.payload.view(np.int16).reshape(-1, 4)[:, [0, 1, 3]]
+            return replace(recorded, pieces=split_pieces(np.ascontiguousarray(words).reshape(-1).view(np.uint8)))
+
+    def both(name: str, row: int, words: np.ndarray) -> None:
+        kill(name, 3)(name, row, words)
+
+    without = make_pipeline(Three()).form_images()  # type: ignore[arg-type]
+    _, images, _ = process(both)
+    for one, other in ((images.h, without.h), (images.v, without.v)):
+        np.testing.assert_allclose(one, other, atol=2e-5 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("rows", [range(16, ROWS), range(16, 17)])
+def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
+    pipeline, _, findings = process(kill("RV", 4, rows=rows))
+    (told,) = about_rx(findings)
+    assert "RX4 of RV" in told
+    assert "first in row 16" in told
+    assert pipeline.quality.result().boards["RV"].dead_rx == {4: list(rows)}
+    assert other_reasons(findings) <= other_reasons(process()[2])
+    assert max(distances(source, findings)) < 9
+
+
+def test_a_weak_rx_stays(process):
+    def weaken(name: str, _: int, words: np.ndarray) -> None:
+        if name == "RV":
+            words[..., 1] = np.rint(words[..., 1] * 10 ** (-10 / 20))
+
+    pipeline, _, findings = process(weaken)
+    assert about_rx(findings) == []
+    assert pipeline.quality.result().boards["RV"].dead_rx == {}
+
+
+def test_two_dead_rx_leave_an_image(source, process):
+    _, _, findings = process(kill("RH", 2, 3))
+    assert len(about_rx(findings)) == 1
+    assert other_reasons(findings) <= other_reasons(process()[2])
+    assert max(distances(source, findings)) < 9
+
+
+def test_a_board_without_any_rx_is_refused(process):
+    _, _, findings = process(kill("RV", 1, 2, 3, 4))
+    assert findings.verdict.level == "none"
+    assert any("RV: the direct path is missing" in r.what for r in findings.verdict.reasons)
+    assert about_rx(findings) == []
+
+
+def test_kept_samples_and_live_images_know_it(source, process):
+    mangle = kill("RV", 4, rows=range(16, ROWS))
+    _, expected, _ = process(mangle)
+    live = make_pipeline(Mangled(source, mangle), live=True)  # type: ignore[arg-type]
+    current = live.form_images(from_sums=True)
+    np.testing.assert_allclose(current.v, expected.v, atol=1e-5 * np.abs(expected.v).max())
+    again = make_pipeline(source)
+    for row in source.rows():
+        for name, board in live.builder.boards.items():
+            again.builder.boards[name].put(row, board.read_reduced(row))
+    np.testing.assert_allclose(again.form_images().v, expected.v, atol=1e-6 * np.abs(expected.v).max())
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.03])
+def test_a_cube_with_a_dead_rx_is_read_like_rows(process, rms):
+    cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
+    level = float(np.sqrt(np.mean(np.abs(cubes.read_row("RV", 15).cube) ** 2)))
+    _, _, healthy = process(None, cubes)
+    _, _, findings = process(kill("RV", 4, rms=rms * level), cubes)
+    (told,) = about_rx(findings)
+    assert "RX4 of RV" in told
+    assert other_reasons(findings) <= other_reasons(healthy)
+    assert len(distances(cubes, findings)) == len(PLATES)
+    assert max(distances(cubes, findings)) < 9

@@ -110,11 +110,13 @@ def test_clipped_chirps_are_an_error_and_a_few_a_warning():
     assert (finding.level, finding.facts["clipped_chirps"]) == ("warning", 1)
 
 
-def test_an_rx_without_a_signal_is_an_error():
+@pytest.mark.parametrize("rms", [0, 6])
+def test_an_rx_without_a_signal_is_an_error(rms):
     words = simulate_frames("RH")
-    words[..., 2] = 0
+    words[..., 2] = np.rint(np.random.default_rng(0).normal(0, rms, words.shape[:-1]))
     finding = check_level(with_frames(words), RIG.by_name("RH"))
-    assert (finding.level, finding.facts["rms"][2]) == ("error", 0)
+    assert (finding.level, finding.facts["rms"][2]) == ("error", pytest.approx(rms * np.sqrt(2), rel=0.1))
+    assert finding.what.startswith("no signal in RX3:")
 
 
 @pytest.mark.parametrize(

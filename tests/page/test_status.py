@@ -134,6 +134,12 @@ def test_a_row_taken_again_is_a_warning_for_a_while(history):
         assert status(history).level == level
 
 
+def test_an_rx_without_a_signal_is_told(history):
+    s = status(history, shown=Shown(sync={"RH": {0: RowSync(0.02, 0.004, 0, dead_rx=(3,))}}))
+    assert s.level == "warn"
+    assert "RX3 of RH gives no signal" in s.headline + s.detail
+
+
 @pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
 def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, level):
     pictures = Shown(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})

@@ -14,9 +14,11 @@ from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig
 
 from polysight.imaging import Images
+from polysight.jobs.process import LiveProcessing
 from polysight.materials import match_truth, truth_plates
 from polysight.pipeline import Pipeline
 from polysight.process import Findings
+from polysight.settings import Settings
 from polysight.store import CubeRow, RowData, ScanFolder, Source
 from polysight.store.source import split_pieces
 from polysight_simulators.scene import decode_scene, simulate
@@ -215,6 +217,15 @@ def test_a_board_without_any_rx_is_refused(process):
     assert findings.verdict.level == "none"
     assert any("RV: the direct path is missing" in r.what for r in findings.verdict.reasons)
     assert about_rx(findings) == []
+
+
+def test_the_operator_hears_of_it_with_the_first_row(source, monkeypatch, caplog):
+    monkeypatch.setattr(ScanFolder, "load", lambda _: Mangled(source, kill("RV", 3)))
+    processing = LiveProcessing(source.path, Settings())
+    for row in range(3):
+        processing.add_row(row)
+    (told,) = [r.getMessage() for r in caplog.records if "RX" in r.getMessage()]
+    assert told.startswith("row 0: RX3 of RV gives no signal")
 
 
 def test_kept_samples_and_live_images_know_it(source, process):

@@ -21,7 +21,16 @@ from polysight.capture.dca1000 import (
     row_words,
     valid_frames,
 )
-from polysight.capture.inspect import CardReport, Layout, Report, inspect_bin, inspect_pcap, is_pcap, recognise_format
+from polysight.capture.inspect import (
+    SILENT_SHARE,
+    CardReport,
+    Layout,
+    Report,
+    inspect_bin,
+    inspect_pcap,
+    is_pcap,
+    recognise_format,
+)
 from polysight.capture.network import check_receive_buffer, route_interface, silent_radar
 from polysight.capture.placement import Evidence, Placed, place_record
 from polysight.capture.receiver import (

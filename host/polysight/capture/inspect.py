@@ -50,10 +50,11 @@ _MAX_PCAP_BYTES = 4 << 30
 # Longest record that byte counts are believed to be of: more than seven hundred rows of the published scan.
 _MAX_RECORD_BYTES = 1 << 34
 # Chosen: a peak over the median of the range profile that noise does not have, a constant offset that the radar's
-# high-pass filter does not let through, and the share of the loudest antenna's level below which one counts as off.
+# high-pass filter does not let through, and the share of the loudest antenna's level below which one counts as off
+# (-23 dB, as in synchronisation).
 _CLEAR_PEAK_DB = 10.0
 _MUCH_DC = 0.05 * _FULL_SCALE
-_SILENT_SHARE = 0.01
+SILENT_SHARE = 0.07
 # First bytes of other kinds of files, and what `recognise_format` calls them.
 MAGIC = {
     b"\x7fELF": "a program", b"\x89PNG": "a picture (PNG)", b"\xff\xd8\xff": "a picture (JPEG)", b"%PDF": "a PDF",
@@ -286,7 +287,7 @@ def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
     if mirrored:
         remarks.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
     # Counted as on the board's silk screen.
-    if silent := [f"RX{k}" for k, v in enumerate(r.rx_rms, 1) if v < _SILENT_SHARE * max(r.rx_rms)]:
+    if silent := [f"RX{k}" for k, v in enumerate(r.rx_rms, 1) if v < SILENT_SHARE * max(r.rx_rms)]:
         remarks.append(f"no signal on {', '.join(silent)}: antennas off, or another lane layout")
     if r.clipped:
         remarks.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")

@@ -27,7 +27,7 @@ from polysight.calibration import (
     load_checked_calibration,
     unwrap_if,
 )
-from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
+from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, SILENT_SHARE, RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
     CheckContext,
     NetworkInterface,
@@ -70,7 +70,7 @@ _MIN_SPEED_MBIT = 1000
 _MIN_RING = 512
 # Share of chirps that may be clipped; chosen.
 _MAX_CLIPPED = 0.01
-# Least rms of the samples, ADC counts; chosen, an RX that is off gives less.
+# Least rms of the samples, ADC counts; chosen.
 _MIN_RMS = 4.0
 # Share of chirps in which the direct path must be found; chosen.
 _MIN_DETECTED = 0.9
@@ -578,9 +578,9 @@ def check_level(context: CheckContext, board: Board) -> Finding:
             "lower the RX gain (radar.rx_gain_db, or the profile in mmWave Studio), or move the reflector away",
             **facts,
         )
-    if rms.min() < _MIN_RMS:
+    if silent := [f"RX{k}" for k, level in enumerate(rms, 1) if level < max(_MIN_RMS, SILENT_SHARE * rms.max())]:
         remedy = f"check the RX mask of the profile; `polysight card reset {board.name} --radar`, and arm it again"
-        return error(observed, "an RX is off, or the radar sends zeros", remedy, **facts)
+        return error(f"no signal in {', '.join(silent)}: {observed}", "an RX is off, or sends zeros", remedy, **facts)
     return ok(observed, **facts)
 
 

@@ -6,6 +6,7 @@ synchronised and cut to the range of the object, so that later processing need n
 
 from __future__ import annotations
 
+import logging
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -45,11 +46,14 @@ from polysight.products import (
     raw_dropped,
     write_json,
 )
+from polysight.results import one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, advice, quote
+
+_log = logging.getLogger(__name__)
 
 PRODUCTS = "products"
 """Folder of the products of a scan, in the scan's folder."""
@@ -318,7 +322,13 @@ class LiveProcessing:
             self._source = ScanFolder.load(self._folder)
             self._pipeline = Pipeline(self._source, self._settings, self._inputs, live=True, samples="keep")
         self._source.reload()
+        known = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
         self._pipeline.add_row(row)
+        for name, board in self._pipeline.quality.boards.items():
+            # Told with the row that shows it, not after the scan.
+            new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in known[name]}
+            for finding in rules.judge_dead_rx(name, new, rows=1):
+                _log.warning("row %d: %s", row, one_line(finding))
         if self._source.complete:
             publish_images(self._pipeline, self._folder / PRODUCTS)
 

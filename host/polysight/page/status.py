@@ -16,7 +16,7 @@ import msgspec
 from polysight.acquisition import STATES, Button, Life, StateLevel, time_left
 from polysight.catalogue import Picture, Program
 from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, seconds, sentence
-from polysight.results import Verdict
+from polysight.results import Verdict, rules
 from polysight.store import ScanEnded
 from polysight.sync import PUBLISHED_STD
 from polysight_shared.errors import quote
@@ -45,13 +45,15 @@ MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 class RowSync(NamedTuple):
     """Synchronisation of one board in one row: phase std after all stages and of the direct path (nan: unknown).
 
-    `masked` is the number of positions without a direct path, `snr_db` the direct path over its scatter between bursts.
+    `masked` is the number of positions without a direct path, `snr_db` the direct path over its scatter between bursts,
+    `dead_rx` are the RX without a signal, counted from 1.
     """
 
     object_rad: float
     direct_rad: float
     masked: int
     snr_db: float = math.nan
+    dead_rx: tuple[int, ...] = ()
 
 
 class Profile(msgspec.Struct, frozen=True):
@@ -358,6 +360,9 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
             continue
         row = max(rows)
         sync = rows[row]
+        for dead in rules.judge_dead_rx(board, {rx: [row] for rx in sync.dead_rx}, rows=1):
+            what, why, do = sentence(dead.what), sentence(dead.why), sentence(dead.do)
+            notices.append(Finding("warning", what, why, do, where=f"row {row}"))
         if sync.masked > MASKED_SHARE * columns:
             problem = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
             cause = "Something stands between the transmitter and this board, or frames are missing"

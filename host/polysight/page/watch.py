@@ -183,7 +183,7 @@ class RowViewer:
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)
             _, _, scatter = figures.residuals.get("averaged", (math.nan,) * 3)
-            sync = RowSync(object_rad, direct_rad, figures.positions_masked)
+            sync = RowSync(object_rad, direct_rad, figures.positions_masked, dead_rx=tuple(figures.dead_rx))
             if scatter > 0:
                 sync = sync._replace(snr_db=-20 * math.log10(scatter))
             self._sync.setdefault(name, {})[row] = sync

@@ -9,6 +9,9 @@ from benchmarks.coverage import Cubes
 from tests.support.pipelines import make_pipeline
 
 from polysight.materials import match_truth, truth_plates
+from polysight.process import read_given_images
+from polysight.products import ProcessedScan
+from polysight.products.maps import nominal_incidence_rad
 from polysight.store import open_source
 from polysight_simulators.scene import decode_scene
 from polysight_simulators.scene.simulated_scan import simulate, truth
@@ -161,6 +164,23 @@ def test_plates_of_other_heights_are_no_tilt_and_keep_their_permittivities(exami
     assert findings.verdict.level == "good"
     assert distances(findings, true).max() < 14.0
     assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+
+
+def test_a_raised_plate_keeps_its_angle_in_images_and_maps(rig, tmp_path):
+    scene = world(disturbances={"leakage_measured": 0.003})
+    plates = tuple(msgspec.structs.replace(p, height_mm=-20.0 * (p.name == "rubber")) for p in scene.plates)
+    pipeline, _ = form_images(Cubes(rig, msgspec.structs.replace(scene, plates=plates)))
+    pipeline.finish(tmp_path)
+    scan = ProcessedScan(tmp_path)
+    given = read_given_images(tmp_path / "image.npz", pipeline.rig)
+    np.testing.assert_array_equal(given.images.raised_m, scan.images.raised_m)
+    pixel_angles = np.degrees(nominal_incidence_rad(scan))
+    on_rubber = scan.images.raised_m < -0.015
+    assert on_rubber.any()
+    # tan(angle) times the distance, 499 and 479 mm, is the same.
+    np.testing.assert_allclose(
+        np.tan(np.radians(pixel_angles[on_rubber])) * 479, np.tan(np.radians(pixel_angles[0, 0])) * 499, rtol=1e-3
+    )
 
 
 def test_a_tilted_plane_is_found(examine):

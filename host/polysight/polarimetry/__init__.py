@@ -28,6 +28,7 @@ from polysight.polarimetry.fresnel import (
     brewster_angle_rad as brewster_angle_rad,
     fresnel as fresnel,
     incidence_choice as incidence_choice,
+    incidence_on_planes as incidence_on_planes,
     multilayer as multilayer,
     permittivity_from_ratio as permittivity_from_ratio,
     ratio_from_permittivity as ratio_from_permittivity,

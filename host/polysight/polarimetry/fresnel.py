@@ -355,13 +355,21 @@ def incidence_choice(
 ) -> IncidenceChoice:
     """Compute both kinds of incidence angles; `choice` is the one to use.
 
-    Pixels were imaged on planes that lie `raised_m` [ny, nx] behind the rig's object plane; None: on it. All antennas
-    are nearly as far from it as the rig's `object_distance_mm` z, so that z tan(theta) is the same on each plane.
+    `raised_m` as of :func:`incidence_on_planes`.
     """
     pixel_rad = effective_incidence_map(rig, x_m, y_m)
     one_rad = np.full(pixel_rad.shape, specular_incidence_rad(rig))
-    if raised_m is not None:
-        distance_m = rig.geometry.object_distance_mm / 1e3
-        nearer = distance_m / (distance_m + raised_m)
-        one_rad, pixel_rad = (np.arctan(nearer * np.tan(angle)) for angle in (one_rad, pixel_rad))
-    return IncidenceChoice(choice, one_rad, pixel_rad)
+    of_planes = (incidence_on_planes(angle_rad, raised_m, rig) for angle_rad in (one_rad, pixel_rad))
+    return IncidenceChoice(choice, *of_planes)
+
+
+def incidence_on_planes(angle_rad: Real, raised_m: Real | None, rig: Instrument) -> Real:
+    """Return the angles [ny, nx] on planes that lie `raised_m` [ny, nx] behind the rig's object plane; None: on it.
+
+    All antennas are nearly as far from it as the rig's `object_distance_mm` z, so that z tan(angle) is the same on each
+    plane.
+    """
+    if raised_m is None:
+        return angle_rad
+    distance_m = rig.geometry.object_distance_mm / 1e3
+    return np.asarray(np.arctan(distance_m / (distance_m + raised_m) * np.tan(angle_rad)), np.float64)

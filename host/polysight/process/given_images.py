@@ -22,7 +22,13 @@ import scipy
 
 from polysight import materials
 from polysight.imaging import UNKNOWN_PLANE, Antennas, Illumination, Images, illumination_geometry
-from polysight.polarimetry import IncidenceChoice, PlaneReference, plane_reference, specular_incidence_rad
+from polysight.polarimetry import (
+    IncidenceChoice,
+    PlaneReference,
+    incidence_on_planes,
+    plane_reference,
+    specular_incidence_rad,
+)
 from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.quality import scene_reasons
 from polysight.process.save import Findings, assemble_result
@@ -39,7 +45,7 @@ NPZ = ".npz"
 # Arrays of an .npz file: required, optional, and the error of P = H / V, which only image.npz of this program has.
 CHANNELS = ("h", "v")
 AXES = ("x_m", "y_m")
-OPTIONAL = ("valid", "incidence_deg", "simulated", "conjugate")
+OPTIONAL = ("valid", "incidence_deg", "simulated", "conjugate", "raised_m")
 OWN_ERROR = "p_sigma"
 # Images in a folder of the published data.
 SAR_FILES = ("sar_h.npy", "sar_v.npy")
@@ -53,11 +59,14 @@ PUBLISHED_OTHER_SIGN = 0.05
 """Probability a priori that images of another program are the conjugates of ours (in which a loss is -j eps''), if
 their file does not say it; and that published ones still are after `restore_phase_sign`, which conjugates them on
 reading. Chosen: the patches decide where they can."""
+MOST_RAISED_M = 0.1
+"""Largest distance of a plate's plane from that of the others; chosen."""
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
 _EXPECTED = (
-    "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid [ny, nx], incidence_deg, simulated, conjugate"
+    "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid and raised_m [ny, nx], incidence_deg,"
+    " simulated, conjugate"
 )
 # Distances of the object plane between which `place_rig` looks for an incidence angle; chosen.
 _NEAREST_MM = 60.0
@@ -145,6 +154,8 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     valid = _find_valid(path, arrays)
     angle = _number(path, arrays, "incidence_deg")
     images = _sort_axes(h, v, valid, x_m, y_m)
+    if "raised_m" in arrays:
+        images = replace(images, raised_m=_find_raised(path, arrays, x_m, y_m))
     simulated = bool(_number(path, arrays, "simulated") or False)
     conjugate_flag = _number(path, arrays, "conjugate")
     # Only our own images hold the error of P.
@@ -330,6 +341,30 @@ def _sort_axes(
     shown_h = np.where(usable, h[rows, columns], 0).astype(np.complex64)
     shown_v = np.where(usable, v[rows, columns], 0).astype(np.complex64)
     return Images(shown_h, shown_v, x_m[columns], y_m[rows], usable)
+
+
+def _find_raised(
+    path: Path, arrays: Mapping[str, npt.NDArray[Any]], x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return how far behind the object plane each pixel was imaged, [ny, nx] with ascending axes, metres.
+
+    Raises DataError if `raised_m` has another shape, or a value that is not finite or beyond `MOST_RAISED_M`.
+    """
+    raised_m = arrays["raised_m"]
+    if raised_m.dtype.kind not in "fiu" or raised_m.shape != arrays["h"].shape:
+        raise DataError(
+            f"{path}: raised_m is {raised_m.dtype} {_shape(raised_m)}", f"expected numbers {_shape(arrays['h'])}",
+            "save the distance behind the plane, metres, with the shape of h, or leave it out",
+            code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+    if not (np.abs(raised_m) <= MOST_RAISED_M).all():
+        raise DataError(
+            f"{path}: raised_m has values beyond +-{MOST_RAISED_M:g} m",
+            "it is the distance of a plate's plane from that of the others", "save it in metres",
+            code=ErrorCode.VALUE_INVALID,
+        )  # fmt: skip
+    steps = (slice(None, None, int(np.sign(axis[1] - axis[0]))) for axis in (y_m, x_m))
+    return np.asarray(raised_m[tuple(steps)], np.float64)
 
 
 def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
@@ -531,7 +566,7 @@ def analyse_given_images(
         images = images.within(plane.valid_on(images.x_m, images.y_m))
         scene = replace(scene, metal=plane)
     # The specular angle, and the pixels' own: without a raster these are the same.
-    everywhere = np.full(images.h.shape, np.radians(angle.deg))
+    everywhere = incidence_on_planes(np.full(images.h.shape, np.radians(angle.deg)), images.raised_m, rig)
     optics = materials.Optics.from_rig(
         rig, IncidenceChoice("one", everywhere, everywhere), theta_std_rad=UNKNOWN_PLANE.incidence_std_rad(rig)
     )

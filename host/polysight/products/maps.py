@@ -24,6 +24,7 @@ from polysight.polarimetry import (
     correct_leakage,
     fresnel,
     incidence_choice,
+    incidence_on_planes,
     permittivity_from_ratio,
     ratio,
     specular_incidence_rad,
@@ -221,7 +222,7 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
 
 
 def nominal_incidence_rad(scan: ProcessedScan) -> Real:
-    """Return the incidence angle of the rig, radians: one number or, if the scan used one by pixel, [ny, nx].
+    """Return the incidence angle of the rig, radians: one number or, if pixels have different ones, [ny, nx].
 
     Not a number if neither rig nor angle are known.
     """
@@ -229,15 +230,15 @@ def nominal_incidence_rad(scan: ProcessedScan) -> Real:
     if scan.rig is None:
         return np.radians(np.float64(incidence.one_deg if incidence else np.nan))
     if incidence and incidence.used == "by pixel":
-        return incidence_choice(scan.rig, scan.x_m, scan.y_m, "pixel").used_rad
-    return np.asarray(specular_incidence_rad(scan.rig))
+        return incidence_choice(scan.rig, scan.x_m, scan.y_m, "pixel", scan.images.raised_m).used_rad
+    return incidence_on_planes(np.asarray(specular_incidence_rad(scan.rig)), scan.images.raised_m, scan.rig)
 
 
 def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
     """Return the incidence angle that the scene tells, radians; the nominal one if the budget has no estimate."""
     if budget is None or budget.incidence is None or budget.incidence.deg is None:
         return theta_rad
-    return theta_rad + (np.radians(budget.incidence.deg) - theta_rad.mean())
+    return theta_rad + (np.radians(budget.incidence.deg) - np.median(theta_rad))
 
 
 def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:

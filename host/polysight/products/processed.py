@@ -70,9 +70,10 @@ _ARRAYS = {
     "y_m": np.float64,
     "valid": np.bool_,
     "p_sigma": np.float32,
+    "raised_m": np.float32,
 }
-# Arrays of image.npz that earlier releases did not write.
-_OPTIONAL = ("p_sigma",)
+# Arrays of image.npz that not every scan has, or that earlier releases did not write.
+_OPTIONAL = ("p_sigma", "raised_m")
 
 
 class PlatesNamed(NamedTuple):
@@ -94,7 +95,7 @@ _PRODUCTS = "products"
 def write_image(path: Path, images: Images) -> None:
     """Write image.npz: h, v, p complex64 [ny, nx], x_m, y_m float64, valid bool; row 0 is the smallest y.
 
-    `p_sigma` float32 [ny, nx] is left out if it is None.
+    `p_sigma` and `raised_m` float32 [ny, nx] are left out if they are None.
 
     Raises
     ------
@@ -116,7 +117,7 @@ def write_image(path: Path, images: Images) -> None:
 
 
 def read_image(path: Path) -> Images:
-    """Read image.npz (no pickle), with `p_sigma` if the file has it. Raises DataError."""
+    """Read image.npz (no pickle), with `p_sigma` and `raised_m` if the file has them. Raises DataError."""
     try:
         with open_npz(path) as z:
             arrays = {name: z[name] for name in _ARRAYS if name in z or name not in _OPTIONAL}
@@ -233,7 +234,7 @@ class ProcessedScan:
 
     @cached_property
     def images(self) -> Images:
-        """Images of image.npz: h, v, p, valid and, if the products have it, p_sigma."""
+        """Images of image.npz: h, v, p, valid and, if the products have them, p_sigma and raised_m."""
         return read_image(self.folder / IMAGE)
 
     @property

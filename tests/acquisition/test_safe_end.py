@@ -272,7 +272,8 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     commands = []
     streams = [kind(), kind()]
     monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
-    monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: SimpleNamespace(add_row=lambda _: None))
+    no_rows = SimpleNamespace(add_row=lambda _: None, quality=SimpleNamespace(boards={}))
+    monkeypatch.setattr(processing, "Pipeline", lambda *_, **__: no_rows)
     monkeypatch.setattr(
         processing,
         "make_products",

@@ -10,14 +10,12 @@ the echoes.
 
 from polysight.sync.backlash import estimate_backlash, object_filter
 from polysight.sync.chain import PUBLISHED_STD, STAGES, BoardSetup, RowSynchroniser, synchronise_row
-from polysight.sync.decimate import FOLD, decimation, whole_blocks
+from polysight.sync.decimate import FOLD, block_frequencies_hz, decimation, sample_frequencies_hz, whole_blocks
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import cis
 from polysight.sync.offsets import (
     AlignedRow,
     SyncedRow,
     align_row,
-    block_frequencies_hz,
     reference,
-    sample_frequencies_hz,
 )

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.sync.decimate import sample_frequencies_hz
 from polysight.sync.direct_path import excess_path_m
-from polysight.sync.offsets import sample_frequencies_hz
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import mean_burst_travel_mm, plan_raster

@@ -17,10 +17,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.sync.decimate import flatten, fold, whole_blocks
+from polysight.sync.decimate import flatten, fold, sample_frequencies_hz, whole_blocks
 from polysight.sync.direct_path import DirectPath, excess_path_m, prepare
 from polysight.sync.loops import phasor
-from polysight.sync.offsets import AlignedRow, SyncedRow, find_dead_rx, reference, sample_frequencies_hz
+from polysight.sync.offsets import AlignedRow, SyncedRow, find_dead_rx, reference
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError

@@ -20,12 +20,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight_shared.config import Chirp
+
 FOLD = 4
 """Samples of a block."""
 TAPS = 10
 """Samples that `fold` weights for a block: three before it, its own, three after it."""
 FLAT = 9
 """Blocks that `flatten` weights."""
+SEARCH_FFT = 256
+"""Size of the FFT that searches the direct path, over decimated samples; chosen."""
 
 # Samples that `fold` weights on either side of a block, and blocks that `flatten` weights on either side of one.
 _BESIDE = (TAPS - FOLD) // 2
@@ -160,3 +164,19 @@ def decimation(samples: int, middle: float) -> NDArray[np.complex128]:
     mixed = np.diag(np.exp(-2j * np.pi * middle * time)).astype(np.complex64)
     blocks = flatten(fold(mixed)).T.astype(np.complex128)
     return blocks * np.exp(2j * np.pi * middle * time.reshape(-1, FOLD).mean(axis=1))[:, None]
+
+
+def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
+    """Return the transmit frequency of every sample of a chirp, Hz [sample]."""
+    return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=np.float64)
+
+
+def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
+    """Return the transmit frequency in the middle of every block of linear samples, Hz [block]."""
+    a, b = whole_blocks(chirp.linear_samples)
+    return sample_frequencies_hz(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
+
+
+def search_window(blocks: int) -> NDArray[np.float32]:
+    """Return the search's window [block]: a Hann window without zeros at its ends."""
+    return np.hanning(blocks + 2)[1:-1].astype(np.float32)

@@ -13,9 +13,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.sync.decimate import FOLD
+from polysight.sync.decimate import FOLD, SEARCH_FFT, block_frequencies_hz, sample_frequencies_hz, search_window
 from polysight.sync.loops import cis, complex64
-from polysight.sync.offsets import SEARCH_FFT, block_frequencies_hz, sample_frequencies_hz, search_window
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import Vector, rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

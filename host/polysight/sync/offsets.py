@@ -37,18 +37,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from polysight.sync import high_pass_filter as hpf, loops
-from polysight.sync.decimate import FOLD, decimator, whole_blocks
+from polysight.sync.decimate import FOLD, SEARCH_FFT, decimator, search_window, whole_blocks
+from polysight.sync.direct_path import DirectPath
 from polysight.sync.loops import Library, NumpyLoops, Real, Removed, Tone, cis, complex64
 from polysight_shared.config import Chirp
-
-if TYPE_CHECKING:
-    from polysight.sync.direct_path import DirectPath
 
 # Burst alignment: reference chirps tried per position; chosen.
 _REFERENCES = 4
@@ -65,8 +63,6 @@ _ROUNDS = 4
 _LEAST_LIMIT = 1024
 _AT_LIMIT = 32
 
-SEARCH_FFT = 256
-"""Size of the FFT that searches the direct path, over decimated samples; chosen."""
 # Gauss-Newton steps to the direct path's frequency. In noise the last one stays large: no direct path is found.
 _STEPS = 3
 # If the strongest peak has a second one of this relative amplitude (chosen) below it, nearer by the object's distance
@@ -521,22 +517,6 @@ def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
     """Return the RMS of errors [3, n]."""
     f, p, a = np.sqrt((values**2).mean(axis=1))
     return float(f), float(p), float(a)
-
-
-def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
-    """Return the transmit frequency of every sample of a chirp, Hz [sample]."""
-    return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples, dtype=np.float64)
-
-
-def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
-    """Return the transmit frequency in the middle of every block of linear samples, Hz [block]."""
-    a, b = whole_blocks(chirp.linear_samples)
-    return sample_frequencies_hz(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
-
-
-def search_window(blocks: int) -> NDArray[np.float32]:
-    """Return the search's window [block]: a Hann window without zeros at its ends."""
-    return np.hanning(blocks + 2)[1:-1].astype(np.float32)
 
 
 def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:

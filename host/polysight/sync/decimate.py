@@ -1,4 +1,4 @@
-"""Decimation of chirps: the linear samples, mixed down, become one sample for every block of `FOLD`.
+"""Decimation of chirps: the linear samples, mixed down, become one sample for every block of `FOLD`; their frequencies.
 
 After mixing to the middle of its band, a chirp's signal lies within a few range bins of zero, far below the rate of its
 samples. `fold` weights the samples of each block and its neighbours with a low-pass filter of ten taps. A plain average

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import os
 import signal
@@ -77,18 +76,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         longest_first(items)
 
 
-# <malloc.h>
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
-
-
 def pytest_collection_finish() -> None:
-    # Searches for cycles, of which there are few, took 5 % of the tests' processor time, and 4 % giving the memory of
-    # arrays back to the system, which has to clear it for the next ones.
     gc.freeze()
+    # A twentieth of the tests' processor time was spent on cycles, of which there are few.
     gc.set_threshold(20_000)
-    malloc = ctypes.CDLL(None)
-    for option, size in ((M_MMAP_THRESHOLD, 1 << 30), (M_TRIM_THRESHOLD, (1 << 31) - 1), (M_TOP_PAD, 1 << 24)):
-        malloc.mallopt(option, size)
     gc.enable()
 
 

@@ -78,8 +78,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def pytest_collection_finish() -> None:
     gc.freeze()
-    # A twentieth of the tests' processor time was spent on cycles, of which there are few.
-    gc.set_threshold(20_000)
     gc.enable()
 
 

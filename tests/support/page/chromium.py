@@ -27,12 +27,8 @@ PHONE = (390, 844, True)
 
 
 def find_chromium() -> str | None:
-    """The browser's program; None where there is none.
-
-    The headless shell comes first: without the windows, its start takes half the processor time and a page a third.
-    """
-    programs = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-    return next(filter(None, map(shutil.which, programs)), None)
+    """The browser's program; None where there is none."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def find_axe() -> Path | None:

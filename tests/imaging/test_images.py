@@ -9,7 +9,16 @@ import pytest
 import scipy.signal
 from tests.support.refusals import refused
 
-from polysight.imaging import UNKNOWN_PLANE, ImageBuilder, Images, backproject, image_grid, move_to_plane, plane
+from polysight.imaging import (
+    UNKNOWN_PLANE,
+    ImageBuilder,
+    Images,
+    backproject,
+    image_grid,
+    move_to_plane,
+    plane,
+    samples as reduced,
+)
 from polysight.imaging.geometry import Antennas, find_ends, row_offsets_m, scene_gate_m
 from polysight.imaging.images import Dispersion
 from polysight.imaging.samples import mirror_samples, reduction
@@ -241,6 +250,18 @@ def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig
             assert np.abs(got - want).max() <= 2e-5 * max(np.abs(want).max(), 0.2)
     for channel in ("h", "v", "valid"):
         np.testing.assert_array_equal(getattr(live.finish(), channel), getattr(plain.finish(), channel))
+
+
+def test_a_gate_of_more_multiplications_than_one_product_may_have_is_applied(make_rig, synced_row, monkeypatch):
+    rig = make_rig(15, 9, pixels=(16, 14))
+    images = []
+    for most in (reduced._PRODUCT, 1):
+        monkeypatch.setattr(reduced, "_PRODUCT", most)
+        builder = ImageBuilder(rig)
+        for name, index, row in _random_rows(rig, synced_row, np.random.default_rng(8)):
+            builder.add_row(name, index, row)
+        images.append(builder.finish())
+    np.testing.assert_allclose(images[0].h_raw, images[1].h_raw, atol=1e-5 * np.abs(images[1].h_raw).max())
 
 
 def test_measured_offsets_of_rows_improve_the_focus(make_rig, points_rows):

@@ -101,10 +101,12 @@ def test_permittivities_are_those_of_the_plates(labels_folder, rig):
 
 def test_the_direction_of_an_axis_does_not_matter(save_images, pair, rig):
     x = 1.3 + np.arange(150) * 2e-3
-    upwards = analyse_file(save_images(x_m=x, y_m=x), rig)
-    turned = {name: image[::-1, ::-1] for name, image in pair.items()}
+    raised_m = np.linspace(-0.01, 0.01, 150 * 150).reshape(150, 150)
+    upwards = analyse_file(save_images(x_m=x, y_m=x, raised_m=raised_m), rig)
+    turned = {name: image[::-1, ::-1] for name, image in {**pair, "raised_m": raised_m}.items()}
     downwards = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **turned), rig)
     np.testing.assert_array_equal(upwards.images.h, downwards.images.h)
+    np.testing.assert_array_equal(upwards.images.raised_m, downwards.images.raised_m)
     assert permittivities(upwards) == permittivities(downwards)
     assert upwards.images.x_m[0] == 1.3
 
@@ -172,6 +174,9 @@ WRONG = {
     "uneven axis": ({"x_m": (np.arange(150) * 2e-3) ** 2}, ErrorCode.VALUE_INVALID, "x_m"),
     "millimetres": ({"x_m": np.arange(150) * 2.0, "y_m": np.arange(150) * 2.0}, ErrorCode.VALUE_INVALID, "2000"),
     "words": ({"incidence_deg": np.array("55")}, ErrorCode.VALUE_INVALID, "incidence_deg"),
+    "raised as one number": ({"raised_m": np.array(0.01)}, ErrorCode.MISMATCH, "raised_m"),
+    "raised by millimetres": ({"raised_m": np.full((150, 150), 12.0)}, ErrorCode.VALUE_INVALID, "raised_m"),
+    "raised by nothing": ({"raised_m": np.full((150, 150), np.nan)}, ErrorCode.VALUE_INVALID, "raised_m"),
     "valid as numbers": ({"valid": np.ones((150, 150))}, ErrorCode.MISMATCH, "valid"),
 }
 

@@ -651,12 +651,15 @@ def _fit_most(
     tilts = np.linspace(-2, 2, 33) * _TILT_PRIOR_RAD
     slopes = np.stack(np.meshgrid(tilts, tilts), axis=-1).reshape(-1, 2)
     rises = slopes @ places.T
-    # [plate of the plane, tilt, plate]: the distance of each plate from the plane through another.
+    # Height at the middle of the tilted plane through each plate, [tilt, plate].
     levels = heights - rises
-    distance = levels[:, None] - levels[:, :, None]
-    cost = np.minimum((distance / stds) ** 2, _LEVEL_STDS**2).sum(axis=-1)
-    cost += (np.sum(slopes**2, axis=1) / _TILT_PRIOR_RAD**2)[:, None]
-    tilt, plate = np.unravel_index(np.argmin(cost), cost.shape)
+    prior = np.sum(slopes**2, axis=1) / _TILT_PRIOR_RAD**2
+    # [plate of the plane, tilt]. Plane by plane: a picture may have hundreds of patches.
+    cost = [
+        prior + np.minimum(((levels - through[:, None]) / stds) ** 2, _LEVEL_STDS**2).sum(axis=1)
+        for through in levels.T
+    ]
+    plate, tilt = np.unravel_index(np.argmin(cost), np.shape(cost))
     return rises[tilt] + levels[tilt, plate]
 
 

@@ -417,7 +417,7 @@ class BoardSamples:
         used, maps = self._maps[sweep_hz.size]
         pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used]
         gated = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
-        step = _PRODUCT // maps.size
+        step = max(1, _PRODUCT // maps.size)
         for first in range(0, pairs.shape[1], step):
             np.matmul(pairs[:, first : first + step], maps, out=gated[:, first : first + step])
         count = self._reduction.frequencies_hz.size + 1

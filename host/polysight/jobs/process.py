@@ -322,11 +322,11 @@ class LiveProcessing:
             self._source = ScanFolder.load(self._folder)
             self._pipeline = Pipeline(self._source, self._settings, self._inputs, live=True, samples="keep")
         self._source.reload()
-        known = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
+        told = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
         self._pipeline.add_row(row)
         for name, board in self._pipeline.quality.boards.items():
             # Told with the row that shows it, not after the scan.
-            new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in known[name]}
+            new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in told[name]}
             for finding in rules.judge_dead_rx(name, new, rows=1):
                 _log.warning("row %d: %s", row, one_line(finding))
         if self._source.complete:

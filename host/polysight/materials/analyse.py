@@ -461,7 +461,9 @@ class SceneScatter:
 
     def usual_background(self, measured: Sequence[PatchMeasurement]) -> float:
         """Return the median of :meth:`background_in` over patches; 0 without any."""
-        return float(np.median([self.background_in(m) for m in measured])) if measured else 0.0
+        if measured:
+            return float(np.median([self.background_in(m) for m in measured]))
+        return 0.0
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ class CaptureRig:
     @property
     def complete(self) -> bool:
         """True if every expected byte of the row has arrived, on every board."""
-        # Poll every receiver, also behind an incomplete one: polling is how a dead process is noticed.
+        # Poll every receiver, also those after an incomplete one: only polling notices a dead process.
         reports = [receiver.poll() for receiver in self.receivers.values()]
         return all(progress.complete for progress in reports)
 

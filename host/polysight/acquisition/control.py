@@ -4,8 +4,8 @@ Ctrl-C and SIGTERM set a `StopRequest`, which any thread may read. Other program
 empty file with the command's name in `<scan>/control/`; `touch SCAN/control/pause` in a shell does the same. The scan
 creates that folder when it begins, renames each command file, obeys and removes it, writes `alive` once a second, and
 removes the folder at its end. A command file may hold who sent it. `alive` says which process scans, what it does and
-what it was asked (`read_life`), so that page, list and terminal tell a killed scan from one that runs. Specification:
-docs/spec/scan-folder.md.
+what it was asked (`read_life`), so that page, list and terminal distinguish a killed scan from one that runs.
+Specification: docs/spec/scan-folder.md.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class Life(msgspec.Struct, frozen=True):
 def read_start_ticks(pid: int) -> int | None:
     """Return the start time of a running process in clock ticks since boot, or None if it has ended.
 
-    It tells a process from a later one with the same number.
+    It distinguishes a process from a later one with the same number.
     """
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -340,7 +340,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
 
 
 def _write_command(path: Path, asker: str) -> None:
-    """Create a command's file, complete at once; on a full disk it is empty, and still a command."""
+    """Create a command's file, complete from the beginning; on a full disk it is empty, and still a command."""
     part = path.with_name(f".{path.name}.part")
     with part.open("wb", buffering=0) as f, suppress(OSError):
         f.write(asker.encode())

@@ -220,7 +220,7 @@ class PiClient:
             heartbeat.stop()
 
         missing_mm = from_mm + distance_mm - _find_place_mm(status, axis)
-        # The stage goes whole steps, so it may rest half a step beside the place; 1 % is for rounding.
+        # The stage moves in whole steps, so it may stop half a step from the target; 1 % is for rounding.
         tolerance_mm = 1.01 * 0.5 / self._instrument.stage.steps_per_mm
         if status.fault or abs(missing_mm) > tolerance_mm:
             raise ScanError(

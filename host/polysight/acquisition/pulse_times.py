@@ -3,7 +3,7 @@
 A record says how many frames a radar sent, not at which pulses: a missed SYNC_IN pulse, a spurious edge and bytes that
 the card dropped unnoticed leave no other trace. Arrival times do. The packets of one frame come together, as a *train*
 between two silences. The *shift* of a train is the number of bytes that are missing before it: 0 in a perfect row, a
-frame more behind a missed pulse, a frame less behind a spurious edge. Arrival times bound it:
+frame more after a missed pulse, a frame less after a spurious edge. Arrival times bound it:
 
 * Upper bound: when the last byte of a train came, the pulse of its frame had been sent. It holds whatever was delayed.
 * Lower bound: the first packet of a train came as soon as it was full, unless something held it back. This bound is
@@ -50,7 +50,7 @@ from polysight_shared.units import us_to_ns
 
 Times = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-# A gap is a range of bytes of the row: its first, and the one behind its last.
+# A gap is a range of bytes of the row: its first, and the one after its last.
 Gap = tuple[int, int]
 
 # Silence between packets that begins a new train (chosen). A radar needs 150 us between two frames (AWR2243, hardware
@@ -390,7 +390,7 @@ def _predict_arrivals(
     if len(sent) < _AGREEING:
         raise _DisturbedError(f"data of {len(sent)} bursts came in time: too few for the offset between the clocks")
 
-    # Delays behind the first one, over the time behind the first pulse.
+    # Delays relative to the first one, over the time since the first pulse.
     start_ns = int(pulses_ns[0, 0])
     sent_at = np.array(sent, dtype=np.float64) - start_ns
     delay = np.array(delays, dtype=np.float64) - delays[0]
@@ -443,8 +443,8 @@ class ReceivedCapture(NamedTuple):
 def find_frames(path: Path, row: Row, events: list[ReceivedCapture], rig: Instrument) -> PlacedFrames:
     """Place the frames of a row.
 
-    `path` is the row's file, with its index beside it; `events` are the row's capture events. Raises DataError if the
-    index is not readable.
+    `path` is the row's file; its index is in the same folder. `events` are the row's capture events. Raises DataError
+    if the index is not readable.
     """
     events = sorted((e for e in events if e.event.pulses == rig.burst.pulses), key=lambda e: e.event.point)
     if [e.event.point for e in events] != list(range(row.points)):
@@ -563,9 +563,9 @@ def move_frames(
 
 
 def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) -> PlacedFrames | None:
-    """Return the frames with which a row is rewritten; None if it stays as its packets' counters say.
+    """Return the frames with which a row is rewritten; None to keep the placement by its packets' counters.
 
-    Without times a row stays as it is, and the manifest says so. If the times contradict the row, no frame is kept.
+    Without times a row is not changed, and the manifest says so. If the times contradict the row, no frame is kept.
     Otherwise the row is rewritten if it has slipped, or if the pulse of some frame is uncertain.
     A row has slipped if its packets cannot be located only because whole frames are missing.
     """
@@ -585,7 +585,7 @@ def _keep_payload(path: Path, received: NDArray[np.uint8]) -> int:
     """
     if not path.exists():
         return 0
-    # What else the packet file tells of the row stays as it is. None: the packet file gets all of the payload, because
+    # The packet file's other entries on the row stay unchanged. None: the packet file gets all of the payload, because
     # the row's file, which held it, is rewritten.
     evidence, log = read_packets(path, received)
     return write_packets(path, log, evidence, None)

@@ -579,7 +579,7 @@ def resume_scan(
                 "start the Pi with the backend the scan was begun with, or make a new scan",
                 code=ErrorCode.MISMATCH,
             )
-        # Settings that the Pi told when the scan began must be those of now. A Pi of an older program tells none:
+        # The Pi's settings must be those that it reported when the scan began. A Pi of an older program reports none:
         # `check_same_stage` then only warns.
         if not hello.stage or (scan.started.pi is not None and scan.started.pi.stage):
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")

@@ -97,8 +97,8 @@ class Classifier(ClassifierMixin, BaseEstimator):
     def fit(self, X: npt.ArrayLike, y: npt.ArrayLike, groups: npt.ArrayLike | None = None) -> Self:
         """Fit to pixels X [n, 4 * angles] of materials y [n].
 
-        `groups` [n] is the scan of each pixel: what the pixels of a scan share is no difference of materials. Without
-        it all pixels are of one scan.
+        `groups` [n] is the scan of each pixel: what the pixels of a scan share is not a difference of materials.
+        Without it all pixels are of one scan.
 
         Raises
         ------

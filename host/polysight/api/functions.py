@@ -1,4 +1,4 @@
-"""Functions beside a scan: plan one, simulate one, compare two, check the plates of many."""
+"""Functions on scans: plan one, simulate one, compare two, check the plates of many."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def open_scan(
     Raises
     ------
     DataError
-        when the folder is none of these, or is damaged.
+        when the folder is not one of these, or is damaged.
     ConfigError
         when a parameter or a rig file is wrong, or a folder of products is given with a rig or processing parameters.
     """
@@ -199,7 +199,7 @@ def _open_products_only(path: Path, settings: Settings, process_again: bool) -> 
 
 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
-    """Open recorded data, also without raw rows; without `rig`, with the rig file beside it or the packaged one."""
+    """Open recorded data, also without raw rows; without `rig`, with the rig file in its folder or the packaged one."""
     if rig is None:
         rig = path / RIG if (path / RIG).exists() else find_packaged(RIG)
     return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)
@@ -352,8 +352,8 @@ class Scan:
             `permittivity_loss_standard_error`; `mask` bool: True where the scan lights the pixel, the errors are below
             half of the value, and a half space can have it (real part 1, loss 0 or more) within twice its errors.
             Errors of neighbouring pixels are mostly the same ones: a mean over a patch is no more certain than they.
-            Pixels are corrected for the leakage and the incidence angle that the scene tells, and those of a patch for
-            all that is known of it: their median has the patch's permittivity.
+            Pixels are corrected for the leakage and the incidence angle that the scene determines, and those of a patch
+            for all that is known of it: their median has the patch's permittivity.
 
         Raises
         ------
@@ -427,7 +427,7 @@ class Scan:
         Returns
         -------
         Path
-            The label file; a picture of the boxes lies beside it.
+            The label file; a picture of the boxes lies in the same folder.
 
         Raises
         ------
@@ -452,7 +452,7 @@ class Scan:
         Returns
         -------
         xarray.Dataset
-            On dimension `patch`: `name` ("" when not named, "unknown" when it is none of the library), `confidence`,
+            On dimension `patch`: `name` ("" when not named, "unknown" when it is not one of the library), `confidence`,
             `runner_up` and `runner_up_share` (the next name and its probability; in products without probabilities
             the share of the patch's pixels that have it),
             `metal_reference`, `pixels`;
@@ -472,7 +472,7 @@ class Scan:
 
         `stack` is typed as for `polysight permittivity --layer`: `scan.layers("sheet,?,0.5-3", "plate,metal")`. `bands`
         are the sub-bands used (None: all where a thickness is fitted), `amplitude_percent` says how far |H| may be
-        trusted. `ambiguous` and `notes` tell what the data leave open. Raises as :meth:`image`, and ConfigError.
+        trusted. `ambiguous` and `notes` say what the data do not determine. Raises as :meth:`image`, and ConfigError.
         """
         return layer_dataset(self.read_or_process(True), self.rig.chirp, stack, bands, amplitude_percent)
 

@@ -246,8 +246,8 @@ def choose_start_offset(
 ) -> BoardStart:
     """Return the start offset that moves a direct path, aliased to `seen_hz`, to the middle of the IF band.
 
-    `expected_hz` is its IF by the rig file, which tells by how many sample rates it is aliased; `error_hz` is the
-    standard error of `seen_hz` over `chirps` chirps. The offset is rounded to 1 Hz.
+    `expected_hz` is its IF by the rig file, which gives the number of sample rates by which it is aliased; `error_hz`
+    is the standard error of `seen_hz` over `chirps` chirps. The offset is rounded to 1 Hz.
     """
     rate = rig.chirp.sample_rate_hz
     middle = sum(band_hz(rig)) / 2

@@ -1,7 +1,7 @@
 """Calibration files, the active calibration of a scan, and the recorded scans that calibrations are made from.
 
 Files are dated TOML files with sources, values and standard errors, units in the key names. The gains of a metal plate
-are arrays and lie in an .npz file beside their TOML file.
+are arrays and lie in an .npz file next to their TOML file.
 
 The rig file names the files that apply. A scan keeps copies of them in `<scan>/calibration`; the manifest lists them
 with their digests. Processing uses the copies, even if the rig file names other files later.
@@ -155,7 +155,7 @@ class MetalBand(msgspec.Struct, frozen=True):
 
 
 class MetalFile(CalibrationFile, frozen=True, kw_only=True):
-    """`metal`: gains over the plane, in the file `images` beside this one, and the settings they depend on.
+    """`metal`: gains over the plane, in the file `images` of the same folder, and the settings they depend on.
 
     `images` is the file's name without a folder, `images_crc32` its digest. The shares, variations and the spread are
     those of :meth:`PlaneReference.facts`, `how` is a sentence for the report. `imaged_with` is None in files of older
@@ -284,7 +284,7 @@ def read_calibration(path: Path, file_type: type[F], kind: str) -> F:
 def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path, bands: Sequence[SubBand] = ()) -> Path:
     """Write the gains of a metal plate and their calibration file; return the path of the latter.
 
-    The gains lie beside it under the same name (.npz). `bands` are the sub-bands of `reference.bands`.
+    The gains lie in the same folder under the same name (.npz). `bands` are the sub-bands of `reference.bands`.
 
     Raises
     ------
@@ -430,7 +430,7 @@ class Calibration:
 
     @staticmethod
     def _shift_board(board: Board, places: PlacesFile) -> Board:
-        """Return a board at its measured position: a shift is added behind the steps of its mount."""
+        """Return a board at its measured position: a shift is added after the steps of its mount."""
         board_place = places.boards.get(board.name)
         if board_place is None:
             return board

@@ -48,7 +48,7 @@ SOCKET_DATAGRAMS = 1000
 EEPROM_REPORT_S = 0.5
 # Command and data port, as the EEPROM holds them.
 _PORTS = struct.Struct("<HH")
-# MAC address of a card as it is delivered.
+# Default MAC address of a card.
 DEFAULT_MAC = "12:34:56:78:90:12"
 _MAC_REMEDY = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
@@ -463,7 +463,7 @@ def survey_cards(instrument: Instrument, listen_s: float = 0.0) -> list[CardSurv
 def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: float) -> CardSurvey:
     """Check a board's card hop by hop; hops that are not checked become notes without text.
 
-    These are all behind the first that fails, and behind the card of a board that is not recorded.
+    These are all checks after the first that fails, and those after the card of a board that is not recorded.
     """
     survey = CardSurvey(board)
     findings = survey.hops

@@ -175,7 +175,7 @@ def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
     return sequence, low | high << 32
 
 
-# Byte ranges of a recording: the first byte of each, and the one behind its last.
+# Byte ranges of a recording: the first byte of each, and the one after its last.
 Gaps = Sequence[tuple[int, int]]
 
 

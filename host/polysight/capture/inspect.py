@@ -120,7 +120,7 @@ class Report:
     `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
     float64 [samples]; its highest bin but those of a constant offset is `peak_bin`, of `peak_db`. `rx_profile_db` is
     that of every antenna, over the same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC
-    counts. `clipped` counts values at full scale in all of the payload, `left_over_bytes` the bytes behind the last
+    counts. `clipped` counts values at full scale in all of the payload, `left_over_bytes` the bytes after the last
     complete chirp. `chirps` are those in the file, of which the first `MAX_CHIRPS` make the other statistics. `remarks`
     are sentences on what is suspicious; `card` is None unless the file is a packet capture. `simulated` is set by the
     caller.
@@ -146,7 +146,7 @@ class Report:
 def read_packets(payload: NDArray[np.uint8]) -> list[bytes]:
     """Return the packets of a file of consecutive full packets, the last perhaps short; [] for any other file.
 
-    Some programs write packets as they come: 1456 bytes of payload, each behind ten bytes of counters. `payload` is the
+    Some programs write packets as they come: 1456 bytes of payload, each after ten bytes of counters. `payload` is the
     file's content, uint8 [n].
     """
     count = min(_HEADERS_READ, payload.size // MAX_PACKET_BYTES)
@@ -270,9 +270,9 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
 def is_mirrored(power: NDArray[np.float64]) -> bool:
     """True if a complex spectrum, float64 [bin], is at negative frequencies: I and Q are swapped.
 
-    TI's mode "complex 1x" has IFs up to 0.9 sample rates, so power in the upper half is no proof, and the last quarter
-    is compared with the first: returns come from near. Three bins beside zero are left out. Four times the power counts
-    as mirrored (both chosen).
+    TI's mode "complex 1x" has IFs up to 0.9 sample rates, so power in the upper half is not a proof, and the last
+    quarter is compared with the first: returns come from near. Three bins on either side of zero are left out. Four
+    times the power counts as mirrored (both chosen).
     """
     n = power.size
     rim = 3
@@ -385,7 +385,7 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
     Raises
     ------
     DataError
-        if the file is no packet capture, has nothing from a card, or several cards and none was selected.
+        if the file is not a packet capture, has nothing from a card, or several cards and none was selected.
     """
     card, packets = _select_from_card(path, card_address)
     data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]

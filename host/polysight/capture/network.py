@@ -227,7 +227,7 @@ class BatchReceiver:
     def receive_all(self) -> Iterator[int]:
         """Fetch every packet that came before this call, in batches; yield the number in each, as :meth:`receive`."""
         # Packets may come without end, and they come in order: after a full buffer all that waited are fetched. Their
-        # times tell less: they are wrong after somebody set the wall clock, and by the error of its reading.
+        # times are less certain: they are wrong after somebody set the wall clock, and by the error of its reading.
         buffer_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self.is_drained = False
         while not self.is_drained and buffer_bytes >= 0:
@@ -330,7 +330,7 @@ class Hop(Enum):
     NEIGHBOUR = "no device at the address"
     # A device has the address but does not answer commands.
     CARD = "the card is mute"
-    # The system's tables do not tell, as on loopback.
+    # The system's tables do not contain it, as on loopback.
     UNKNOWN = "unknown"
 
 

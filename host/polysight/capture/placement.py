@@ -27,14 +27,14 @@ from polysight.capture.dca1000 import BYTE_COUNT_BITS, MAX_PAYLOAD_BYTES, SEQUEN
 Bytes = NDArray[np.uint8]
 Counts = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-# A gap is a range of bytes of the row: its first, and the one behind its last.
+# A gap is a range of bytes of the row: its first, and the one after its last.
 Gap = tuple[int, int]
 
 SWITCHED_ON = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
 # Fewer packets that seem to be of another record, or of a second card, are taken for damaged ones; chosen.
 MIN_PACKETS_OF_A_RECORD = 3
-# A packet that comes behind one so many packets further on was not delayed by the network: the card restarted, and gave
+# A packet that comes after one so many packets further on was not delayed by the network: the card restarted, and gave
 # the same counters twice. Chosen: far more than a switch or the kernel reorders.
 _FAR_BEHIND = 64
 # A size seen in fewer packets is not taken for that of full packets: the last packet of a record is short.
@@ -55,7 +55,7 @@ class Past:
 
     @staticmethod
     def after_reset() -> Past:
-        """Return the start after a reset by the host: the card's memory is empty, and its counters begin anew."""
+        """Return the start after a reset by the host: the card's memory is empty, and its counters start again."""
         return Past(start=SWITCHED_ON)
 
 
@@ -75,7 +75,7 @@ class PacketCounts:
     leftover: int = 0
     # Packets with the counters of a card that restarted within the row.
     restarted: int = 0
-    # Packets behind the record's last expected byte, or not kept for lack of memory.
+    # Packets beyond the record's last expected byte, or not kept for lack of memory.
     outside: int = 0
     # All others: their byte count and sequence number contradict each other, or are far from the row's.
     disagreeing: int = 0
@@ -160,7 +160,7 @@ class Preview:
 
 
 class Evidence(msgspec.Struct, frozen=True):
-    """Inputs for placing a row, beside its packets (see :func:`place_record`). By default the start is unknown."""
+    """Inputs for placing a row, in addition to its packets (:func:`place_record`). By default the start is unknown."""
 
     # Bytes of the whole row.
     expected: int
@@ -228,7 +228,8 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     record = _find_record(log, past, not_before_ns)
     if not record.of_row.any():
         return Preview(0, log.expected == 0, ended=False)
-    # Packets in the order of their place, so that each byte counts once: of a packet, those behind all earlier ends.
+    # Packets in the order of their place. Each byte counts once: of a packet, those beyond the ends of all earlier
+    # ones.
     starts = record.offsets[record.of_row]
     ends = np.minimum(starts + log.sizes[record.of_row], log.expected)
     order = np.lexsort((ends, starts))
@@ -254,9 +255,9 @@ class _Record:
     steps: Counts
     # Packets with counters within the row that came after the first pulse.
     of_row: Flags
-    # Packets whose counters go on from this record behind the row's last byte.
+    # Packets whose counters continue those of this record beyond the row's last byte.
     beyond: Flags
-    # Packets of a record behind this one: their counters do not fit this record's start.
+    # Packets of a record after this one: their counters do not fit this record's start.
     later: Flags
     # True for packets that came before the row's first pulse.
     early: Flags
@@ -303,8 +304,8 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     is_beyond = is_near & counters_agree & (offsets >= expected)
     later = is_near & ~counters_agree & (offsets >= max(length, full_payload))
     ends_in_short = expected % full_payload > 0
-    # A card that restarts counts again from byte 0 and packet 1. Its packets can be told from the row's own only if the
-    # row began far from there. They come after the row's first packet.
+    # A card that restarts counts again from byte 0 and packet 1. Its packets can be distinguished from the row's own
+    # only if the row began far from there. They come after the row's first packet.
     after_restart = np.zeros_like(is_of_row)
     if start.byte_count > 2 * expected and is_of_row.any():
         counts_anew = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
@@ -475,7 +476,7 @@ class _Row:
             return
         starts = self._record.offsets[placed]
         stops = self._stops[placed]
-        # In the order of their place, a packet that starts behind all earlier ends begins a new range.
+        # In the order of their place, a packet that starts beyond the ends of all earlier ones begins a new range.
         order = np.argsort(starts, kind="stable")
         ordered_starts = starts[order]
         furthest_ends = np.maximum.accumulate(stops[order])

@@ -200,7 +200,7 @@ class RowCapture(_Message, frozen=True):
     `packets` were placed, some of them `late` (after a packet of a later place, by at most `late_by_bytes`) or `short`
     (not full). Not placed were `duplicates`, `conflicting` (equal counters, other bytes), `leftover` (of an earlier
     record; `before_pulses` of them came before the first pulse), `restarted` (the card restarted within the row),
-    `outside` (behind the row's end), `disagreeing` (their counters contradict each other) and `malformed` packets. Not
+    `outside` (beyond the row's end), `disagreeing` (their counters contradict each other) and `malformed` packets. Not
     of the row are `strangers` (packets from another address than the card's), `stale` (packets from between rows) and
     `kernel_drops` (dropped by the kernel during the row).
 
@@ -365,7 +365,7 @@ class ReceiverProcess:
     def begin_row(
         self, row: int, take: int, expected_bytes: int, frame_bytes: int, path: Path, after_reset: bool = False
     ) -> int:
-        """Receive a row into the file at `path`, with its index beside it; return the number of dropped stray packets.
+        """Receive a row into the file at `path` and its index; return the number of dropped stray packets.
 
         `after_reset`: the card was reset since its last record. Raises DeviceError if the file cannot be made.
         """

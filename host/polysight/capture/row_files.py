@@ -60,7 +60,7 @@ def _explain_damage(path: Path) -> tuple[str, str]:
 
 
 class Segment:
-    """A file of `size` bytes with reserved disk space, which :meth:`finish` writes at once; its folder is made.
+    """A file of `size` bytes with reserved disk space, which :meth:`finish` writes in one piece; its folder is made.
 
     The row is written at its end, from memory: a file written during reception (a mapped one, too) could block the
     receiver while the kernel writes it back, and a receive buffer of 8 MiB holds only 0.2 s of a card that sends a
@@ -143,7 +143,7 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
     return facts, pairs
 
 
-# Suffix of the packet file, which lies beside the row's file.
+# Suffix of the packet file, which lies next to the row's file.
 PACKETS = ".pkt"
 FORMAT = 2
 """Files of format 1 are read, but not what they say of earlier records of the card: a row that is placed again from one

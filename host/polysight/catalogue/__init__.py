@@ -1,7 +1,7 @@
 """Recorded and processed scans for lists, pages and commands; nothing is processed here.
 
 `Scans` lists the scans under a folder and finds the folder of one by its name. `Notes` are the operator's notes and
-tags beside a scan. Of a processed scan, `read_result` gives the results for a page, `draw_products` draws its maps and
+tags of a scan. Of a processed scan, `read_result` gives the results for a page, `draw_products` draws its maps and
 `probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 

@@ -1,4 +1,4 @@
-"""The operator's notes and tags of a scan, in a file beside its rows.
+"""The operator's notes and tags of a scan, in a file of the scan's folder.
 
 A scan folder may come from anybody: its notes are read only up to a limit, from a regular file, and shown without
 characters that would change the line or the reading direction.
@@ -28,7 +28,7 @@ MAX_NOTES_BYTES = 1 << 17
 
 
 class Notes(msgspec.Struct, frozen=True):
-    """Free text and short tags of one scan, in `operator.json` beside its rows."""
+    """Free text and short tags of one scan, in `operator.json` of the scan's folder."""
 
     notes: str = ""
     tags: tuple[str, ...] = ()

@@ -82,7 +82,7 @@ class File(msgspec.Struct, frozen=True):
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """A processed scan for its page; `metal` says how the metal reference was chosen.
 
-    `generation` tells these products from those that replace them, `extent_mm` is x from, to, y from, to.
+    `generation` distinguishes these products from those that replace them, `extent_mm` is x from, to, y from, to.
     """
 
     generation: str

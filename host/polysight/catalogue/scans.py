@@ -1,7 +1,7 @@
 """The scans under a folder: a list with one line for each, and the folder of a scan by its name.
 
-Nothing is read again that has not changed, so that thousands of scans are listed at once: a line of the list is kept
-with the times and sizes of the files that it was made from, also over a restart (`Index`).
+Nothing is read again that has not changed, so that thousands of scans are listed without delay: a line of the list is
+kept with the times and sizes of the files that it was made from, also over a restart (`Index`).
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Summary(msgspec.Struct, frozen=True):
         Its path below the folder that is listed, with `/`.
     state
         One of :data:`polysight.acquisition.BADGES`: `lost` (its program was killed), `frozen` (it gives no sign of
-        life), `begun` (a folder in which a program was started and no scan is yet), `products` (no rows beside),
+        life), `begun` (a folder in which a program was started and no scan is yet), `products` (without rows),
         `silent` (its folder does not answer: a network drive that is gone), ...
     rows, committed
         Of the plan, and those that count.
@@ -118,7 +118,7 @@ class Summary(msgspec.Struct, frozen=True):
 
 
 def read_generation(products: Path) -> str:
-    """Return a text that changes when the products in a folder are replaced; they are replaced all at once.
+    """Return a text that changes when the products in a folder are replaced; they are replaced all together.
 
     To read several files that belong together, compare the text before and after.
     """
@@ -366,7 +366,7 @@ def _read_modified_s(path: Path) -> float:
 
 
 def _parse_utc(utc: str) -> float:
-    """Return a time in seconds since 1970; 0 if the text is none."""
+    """Return a time in seconds since 1970; 0 if the text is not a time."""
     try:
         return datetime.fromisoformat(utc).timestamp()
     except ValueError:
@@ -513,7 +513,7 @@ class Scans:
                 worker.join(READ_S)
 
     def _read_entries(self, waiting: deque[str], until_s: float) -> None:
-        """Summarise waiting entries of the root, one after another; behind `until_s` drop those that still wait."""
+        """Summarise waiting entries of the root, one after another; after `until_s` drop those that still wait."""
         # Two threads may read: the other one may take the last entry.
         with suppress(IndexError):
             while True:

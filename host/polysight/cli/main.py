@@ -2,8 +2,8 @@
 
 The exit status is 0 only when the command worked, or when the reader of its output has closed the pipe (`| head`).
 
-Only the module of the command is imported, so that every command starts at once; this module imports what `main` needs
-to be interrupted, and the rest is loaded below it. Errors go to stderr: what happened, why, and what to do.
+Only the module of the command is imported, so that every command starts without delay; this module imports what `main`
+needs to be interrupted, and the rest is loaded below it. Errors go to stderr: what happened, why, and what to do.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def _parse_layer_option(text: str) -> Layer:
     try:
         return parse_layer(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no layer: write {LAYER_FORMS}") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a layer: write {LAYER_FORMS}") from None
 
 
 def _parse_value(text: str) -> tuple[str, float]:
@@ -290,7 +290,7 @@ def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:
 
 
 def _parse_pair(text: str) -> str:
-    """Check that a text has the form NAME=TEXT, neither of them empty, and return it as it is."""
+    """Check that a text has the form NAME=TEXT, neither of them empty, and return it unchanged."""
     if "=" not in text.strip("="):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
     return text

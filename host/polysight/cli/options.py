@@ -17,13 +17,13 @@ from polysight.settings import Settings, path_text
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 
-# The rig file, the settings of the whole instrument, as it is named in a folder.
+# Name of the rig file, the settings of the whole instrument, in a folder.
 RIG = Path("instrument.toml")
 # Number of options that help shows before "more options"; chosen.
 _FIRST = 3
 # Largest coordinate of a box: far beyond any image, so that a unit mixed up is noticed.
 _FARTHEST_MM = 10_000
-# Names in a parsed command line that are no options.
+# Names in a parsed command line that are not options.
 _OF_THE_PARSER = ("command", "action", "run")
 
 
@@ -195,7 +195,7 @@ def _parse_four_numbers(text: str, form: str) -> Box:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form {form}") from None
     if not all(abs(value) <= _FARTHEST_MM for value in (a, b, c, d)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no place on the image: numbers of at most {_FARTHEST_MM} mm")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a place on the image: numbers of at most {_FARTHEST_MM} mm")
     return a, b, c, d
 
 

@@ -236,7 +236,7 @@ def _add_sparse(sub: argparse.ArgumentParser) -> None:
 
 
 def _add_several_options(sub: argparse.ArgumentParser) -> None:
-    """Add the options for several scans at once."""
+    """Add the options for several scans."""
     group = sub.add_argument_group(
         "several scans", "their products go to DIR/<scan>/, their messages to DIR/<scan>.log"
     )

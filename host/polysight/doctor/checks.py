@@ -65,7 +65,7 @@ CHECKS = (
 
 
 def run_checks(context: CheckContext) -> Iterator[Finding]:
-    """Run every check in order and yield its finding at once."""
+    """Run every check in order and yield each finding as soon as it is there."""
     # Check and board that failed or was skipped, and the title of the check that failed.
     blocked: dict[tuple[str, str], str] = {}
     for check in CHECKS:

@@ -55,7 +55,7 @@ _STA_UNSYNC = 0x40
 # The ioctl of ethtool (linux/sockios.h), and its command to read the sizes of rings (linux/ethtool.h).
 _SIOCETHTOOL = 0x8946
 _ETHTOOL_GRINGPARAM = 0x10
-# Words of struct ethtool_ringparam behind the command: the largest receive ring and the one in use.
+# Words of struct ethtool_ringparam after the command: the largest receive ring and the one in use.
 _RX_MAX_WORD = 1
 _RX_WORD = 5
 # Files of sysfs that count packets which an interface dropped.
@@ -120,7 +120,7 @@ def read_interface(name: str, root: Path = Path("/")) -> NetworkInterface:
 
 
 def _receive_ring(name: str) -> tuple[int, int] | tuple[None, None]:
-    """Return the receive descriptors in use and their maximum (ethtool -g); None if the interface does not tell."""
+    """Return the receive descriptors in use and their maximum (ethtool -g); None if not reported."""
     # The structure has the command and eight sizes; the request names the interface and points to it.
     words = array.array("I", [_ETHTOOL_GRINGPARAM] + 8 * [0])
     request = struct.pack("16sP16x", name.encode()[:15], words.buffer_info()[0])
@@ -151,7 +151,7 @@ def write_speed(folder: Path) -> float:
 
 # Duration of the load at each rate; chosen, the whole check takes a few seconds.
 _RATE_S = 1.5
-# A receiver that was behind gets so long to read what waits in its socket; chosen.
+# Time for a receiver that was late to read the packets that wait in its socket; chosen.
 _DRAIN_S = 5.0
 _SENDER = Path(__file__).with_name("send_packets.py")
 _BUSY_LOOP = "while True: sum(range(100_000))"

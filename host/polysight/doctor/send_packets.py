@@ -1,6 +1,7 @@
 """Send packets as a capture card does: `python -I send_packets.py CARD CARD_PORT HOST PORT FIRST PACKETS RATE BYTES`.
 
-Prints the seconds it took. A program without imports from this package, so that it starts at once on a busy machine.
+Prints the seconds it took. A program without imports from this package, so that it starts without delay on a busy
+machine.
 """
 
 import socket
@@ -23,7 +24,7 @@ def main(card: str, card_port: int, host: str, port: int, first: int, packets: i
             # Header: sequence number, which begins with 1, and bytes sent before, 48 bits; little-endian.
             sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
             due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
-            # Shorter sleeps take longer than asked for: several packets are sent at once instead.
+            # Shorter sleeps take longer than asked for: several packets are sent together instead.
             if (ahead := due - time.perf_counter()) > 0.0005:
                 time.sleep(ahead)
         sys.stdout.write(f"{time.perf_counter() - began}\n")

@@ -82,17 +82,17 @@ _PHASE_STD_M = 5e-5
 """Standard deviation of a height by phase, due to roughness and to the phase of the reflection (some degrees for lossy
 plates); chosen."""
 RAISED_M = 1.5e-3
-"""Least distance of a plate by range from the plane of the others, beside three standard deviations, for a plane of its
-own. It turns the angle by 1.5 mrad, as much as the error of the angle. Thin plates seem to lie up to a millimetre
-deeper, because their rear face echoes, too. Chosen."""
+"""Least distance of a plate by range from the plane of the others for a plane of its own, and at least three standard
+deviations. It turns the angle by 1.5 mrad, as much as the error of the angle. Thin plates seem to lie up to a
+millimetre deeper, because their rear face echoes, too. Chosen."""
 _PRECISE_STD_M = 2e-3
 """Largest standard deviation of a height by range that can show that a plate is raised; chosen. In the demo's scene a
 table shines through: heights of its plates have 4 to 13 mm, but for copper."""
 _BOARDS_AGREE_M = 3e-3
-"""Largest difference of a raised plate's heights by range in H and in V, beside three standard deviations; chosen. A
+"""Largest difference of a raised plate's heights by range in H and in V, plus three standard deviations; chosen. A
 liquid behind glass changes over the sweep, differently in H and V: its two heights are 35 mm apart."""
 _LEVEL_STD_M = 5e-4
-"""Standard deviation of the heights of plates of one plane, beside that by range; chosen."""
+"""Standard deviation of the heights of plates of one plane, in addition to that by range; chosen."""
 _LEVEL_STDS = 3.0
 """Distance from the plane, in standard deviations, beyond which a plate does not count for the plane; chosen."""
 _RAISED_REACH_M = 0.012
@@ -594,7 +594,7 @@ def _estimate_heights_by_phase(
     heights = phases[with_phase] / rad_per_m
     phasors = np.exp(2j * np.pi * (heights - guesses) / ambiguity_m)
     common_height = np.angle(np.mean(phasors, axis=1)) / (2 * np.pi) * ambiguity_m
-    # First onto one plane beside that of the ranges, then together by as many whole turns as bring them nearest to it.
+    # First onto one plane near that of the ranges, then together by as many whole turns as bring them nearest to it.
     lifted = heights + ambiguity_m * np.round((guesses + common_height[:, None] - heights) / ambiguity_m)
     lifted += ambiguity_m * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / ambiguity_m)[:, None]
     # The matrix depends on the places alone, so one solution serves all trial tilts.

@@ -42,7 +42,7 @@ from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # `Reduction.maps` is fitted to echoes from so much before the direct path to so much behind the gate, and at least so
-# far behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude beside noise of 1 (chosen).
+# far behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude relative to the noise (chosen).
 _BESIDE_M = 0.1
 _PASSED_M = 1.0
 _ECHO = 30.0
@@ -132,7 +132,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     band = sweep[-1] - sweep[0]
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
     frequencies = np.linspace(sweep[0], sweep[-1], int(np.ceil(product)) + extra)
-    # Dense (chosen), so that the fits hold between them. `rcond` drops combinations that only rounding tells apart.
+    # Dense (chosen), so that the fits hold between them. `rcond` drops combinations that differ only by rounding.
     delay_s = np.linspace(*gate_m, max(64, 8 * frequencies.size)) / SPEED_OF_LIGHT_M_S
     target = np.exp(-2j * np.pi * np.outer(delay_s, sweep)) * weight
     basis = np.exp(-2j * np.pi * np.outer(delay_s, frequencies))
@@ -545,7 +545,7 @@ class BoardSamples:
             image = imager.image_of_spectra(self._spectra, (1 / self.rx_calibration()).astype(np.complex64))
         else:
             image = np.zeros(imager.aperture.grid.shape, np.complex64)
-            # All rows at once, unless an RX dies within the scan.
+            # All rows together, unless an RX dies within the scan.
             for column in np.unique(factors[:, factors.any(axis=0)], axis=1).T:
                 rows = (factors == column[:, None]).all(axis=0)
                 image += imager.weighted_image(self._cube, self.weights * rows[:, None], column)

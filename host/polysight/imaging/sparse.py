@@ -3,8 +3,8 @@
 The matched filter of a thinned grid contains aliases. In mostly empty scenes they can be removed: FISTA (Beck and
 Teboulle, SIAM J. Imaging Sci. 2, 2009) finds the image x that minimises `1/2 |W (G A x - y)|^2 + threshold |x|_1`, with
 the imager's forward model A, the effect G of the range gate on an echo, and the weights W of the positions.
-`fill_missing` predicts the samples of the missing positions from x; recorded samples stay as they are, so that a whole
-scan does not change. Some recorded positions are left out of a first fit: their prediction tells the error.
+`fill_missing` predicts the samples of the missing positions from x; recorded samples are not changed, so that a whole
+scan does not change. Some recorded positions are left out of a first fit: their prediction gives the error.
 """
 
 from __future__ import annotations

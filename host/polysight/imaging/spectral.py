@@ -364,7 +364,7 @@ class RowSpectra:
 
 
 class SpectralImager(RowSpectra):
-    """Imager of all rows at once: one 2-D product per RX and frequency, one inverse transform."""
+    """Imager of all rows together: one 2-D product per RX and frequency, one inverse transform."""
 
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         super().__init__(aperture, xp, device, slack_m)

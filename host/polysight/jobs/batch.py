@@ -1,4 +1,4 @@
-"""Many scans at once: one program each, as many at a time as cores and memory allow, here or on a Dask cluster.
+"""Processing of many scans: one program each, as many at a time as cores and memory allow, here or on a Dask cluster.
 
 A scan that fails, or whose program is killed because memory runs out, does not stop the others. Finished products have
 a mark file with their dependencies; a later run skips them unless data, options, rig file or version have changed.
@@ -106,7 +106,7 @@ class Outcome:
 def find_scans(paths: Sequence[Path]) -> list[Path]:
     """Return the scans at paths: scan folders themselves, and the scans in other folders.
 
-    A path without any scan is returned as it is: the error comes from the program that processes it.
+    A path without any scan is returned unchanged: the error comes from the program that processes it.
     """
     folders: list[Path] = []
     for path in paths:
@@ -189,7 +189,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
     """Return the files that products of a scan are made from: manifest, rows, calibration and truth.
 
     `config` is the rig file of scans without one. Stored samples count only if raw data was dropped: otherwise they are
-    made again from the raw data. Notes, labels, exports, programs and products in the folder are no data.
+    made again from the raw data. Notes, labels, exports, programs and products in the folder are not data.
     """
     if is_given_images(folder) and folder.is_file():
         return [folder]
@@ -233,7 +233,7 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     log = job.out.with_name(job.name + ".log")
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    # Nothing is written to the pipe: its end tells the child that this program is gone.
+    # Nothing is written to the pipe: its end shows the child that this program has ended.
     child_end, parent_end = os.pipe()
     try:
         environment[ALIVE] = str(child_end)
@@ -358,7 +358,7 @@ def free_memory_bytes() -> int:
     except OSError:
         pass
     if not hasattr(os, "sysconf"):
-        # Windows does not tell. Zero makes one scan at a time.
+        # Windows does not report it. With zero, one scan is processed at a time.
         return 0
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
@@ -544,7 +544,7 @@ def main() -> int:
 
 
 def peak_memory_bytes() -> int:
-    """Return the largest memory of this process until now; 0 if the system does not tell."""
+    """Return the largest memory of this process until now; 0 if the system does not report it."""
     try:
         import resource
     except ModuleNotFoundError:

@@ -1,6 +1,6 @@
 """`polysight calibrate` and `polysight leakage`: calibration of the rig from recorded scans.
 
-Each `calibrate` command looks at scans, writes one dated file (`metal` with its images beside it), and prints the keys
+Each `calibrate` command looks at scans, writes one dated file (`metal` also its images), and prints the keys
 of the rig file that use it; neither the scans nor the rig file are written. `leakage` writes no file, and prints what
 belongs into the rig file's [polarimetry].
 """

@@ -167,7 +167,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
     with CardClient(present, rig.limits.command_timeout_s) as card:
         message = (
             f"{name}: a card, FPGA {card.version()}, answers at {present.card_address}:{present.command_port}; its"
-            f" EEPROM is written anew, and cannot be read back.\n{name}: {settings.text()}"
+            f" EEPROM is written again, and cannot be read back.\n{name}: {settings.text()}"
         )
         program_eeprom(card, settings, confirm(message, settings.confirmation, yes))
     sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
@@ -200,7 +200,7 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
         else:
             if was_off:
                 return version
-        # An interface that is down refuses at once.
+        # An interface that is down refuses immediately.
         time.sleep(_PAUSE_S)
     missing = "the card was not switched off"
     if was_off:
@@ -221,7 +221,7 @@ def reset_card(config: Path, name: str, radar: bool) -> int:
             sys.stdout.write(f"{name}: the radar is reset; it must be armed again\n")
         else:
             card.reset_fpga()
-            sys.stdout.write(f"{name}: the card is reset; a scan configures it anew\n")
+            sys.stdout.write(f"{name}: the card is reset; a scan configures it again\n")
         sys.stdout.write(f"{name}: the card answers, FPGA {card.version()}\n")
     return 0
 

@@ -165,7 +165,7 @@ def analyse_points(
 
 
 def name_segment(segment: surfaces.Segment, classifier: Classifier) -> surfaces.Segment:
-    """Name a segment by its permittivity, with the library that names flat patches; others stay as they are."""
+    """Name a segment by its permittivity, with the library that names flat patches; others are not changed."""
     if segment.permittivity is None or segment.covariance is None:
         return segment
     named = name_permittivity(segment.permittivity, np.array(segment.covariance), classifier)
@@ -187,7 +187,7 @@ def has_steep_patch(products: Path) -> bool:
 
 
 def add_surfaces(pipeline: Pipeline, products: Path) -> None:
-    """Measure the surfaces of a processed scan, write them beside its products, and write the report again with them.
+    """Measure the surfaces of a processed scan, write them into its products, and write the report again with them.
 
     The range gate is that of the images, so that only what lies near the object plane is seen. quality.json counts the
     time.

@@ -94,7 +94,7 @@ def form_scan_images(data: Path, settings: Settings = DEFAULT) -> tuple[Pipeline
 
 
 def find_plates(data: Path) -> Plates:
-    """Read the plates of truth.json beside the data; none, with a note on stderr, if it is not a truth file."""
+    """Read the plates of truth.json in the data's folder; none, with a note on stderr, if it is not a truth file."""
     plates, note = find_truth(data)
     if note:
         sys.stderr.write(f"note: {note}\n")
@@ -141,8 +141,8 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
 def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
     """Write all products, replacing those in `out`; show the current step on stderr.
 
-    If no materials can be found (the given metal is none, a board has no signal), the images alone are written, unless
-    `out` holds a report; the error says where they are. Raises PolysightError.
+    If no materials can be found (the given metal is not metal, a board has no signal), the images alone are written,
+    unless `out` holds a report; the error says where they are. Raises PolysightError.
     """
     with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
         # The rows were added before `out` was locked: `drop-raw` may have run in between.
@@ -163,7 +163,7 @@ def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
                     f"{out} holds the earlier products; `polysight image` with another --out writes the images"
                 )
                 raise DataError(e.what, e.why, advice(e.remedy, images_note), code=e.code) from None
-            # Raised below, behind the `with`: an error inside it would throw the new images away.
+            # Raised below, after the `with`: an error inside it would discard the new images.
             failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
     raise failed
 
@@ -325,7 +325,7 @@ class LiveProcessing:
         told = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
         self._pipeline.add_row(row)
         for name, board in self._pipeline.quality.boards.items():
-            # Told with the row that shows it, not after the scan.
+            # Reported with the row that shows it, not after the scan.
             new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in told[name]}
             for finding in rules.judge_dead_rx(name, new, rows=1):
                 _log.warning("row %d: %s", row, one_line(finding))

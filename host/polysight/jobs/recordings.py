@@ -1,7 +1,7 @@
 """Commands that check recordings: `validate` lists all faults of a scan folder, `inspect` describes a recording.
 
 `inspect --placement` shows how the packets of a row are placed, `validate --replace` places all rows again. Nothing of
-the processing is loaded, so that these commands start at once.
+the processing is loaded, so that these commands start without delay.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def inspect_file(
         from polysight.results import to_plain
 
         content = asdict(report)
-        # In JSON the fields of the layout stand beside the others, not in an object of their own.
+        # In JSON the fields of the layout are on the same level as the others, not in an object of their own.
         content |= content.pop("layout")
         print_json(to_plain(content))
     else:
@@ -220,7 +220,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
     """Print how the packets of a row are placed; return 1 if the row was committed with other missing ranges.
 
     A row whose frames were placed by the times of their pulses is not compared, and gives 0. `file` is the row's file,
-    or one of those beside it. Raises DataError when a file is damaged, is not the one that the scan's manifest has
+    or one of those next to it. Raises DataError when a file is damaged, is not the one that the scan's manifest has
     committed, or the packets were not kept.
     """
     row = file.with_suffix(".bin")

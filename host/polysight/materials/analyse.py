@@ -199,7 +199,7 @@ HALO_OF_PATCH = 3.0
 """Error of the metal's V / H, and of V on a plate, relative to the halo of V (light beside the patches) around them: in
 scenes of an independent generator where 10 to 50 % of the largest amplitude were clipped."""
 UNEVEN_AT_END = 0.01
-"""Error of ln|V / H| by the end of the aperture above which a plate's slopes tell nothing of the whole scan; chosen."""
+"""Error of ln|V / H| by the aperture's end above which a plate's slopes are not those of the whole scan; chosen."""
 ANGLE_BY_APART = 1.0
 """Error of the incidence angle, radians per metre between the images of H and V: boards 2 to 5 mm out of place turn it
 by 2 mrad and move the images 2 mm apart (rms; geometry of the published rig)."""
@@ -218,8 +218,8 @@ def analyse(
 ) -> MaterialsResult:
     """Find the patches of the images, estimate their permittivities, and name them if there is a classifier.
 
-    A scene without patches, metal or a valid pixel is no error; see `metal` and each patch's `refused` in the result.
-    Raises DataError if the given metal box or patch number does not exist.
+    A scene without patches, metal or a valid pixel is not an error; see `metal` and each patch's `refused` in the
+    result. Raises DataError if the given metal box or patch number does not exist.
     """
     known_scene = given_scene or KnownScene()
     plane = known_scene.plane
@@ -475,7 +475,7 @@ class RelativeScene:
     metal, raw
         The reference, and the images relative to it; leakage is not removed.
     refused, judged
-        Patch number to why the patch is no flat plate, and all other patches but the reference.
+        Patch number to why the patch is not a flat plate, and all other patches but the reference.
     scatter, prior
         What the plates show of the scene's errors, and the prior of the rig's errors with it.
     measured, solution
@@ -540,8 +540,8 @@ class _Scene:
 def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
     """Return the scene relative to the reference that the other patches show best to be bare metal.
 
-    A reference that its own V / H contradicts, or that is no flat plate, is taken only if none is better; of equals the
-    first is taken.
+    A reference that its own V / H contradicts, or that is not a flat plate, is taken only if none is better; of equals
+    the first is taken.
     """
 
     def bare(relative: RelativeScene) -> float:

@@ -99,7 +99,7 @@ def read_catalogue(path: Path) -> tuple[CatalogueMaterial, ...]:
     Raises
     ------
     ConfigError
-        if the file is missing, is no TOML, has a wrong or unknown key, or a kind or source that it does not list.
+        if the file is missing, is not TOML, has a wrong or unknown key, or a kind or source that it does not list.
     """
     file = decode(read_toml(path), _File, str(path), keys="docs/spec/catalogue.md explains every key")
     try:

@@ -187,7 +187,7 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
     usual = float(
         np.mean([_estimate_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)])
     )
-    # Plates at the border, whose slopes tell nothing, get the usual size.
+    # Plates at the border, whose slopes say nothing about it, get the usual size.
     excess = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
     return np.sqrt((WEIGHT_OF_USUAL * usual + excess) / (WEIGHT_OF_USUAL + len(slopes)))
 

@@ -25,7 +25,7 @@ SAME_DB = 3.0
 VISIBLE = 0.06
 """Amplitude relative to the brightest plate at which the other channel shows a patch: -24 dB; chosen."""
 SKIRT_PX = 4
-"""Pixels around the plates in which a copy cannot be told from the plate's own edge; chosen."""
+"""Pixels around the plates in which a copy cannot be distinguished from the plate's own edge; chosen."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def find_copies(patches: Sequence[Patch], h: Image, v: Image, pixel_mm: float) -
     """
     amplitudes = [np.abs(h), np.abs(v)]
     copies_of_channels = []
-    # Each channel once, with the other one beside it.
+    # Each channel once, paired with the other one.
     for amplitude, other in (amplitudes, amplitudes[::-1]):
         copies = _find_copies_in_channel(patches, amplitude, pixel_mm)
         if copies is not None and not _are_plates(copies, patches, other, pixel_mm):
@@ -109,7 +109,7 @@ def _find_copies_at_shift(
     """Return the copies with this shift (rows, columns), None if fewer than two fit.
 
     `weak` are the patches that may be copies, `plates` the pixels of the bright ones, `hidden` those in which a copy
-    cannot be told from a plate's edge, bool [ny, nx].
+    cannot be distinguished from a plate's edge, bool [ny, nx].
     """
     expected = np.asarray(scipy.ndimage.shift(plates.astype(np.uint8), shift_px, order=0), bool) & ~hidden
     observed = np.logical_or.reduce([p.mask for p in weak])

@@ -73,7 +73,7 @@ def estimate_common_error(mean: Real, own_errors: Real, prior: Real, level: floa
     `mean` [patch, materials, d] are the deviations of patches from the materials, `own_errors` [materials, d, d] the
     covariances of these, `prior` [d, d] that of the error. Patches whose squared distance to every material is above
     `level` have little weight. Expectation maximisation: a patch of uncertain material counts with the moments of the
-    mixture. A single patch tells nothing of it.
+    mixture. A single patch says nothing about it.
     """
     value = np.zeros(len(prior))
     covariance = prior
@@ -141,7 +141,7 @@ class ErrorDiscriminant(Model):
         scan = np.unique(samples.groups, return_inverse=True)[1][first]
         plate = samples.plates[first]
         mean = np.stack([np.bincount(patch, c) for c in d.T], axis=1) / count[:, None]
-        # Metal-like patches have no error of their own, and tell nothing of those of scans.
+        # Metal-like patches have no error of their own, and say nothing about the errors of scans.
         informative = ~self._find_metal_like(samples.x, patch)
         if not informative.any():
             informative[:] = True
@@ -161,7 +161,7 @@ class ErrorDiscriminant(Model):
             _compute_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1))
         )
         self._effects = self._compute_specimen_effects()
-        # The only patch of a material is its mean: its residual of zero tells nothing of errors.
+        # The only patch of a material is its mean: its residual of zero says nothing about errors.
         repeated = informative & (np.bincount(material[informative], minlength=self.names.size)[material] > 1)
         if not repeated.any():
             repeated = informative

@@ -402,7 +402,7 @@ class SceneLikelihood:
         return out
 
     def _estimate_paint_probability(self) -> float:
-        """Return the probability of paint; 0 without kinds of materials, for nothing else could tell it."""
+        """Return the probability of paint; 0 without kinds of materials: only they distinguish paint."""
         return self.prior.painted if self.kinds is not None else 0.0
 
     def leakage(self, z: Real) -> tuple[Complex, Complex]:

@@ -77,7 +77,7 @@ METAL_SPREAD = 0.01
 """Standard deviation of metal's t: sheets are not perfectly flat. Chosen."""
 SAME_MATERIAL = 0.005
 """Probability that two plates of a scene are of one material, before they are measured. Chosen: more leaves too few
-plates to tell the published picture's leakage (its half widths exceed 20 % from 0.02 on)."""
+plates to determine the published picture's leakage (its half widths exceed 20 % from 0.02 on)."""
 DENSITY_OF_OTHERS = 20.0
 """Density over t of a plate of another material: that of half spaces is 5 to 50 where most solids are."""
 SPECIMEN_STD = 0.01
@@ -501,7 +501,7 @@ def _half_space_coordinates(real: npt.ArrayLike, loss: npt.ArrayLike) -> Real:
 def _tabulate_coordinate_density() -> tuple[Real, Real, Real]:
     """Return the density of half spaces of no kind over both coordinates, float64 [eps', eps''], and its two axes.
 
-    All families of the catalogue have the same weight: those with many entries (laminates, tissues) are no more common
+    All families of the catalogue have the same weight: those with many entries (laminates, tissues) are not more common
     on a table than others. Density that would lie beyond the ranges is reflected at their ends.
     """
     ends = _half_space_coordinates(REAL_RANGE, LOSS_RANGE)

@@ -72,7 +72,7 @@ def specimen_seed(path: Path) -> int | None:
     """
     # Only to check the file: what it holds is read again below.
     read_truth(path)
-    # [real, loss]: relative standard deviations of the plates' permittivities; zeros are none.
+    # [real, loss]: relative standard deviations of the plates' permittivities; zeros: no deviation.
     scene = read_json(path).get("scene")
     spread = scene.get("specimen_spread") if isinstance(scene, dict) else None
     if isinstance(scene, dict) and isinstance(spread, list) and any(spread):

@@ -203,7 +203,7 @@ def predict(stack: Sequence[Layer], spectrum: Spectrum, theta_rad: float) -> tup
 def average(
     eps: Sequence[npt.ArrayLike], thickness: Sequence[npt.ArrayLike], spectrum: Spectrum, theta_rad: npt.ArrayLike
 ) -> tuple[Complex, Real]:
-    """Return V / H and |H| [..., K] of stacks of layers, relative to metal: :func:`predict` for many stacks at once.
+    """Return V / H and |H| [..., K] of stacks of layers, relative to metal: :func:`predict` for many stacks together.
 
     `eps` and `thickness` (metres) of each layer, and `theta_rad`, are numbers or arrays [..., 1, 1].
     """
@@ -323,7 +323,7 @@ class LayerFit:
 
     @property
     def ambiguous(self) -> bool:
-        """True if there are rivals, or two sigma of a fitted thickness, or of a permittivity beside it, exceed 5 %.
+        """True if there are rivals, or two sigma of a fitted thickness or permittivity exceed 5 %.
 
         The limit is `DETERMINED`.
         """
@@ -466,7 +466,7 @@ def _drop_repetitions(solutions: Sequence[_Solution], level: float, relative: fl
 class _Model:
     """Residuals of one fit. Unknowns: eps', eps'', the thickness in mm if fitted, the angle's error over its deviation.
 
-    The last only if the angle has a deviation; it is no unknown of the layer and has its own residual (the prior).
+    The last only if the angle has a deviation; it is not an unknown of the layer and has its own residual (the prior).
     """
 
     def __init__(
@@ -610,7 +610,7 @@ class _Model:
         thickness_m = self.stack[self.layer_index].thickness_m
         if self.fits_thickness:
             thickness_m = float(solution.x[2]) * 1e-3
-        # The last says if the lower end counts: a loss of zero is no limit of the search.
+        # The last says if the lower end counts: a loss of zero is not a limit of the search.
         ends = zip(("the real part", "the loss", "the thickness"), solution.active, (True, False, True), strict=False)
         return LayerFit(
             permittivity=complex(solution.x[0], -solution.x[1]),

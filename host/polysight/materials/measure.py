@@ -1,7 +1,7 @@
 """Measure patches: ratio, brightness and their errors, and the permittivity.
 
 `measure_patch` gives the input of the joint inversion, `permittivity_of_patch` combines its result with the percentiles
-of the pixels. `check_patches` refuses patches that are no flat plates.
+of the pixels. `check_patches` refuses patches that are not flat plates.
 
 The constants of errors were fitted to scenes of two generators, this project's simulator and an independent one with
 other physics (package `polysight_worlds`), and to a picture that the authors of POLySIGHT published.
@@ -85,7 +85,7 @@ DIM_V = 0.12
 LEAST_COHERENCE = 0.7
 """Least coherence of H and V over the pixels of a plate; chosen."""
 IN_NOISE = 2.0
-"""|V| over its background below which V is rather noise: its phase tells nothing. Chosen."""
+"""|V| over its background below which V is mostly noise and its phase is not used. Chosen."""
 # Margin around patches that does not count as background; chosen.
 _AROUND_PX = 6
 # A region that was left out is a table behind if it is larger than this many times the largest patch. In the demo it is
@@ -97,7 +97,7 @@ BELOW_AIR = "its permittivity would be below that of air"
 STRONGER_V = "V is stronger than H, relative to the metal"
 POSSIBLE_LAYER = "possible layer"
 NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, STRONGER_V, POSSIBLE_LAYER)
-"""Reasons for refusing plates that are no half spaces; they may be fitted as layers."""
+"""Reasons for refusing plates that are not half spaces; they may be fitted as layers."""
 THIN = Finding(
     "error",
     POSSIBLE_LAYER,
@@ -123,7 +123,7 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
     """Return the rms over places of the mean of H and of V, in squares of a plate's size away from all patches.
 
     What lies behind the plates, such as a table, adds to them as well, with a phase that nobody knows. It changes
-    little over a plate, so that neither averaging nor the scatter of the plate's pixels tells of it: on the published
+    little over a plate, so that neither averaging nor the scatter of the plate's pixels shows it: on the published
     picture the mean over a plate's size is only 6 dB below the background itself. 0 without such places.
     """
     background_mask = _select_background(h, v, segmentation, usable)
@@ -140,7 +140,7 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
 
 
 def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> Mask:
-    """Return the usable pixels with some distance to every patch, and to dim plates that are no patches.
+    """Return the usable pixels with some distance to every patch, and to dim plates that are not patches.
 
     A region that was left out is taken for a dim plate if it is as small as one, else for the table behind, which is
     background.
@@ -168,7 +168,7 @@ def _compute_rms(values: Image) -> float:
 
 
 def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], uneven: float) -> Finding | None:
-    """Return why a patch is no flat plate; None if it may be one.
+    """Return why a patch is not a flat plate; None if it may be one.
 
     Parameters
     ----------
@@ -478,7 +478,7 @@ def _measure_phase_spread(h: Image) -> float:
 def check_patches(
     segmentation: Segmentation, h: Image, v: Image, dark: tuple[float, float], metal: Mask
 ) -> dict[int, Finding]:
-    """Return patch number to reason for all patches that are no plates; parameters as of :func:`check_patch`.
+    """Return patch number to reason for all patches that are not plates; parameters as of :func:`check_patch`.
 
     `metal`, bool [ny, nx], is the metal reference's interior.
     """
@@ -670,7 +670,7 @@ def _find_impossibility(e: Permittivity) -> Finding | None:
     """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
-    # Eq. 3 does not tell P from 1 / P, but no half space reflects more of p than of s.
+    # Eq. 3 does not distinguish P from 1 / P, but no half space reflects more of p than of s.
     if e.ratio and not e.metal_like and abs(1 / e.ratio) > 1 + ACTIVE * e.inverse_std + ALLOWED_EXCESS:
         return Finding("error", STRONGER_V, causes, remedy)
     if e.value is None or e.real_std is None or e.loss_std is None:
@@ -685,6 +685,6 @@ def _find_impossibility(e: Permittivity) -> Finding | None:
 def refuse_impossible(
     patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
 ) -> dict[int, Finding]:
-    """Return patch number to why it is no half space: an impossible permittivity, or possibly a thin plate."""
+    """Return patch number to why it is not a half space: an impossible permittivity, or possibly a thin plate."""
     thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
     return thin | {label: reason for label, e in patches.items() if (reason := _find_impossibility(e)) is not None}

@@ -43,8 +43,8 @@ Complex = npt.NDArray[np.complex128]
 
 DOUBTFUL_V_DB = -2.5
 WEAK_V_DB = -7.0
-"""V / H relative to the direct path. Below the first value a patch that nobody declared is no metal; below the second
-even a declared one is none. At 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water has
+"""V / H relative to the direct path. Below the first value a patch that nobody declared is not metal; below the second
+even a declared one is not. At 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water has
 -4 dB, and metal 0 dB. The patterns of the antennas are added: -4 dB with those of an independent generator."""
 LEAST_SCORE = 1.7
 SURE_MARGIN = 1.5
@@ -54,7 +54,7 @@ direct path, the reference counts as metal in none of 125 drawn scenes without m
 doubtful by its V / H), and in all of 75 with metal (tests/materials/test_metal_evidence.py)."""
 REFERENCE_REAL = (1.5, 30.0)
 REFERENCE_LOSS_TANGENT = (1e-3, 2.0)
-"""Ranges of eps' and of the loss tangent of a reference that is no metal, uniform on logarithmic scales; they hold all
+"""Ranges of eps' and of the loss tangent of a reference that is not metal, uniform on logarithmic scales; they hold all
 half spaces, water among them."""
 CHANNEL_RATIO_STD_DB = 2.5
 """Standard deviation of metal's V / H relative to the direct path, because the boards' patterns differ off their axes;
@@ -212,8 +212,8 @@ class _DielectricReference(SceneLikelihood):
         size = np.abs(reference)
         measured = half_spaces.t / reference
         # The measured ratio is t / t0, so its density is |t0|^2 that of t. A plate may also be of the material of the
-        # reference, with the prior probability of metal beside metal: its ratio is then 1, with this variance of real
-        # and imaginary part each.
+        # reference, with the same prior probability as a second metal patch: its ratio is then 1, with this variance
+        # of real and imaginary part each.
         variance = METAL_SPREAD**2 + self.own_variance
         of_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
         of_some_kind = parts[..., 1:] + 2 * np.log(size)
@@ -312,7 +312,7 @@ def metal_in_box(
     overlaps = [(int((p.interior & mask).sum()), p) for p in segmentation.patches]
     count, patch = max(overlaps, key=lambda o: o[0], default=(0, None))
     label = None
-    # Fewer pixels than 3 by 3 (chosen) are only the edge of a patch: then the box is taken as it is.
+    # Fewer pixels than 3 by 3 (chosen) are only the edge of a patch: then the whole box is taken.
     if patch is not None and count >= 9:
         mask = mask & patch.interior
         label = patch.label
@@ -401,7 +401,7 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
 
     The brightness is the median of |H| times that of |V|. Metal reflects both polarisations fully (|r_s| = |r_p| = 1);
     every dielectric loses most of p at these angles. The unknown gains of H and V do not change the order of the
-    products. In a scene without metal the brightest patch is a dielectric: :func:`metal_evidence` tells whether it is
+    products. In a scene without metal the brightest patch is a dielectric: :func:`metal_evidence` judges whether it is
     metal, and which of several metals is bare.
     """
     patches = [p for p in segmentation.patches if p.interior.any()]

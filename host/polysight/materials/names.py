@@ -44,7 +44,7 @@ INCLUSIONS = 0.05
 """Share of a patch's pixels that may be of any material of the library (chosen); the prior of the others is the patch's
 probabilities."""
 UNKNOWN_BUDGET = 0.03
-"""Relative error of V / H, beside the spread of its pixels, assumed if the scan's error budget is not known; chosen."""
+"""Relative error of V / H, in addition to its pixels' spread, if the scan's error budget is not known; chosen."""
 LIKELY = 0.005
 """Materials of less probability are not listed; chosen."""
 LAYER = "possible layer"
@@ -104,7 +104,7 @@ class PatchName:
 
     @property
     def source(self) -> Literal["library", "literature"] | None:
-        """Origin of the name; None if it is no material's."""
+        """Origin of the name; None if it is not that of a material."""
         if self.name in (UNKNOWN, LAYER):
             return None
         return "literature" if self.from_literature else "library"
@@ -161,7 +161,7 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
     density = _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))
     density = density * _weigh_brightness(kinds, scan_evidence) * by_dispersion
     sheet = (1 - library_share) * first.sheet_share * float(np.mean(density))
-    # Stacks of layers count only where the change over the sweep can tell them from half spaces.
+    # Stacks of layers count only where the change over the sweep can distinguish them from half spaces.
     if any(evidence.dispersion is not None for evidence in scan_evidence):
         sheet += (1 - library_share) * STACK_SHARE / np.pi ** len(scan_evidence) * float(np.mean(by_dispersion))
     other_weight = (1 - library_share) * first.other * _evaluate_other_density(kinds, scan_evidence)
@@ -234,7 +234,8 @@ def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[Rati
 def format_permittivity(value: complex, digits: int = 2, width: int = 0) -> str:
     """Format a permittivity: `2.89 - j0.43` for a lossy medium, `2.89 + j27.30` for one with gain.
 
-    `digits` stand behind the point; `width` is the least width of the real part, for aligned columns.
+    `digits`: number of digits after the decimal point; `width` is the least width of the real part, for aligned
+    columns.
     """
     # Adding zero after rounding removes the sign of a negative zero.
     real = round(float(value.real), digits) + 0.0

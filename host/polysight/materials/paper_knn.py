@@ -17,7 +17,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from polysight.materials.library import WIDTH, Measure, Real, channel_distances, find_neighbours, ratio_columns
 
-# Pixels whose distances are computed at once: 512 x 20,000 numbers are 80 MB.
+# Pixels whose distances are computed together: 512 x 20,000 numbers are 80 MB.
 _CHUNK = 512
 
 
@@ -27,7 +27,7 @@ def paper_distance(
     """Return the paper's distance of pixels a [n, columns] to b [m, columns], [n, m]; of two single pixels a number.
 
     Columns are |H|, |V|, real and imaginary part of P for each incidence angle; `h`, `v` and `p` are the weights
-    lambda_H, lambda_V and lambda_P. A number of columns that is no multiple of four is not of this kind, such as |H|
+    lambda_H, lambda_V and lambda_P. A number of columns that is not a multiple of four is not of this kind, such as |H|
     alone: then each column counts by itself.
     """
     first = np.atleast_2d(np.asarray(a, np.float64))
@@ -109,7 +109,7 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
         for rows in gen_batches(len(pixels), _CHUNK):
             distance = self.metric(pixels[rows], self._fit_X)
             if X is None:
-                # A pixel is no neighbour of itself.
+                # A pixel is not a neighbour of itself.
                 row_indices = np.arange(rows.start, rows.stop)
                 distance[row_indices - rows.start, row_indices] = np.inf
             nearest[rows] = find_neighbours(distance, count)

@@ -1,8 +1,8 @@
 """The sign of all phases of images that another program made: an unknown of their analysis, and a part of its errors.
 
 With the wrong sign every loss is a gain. The joint inversion is solved with either sign; the evidence of the patches
-tells which one is likelier, and errors hold both in the share of their probability. An `inverse_ratio` is V / H, after
-all corrections r_p / r_s.
+shows which one is more probable; the errors include both, weighted by their probability. An `inverse_ratio` is V / H,
+after all corrections r_p / r_s.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Real = npt.NDArray[np.float64]
 
 PHASE_SIGN = "phase sign"
 SIGN_EVIDENCE = 0.5
-"""Weight of the patches' evidence on the sign of the phases. Patches that are no half spaces may speak for the wrong
+"""Weight of the patches' evidence on the sign of the phases. Patches that are not half spaces may speak for the wrong
 one: by 5 (natural logarithm) where liquids stood behind walls; the plates of the published picture speak by 4 in all.
 """
 UNLIKELY_SIGN = 0.005
@@ -30,7 +30,7 @@ given hold 68 and 95 %."""
 
 
 def mirror_phases(measured: Sequence[PatchMeasurement], prior: RigPrior) -> tuple[list[PatchMeasurement], RigPrior]:
-    """Return the patches and the prior as they are if all phases have the other sign.
+    """Return the patches and the prior for the other sign of all phases.
 
     Tilts are read from phases, too. The change over the sweep stays: images of other programs have none.
     """

@@ -37,9 +37,9 @@ from polysight_shared.errors import DataError
 from polysight_shared.findings import Finding
 
 MAX_BEND = 3.5
-"""Curvature above which a patch is no flat plate, 1 / m. Flat plates that are uneven by 0.25 mm have up to 1.4 in drawn
-scenes and ripple of the published picture up to 3; sheets bent to a radius of 150 mm have 5.6, spheres of 100 mm 6 to
-10."""
+"""Curvature above which a patch is not a flat plate, 1 / m. Flat plates that are uneven by 0.25 mm have up to 1.4 in
+drawn scenes and ripple of the published picture up to 3; sheets bent to a radius of 150 mm have 5.6, spheres of 100 mm
+6 to 10."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +338,7 @@ def _add_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
 
 
 def _replace_infinite(value: float) -> float | None:
-    """Return a number for a file; None for infinity and for what is no number."""
+    """Return a number for a file; None for infinity and for what is not a number."""
     return value if math.isfinite(value) else None
 
 

@@ -35,7 +35,7 @@ A relative error d of P changes eps by about 4 d / |P - 1/P|: at 0.25 the usual 
 permittivity, and the error grows without bound towards P = 1.
 """
 METAL_WITHOUT_BRIGHTNESS = 0.25
-"""Measured |V/H - 1| below which |H| tells nothing about leakage: metal has |H| = 1 with any leakage."""
+"""Measured |V/H - 1| below which |H| says nothing about leakage: metal has |H| = 1 with any leakage."""
 METAL_WITHOUT_ERROR = 0.25
 """Median |V/H - 1| of a patch below which it has no error of its own, and gives no information on common errors."""
 METAL_UNLIKE = 0.2
@@ -119,7 +119,7 @@ def fit_spread(
 
     Return the variances of ln eps' and ln eps'' of each material, [materials, 2], and the covariance of placements,
     [d, d]. The spread is that of all materials together, with the published spread as prior, corrected by each
-    material's own. A material with a single specimen tells nothing of it, but its patches count for the placements.
+    material's own. A material with a single specimen says nothing about it, but its patches count for the placements.
     """
     is_single = np.array([np.unique(specimen[material == k]).size < 2 for k in range(len(effects))])
     has_spread = ~is_single & (np.abs(effects).max(axis=(1, 2), initial=0) > 0)

@@ -1,9 +1,9 @@
 """Fit a patch's ratios over the sub-bands of the sweep, or the concentration of a solution to its polarisation angle.
 
-Ratios in sub-bands of the sweep tell thin layers, whose reflection changes with frequency, from thick ones. The error
-of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part of its
-own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their full
-covariance is stored.
+Ratios in sub-bands of the sweep distinguish thin layers, whose reflection changes with frequency, from thick ones. The
+error of a ratio has a part common to all sub-bands of a patch (leakage, metal reference, edges and tilt) and a part of
+its own in each (noise, sidelobes). Differences between sub-bands are therefore known better than each of them: their
+full covariance is stored.
 
 `add_bands` measures them; `bands_of_row` reads them back from a segment of materials.json (that is what files call a
 patch), and `fit_row` fits the unknown layer of a stack to it.
@@ -278,7 +278,7 @@ def bands_of_row(
     if count > 1 and len(shared) == count:
         covariance = np.array([line for lines in shared for line in lines], np.float64)
     else:
-        # Products of earlier releases have no covariance: K bands are then no better than one (count = 1 stays as is).
+        # Products of earlier releases have no covariance: K bands are then no better than one (count = 1 is kept).
         sigma = np.sqrt(count) * sigma
     theta_std = 0.0
     phase_per_angle = 0.0
@@ -371,7 +371,8 @@ def fit_row(
 
     Returns
     -------
-    None for the metal reference, a segment without a usable ratio, or one that is no plate (noise, several materials).
+    None for the metal reference, a segment without a usable ratio, or one that is not a plate (noise, several
+    materials).
 
     Raises
     ------

@@ -23,7 +23,7 @@ def accuracy_lines(library: Library) -> list[str]:
         if not fit["judged"]:
             lines.append(
                 f"{angle} degrees: accuracy not known: it is measured on a second scan of a material, and there is none"
-                " but of metal. Scan each material once more, placed anew, and train on all scans"
+                " but of metal. Scan each material once more, placed again, and train on all scans"
             )
             continue
         lines += _judge_confidence(angle, fit)
@@ -60,7 +60,7 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
         # Libraries of earlier releases have no confidence.
         return []
     missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
-    # Scans of one and the same piece cannot tell how often names are right on another piece.
+    # Scans of one and the same piece cannot show how often names are right on another piece.
     need = (
         f"{fit['specimen_freedom']} specimens beyond the first of a material tell how far specimens differ;"
         f" {missing} more are needed to know it to 25 % (scan other pieces: polysight label --specimen NAME=WHICH)"
@@ -96,7 +96,7 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
 
 
 def alike_pairs(samples: Samples) -> list[tuple[str, str, float]]:
-    """Return pairs of materials that a patch hardly tells apart, and their distance in standard deviations."""
+    """Return pairs of materials that a patch hardly distinguishes, and their distance in standard deviations."""
     model = ErrorDiscriminant().fit(samples)
     distances = model.distances()
     pairs = []

@@ -74,7 +74,7 @@ RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "puls
 
 
 def sentence(text: str) -> str:
-    """Return the text with a capital letter first; a command stays as it is."""
+    """Return the text with a capital letter first; a command is not changed."""
     if text.startswith("polysight"):
         return text
     return text[:1].upper() + text[1:]
@@ -116,7 +116,7 @@ def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
 def notice_of_rejection(
     row: int, take: int, reasons: Sequence[str], faults: Sequence[store.RowFault], utc: str
 ) -> Finding:
-    """Return the notice of a rejected take; one that somebody asked for is no fault."""
+    """Return the notice of a rejected take; one that somebody asked for is not a fault."""
     cause, remedy = _find_cause(faults)
     remedy = remedy or "Nothing: the row is retaken automatically"
     if is_on_request(faults):
@@ -322,7 +322,7 @@ class ScanHistory:
             )
             self.notices.append(notice)
         if not fact.committed_utc:
-            # `polysight simulate` writes all rows at once, without times.
+            # `polysight simulate` writes all rows together, without times.
             return
         committed_s = seconds(fact.committed_utc)
         self.last_row_utc = fact.committed_utc

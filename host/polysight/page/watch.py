@@ -192,7 +192,7 @@ class RowViewer:
             self._drawn_at = time.monotonic()
 
     def _compute_profile(self, pipeline: Pipeline, row: int) -> Profile:
-        """Return the profile of a row, synchronised anew: kept samples hold the scene, but not the direct path."""
+        """Return the profile of a row, synchronised again: kept samples hold the scene, but not the direct path."""
         rig = pipeline.source.instrument
         nearest, farthest = scene_m(rig)
         excess = np.linspace(-BEFORE_M, farthest + BEYOND_M, PROFILE_POINTS)

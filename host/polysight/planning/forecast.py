@@ -146,7 +146,7 @@ def scan_time(rig: Instrument, row_overhead_s: float = ROW_OVERHEAD_S) -> ScanTi
     stage = rig.stage
     row_s = row_motion_s(grid, stage)
     measuring_row_s = measuring_s(rig)
-    # The start of the first row, from the home corner; both axes move at once.
+    # The start of the first row, from the home corner; both axes move at the same time.
     start_x_mm = stage.centre_x_mm - (grid.columns - 1) / 2 * grid.step_x_mm - stage.run_up_mm(grid.step_x_mm)
     start_y_mm = stage.centre_y_mm - (grid.rows - 1) / 2 * grid.step_y_mm
     return ScanTime(

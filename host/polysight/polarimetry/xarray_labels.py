@@ -56,7 +56,7 @@ class _PermittivityFromRatio(Protocol):
 class _Multilayer(Protocol):
     """Type of :func:`multilayer`: labelled arrays if an argument, or all media of a list, are labelled.
 
-    One labelled array in a list is enough when it runs; the type of such a list cannot be told from one without.
+    One labelled array in a list is enough when it runs; its type is the same as that of a list without one.
     """
 
     @overload
@@ -116,7 +116,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
                 keywords = dict(zip(named, filled[len(arguments) :], strict=True))
                 return function(*filled[: len(arguments)], **keywords)
 
-            # No result has dimensions beside those of the arguments.
+            # No result has dimensions other than those of the arguments.
             no_own_dims: list[list[str]] = [[] for _ in results]
             labelled = xarray.apply_ufunc(compute, *entries, output_core_dims=no_own_dims, keep_attrs="override")
             labelled_arrays = labelled if len(results) > 1 else (labelled,)
@@ -176,7 +176,7 @@ def _take_arrays_as_one_medium(function: Function) -> Function:
 
 
 def _list_one_medium(value: Any) -> Any:
-    """Return a `DataArray` in a list of one, anything else as it is."""
+    """Return a `DataArray` in a list of one, anything else unchanged."""
     xarray = sys.modules.get("xarray")
     if xarray is not None and isinstance(value, xarray.DataArray):
         return [value]

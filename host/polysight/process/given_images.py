@@ -447,7 +447,7 @@ def choose_angle(pair: GivenPair, settings: Settings, rig: Instrument) -> Angle:
 
 
 def describe_illumination(images: Images, rig: Instrument) -> Illumination:
-    """Return the illumination by which the phase of a plate tells its tilt (`Illumination.rise`), for this rig.
+    """Return the illumination with which the phase of a plate gives its tilt (`Illumination.rise`), for this rig.
 
     The footprints are not known and taken as even: nothing is divided out. `moved_m` (how far a tilt moves the point
     that reflects) and `steepness_rad_m` (phase of a tilt along the plate) are those at each board's specular point.
@@ -488,7 +488,7 @@ def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
 
 
 TOLD_TILT_DEG = 0.5
-"""Tilt of a plate across the plane of incidence from which on the verdict tells how its polarisations were turned;
+"""Tilt of a plate across the plane of incidence from which on the verdict reports how its polarisations were turned;
 chosen."""
 
 
@@ -511,7 +511,7 @@ def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:
 
 TOLD_PAINT = 0.2
 TOLD_SIGN = 0.02
-"""Probability of paint and of the other sign from which on the verdict tells them; chosen."""
+"""Probability of paint and of the other sign from which on the verdict reports them; chosen."""
 
 
 def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> list[Finding]:

@@ -599,7 +599,7 @@ _FOLDER = "export"
 
 
 def export_folder(folder: Path, out: Path | None) -> Path:
-    """Create and return the folder for exports: `out`, or one beside `folder`. Raises ConfigError if that is a link."""
+    """Create and return the folder for exports: `out`, or one next to `folder`. Raises ConfigError for a link."""
     if out is None:
         out = folder.parent / f"{folder.name}-{_FOLDER}"
         if out.is_symlink():

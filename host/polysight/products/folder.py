@@ -1,7 +1,7 @@
 """Write a folder of products atomically, and find the label files of a scan.
 
-New products are written beside the old folder and replace it when complete. If the program is killed at any time, the
-folder holds either the old or the new products.
+New products are written into a folder next to the old one, and replace it when complete. If the program is killed at
+any time, the folder holds either the old or the new products.
 
 Boxes drawn by hand are kept in `labels.json` of the scan folder. The `labels.json` among products is the classifier's
 unless it contains `by_hand`; such a file is kept when products of the same scan are replaced.
@@ -51,7 +51,7 @@ _EXCHANGE = 2
 class FolderLock:
     """Lock of a folder until it is closed; the folder is created.
 
-    POSIX systems lock the folder itself. Windows cannot open folders: there a file beside it is locked.
+    POSIX systems lock the folder itself. Windows cannot open folders: there a file next to it is locked.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def products_locked(out: Path) -> Iterator[None]:
 
 
 def _lock(out: Path, new: Path) -> FolderLock:
-    """Create and lock the new folder beside `out`, and empty it. Raises ConfigError."""
+    """Create and lock the new folder next to `out`, and empty it. Raises ConfigError."""
     try:
         new.parent.mkdir(parents=True, exist_ok=True)
         return _create_locked(new)
@@ -236,8 +236,8 @@ def _create_locked(new: Path) -> FolderLock:
 def _replace(new: Path, place: Path, old: Path) -> None:
     """Put the folder `new` in the place of `place`, then move files of other programs from the old folder to it.
 
-    Where both cannot be swapped at once, `old` is the name of the old folder for a moment. The old products end up in
-    the folder `new`.
+    Where both cannot be swapped in one step, `old` is the name of the old folder for a moment. The old products end up
+    in the folder `new`.
     """
     sync_folder(new)
     if not place.exists():

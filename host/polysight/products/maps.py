@@ -3,7 +3,7 @@
 Figures of reports and pictures of pages draw the same values. Amplitudes are in dB, phases in degrees. A phase or a
 ratio means nothing where a channel holds only noise: there its pixels fade out.
 
-For permittivities: the pixels of image.npz are relative to metal and free of known leakage. What the scene tells beyond
+For permittivities: the pixels of image.npz are relative to metal and free of known leakage. What the scene shows beyond
 that is in the error budget and in the patches: leakage and incidence angle apply to all pixels, drift, tilt and the
 error of the metal reference are known where a patch is.
 """
@@ -235,7 +235,7 @@ def nominal_incidence_rad(scan: ProcessedScan) -> Real:
 
 
 def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
-    """Return the incidence angle that the scene tells, radians; the nominal one if the budget has no estimate."""
+    """Return the incidence angle that the scene determines, radians; the nominal one if the budget has no estimate."""
     if budget is None or budget.incidence is None or budget.incidence.deg is None:
         return theta_rad
     return theta_rad + (np.radians(budget.incidence.deg) - np.median(theta_rad))
@@ -244,7 +244,7 @@ def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
 def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
     """Return V / H with the estimated leakage removed, in place of the known one that was removed from the pixels.
 
-    `inverse` is V / H of the pixels, complex [ny, nx]; it stays as it is if the products do not say what was removed.
+    `inverse` is V / H of the pixels, complex [ny, nx]; it is not changed if the products do not say what was removed.
     """
     removed_h = _join_parts(leakage.removed_h)
     removed_v = _join_parts(leakage.removed_v)

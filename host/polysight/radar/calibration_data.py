@@ -28,7 +28,7 @@ PART_BYTES = 224
 RESTORED = 0x14E0
 # Calibrations of the RF init (ICD 63).
 ALL = 0x1FF0
-# Die ids that do not identify a board: zeros, and that of firmware that cannot tell it.
+# Die ids that do not identify a board: zeros, and that of firmware that cannot report it.
 NO_DIE = "-".join(["00000000"] * 4)
 UNKNOWN_DIE = "unknown"
 NO_DIES = (NO_DIE, UNKNOWN_DIE)

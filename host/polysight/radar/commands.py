@@ -238,7 +238,7 @@ class Chirp(Command):
 
 @dataclass(frozen=True)
 class Frame(Command):
-    """Frames of `loops` chirps, started one by one by edges of SYNC_IN, or all at once by software (ICD 90-94).
+    """Frames of `loops` chirps, started one by one by edges of SYNC_IN, or all together by software (ICD 90-94).
 
     `frames` is their number, `period_us` the frame period (:func:`frame_period_us`), `trigger` what starts them. TI's
     library writes the number of 16-bit words per chirp (2 x `samples`) into a field that the ICD calls reserved.

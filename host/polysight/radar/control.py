@@ -7,9 +7,9 @@ it was armed, because an armed radar sends nothing before its first pulse.
 * `NativeRadars`: this host configures and arms the radars over USB. After a fault a board is reset and configured again
   when the next row, or the retake of a row, is armed; a lost link is reopened. Not run on hardware yet.
 * `LineServers` re-arms the radars for each row over TCP: a server for each board receives the line `Retrigger` and
-  never replies. The published rig works so: a MATLAB server beside mmWave Studio configures a radar for the frames of
-  one row, and restarts it at each line. The kernel of the server's machine acknowledges the line; only the data of the
-  row shows that the server read it and that the radar started.
+  never replies. The published rig works so: a MATLAB server on the computer of mmWave Studio configures a radar for the
+  frames of one row, and restarts it at each line. The kernel of the server's machine acknowledges the line; only the
+  data of the row shows that the server read it and that the radar started.
 * `Endless`: another program started the radars.
 """
 

@@ -38,7 +38,7 @@ VOLTAGE_MONITOR_BIT = 57
 
 
 class Row(NamedTuple):
-    """Result of one step, as it is printed.
+    """Printed result of one step.
 
     `holds`: True if the step passed; `came`: its outcome, or the error; `do`: the remedy, empty after a success.
     """
@@ -163,8 +163,8 @@ class TracedWords:
     words, clock
         The link, and the clock for the log.
     file
-        Overwritten; each line is flushed at once. A full disk ends only the log; `ended` then has the reason, and is
-        empty before.
+        Overwritten; each line is flushed immediately. A full disk ends only the log; `ended` then has the reason, and
+        is empty before.
     facts
         Content of the first line, see `trace_words`.
 
@@ -379,7 +379,7 @@ class ReplayedWords:
         self._step()
 
     def _step(self) -> TraceLine:
-        """Return the next line, and move behind it, in time too."""
+        """Return the next line, and move to the one after it; the clock advances to its time."""
         line = self._lines[self._at]
         self._time = max(self._time, line.t)
         self._at += 1

@@ -247,5 +247,5 @@ def send_image(
 def _file_error(name: str, what: str, why: str) -> ConfigError:
     """Return the error for a file that is not an image, or not one for an AWR2243."""
     return ConfigError(
-        f"{name} is no firmware for an AWR2243: {what}; nothing was sent", why, _REMEDY, code=ErrorCode.FILE_FOREIGN
+        f"{name} is not firmware for an AWR2243: {what}; nothing was sent", why, _REMEDY, code=ErrorCode.FILE_FOREIGN
     )

@@ -210,7 +210,7 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
     low = np.minimum(low, lowest) - _MARGIN_SHARE * span
     high = np.maximum(high, highest) + _MARGIN_SHARE * span
     ax.set_xlim(low[0], high[0])
-    # A strip of negative losses always shows, to tell that they would be gain.
+    # A strip of negative losses always shows, as a reminder that they would be gain.
     ax.set_ylim(min(low[1], -0.1), high[1])
 
 

@@ -490,7 +490,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     box: Annotated[
         str | UnsetType, Column("drawn_as", "what a person called the box of the patch", "", optional=True)
     ] = UNSET
-    # Old products do not tell how many pixels were left after the edges.
+    # Old products do not have the number of pixels that were left after the edges.
     pixels_used = derive(
         int, lambda patch: patch.pixels if patch.interior_pixels is None else patch.interior_pixels,
         Column("", "pixels", "1", "", title="Pixels"),
@@ -498,7 +498,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def _second(self) -> "_NameShare":
-        """The likeliest name beside `name`, by probability, or by votes in products without probabilities."""
+        """The second likeliest name after `name`, by probability, or by votes in products without probabilities."""
         shares = self.probabilities or self.votes
         other_shares = [_NameShare(name, share) for name, share in shares.items() if name != self.name]
         return max(other_shares, key=lambda other: other.share or 0.0, default=_NameShare())

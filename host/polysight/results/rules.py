@@ -42,8 +42,9 @@ APART_MM = 1.0
 DRIFT_CARE = 0.035
 """Drift of ln(V / H) between plates above which the result needs care, each part."""
 DRIFT_LIKELY = 0.9
-"""Probability of a drift above which it is told. Below it may as well be slopes that the plates have by themselves: the
-errors contain it. Of 40 undisturbed scenes of the independent generator two are told so, seven without this limit."""
+"""Probability of a drift above which it is reported. Below it may as well be slopes of the plates themselves: the
+errors contain it. It is reported for two of 40 undisturbed scenes of the independent generator, for seven without this
+limit."""
 HALO_CARE = 0.005
 """Halo of V around the metal above which a receiver is overdriven."""
 BACKGROUND_CARE = 0.04
@@ -54,10 +55,10 @@ DISTURBED_CARE = 0.025
 """Error of a permittivity by slopes of V / H that a plate has of its own, above which it is named. In 40 undisturbed
 scenes of the independent generator it is 0.009 at most, above 0.025 in nine of twelve with a second path."""
 FRINGES_CARE = 0.5
-"""Probability of fringes above which they are told: undisturbed scenes have less than 0.01."""
+"""Probability of fringes above which they are reported: undisturbed scenes have less than 0.01."""
 MOVED_CARE = 0.9
-"""Probability that boards have turned above which it is told; its prior is a half. With 0.8 two of eight
-undisturbed scenes of another author's generator were told it (0.81 and 0.87)."""
+"""Probability that boards have turned above which it is reported; its prior is a half. With 0.8 two of eight
+undisturbed scenes of another author's generator exceeded that (0.81 and 0.87)."""
 RELIEF_CARE_RAD = 0.035
 """Scatter of the phase of H inside plates above which they are uneven; flat ones have up to 0.005, tilted ones 0.03."""
 PLATE_ACROSS_DEG = 0.5
@@ -69,7 +70,7 @@ LEAKAGE_SHARE = 0.02
 LIBRARY_ANGLE_DEG = 0.3
 """Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
 PAINT_TOLD = 0.2
-"""Probability of a painted metal reference from which on the verdict tells it; chosen."""
+"""Probability of a painted metal reference from which on the verdict reports it; chosen."""
 MOST_OUTSHINING_DB = 6.0
 """Largest level of a plate relative to metal: a factor of two by thickness, tilt and illumination (published
 pictures)."""
@@ -312,7 +313,7 @@ def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list
     return [reason(
         "care",
         f"the given metal reference ({patch}) is {brighter_db:.0f} dB darker in H than patch {brightest}",
-        "nothing reflects more than metal: it is no metal, lies askew, or its box is beside it",
+        "nothing reflects more than metal: it is not metal, lies askew, or its box is beside it",
         "look at the picture of H in the report, and give the box of the metal", 5.0,
     )]  # fmt: skip
 
@@ -509,7 +510,7 @@ def judge_tilts(across_deg: Mapping[int, float]) -> list[Finding]:
 
 
 def judge_passivity(refused: Mapping[int, Finding]) -> list[Finding]:
-    """Judge patches that are no passive half space: number to why."""
+    """Judge patches that are not a passive half space: number to why."""
     labels: dict[str, list[int]] = {}
     for label, fault in refused.items():
         labels.setdefault(fault.what, []).append(label)

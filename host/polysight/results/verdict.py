@@ -126,7 +126,7 @@ def percent(part: int, whole: int, digits: int) -> str:
 
 
 class Coverage(msgspec.Struct, frozen=True):
-    """Recorded rows, positions and frames beside the plan, and the faults of the manifest.
+    """Recorded rows, positions and frames and those of the plan, and the faults of the manifest.
 
     `rows_absent`: numbers of the rows without data; their frames and positions count as not received.
     """
@@ -148,7 +148,7 @@ class Coverage(msgspec.Struct, frozen=True):
         return f"The manifest is damaged: {'; '.join(self.manifest)}. `polysight validate` lists the losses."
 
     def lines(self) -> tuple[str, ...]:
-        """Return text for a terminal: rows and frames beside the plan, and faults of the manifest."""
+        """Return text for a terminal: rows and frames and those of the plan, and faults of the manifest."""
         rows = f"rows: {self.rows_recorded} of {self.rows_planned} recorded"
         if self.positions_absent:
             rows += f" ({100 * self.positions_absent / self.positions_planned:.1f} % of positions absent)"

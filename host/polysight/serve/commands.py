@@ -320,7 +320,7 @@ def _archive_scan(site: Site, scan: Named, body: ScanName) -> None:
 
 def _delete(site: Site, scan: Named, body: ScanName) -> None:
     """Move a scan out of the list, and delete its files in the background."""
-    # Out of the list at once; the files take their time.
+    # The scan leaves the list immediately; its files may take longer.
     place = _put_away(site, scan, body.name)
     threading.Thread(target=shutil.rmtree, args=(place, True), name="delete").start()
 
@@ -422,7 +422,7 @@ def _fit_layers(site: Site, scan: Named, body: LayersRequest) -> None:
             parse_layer(text)
         except ValueError:
             raise ConfigError(
-                f"{text!r} is no layer", "a value is missing, or is no number", f"write {LAYER_FORMS}",
+                f"{text!r} is not a layer", "a value is missing, or is not a number", f"write {LAYER_FORMS}",
                 code=ErrorCode.VALUE_INVALID,
             ) from None  # fmt: skip
     stack = [f"--layer={text}" for text in body.layers]
@@ -438,7 +438,7 @@ class SavedLabels(msgspec.Struct, frozen=True):
 
 
 def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
-    """Save the boxes drawn on the page beside the products; without boxes the file is removed."""
+    """Save the boxes drawn on the page in the folder of the products; without boxes the file is removed."""
     del site
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
     if not labels.boxes:

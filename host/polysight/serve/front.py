@@ -443,7 +443,7 @@ class ConnectionLimit:
 
 
 class CountedConnection(H11Protocol):
-    """A connection of uvicorn that tells its limit what was read."""
+    """A connection of uvicorn that reports to its limit what was read."""
 
     def __init__(self, *arguments: Any, limit: ConnectionLimit, **options: Any) -> None:
         super().__init__(*arguments, **options)

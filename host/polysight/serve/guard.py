@@ -265,7 +265,7 @@ def refuse(status: int, code: ErrorCode, problem: str, why: str, do: str) -> Res
 
 
 async def tell_error(request: Request, e: Exception) -> Response:
-    """Answer with an error that was raised. A file that cannot be written or read is no defect of this program."""
+    """Answer with an error that was raised. A file that cannot be written or read is not a defect of this program."""
     if isinstance(e, OSError):
         error = os_error(e)
     else:

@@ -198,7 +198,7 @@ class Queue:
             self._held = ""
 
     def _list_requests(self) -> list[tuple[str, Path]]:
-        """Return the names and files of the requests, oldest first; files that are no requests are left out."""
+        """Return the names and files of the requests, oldest first; files that are not requests are left out."""
         requests = []
         for path in sorted(self._folder.glob("*.json")):
             try:

@@ -35,7 +35,7 @@ REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src
 # Bytes of a file that are read and sent at a time; chosen.
 CHUNK_BYTES = 1 << 18
 LIST_S = 0.5
-"""Time after which a list of scans is sent as far as it was read: 2,000 scans without an index take 8 s."""
+"""Time after which the scans that were read so far are sent as a list: 2,000 scans without an index take 8 s."""
 # Number of attempts to read products, which may be replaced meanwhile; chosen.
 MAX_TRIES = 5
 T = TypeVar("T")

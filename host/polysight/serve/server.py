@@ -65,7 +65,7 @@ ACCEPTED_AT_ONCE = 128
 KEEP_ALIVE_S = 10**6
 # Time that open connections have to end when the server stops; chosen.
 CLOSE_S = 1
-# Pause before the reading process is started again, so that one that fails at once takes no processor.
+# Pause before the reading process is started again, so that one that fails immediately takes no processor.
 RESTART_S = 1.0
 # The cached list of scans, in the hidden folder of the scans.
 LIST_INDEX = "list.json"
@@ -229,7 +229,7 @@ def load_token() -> str:
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as f:
             f.write(secrets.token_urlsafe(TOKEN_BYTES))
-        # Of two servers that start at once one makes the file, complete; the other one's link fails.
+        # Of two servers that start at the same time one makes the file, complete; the other one's link fails.
         try:
             os.link(part, path)
         finally:

@@ -35,7 +35,7 @@ READ_S = 30.0
 SIZE_S = 30.0
 """When the count of a folder's size takes longer, another thread goes on with the other folders; chosen."""
 HIDDEN = ".polysight"
-"""Hidden folder beside the scans: logs of programs that belong to no scan, the queue, the archive, the list's index."""
+"""Hidden folder in the folder of scans: logs of programs without a scan, the queue, the archive, the list's index."""
 LIBRARIES = "libraries"
 THUMBNAIL = "thumbnail"
 # Drawn pictures and comparisons that are kept for the next request; chosen.
@@ -190,7 +190,7 @@ def _stamp_products(folder: Path) -> tuple[Path, str]:
 
 @lru_cache(maxsize=MAX_PICTURES)
 def _draw(products: Path, stamp: str, name: str, limits: tuple[float, float] | None) -> catalogue.Picture:
-    """Draw a map, or the thumbnail; `stamp` only tells cached products of another generation apart."""
+    """Draw a map, or the thumbnail; `stamp` only distinguishes cached products of another generation."""
     del stamp
     pixels = catalogue.Pixels(products)
     if name == THUMBNAIL:
@@ -210,7 +210,7 @@ def _check(products: Path, stamp: str) -> CheckResult | None:
 
 @lru_cache(maxsize=MAX_COMPARISONS)
 def _compare(first: Path, second: Path, *stamps: tuple[Path, str]) -> catalogue.Comparison:
-    """Compare two scans; `stamps` only tell cached products of another generation apart."""
+    """Compare two scans; `stamps` only distinguish cached products of another generation."""
     del stamps
     return catalogue.compare(first, second)
 
@@ -359,7 +359,7 @@ class Watches:
             return self._lasting.get(name)
 
     def _make_room(self) -> None:
-        """Close live views without pages: after a while, or at once when there are too many. Raises DeviceError."""
+        """Close live views without pages: after a while, or immediately when there are too many. Raises DeviceError."""
         too_many = len(self._open) >= MAX_WATCHES
         for name, opened in list(self._open.items()):
             if not opened.streams and (too_many or time.monotonic() - opened.used_at > LINGER_S):
@@ -417,7 +417,7 @@ class Watches:
 
 # --- the list of scans, as the page asks for it ---
 
-# Random bytes that tell the states of this server from those of one that ran before.
+# Random bytes that distinguish the states of this server from those of one that ran before.
 ORIGIN_BYTES = 4
 
 

@@ -35,7 +35,7 @@ __all__ = ["AppendFile", "EventLog", "EventWriter", "LogDigest", "crc32", "parse
 class AppendFile:
     """A file open for durable, unbuffered appending; with `create`, made if missing.
 
-    `length` is the number of valid bytes; bytes behind them, from a failed :meth:`append`, are overwritten or cut off.
+    `length` is the number of valid bytes; bytes after them, from a failed :meth:`append`, are overwritten or cut off.
 
     Raises
     ------
@@ -177,7 +177,7 @@ class LogDigest(msgspec.Struct, frozen=True):
 class EventWriter:
     """Appends events to a file; they are durable after :meth:`sync`. `last_seq` is the newest sequence number.
 
-    Torn or damaged data behind the last complete event is moved to `events.msgpack.damaged`.
+    Torn or damaged data after the last complete event is moved to `events.msgpack.damaged`.
 
     Raises
     ------

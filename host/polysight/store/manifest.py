@@ -36,7 +36,7 @@ except ModuleNotFoundError:
 
 MANIFEST = "manifest.jsonl"
 State = Literal["open", "paused", "finished", "stopped", "failed"]
-"""`open`: a program records the scan, or was killed; `control/alive` tells these apart, also for `paused`."""
+"""`open`: a program records the scan, or was killed; `control/alive` distinguishes these, also for `paused`."""
 
 
 # --- facts ---
@@ -114,7 +114,7 @@ class Reception(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
 
 class BoardRow(Reception, frozen=True, kw_only=True, omit_defaults=True):
-    """One board's part of a committed row. `file` is relative to the scan folder; the index is beside it.
+    """One board's part of a committed row. `file` is relative to the scan folder; the index is in the same folder.
 
     `bytes` are those of the whole row, `frames_received` the frames without a missing byte; the three CRC-32 (hex) are
     of payload, index and packets, "" where there is no such file.
@@ -386,7 +386,7 @@ class Manifest:
     torn: bool = False
     count: int = 0
     digest: str = ""
-    # One more than the count of the last whole line; less than `count` behind damaged lines.
+    # One more than the count of the last whole line; less than `count` after damaged lines.
     _next_whole: int = 0
     # Lines so far, damaged ones too.
     _lines: int = 0
@@ -516,7 +516,7 @@ def read(path: Path) -> Manifest:
 
 # --- locks, and the writer ---
 
-# A byte behind the end of any file, which Windows locks.
+# A byte beyond the end of any file, which Windows locks.
 _LOCKED_BYTE = 1 << 30
 
 
@@ -543,7 +543,7 @@ def lock_file(file: IO[Any] | int, *, shared: bool = False) -> None:
     else:
         descriptor = file.fileno()
     position = os.lseek(descriptor, 0, os.SEEK_CUR)
-    # A byte behind the end, because Windows keeps others from reading what is locked. All its locks are exclusive.
+    # A byte beyond the end, because Windows keeps others from reading what is locked. All its locks are exclusive.
     os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
     try:
         msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
@@ -587,7 +587,7 @@ class ManifestWriter:
                     code=ErrorCode.FILE_EXISTS,
                 )
             problem = f"{path}: does not exist"
-            cause = f"{path.parent} is no scan folder"
+            cause = f"{path.parent} is not a scan folder"
             raise DeviceError(problem, cause, "give the folder of a scan", code=ErrorCode.FILE_MISSING)
         self._file = AppendFile(path, create)
         if not self._lock():

@@ -36,7 +36,7 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
     Raises
     ------
     DataError
-        if it is none of them, its raw rows were dropped, or an authors' scan is opened without `base`.
+        if it is not one of them, its raw rows were dropped, or an authors' scan is opened without `base`.
     ConfigError
         if the rig file is wrong.
     """

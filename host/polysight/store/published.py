@@ -26,7 +26,7 @@ from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, plan_raster
 
 Gaps = list[tuple[int, int]]
-# Payload of a full packet in bytes, where no log of the packets tells it.
+# Payload of a full packet in bytes, where no log of the packets gives it.
 PACKET_BYTES = 1456
 # Largest deviation of a pause from a whole number of periods between positions, as a share of a period (chosen).
 _UNEVEN = 0.25
@@ -236,7 +236,7 @@ def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zeroed_raw:
 
 
 def _find_pauses(at_s: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Return the indices of the packets behind a pause between bursts, of which about `count` are expected.
+    """Return the indices of the packets after a pause between bursts, of which about `count` are expected.
 
     Most of the `count` longest pauses are those between neighbouring positions; the threshold is half of their first
     quartile.
@@ -256,7 +256,7 @@ def find_bursts(stream: Stream, shape: RowShape) -> Bursts | None:
     end = stream.data.size
     first_packets = _find_pauses(stream.at_s, -(-end // shape.burst_bytes) - 1)
     ends = np.zeros(first_packets.size, np.int64)
-    # A burst ends between the ends of the packets before and behind the pause, for the latter holds its last bytes.
+    # A burst ends between the ends of the packets before and after the pause, for the latter holds its last bytes.
     ends_before = np.minimum(stream.start[first_packets - 1] + stream.packet_bytes, end)
     ends_behind = stream.start[first_packets] + stream.packet_bytes
     for i, (low, high) in enumerate(zip(ends_before, ends_behind, strict=True)):

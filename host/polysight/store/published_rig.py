@@ -79,7 +79,7 @@ class Rig(NamedTuple):
 
 
 def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
-    """Read a JSON object from a file; with `missing_ok`, {} for a missing file. Raises DataError if it is none."""
+    """Read a JSON object; with `missing_ok`, {} for a missing file. Raises DataError if it is not an object."""
     if missing_ok and not path.exists():
         return {}
     cause = "the download is not complete"

@@ -179,7 +179,7 @@ class Replaced:
 class PlacedAgain:
     """A row placed again from its packets."""
 
-    # What was known for placing it, beside the packets.
+    # Other data that the placement used than the packets.
     evidence: capture.Evidence
     placed: capture.Placed
     # uint8: the payload as placed now.
@@ -191,7 +191,7 @@ class PlacedAgain:
 
 
 def place_again(path: Path) -> PlacedAgain:
-    """Place a row again; `path` is its file, with `.idx` and `.pkt` beside it. Raises DataError."""
+    """Place a row again; `path` is its file; `.idx` and `.pkt` are next to it. Raises DataError."""
     try:
         row = np.fromfile(path, dtype=np.uint8)
     except OSError as e:
@@ -234,7 +234,7 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
 
 
 def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
-    """Place one board's row again; None beside the report if that cannot be done."""
+    """Place one board's row again; None with the report if that cannot be done."""
     name = Path(board.file).parent.name
     path = scan.path / board.file
     unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)

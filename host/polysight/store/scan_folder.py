@@ -648,7 +648,7 @@ def open_npz(path: Path) -> Iterator[Any]:
     Raises
     ------
     DataError
-        if it is no regular file, or its arrays exceed :data:`MAX_BYTES`.
+        if it is not a regular file, or its arrays exceed :data:`MAX_BYTES`.
     OSError, ValueError, KeyError, EOFError
         if it is not an archive of arrays, as numpy does.
     """

@@ -54,12 +54,12 @@ def _make_error(where: str, what: str, do: str = "", code: ErrorCode = ErrorCode
 
 
 def _note(where: str, what: str, do: str = "") -> Finding:
-    """Return a finding that is no fault of the data."""
+    """Return a finding that is not a fault of the data."""
     return Finding("note", what, do=do, where=where)
 
 
 def validate(path: Path) -> list[Finding]:
-    """List faults of a scan folder and notes on it; [] if complete and undamaged. Raises DataError if it is no scan."""
+    """List faults of a scan folder and notes on it; [] if it is complete. Raises DataError if it is not a scan."""
     content = manifest.read(path / MANIFEST)
     being_written = manifest.is_being_written(path / MANIFEST)
     findings = []

@@ -41,19 +41,19 @@ NEIGHBOURHOOD_M = 0.024
 # Points so close on a surface have the same curvature; they are counted in cells; chosen.
 SAME_CURVATURE_M = 0.012
 CELL_M = 0.004
-# A group of fewer points is no surface: a chance of noise and edges.
+# A group of fewer points is not a surface: a chance of noise and edges.
 MIN_POINTS = 8
 # Least number of windows to fit a curvature to: each gives two slopes and three curvatures for the five unknowns.
 MIN_NEIGHBOURS = 6
-# Windows of one surface that tell how far slopes ripple. Near the border of a zone that reflects, its edge ripples by
-# waves of about 100 mm, which a fit within 24 mm takes for curvature.
+# Windows of one surface from which the ripple of slopes is estimated. Near the border of a zone that reflects, its edge
+# ripples by waves of about 100 mm, which a fit within 24 mm takes for curvature.
 RIPPLE_REACH_M = 0.054
 # Least number of these windows: nine unknowns are fitted.
 MIN_AROUND = 16
 # Distance at which a window's own curvature counts as a slope (see SlopeFit): a third of a window, about the rms
 # distance of its positions from its middle.
 LEVER_OF_WINDOW_M = 0.011
-# A smaller radius (chosen, three wavelengths) is an edge or a wire: what it diffracts is no reflection.
+# A smaller radius (chosen, three wavelengths) is an edge or a wire: what it diffracts is not a reflection.
 MIN_RADIUS_M = 0.012
 # Range of z in which objects are searched, and the largest slope of an echo's path over the stage offset; chosen. Fits
 # that start within the search's 0.47 may end somewhat beyond it.
@@ -124,7 +124,7 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     rx_m = optics.v.at_m
     at_m = find_offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
-    # V tells the echoes of one window of H apart by their paths: number the windows.
+    # V distinguishes the echoes of one window of H by their paths: number the windows.
     window = np.unique(np.round(echoes.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
     # V's echoes are those of the points `inside` V's scan only.
     seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
@@ -180,7 +180,7 @@ def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
 def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
     """Replace the curvature of each echo's path by a fit to its neighbours in the same surface; enlarge `slope_std`.
 
-    Echoes with too few neighbours stay as they are.
+    Echoes with too few neighbours are not changed.
     What a fit leaves of the slopes is an error of each that its own window does not show: ripple of edges and of other
     echoes, whose variance is added to that of the slope. Ripple is as long as the neighbourhood to which the curvature
     is fitted, and a fit follows it there. So where there are enough windows it is judged over a larger one, by a fit in
@@ -240,7 +240,7 @@ class SlopeFit:
             rows = rows[..., :5]
         rows[2:] *= LEVER_OF_WINDOW_M
         self.matrix = rows[:2]
-        # The windows of a single line do not tell all derivatives.
+        # The windows of a single line do not determine all derivatives.
         inverse = np.linalg.pinv(np.einsum("rnp,rnq->pq", rows, rows), hermitian=True)
         self.answer = np.einsum("pq,rnq->prn", inverse, rows)
         noise, ripple = correlate_windows(d)
@@ -307,8 +307,8 @@ def share_curvatures(echoes: Echoes, segment: NDArray[np.int_], optics: Optics) 
 
     The motion is how far the point moves on the surface while the stage moves (`find_motion`); the path's curvature is
     linear in it. A small body shows nearly the same place to all windows, which moves by millimetres: each window alone
-    tells little of its curvature, all together much. On a plane only the next windows see the same place. Echoes count
-    by power.
+    says little about its curvature, all together much. On a plane only the next windows see the same place. Echoes
+    count by power.
     """
     shape = find_shape(echoes, optics)
     geometry = (shape.points, shape.normals, echoes.at_m, optics.tx.at_m, optics.h.at_m)

@@ -42,7 +42,7 @@ ANGLE_STEP = 1e-3
 class Antenna:
     """Place (metres), boresight, and field vectors at boresight of the wanted polarisation and of the other one, [3].
 
-    `leakage` is how much of the other polarisation the antenna has beside 1 of the wanted one.
+    `leakage` is the amplitude of the other polarisation relative to the wanted one.
     """
 
     at_m: Array

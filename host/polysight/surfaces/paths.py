@@ -91,7 +91,7 @@ class _Search:
         # `back` are unit vectors from the board's middle to the points, `lever` the places of the RX from that middle:
         # an RX is nearer to a point by back . lever, and has so much less path.
         lead = np.exp(1j * fit.middle * (back @ fit.lever.T))
-        # Places behind the stage or far away (limits chosen) are no surfaces of the scene.
+        # Places behind the stage or far away (limits chosen) are not surfaces of the scene.
         lead[(points[:, 2] < 0.2) | (points[:, 2] > 1.5)] = 0
         self.lead = np.moveaxis(lead.reshape(*path.shape, -1), -1, 0).astype(np.complex64)
 
@@ -274,8 +274,8 @@ def measure_echoes(
 
     `path_m` [n] are the paths there, `slope` [n, 2] and `bend` [n, 2, 2] their first and second derivatives by the
     stage's place. The path is not fitted: a maximum over paths is too high by the noise, by most where V nearly
-    vanishes. Echoes of the same number `window` [n] are told apart by their paths; without it, each is measured as if
-    alone.
+    vanishes. Echoes of the same number `window` [n] are distinguished by their paths; without it, each is measured as
+    if alone.
     Returns the echoes and which of them lie inside the scan and are to be measured (others are not).
     """
     fit = BoardFit(board)
@@ -325,7 +325,7 @@ def _move_starts(values: Array, offsets_m: Array) -> Array:
 
 
 def _measure_windows(fit: BoardFit, windows: Windows, values: Array) -> Echoes:
-    """Measure the first echo of each window, of known values [window, echo, 6], beside the others."""
+    """Measure the first echo of each window, of known values [window, echo, 6], in the presence of the others."""
     first_values = values[:, 0]
     if values.shape[1] > 1:
         joint = JointFit(fit, windows, values, np.zeros(values.shape[:2]))

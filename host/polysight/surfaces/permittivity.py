@@ -23,7 +23,7 @@ The covariance of (real, imaginary) of eps is the sum over these sources (`add_c
 * the model: error of the curvature, next order of the expansion in it, and slopes of the antennas' patterns.
 An error that all points share changes their misses; one Gauss-Newton step turns that into a change of eps.
 
-Two quantities that the fit does not use tell whether a single medium reflected at a single surface (`judge_medium`):
+Two quantities that the fit does not use show whether a single medium reflected at a single surface (`judge_medium`):
 the level of H relative to metal, and the change of the levels of H and V over the band.
 """
 
@@ -74,7 +74,7 @@ USUAL_RIPPLE = 0.02
 # chosen.
 EXPECTED_BLOCKS = 2.0
 # Relative error of the curvature; chosen: the curvatures of 14 spheres and cylinders (50 to 190 mm, simulated) were
-# measured 0.4 to 3 % too large, 1.6 % in the root mean square, because a window is not small beside such bodies.
+# measured 0.4 to 3 % too large, 1.6 % in the root mean square, because a window is not small compared with such bodies.
 CURVATURE_ERROR = 0.02
 # The reflection at a curved surface is a series in K / (k cos^3 theta), with K the curvature, k the wave number, theta
 # the angle of incidence. This is its second term over the first, in that unit: 1.9 by the exact series of spheres (100
@@ -511,7 +511,7 @@ def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, 
 
     The disc has the radius `BORDER_DISC_M` in the plane of the stage offsets `at_m` [n, 2], metres. `extent_m` is the
     smallest and the largest offset of the scan, [2] each. Only the part of the disc inside this extent counts, for the
-    end of the scan is no border of a surface.
+    end of the scan is not a border of a surface.
     """
     filling = np.zeros(len(at_m))
     stride_m = np.array([_find_stride(column) for column in at_m.T])
@@ -581,7 +581,7 @@ def judge_medium(
     # Includes the error in directions that the reference does not cover.
     unknown_std = float(np.median(gains.estimate_level_std(v)))
     variance = _spread(levels) ** 2 / blocks + unknown_std**2
-    # An error of the rig changes the permittivity, and with it the expected level, beside the measured one.
+    # An error of the rig changes the permittivity, and with it the expected level, not only the measured one.
     miss = find_misses(v, gains, reflect_points(fit.eps, v, wave_number))
     for scan in disturbed:
         real, imaginary = find_common_error(fit, miss, scan, wave_number)
@@ -601,7 +601,7 @@ def _spread(values: Array) -> float:
 def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_number: float) -> Array:
     """Return the covariance of (real, imaginary) of each point's own permittivity by the scatter around it, [n, 2, 2].
 
-    Ripple by edges and other echoes is no part of a point's noise, and differs over a segment. So the noise's variance
+    Ripple by edges and other echoes is not part of a point's noise, and differs over a segment. So the noise's variance
     is multiplied by the mean of `fit.excess2` over the points within `RIPPLE_M`, outliers included.
     """
     around = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)

@@ -46,7 +46,7 @@ from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
 from polysight_shared.files import write_atomically
 
-# Fields of a surface that are no arrays of points.
+# Fields of a surface that are not arrays of points.
 NOT_POINTS = ("scan_id", "simulated", "segments")
 SURFACE = "surface.npz"
 POINTS = "surface.ply"
@@ -59,7 +59,7 @@ MIN_POINTS = 20
 # A segment whose ratio r_s / r_p is nearer to 1 is metal. Metal has 1; a permittivity of 40 without loss has 1.5 at 55
 # degrees.
 METAL_RATIO = 0.15
-# A loss below zero by so many standard deviations is no property of one medium, nor is a real part beyond these: the
+# A loss below zero by so many standard deviations is not a property of one medium, nor is a real part beyond these: the
 # fit ends at 1.2 and at 40.
 MAX_GAIN_SIGMA = 3.0
 LEAST_REAL = 1.25
@@ -363,8 +363,8 @@ def doubt_places(
 ) -> tuple[list[Segment], Array]:
     """Return the segments with their reasons, and the standard errors of points by what no single medium explains, [n].
 
-    They are in metres, 0 for segments of one medium. A wall is not told from other things that no single medium
-    explains, so that the radius gets a wall's error, too.
+    They are in metres, 0 for segments of one medium. A wall is not distinguished from other things that no single
+    medium explains, so that the radius gets a wall's error, too.
     """
     reflection = find_reflection(voltages, gains)
     rise = voltages.band_rise[:, 0] - gains.band_rise[0]

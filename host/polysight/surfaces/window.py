@@ -20,7 +20,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 WINDOW_M = 0.034
 # Steps of Newton's method: from a start of the coarse search they reach the maximum.
 ITERATIONS = 7
-# Positions of a window that are enough to tell whether its echoes lie apart; a window of steps of 2 mm has 289.
+# Positions of a window that are enough to see whether its echoes lie apart; a window of steps of 2 mm has 289.
 THINNED_POSITIONS = 48
 # Largest step of path (m), slopes, and curvatures (1 / m); chosen.
 STEP_LIMITS = np.array([0.02, 0.05, 0.05, 1.5, 1.5, 1.5])
@@ -323,7 +323,7 @@ def maximise(
     return Maximum(
         values=values,
         amplitude=amplitude,
-        # At an offset zero beside the window's centre, the plane's value is less certain than the mean.
+        # At an offset zero that is not the window's centre, the plane's value is less certain than the mean.
         amplitude_std=np.sqrt(noise * np.maximum(1, count * plane_inverse[:, 0, 0])),
         std=std,
         share=share,

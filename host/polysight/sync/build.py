@@ -129,7 +129,7 @@ def _run(command: Sequence[str]) -> None:
 
 
 def main() -> int:
-    """Compile for this machine; the library lies beside this file."""
+    """Compile for this machine; the library lies in the folder of this file."""
     try:
         sys.stdout.write(f"{build()}\n")
     except (BuildError, OSError) as e:

@@ -170,7 +170,7 @@ def _group_bursts(
     for words in pieces:
         chirps, samples, _, rx = words.shape
         frames -= chirps
-        # The first chirp of a piece tells whether an RX is stuck.
+        # The first chirp of a piece shows whether an RX is stuck.
         silent = (words[:1] == words[:1, :1]).all(axis=(0, 1, 2))
         if dead is not None:
             silent |= dead

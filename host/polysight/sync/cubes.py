@@ -164,8 +164,8 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     mean, coherent = _average_direct_path(cube[..., a:b], gate)
     if coherent > _COHERENT:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
-        # If all RX are referenced to the first, each keeps its lag behind it: their phases agree only without the lags
-        # (at the middle frequency). Otherwise they agree as they are.
+        # If all RX are referenced to the first, each keeps its delay relative to it: their phases agree only without
+        # the delays (at the middle frequency). Otherwise they agree with them.
         if abs((mean * lag[:, (a + b) // 2].conj()).sum()) > abs(mean.sum()):
             turn = turn * lag.conj()
             form.append("all RX referenced to the direct path of one")

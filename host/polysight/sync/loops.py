@@ -295,7 +295,7 @@ def against_others(
         float64 [2, position, chirp]: difference of the tones from even and from odd RX, with the chirp itself in the
         sum: cycles per sample, and radians.
     residual_energy
-        float64 [position, chirp, part]: energy of a chirp's part that is no multiple of the others' sum.
+        float64 [position, chirp, part]: energy of a chirp's part that is not a multiple of the others' sum.
     """
     positions, chirps, rx, blocks = reduced.shape
     good_sum = good[:, None].astype(np.complex64) @ reduced.reshape(positions, chirps, rx * blocks)
@@ -567,7 +567,7 @@ class Library:
     Parameters
     ----------
     path
-        File of the library; None: beside the sources.
+        File of the library; None: in the folder of the sources.
     bits
         Width of vectors, 128, 256 or 512; None: the widest of the processor.
 

@@ -77,7 +77,7 @@ _PRESENT = 30.0
 
 # An RX is dead if its power is this part (-23 dB, chosen) of the strongest one's, without its noise.
 _DEAD = 0.005
-# The strongest RX tells nothing about others if a smaller part of its power is signal, and not noise; chosen.
+# The strongest RX says nothing about others if a smaller part of its power is signal, and not noise; chosen.
 _SIGNAL = 0.3
 # About so many positions are judged together; chosen.
 _JUDGED = 16

@@ -25,8 +25,8 @@ let server = {}, name = scanName, summary = {}, curve = "sync";
 
 // --- what is shown ---
 
-/** A terminal's advice on a scan that could not start: there is nothing to resume, and the button reads the rig file anew. */
-function beforeTryingAgain(advice) {
+/** A terminal's advice on a scan that could not start: there is nothing to resume, and the button reads the rig file
+again. */ function beforeTryingAgain(advice) {
   const here = advice.replace(/ \([^()]*`polysight resume [^()]*\)/g, "").replace(", and add --config instrument.toml", "")
     .replace(/`polysight resume [^`]*`/g, "Try again");
   const mend = `${here}${here.includes("`") ? " (commands: in a shell)" : ""}`;

@@ -261,7 +261,7 @@ def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
 
 
 def _check_release(modules: Path) -> Finding:
-    """Warn if the kernel keeps an output as it is when its program dies: SYNC_IN could stay high."""
+    """Warn if the kernel keeps an output's level when its program dies: SYNC_IN could stay high."""
     summary = "this kernel does not say if outputs are released when their program dies"
     for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
         parameter = modules / module / "parameters" / "persist_gpio_outputs"

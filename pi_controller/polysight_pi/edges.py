@@ -1,4 +1,4 @@
-"""Check the trigger edges of a row: a lost edge and a spurious one keep the count right, only their times tell.
+"""Check the trigger edges of a row: a lost edge and a spurious one keep the count right; only their times show them.
 
 The edges are compared with three reports of the stage:
 
@@ -6,7 +6,7 @@ The edges are compared with three reports of the stage:
   status names, and from there it speeds up again, so those intervals are known too, except for the time at rest;
 * the number of points in each status: at most as many edges before the status was requested, and at least as many by
   the time when it was written;
-* the end: behind the last point the stage runs on and slows down, so its `done` follows after a known time.
+* the end: after the last point the stage runs on and slows down, so its `done` follows after a known time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STATUS_TOLERANCE = 0.2
 
 
 class RowMotion(NamedTuple):
-    """A row as the stage is told it, and the motion that follows (docs/spec/stage-line.md, "A row").
+    """A row as it is sent to the stage, and the motion that follows (docs/spec/stage-line.md, "A row").
 
     Lengths are in motor steps: `x_start` and `y` of the first point, in stage coordinates; `step` from point to point,
     below zero towards -x; `backlash`, the play that the run-up takes up. `feed` is the speed at the points in steps/s,
@@ -235,7 +235,7 @@ class EdgeTimes:
             return self._judge_motion([], done_ns)
         stops = sorted(self._stops)
         # A hold before the first point was either in the travel to the row, without effect on the row's motion, or in
-        # the run-up. Its report does not tell which, so the edges may agree with either.
+        # the run-up. Its report does not say which, so the edges may agree with either.
         fault = self._judge_motion(stops, done_ns)
         if fault and self._early_stops:
             fault = self._judge_motion(sorted(self._early_stops) + stops, done_ns)

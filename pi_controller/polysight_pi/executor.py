@@ -2,7 +2,7 @@
 
 It executes the host's commands and manages the run; machine.py controls stage and row. It waits for no storage: a
 command that has to be journalled or replayed is answered by the journal's thread, test pulses when they have ended, and
-what comes while a run begins or ends when it has; all others at once. docs/spec/wire.md describes each command.
+what comes while a run begins or ends when it has; all others immediately. docs/spec/wire.md describes each command.
 
 `Machine.happen` applies the rule that a state has for an event, if there is one; `Machine.command` does the same for a
 command, and refuses it without a rule. Both name their event by a string, a key of machine.py's table of rules. What
@@ -155,7 +155,7 @@ class Executor:
     # --- for other threads ------------------------------------------------------------------------------------------
 
     def post(self, item: StageNews | BurstSent | m.Pulsed | LoopFault | Callable[[], object]) -> None:
-        """Append an item to the queue; return at once. Replies of the stage are dropped if too many wait."""
+        """Append an item to the queue; return immediately. Replies of the stage are dropped if too many wait."""
         if isinstance(item, Reply) and self._inbox.qsize() > LINES_WAITING:
             # The end of a motion among them is requested again (`Machine._on_status`).
             return
@@ -453,7 +453,7 @@ class Executor:
             )
         if self._machine.row is not None:
             # The host that started the row is gone, or begins its run again: nothing of the row is committed. An abort
-            # never ends a row at once; when it has ended, `_end_row` executes the request.
+            # never ends a row immediately; when it has ended, `_end_row` executes the request.
             self._after_row = request
             self._machine.happen("Abort", f"run {run.scan_id} was begun again")
         return self._machine.row is not None
@@ -484,7 +484,7 @@ class Executor:
         self._machine.happen("EndRun")
 
     def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
-        """End the run; the reply follows when `RunStopped` is on the disk. Accept a repeated request at once."""
+        """End the run; the reply follows when `RunStopped` is on the disk. Accept a repeated request immediately."""
         if self._run is None and command.scan_id == self.journal.position[0]:
             # The host repeats a request that was already executed.
             return self._accept()

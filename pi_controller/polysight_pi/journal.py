@@ -373,7 +373,7 @@ class Journal:
         """Number events, write them to the file, then publish them; long texts are cut to the limit of the messages.
 
         Raises JournalFullError if they cannot be written; of them only faults and the end of a row are then published.
-        While the journal is `broken` (until the scan is opened again, or `Home` or `EndRun` tries anew), events have
+        While the journal is `broken` (until the scan is opened again, or `Home` or `EndRun` tries again), events have
         the last good number and are not stored, and a row that is done ends with a fault: what is not journalled is not
         acknowledged.
         """
@@ -409,7 +409,8 @@ class Journal:
     def read(self, scan_id: str, from_seq: int, limit: int) -> tuple[list[bytes], int]:
         """Return at most `limit` packed events of any scan from `from_seq` on, and the scan's newest number.
 
-        Return ([], 0) if the scan has no journal. Raises DataError for a damaged record or a file that is no journal.
+        Return ([], 0) if the scan has no journal. Raises DataError for a damaged record or a file that is not a
+        journal.
         """
         if self._file is not None and scan_id == self.scan_id:
             return self._file.read(from_seq, limit), self.last_seq
@@ -432,7 +433,7 @@ class Journal:
 
 
 def _end_with_fault(event: m.AnyEvent) -> m.AnyEvent:
-    """Return a `RowFinished` of status `done` as one with a fault, because it is not journalled; others as they are."""
+    """Return a `RowFinished` of status `done` as one with a fault, because it is not journalled; others unchanged."""
     if not isinstance(event, m.RowFinished) or event.status != "done":
         return event
     explanation = explain(PiFault.JOURNAL_FULL)
@@ -492,7 +493,7 @@ class JournalThread:
         return 0.0 if since_s is None else time.monotonic() - since_s
 
     def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
-        """Add an event to the batch; events that are not journalled are published at once."""
+        """Add an event to the batch; events that are not journalled are published immediately."""
         if issubclass(kind, m.JOURNALLED):
             self._events.append(NewEvent.now(kind, **fields))
         else:
@@ -502,7 +503,7 @@ class JournalThread:
         """Queue the batch for writing and publishing; `then` is called with None, or with the error.
 
         Return False if the queue is full: the batch then waits for a later call. A batch that is too long is dropped,
-        and `then` gets the error at once.
+        and `then` gets the error immediately.
         """
         if self._jobs.qsize() >= JOBS_WAITING and len(self._events) < EVENTS_WAITING:
             return False

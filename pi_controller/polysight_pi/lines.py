@@ -477,7 +477,7 @@ class WireLines:
         return self._now_ns
 
     def sleep_until(self, t_ns: int) -> None:
-        """Advance the wire time; return at once."""
+        """Advance the wire time; return immediately."""
         self._now_ns = max(self._now_ns, t_ns)
 
     def wait_edge(self, timeout_s: float) -> Edge | None:

@@ -56,7 +56,7 @@ class RunningRow(_Motion):
     row: Row
     # Number of the attempt at this row: 1, and one more for each retake.
     take: int
-    # What the trigger loop was told: number of edges, and the burst for each. Bursts that it reports name their job.
+    # The orders to the trigger loop: number of edges, and the burst for each. Bursts that it reports name their job.
     job: Job
     # The same row in motor steps.
     motion: RowMotion

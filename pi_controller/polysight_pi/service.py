@@ -43,7 +43,7 @@ POLL_MS = 250
 # Each part gets this long to end; a thread that hangs is left alone then. Chosen: all together end within the 5 s of
 # TimeoutStopSec in polysight-pi.service.
 END_TIMEOUT_S = 0.8
-# File beside the journals with a key that every run accepts from a person at the Pi.
+# File in the journals' folder with a key that every run accepts from a person at the Pi.
 TAKE_OVER_KEY = "take-over-key"
 # Frames of a message before its content: the route to the client, and an empty frame.
 Envelope = tuple[bytes, ...]
@@ -84,7 +84,7 @@ class Server:
         self._stop = False
 
     def publish(self, events: list[bytes]) -> None:
-        """Queue packed events, in order. From any thread; returns at once."""
+        """Queue packed events, in order. From any thread; returns immediately."""
         for raw in events:
             self._unsent.put(raw)
 
@@ -188,7 +188,7 @@ class Server:
             self._reply(envelope, m.pack(reply))
 
     def _reply(self, envelope: Envelope, raw: bytes) -> None:
-        """Send an encoded reply to the client that `envelope` names, if it takes it at once."""
+        """Send an encoded reply to the client that `envelope` names, if it takes it immediately."""
         try:
             self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
         except zmq.ZMQError:

@@ -46,7 +46,7 @@ BANNER_TIMEOUT_S = 3.0
 ANSWER_TIMEOUT_S = 0.5
 # How often a line is sent before the stage counts as lost (chosen).
 TRIES = 4
-# Error numbers of answers that tell of a damaged line: it is sent again.
+# Error numbers of answers that report a damaged line: it is sent again.
 RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 # Status requests to a moving stage per heartbeat, so that a lost one does not stop it.
 STATUS_PER_HEARTBEAT = 4
@@ -169,7 +169,7 @@ class StageLink:
     ----------
     news
         Called by the reader thread with every unsolicited reply, every `ok` (it separates replies before a command from
-        those after it), and one :class:`StageLost` when the link is lost. Must return at once.
+        those after it), and one :class:`StageLost` when the link is lost. Must return immediately.
     heartbeat_s
         The stage's heartbeat; a moving stage is lost if a status request is not answered within half of it.
     banner_timeout_s

@@ -25,7 +25,7 @@ from polysight_shared.stage_line import END_OF_TIME_NS
 from polysight_shared.units import us_to_ns
 
 # From edge to first pulse. A fixed delay, longer than the usual wake-up time, keeps the pulses of all positions at the
-# same distance behind their edges; 200 us are 4 um of travel at 20 mm/s.
+# same distance after their edges; 200 us are 4 um of travel at 20 mm/s.
 FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
 # Timeout of waiting for an edge, after which the loop checks if it has to stop or to send a burst without an edge;
 # chosen.
@@ -473,7 +473,7 @@ class TriggerLoop:
             self._fail(None, PiFault.TRIGGER_LINE_LOST, f"internal error: {e!r}")
             raise
         finally:
-            # An error in closing tells nothing new: the lines are lost already, or the process ends.
+            # An error in closing has no new information: the lines are lost already, or the process ends.
             with contextlib.suppress(DeviceError):
                 self._lines.close()
 
@@ -514,7 +514,7 @@ class TriggerLoop:
     def _look_back(self, record: BurstRecord) -> tuple[BurstRecord, str]:
         """Return the record with the pulses seen by the return wire, and how they differ from those sent, or "".
 
-        Without a return wire the record stays as it is.
+        Without a return wire the record is not changed.
         """
         returned = self._lines.look_back(record.pulses)
         self.sees_pulses = returned is not None

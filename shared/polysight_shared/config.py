@@ -226,7 +226,7 @@ class Board(Section, frozen=True):
 class Card(Section, frozen=True):
     """DCA1000 settings common to all boards."""
 
-    # Packet size as the card is told it (0x0B in docs/spec/dca1000.md); 1470 makes packets of 1456 bytes of samples.
+    # Packet size as it is sent to the card (0x0B in docs/spec/dca1000.md); 1470 makes packets of 1456 bytes of samples.
     packet_bytes: Annotated[int, msgspec.Meta(ge=24, le=1470)] = 1470
     # Pause of the card between two packets.
     packet_delay_us: NonNegative = 25.0
@@ -382,7 +382,7 @@ class Limits(Section, frozen=True):
 
 
 class Notify(Section, frozen=True):
-    """Who is told when a scan ends: a command that gets the text, a web address that gets JSON. Not stored in scans."""
+    """Who is notified of a scan's end: a command gets the text, a web address gets JSON. Not stored in scans."""
 
     command: str = ""
     url: Annotated[str, msgspec.Meta(pattern=r"^(https?://\S+)?$")] = ""

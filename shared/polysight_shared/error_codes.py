@@ -9,7 +9,7 @@ from enum import StrEnum
 
 
 class ErrorCode(StrEnum):
-    """`PolysightError.code`: stable names, in lower case with hyphens, unlike the sentences beside them."""
+    """`PolysightError.code`: stable names, in lower case with hyphens, unlike the sentences of the messages."""
 
     OTHER = "other"
 
@@ -51,7 +51,7 @@ class ErrorCode(StrEnum):
     MISMATCH = "mismatch"
 
     # host/polysight/serve
-    # The Host header of the request is no name of this server.
+    # The Host header of the request is not a name of this server.
     HOST_UNKNOWN = "host-unknown"
     # The request comes from a page of another site.
     ORIGIN_FOREIGN = "origin-foreign"

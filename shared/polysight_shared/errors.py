@@ -49,7 +49,7 @@ class PolysightError(Exception):
 def expand_paths(text: str) -> str:
     """Return a text with pages of the documentation, such as docs/how-to/install.md, as paths of this installation.
 
-    The host's wheel brings the pages; without it (on the Pi alone) the text stays as it is.
+    The host's wheel brings the pages; without it (on the Pi alone) the text is not changed.
     """
     if "docs/" not in text:
         return text
@@ -137,7 +137,7 @@ def os_error(
     if e.filename:
         summary = f"{e.filename}: {summary}"
     if e.errno == errno.ENOENT:
-        # A folder that was renamed is no full disk.
+        # A folder that was renamed does not mean a full disk.
         cause = "it was moved, renamed or deleted"
     code = ErrorCode.OTHER
     if e.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -99,15 +99,16 @@ def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file, or leave the present one as it is; raises as :func:`write_together`."""
+    """Write a file, or keep the present one; raises as :func:`write_together`."""
     write_together({path: data})
 
 
 def write_together(files: Mapping[Path, bytes]) -> None:
     """Write files that belong together.
 
-    Each is written beside its place and flushed to disk; then all are renamed, in their order. A program killed between
-    two renames leaves the last file as it was: readers must take that one as the sign that the others are complete.
+    Each is written to a temporary file in its folder and flushed to disk; then all are renamed, in their order. A
+    program killed between two renames leaves the old last file: readers must take that one as the sign that the others
+    are complete.
 
     Raises
     ------
@@ -119,7 +120,7 @@ def write_together(files: Mapping[Path, bytes]) -> None:
     parts: dict[Path, Path] = {}
     try:
         for path, data in files.items():
-            # A name of its own: two programs may write the same file at once.
+            # A name of its own: two programs may write the same file at the same time.
             part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
             with name_in_errors(path):
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -256,7 +256,7 @@ class Alive(Command, frozen=True, kw_only=True):
 
 
 class Home(Command, frozen=True, kw_only=True):
-    """Home the stage. Accepted at once; the state is `homing`, then `ready` in a run and `homed` outside of one.
+    """Home the stage. Accepted immediately; the state is `homing`, then `ready` in a run and `homed` outside of one.
 
     `owner`: the owner of the current run, if there is one and its host is alive.
     """
@@ -265,7 +265,7 @@ class Home(Command, frozen=True, kw_only=True):
 
 
 class Jog(Command, frozen=True, kw_only=True):
-    """Move one axis of the homed stage by a distance. Accepted at once; `Jogged` has the result.
+    """Move one axis of the homed stage by a distance. Accepted immediately; `Jogged` has the result.
 
     `from_mm`: the axis' position by the sender's knowledge; the stage does not move if it is elsewhere, so that a
     repeated command moves it once. `heartbeat_ms`: period of the sender's `Alive`, without which the stage stops.
@@ -281,7 +281,7 @@ class Jog(Command, frozen=True, kw_only=True):
 
 
 class RunRow(Command, frozen=True, kw_only=True):
-    """Run one row of the plan. Accepted at once; RowFinished has the result."""
+    """Run one row of the plan. Accepted immediately; RowFinished has the result."""
 
     scan_id: ScanId
     row_index: Index
@@ -302,7 +302,7 @@ class Resume(Command, frozen=True, kw_only=True):
 
 
 class Abort(Command, frozen=True, kw_only=True):
-    """Stop the row, jog or homing at once. RowFinished or Jogged with status `aborted` follows for a row or a jog."""
+    """Stop the row, jog or homing immediately. For a row or a jog, RowFinished or Jogged (`aborted`) follows."""
 
     reason: Text = ""
     owner: Owner = ""

@@ -22,7 +22,7 @@ _INTERRUPTS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 def expand_home(words: Sequence[str]) -> list[str]:
     """Put the home folder in the place of `~/` at the start of a word or of an option's value.
 
-    A shell leaves it as it is in quotes, and in `--out=~/scans`.
+    A shell does not expand it in quotes, and in `--out=~/scans`.
     """
     option_or_nothing = r"^((?:-[\w-]*|[\w.]+)=)?"
     return [re.sub(option_or_nothing + "~/", lambda m: f"{m[1] or ''}{Path.home()}/", word) for word in words]

@@ -212,7 +212,7 @@ class HandshakeMonitor:
         self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
         self._refused = False
         self.lacks_curve = False
-        # A refusal before this monitor would not come again: the socket connects anew.
+        # A refusal before this monitor would not be repeated: the socket connects again.
         if endpoint := socket.getsockopt_string(zmq.LAST_ENDPOINT):
             socket.disconnect(endpoint)
             socket.connect(endpoint)

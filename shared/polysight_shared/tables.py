@@ -92,7 +92,7 @@ _TYPES = {
 
 
 def _rewrite_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
-    """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` as it is."""
+    """Rewrite a message of msgspec in plain words, with its code; keep a rule of `require` unchanged."""
     if match := re.search(r"unknown field `(.*)`", rule):
         return f"unknown key {match[1]!r}: {_suggest_key(match[1], kind)}", ErrorCode.KEY_UNKNOWN
     if match := re.search(r"missing required field `(.*)`", rule):

@@ -1,4 +1,4 @@
-"""Addresses of a simulated rig: its own loopback subnet 127.x.y.0, so that several rigs run at once with equal ports.
+"""Addresses of a simulated rig: its own loopback subnet 127.x.y.0, so that rigs with equal ports can run together.
 
 The last byte of every card and host address is kept (.180, .181, .182, .30), as in the real rig.
 """

@@ -1,6 +1,6 @@
 """Hub of the simulated wires: relay GPIO edges and stage motion between the processes of a simulated rig.
 
-Protocol: docs/spec/simulated-rig.md; a line of text for each message, its first letter tells the kind:
+Protocol: docs/spec/simulated-rig.md; a line of text for each message; its first letter gives the kind:
 
     `S <t_ns> <line> <0|1>`                 a GPIO line changed at wire time t_ns
     `M <t_ns> <x_um> <y_um> <vx_um_s>`      place and speed of the stage from t_ns on
@@ -198,7 +198,7 @@ class WireHub:
                 client.pending += line + b"\n"
 
     def _write(self, client: _Client) -> None:
-        """Send what a client takes at once; if bytes are left, let `step` wake when it takes more.
+        """Send what a client takes immediately; if bytes are left, let `step` wake when it takes more.
 
         Disconnect it if more than the limit is left.
         """

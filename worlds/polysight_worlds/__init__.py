@@ -2,8 +2,8 @@
 
 `draw_world` and `draw_nuisances` make a scene and what disturbs its scan, `simulate` gives the pair of images. Curved
 and tilted pieces (`sphere`, `cylinder`, `plate`; more in `shapes`) are seen by `record_shapes`: the samples of both
-boards after synchronisation, at any stage positions; `Shape.project` tells where their surface is. `draw_shapes` and
-`scan_shapes` draw and disturb such scans. Only numpy and scipy are used, nothing of the instrument or its
+boards after synchronisation, at any stage positions; `Shape.project` gives the place of their surface. `draw_shapes`
+and `scan_shapes` draw and disturb such scans. Only numpy and scipy are used, nothing of the instrument or its
 simulators, so that tests may compare the two.
 """
 

@@ -2,7 +2,7 @@
 
 Physical optics takes each point's tangent plane for the surface. The true reflection differs by terms of first order
 in 1 / (k R), which are linear in the three curvatures: along the plane of incidence, across it, and the twist between
-both (which couples s and p). Three solids with exact series tell them apart: a cylinder across the plane of incidence,
+both (which couples s and p). Three solids with exact series distinguish them: a cylinder across the plane of incidence,
 one along it, and one at 45 degrees. Series minus physical optics at two radii gives the terms for any medium, also
 those of a plane (radius without end) for antennas at a finite distance.
 """

@@ -102,8 +102,8 @@ def simulate(
 ) -> ImagePair:
     """Scan a world and image it on `pixels` x `pixels` of one stage step, centred as `Rig.centre_m`.
 
-    `kaiser_beta`: window over the aperture, 0 is none. With a window, H / V of metal changes by some per cent over the
-    picture, because H and V see a place from offsets 17 mm apart.
+    `kaiser_beta`: window over the aperture; 0: no window. With a window, H / V of metal changes by some per cent over
+    the picture, because H and V see a place from offsets 17 mm apart.
     """
     nominal = published_rig() if rig is None else rig
     nuisances = Nuisances() if nuisances is None else nuisances

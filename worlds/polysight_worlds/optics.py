@@ -79,7 +79,7 @@ class Antenna:
 
 
 def _make_column(vector: NDArray, like: NDArray) -> NDArray:
-    """Return a vector [3] in a shape that broadcasts with `like` [3, ...]; an array of vectors as it is."""
+    """Return a vector [3] in a shape that broadcasts with `like` [3, ...]; an array of vectors unchanged."""
     if vector.ndim == 1:
         return vector.reshape(3, *(1,) * (like.ndim - 1))
     return vector

@@ -62,7 +62,7 @@ class ShapeScene:
             # `a` and `b` are the surface's parameters.
             distance, a, b = shape.project(points_m)
             facing = shape.evaluate(a, b).normal.T
-            # The back of a body is no surface that antennas see.
+            # The antennas do not see the back of a body.
             is_seen = facing[:, 2] < 0
             if len(self.shapes) > 1:
                 # The surface of a piece goes on beyond its edges, through other pieces.
@@ -75,7 +75,7 @@ class ShapeScene:
 
 @dataclass(frozen=True)
 class ShapeNuisances:
-    """What disturbs a scan of shapes; 0 is none. By `seed`, all but the phases is drawn from normal distributions.
+    """What disturbs a scan of shapes; 0: undisturbed. By `seed`, all but the phases is drawn from normal distributions.
 
     `noise`: of the nominal noise. Root mean squares: `misplaced_mm` how far each board stands from where the rig file
     says, `axes_deg` how far its polarisation is turned about its boresight, `leakage` the magnitude of the other

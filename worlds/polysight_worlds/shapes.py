@@ -168,7 +168,7 @@ class Graph(Shape):
 
     @property
     def is_bent(self) -> bool:  # type: ignore[override]
-        """True if it is no plane."""
+        """True if it is not a plane."""
         return bool(self.bend_x or self.bend_y or self.twist)
 
     @property

@@ -100,7 +100,7 @@ def dish(name: str, centre_m: tuple[float, float], diameter_m: float, liquid: co
 
 @dataclass(frozen=True)
 class Nuisances:
-    """What disturbs a scan; 0 is none. Directions, phases and places are drawn from `seed`.
+    """What disturbs a scan; 0: undisturbed. Directions, phases and places are drawn from `seed`.
 
     | field | what |
     | --- | --- |
@@ -261,9 +261,9 @@ def draw_world(
 def disturb_plates(world: World, nuisances: Nuisances) -> World:
     """Return the world with what `nuisances` add to plates: heights, tilts, roughness, waviness, bow and brightness.
 
-    A plate named "table" stays as it is.
+    A plate named "table" is not changed.
     """
-    # The 1 tells these draws from other ones of the same seed.
+    # The 1 makes these draws differ from other ones of the same seed.
     rng = np.random.default_rng([nuisances.seed, 1])
     disturbed = []
     for plate in world.plates:

@@ -60,12 +60,12 @@ RADAR = (
     "missed",
     # Nobody sent these edges; the radar counts its frames and ignores as many pulses at the end.
     "spurious",
-    # An edge comes beside a pulse that the radar missed.
+    # A spurious edge replaces a pulse that the radar missed.
     "near",
     # The radar does not count its frames.
     "endless",
 )
-"""What a radar can do, in :meth:`Adversary.take`: only the times of its frames tell."""
+"""What a radar can do, in :meth:`Adversary.take`: only the times of its frames show it."""
 # Time in which a radar sends a frame: the published chirp.
 _FRAME_NS = 128_000
 NEAREST_EDGE_NS = 350_000

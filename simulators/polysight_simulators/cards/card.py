@@ -138,7 +138,7 @@ class CardSender:
         return dropped
 
     def reply(self, message: bytes) -> None:
-        """Send a command's reply at once."""
+        """Send a command's reply immediately."""
         self._send_datagram(message, self._command_to)
 
     def put_status(self, message: bytes) -> None:
@@ -180,7 +180,7 @@ class CardSender:
         return None
 
     def send_now(self) -> None:
-        """Send everything queued at once, before the sockets are closed."""
+        """Send everything queued immediately, before the sockets are closed."""
         for item in self._queue:
             if isinstance(item, bytes):
                 self._send_datagram(item, self._command_to)
@@ -270,7 +270,7 @@ if TYPE_CHECKING:
 
 # Number of frames per call, which bounds the memory; chosen.
 FRAMES_PER_CALL = 64
-# MAC address of a card as it is delivered.
+# Default MAC address of a card.
 MAC = b"\x12\x34\x56\x78\x90\x12"
 Clock = Callable[[], float]
 
@@ -388,7 +388,7 @@ class CardEndpoint:
         if self._faults.mute:
             self.counts["requests_unanswered"] += 1
             return
-        # The reply; behind that of a record stop come the short last packet and the status.
+        # The reply; after that of a record stop come the short last packet and the status.
         reply, *last_of_record = self.card.command(datagram, self.wire_s())
         if isinstance(reply, dca1000.Message):
             self.counts["replies"] += 1
@@ -499,7 +499,7 @@ class SimulatedCard:
         later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
         dead_s = (later_us + rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6
         native = rig.radar.control == "native"
-        # Number of the chip, by which the host tells boards apart.
+        # Number of the chip, by which the host distinguishes boards.
         die = 1 + [b.name for b in rig.boards].index(board.name)
         if native:
             self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die)

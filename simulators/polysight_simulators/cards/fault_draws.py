@@ -50,7 +50,7 @@ class NetworkFaults:
         rows = self._corrupt(rows)
         draws = self._rng.random((len(rows), 4))
         suffers = np.any(draws < (f.loss, f.reorder, f.truncate, f.duplicate), axis=1)
-        # A packet with a fault is alone, and so is the one behind it, which may overtake it.
+        # A packet with a fault is a part by itself, and so is the next one, which may overtake it.
         cuts = {0, len(rows)}
         if self._held:
             cuts.add(1)
@@ -99,7 +99,7 @@ class NetworkFaults:
         return rows
 
     def drain(self) -> list[Rows]:
-        """Return the packets held back, which arrive now: behind the next packet, or at the end of a record."""
+        """Return the packets held back, which arrive now: after the next packet, or at the end of a record."""
         held = self._held
         self._held = []
         return held

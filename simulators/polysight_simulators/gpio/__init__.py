@@ -62,8 +62,8 @@ def environment(
         of each change of an output), `stuck` (the call that sets an output high does not return). Signal
         :data:`VANISH` makes the chip vanish.
     wire_time
-        The thread that reads edges uses wire time, in which a sleep is exact and returns at once, so that nothing is
-        late on a busy machine. Else real time.
+        The thread that reads edges uses wire time, in which a sleep is exact and returns immediately, so that nothing
+        is late on a busy machine. Else real time.
     spi
         Path of a spidev device to make; its transfers become edges of MOSI, GPIO 10.
     spi_settings

@@ -9,8 +9,8 @@ The timing of USB is not simulated.
 (A..D), `W` or `R`, size (u16, little-endian), and the bytes of a write. The answer to a read is a u16 count and the
 available bytes.
 
-`LineServer` simulates the published rig's MATLAB servers beside mmWave Studio: over TCP it receives the line
-`Retrigger\n`, arms the radar, and never replies. Faults of the `[faults]` table: a line without effect
+`LineServer` simulates the published rig's MATLAB servers, which run next to mmWave Studio: over TCP it receives the
+line `Retrigger\n`, arms the radar, and never replies. Faults of the `[faults]` table: a line without effect
 (`retrigger_fails`), a connection reset at a line (`retrigger_resets`). Specification: docs/spec/simulated-rig.md.
 """
 

@@ -411,7 +411,7 @@ class Cores:
         return 0, b""
 
     def _start_or_stop(self, what: int) -> int:
-        """Start (1) or stop frames (0; 4: at once); return 0, or 21: not started, 23: another number; see `_start`."""
+        """Start (1) or stop frames (0; 4: immediately). Return 0, 21 (not started) or 23 (invalid command)."""
         if what == 1:
             return self._start()
         if what not in (0, 4):
@@ -439,7 +439,7 @@ class Cores:
         self.armed = True
         self.frame_ends = -1.0
         self.armings += 1
-        # Software trigger: they run at once (ICD table 5.27), frames without a number until they are stopped.
+        # Software trigger: they start immediately (ICD table 5.27), frames without a number until they are stopped.
         if trigger == 1:
             self.frames_left = 0
             self.armed = frames == 0

@@ -101,7 +101,7 @@ def _transform_intervals(
 
 
 # Products of matrices of at most this size (rows x terms x columns) stay in one thread with OpenBLAS: threads are slow
-# beside other processes.
+# while other processes run.
 _PRODUCT_SIZE = 1 << 18
 
 

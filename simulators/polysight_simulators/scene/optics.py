@@ -89,7 +89,7 @@ def reflect_layers(
     media = [(x.epsilon, x.thickness_mm) for x in layers]
     if media[-1][1] is not None:
         media.append((1.0 + 0j, None))
-    # Impedance of what lies behind the layer: of nothing yet.
+    # Impedance of the layers behind this one, for both polarisations. The last layer has none behind it.
     z_s: Complex = np.zeros(theta.shape, np.complex128)
     z_p: Complex = z_s
     for epsilon, thickness_mm in reversed(media):

@@ -387,7 +387,7 @@ class SimulatedRig:
         if inside.any():
             gains = echo_drift(self.rig, d, board, chirps[inside])[:, None] * simulated.receiver.gains
             nodes[inside] = simulated.field.interpolate(x_m[inside], y_m[inside]) * gains[:, :, None]
-        # One small product per chirp: BLAS runs larger ones in threads, which is slow beside other processes.
+        # One small product per chirp: BLAS runs larger ones in threads, which is slow while other processes run.
         # [chirp, 2, rx, sample]
         ideal = np.matmul(nodes[:, None], simulated.expand)
         ideal += simulated.direct

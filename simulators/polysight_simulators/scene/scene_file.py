@@ -402,7 +402,7 @@ class Scene(_Table, frozen=True):
 def _apply_switches(table: Any, source: str) -> Any:
     """Replace `ideal = true` and "off"/"on" (or false/true) in a [disturbances] table by plain values.
 
-    Raises ConfigError for a switch that is none.
+    Raises ConfigError for an unknown switch.
     """
     if not isinstance(table, dict):
         return table
@@ -585,7 +585,7 @@ def _move_with_plane(plate: Plate, scene: Scene) -> Plate:
 
 
 def _draw_permittivities(plate: Plate, index: int, scene: Scene) -> Plate:
-    """Return the plate with drawn permittivities; metal stays as it is."""
+    """Return the plate with drawn permittivities; metal is not changed."""
     if not any(scene.specimen_spread) or plate.metal:
         return plate
     rng = np.random.default_rng([stream_key(scene.seed, "specimen"), index])

@@ -86,7 +86,7 @@ def spectral_axes(rig: Instrument, scene: Scene, ant: Antennas, top_hz: float) -
     55 degrees of incidence), but the kernel already extends from every offset to the edges of every plate. Raises
     ConfigError if that is too much memory.
     """
-    # The last pulse of a burst is sent about twice the mean travel behind the trigger.
+    # The last pulse of a burst is sent about twice the mean travel after the trigger.
     travel = 2 * mean_burst_travel_mm(rig.burst, rig.stage) + abs(scene.disturbances.backlash_mm)
     # Centre and half size of each object, mm.
     edges = [(*p.centre_mm, p.size_mm[0] / 2, p.size_mm[1] / 2) for p in scene.plates]

@@ -36,8 +36,8 @@ REST_POLL_MS = 20
 _IN_CLOSE = 0x08 | 0x10
 _IN_OPEN = 0x20
 _EVENT = struct.Struct("iIII")
-# Longest advance at once while the stage steps, wall time; chosen. A process that gets no CPU time for longer slows the
-# simulated world down, instead of making the steps of all that time at once.
+# Longest single advance while the stage steps, wall time; chosen. A process that gets no CPU time for longer slows the
+# simulated world down, instead of making the steps of all that time together.
 LONGEST_LEAP_NS = 20 * NS_PER_MS
 
 

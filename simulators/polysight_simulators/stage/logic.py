@@ -82,7 +82,7 @@ class StageLogic:
     engine
         Moves the stage.
     arm
-        Told the ticks to the next step when the engine starts stepping; 0 when it does not.
+        Called with the ticks to the next step when the engine starts stepping; 0 when it does not.
     inputs
         The switches that are pressed now.
     """

@@ -204,7 +204,7 @@ class StepEngine:
         Returns
         -------
         n, dx, dy, ticks
-            Steps of the longer axis (0: nothing can be taken at once), of x and of y, and the ticks from the first of
+            Steps of the longer axis (0: steps cannot be taken together), of x and of y, and the ticks from the first of
             them to the step after the last.
         """
         if not self.cruise or self.hold or self.leg.until or self.stable:

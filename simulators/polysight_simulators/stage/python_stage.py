@@ -1,6 +1,6 @@
 """The stage in Python, for machines without a C++ compiler: the dialogue and the motion of arduino_stage/.
 
-The tests run it beside the firmware's own code and compare them line by line and tick by tick.
+The tests run it and the firmware's own code and compare them line by line and tick by tick.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class PythonStage:
     def receive(self, data: bytes) -> None:
         """Process bytes from the host."""
         for byte in data:
-            # HOLD, RESUME, STATUS and STOP are single bytes, which act at once, even within a line.
+            # HOLD, RESUME, STATUS and STOP are single bytes, which act immediately, even within a line.
             if not self._logic.immediate(byte):
                 self._take(byte)
             self._settle()
@@ -197,7 +197,7 @@ class PythonStage:
         if ticks:
             self._next = self.tick + ticks
             self._armed = True
-            # A motion without a ramp has its full speed at once, which no later step would report.
+            # A motion without a ramp has its full speed immediately, which no later step would report.
             if self._engine.cruise:
                 self._report_motion()
 

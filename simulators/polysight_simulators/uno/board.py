@@ -179,7 +179,7 @@ class EmulatedUno:
         self._apply_action("watch " + ",".join(map(str, pins)))
 
     def cost(self) -> Cost:
-        """Return the worst cases, and begin anew with those of interrupts."""
+        """Return the worst cases, and start again with those of interrupts."""
         self._counted = {}
         self._apply_action("cost")
         return Cost(self._counted, *self._pulse_cycles)

@@ -1,6 +1,6 @@
 """Accuracy against theory and against the published method: alignment, tones, direct path, image.
 
-Trials of the estimators on simulated signals of known truth, the Cramer-Rao bounds beside them; the instrument's image
+Trials of the estimators on simulated signals of known truth, compared with Cramer-Rao bounds; the instrument's image
 against a matched filter over all samples in double precision.
 """
 
@@ -161,7 +161,7 @@ def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
 
 
 def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials: int = 3000) -> tuple[float, float]:
-    """Return the direct path's rms phase error beside an equal echo: in rad, and over its Cramer-Rao bound.
+    """Return the direct path's rms phase error in the presence of an equal echo: in rad, and over its Cramer-Rao bound.
 
     The bound is of the joint estimate from all RX: the direct path's amplitude, phase and frequency, and the echo's
     complex amplitude and frequency, with the directions of both known, from the geometry. Trials in which the direct

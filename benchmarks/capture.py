@@ -1,4 +1,4 @@
-"""Two capture cards at once, paced, into real row files, with the processing of rows running beside them."""
+"""Two capture cards together, paced, into real row files, while rows are processed."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ class Receivers:
     def try_rate(self, rate: float, seconds: float, beside: Child | None) -> Trial:
         """Receive rows for about `seconds` of sending; the time to make them durable in between does not count.
 
-        `rate`: packets/s of all cards; `beside`: process whose progress meanwhile is noted.
+        `rate`: packets/s of all cards; `beside`: process that runs meanwhile and whose progress is noted.
         """
         cards = self._cards
         blocks_of_card = max(1, round(rate / len(cards.boards) * seconds / PACKETS))
@@ -287,7 +287,7 @@ class PlainLoops:
 
 
 def show(text: str) -> None:
-    """Print a line at once."""
+    """Print a line and flush it."""
     print(text, flush=True)
 
 
@@ -311,7 +311,7 @@ def run(args: argparse.Namespace) -> int:
             sink = Receivers(cards, ours)
             show(f"{len(cards.boards)} cards, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; {sink.text}")
             show(HEAD)
-            # A slow trial first (chosen rate): it warms up, and its row is the one that is processed beside.
+            # A slow trial first (chosen rate): it warms up, and its row is the one that is processed during the others.
             show(sink.try_rate(20_000, min(args.seconds, 2.0), None).line())
             beside = None
             if not args.alone:

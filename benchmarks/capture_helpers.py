@@ -7,7 +7,7 @@ renewed, a block at a time.
 `count HOST_ADDRESS PORT BUFFER_BYTES`: the plain way, one `recv_into` a packet, no placement, no file. Reads lines
 `PACKETS`, and answers when that many came, or after three seconds without any in all.
 
-`process RIG ROW_FILE`: the processing of a live scan beside the capture. Decodes and synchronises the first published
+`process RIG ROW_FILE`: the processing of a live scan during the capture. Decodes and synchronises the first published
 row (350 points of 16 chirps) of a recorded file, again and again, for the receiving boards in turn, and answers every
 line with the rows done so far and its CPU seconds.
 
@@ -198,7 +198,7 @@ def process(rig_path: str, row_file: str) -> None:
 
 
 def say(text: str) -> None:
-    """Write a line to the standard output at once."""
+    """Write a line to the standard output and flush it."""
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 

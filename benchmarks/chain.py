@@ -2,7 +2,7 @@
 
 SOURCE.json names a scan folder (`scan`), or rows that are repeated to a grid: `files` has the paths of each board's
 recorded rows by its name, `grid` the keys of the scene's grid that differ (`published_scene`). HOW is "batch", or
-"live" as beside a running scan, with the images updated by every row. For every line on the standard input all of it is
+"live" as during a scan, with the images updated by every row. For every line on the standard input all of it is
 processed once, from reading to the images of H and V, then the last row a few times more; the answer is one line of
 JSON (:func:`process`).
 

@@ -82,7 +82,7 @@ NOTHING = ("no metal", "no direct path", "noise", "empty")
 # Of "wide" scenes: ranges of the real part and of the loss tangent; chosen.
 WIDE_REAL = (2.0, 12.0)
 WIDE_LOSS_TANGENT = (0.003, 0.4)
-# Columns and rows; the image stays as it is, so that the outer plates lie beyond the smallest aperture.
+# Columns and rows; the image is not changed, so that the outer plates lie beyond the smallest aperture.
 WIDE_APERTURES = ((45, 43), (33, 31), (25, 25))
 # Limits of the bins of a name's probability, the upper ones outside: the last bin holds 1. Chosen.
 SURE = (0.0, 0.5, 0.8, 0.95, 1.01)
@@ -120,7 +120,7 @@ class PatchFigures:
     loss_pull: float
     real_pull_68: float
     loss_pull_68: float
-    # Columns of the scene's grid, which tell its aperture.
+    # Columns of the scene's grid, which determine its aperture.
     columns: int
     # True for a thin sheet that was not declared.
     sheet: bool = False
@@ -376,7 +376,7 @@ def _measure_scene(job: tuple[int, str, bool]) -> list[PatchFigures]:
 
 
 def _read_names(seed: int) -> list[tuple[float, bool]]:
-    """Return the probability beside each name of one scene of kind "named", and whether the name is right."""
+    """Return the probability of each name of one scene of kind "named", and whether the name is right."""
     scene, rig, findings, _ = judge_scan(seed, "named")
     plates = truth_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
@@ -386,7 +386,7 @@ def _read_names(seed: int) -> list[tuple[float, bool]]:
 
 
 def _print_reliability(pairs: list[tuple[float, bool]]) -> list[dict[str, float]]:
-    """Print how often names are correct beside their probability, by bin; return the same."""
+    """Print how often names are correct for each bin of their probability; return the same."""
     out = []
     for low, high in itertools.pairwise(SURE):
         inside = [(p, right) for p, right in pairs if low <= p < high]

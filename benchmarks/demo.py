@@ -32,7 +32,7 @@ QUICK = ROOT / "examples" / "own-scene.toml"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Scan and process the demo; print CPU seconds beside limits (chosen)."""
+    """Scan and process the demo; print CPU seconds and their limits (chosen)."""
     # Not in `args.folder`, which is not used here: paths of the rig's sockets must be short.
     with temporary(None) as folder:
         scene = ROOT / "examples" / "demo.toml"

@@ -1,4 +1,4 @@
-"""Imaging of a synchronised cube on a GPU: beside one CPU core, the exact sum, and the authors' own code on that GPU.
+"""Imaging of a synchronised cube on a GPU, compared with one CPU core, the exact sum, and the authors' code.
 
 Without a GPU, or without PyTorch and CuPy, it says so and measures nothing.
 """
@@ -71,7 +71,7 @@ class Library:
 
 
 def libraries() -> list[Library]:
-    """Return PyTorch and CuPy, as far as they are installed and see a GPU."""
+    """Return those of PyTorch and CuPy that are installed and see a GPU."""
     usable = []
     try:
         torch = importlib.import_module("torch")

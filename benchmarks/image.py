@@ -198,7 +198,7 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
 
 
 def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
-    """Compare imaging row by row with imaging at once, both with the footprint."""
+    """Compare imaging row by row with imaging all rows together, both with the footprint."""
     aperture, samples = bench.reduce_cube("hann")
     weights = np.ones(samples.shape[2:], np.float32)
     # The echo of the mirror, of whose image the footprint is made: any constant takes the same time.
@@ -236,7 +236,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     ):
         ours = took[rows].median
         theirs = took[batch].median
-        # How many images at once all updates of an image row by row cost.
+        # Cost of all updates of an image row by row, relative to imaging all rows together.
         name = f"all row updates in batch images, both from {placement}"
         note = f"{1e3 * ours / len(starts):.2f} ms a row"
         at_least, aim = limits

@@ -1,6 +1,6 @@
 """The published rig's own picture: patches, permittivities, names and verdict, for each form of the input.
 
-The picture is no part of the repository: `--images DIR` or POLYSIGHT_PUBLISHED_IMAGES names its folder, with
+The picture is not part of the repository: `--images DIR` or POLYSIGHT_PUBLISHED_IMAGES names its folder, with
 `<name>.npz` (h, v) and `<name>.json` (`boxes_px`); of several the first is taken. It is processed as `.npz` and as the
 published `labels/<scan>`, with its boxes and without. Table 2 of the POLySIGHT paper (permittivities of its plates)
 stands beside the figures; the incidence angle, which is not given, is assumed to be 55 degrees. With `--table-2` the

@@ -1,4 +1,4 @@
-"""Cost against work: time and memory of the processing at 1/4 to 4 times the published grid; two threads beside one."""
+"""Time and memory of the processing at 1/4 to 4 times the published grid; two threads compared with one."""
 
 from __future__ import annotations
 

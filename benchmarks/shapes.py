@@ -3,7 +3,7 @@
 Each object is drawn by `polysight_worlds`: exact series for spheres and cylinders, physical optics for all else, no
 code shared with the host. A metal sphere, scanned with the same rig, is the reference. The rig of each object is
 disturbed as said. All is simulated, at the nominal noise of the published rig. Figures of an object are medians over
-its points; figures of a kind are 68th percentiles over its objects, beside what must hold. The host is told the
+its points; figures of a kind are 68th percentiles over its objects, with their limits. The host is given the
 standard errors that the disturbance really has, so that its 95 % regions can be judged.
 
 `--quick` scans every 4 mm with one RX a board, with the noise that the averages of the whole scan have: the same
@@ -50,7 +50,7 @@ DISTURBANCES: dict[str, dict[str, float]] = {
     "table": {},
     "all": {"misplaced_mm": 1.0, "axes_deg": 2.0, "leakage": 0.05},
 }
-# Standard errors that the host is told: those of the disturbance (each axis of a place, each part of a leakage), and
+# Standard errors that the host is given: those of the disturbance (each axis of a place, each part of a leakage), and
 # none of a rig that stands as its file says.
 EXACT = surfaces.Uncertainty(leakage=0.0, axis_rad=0.0, place_m=0.0)
 PLACES = {"place_m": 0.001 / np.sqrt(3)}
@@ -200,7 +200,7 @@ def analyse_shapes(
 def judge_object(kind: str, seed: int, disturbance: str, scan: ScanKind) -> ObjectFigures:
     """Draw, scan and judge one object."""
     scene = worlds.draw_shapes(seed, kind, with_table=disturbance in ("table", "all"))
-    # Every rig has unknown gains, spread by 1.5 dB (chosen): the reference has to tell them.
+    # Every rig has unknown gains, spread by 1.5 dB (chosen): the reference has to determine them.
     nuisances = worlds.ShapeNuisances(seed=seed, noise=scan.noise, gain_db=1.5, **DISTURBANCES[disturbance])
     surface, seconds = analyse_shapes(scene, nuisances, KNOWN[disturbance], scan)
     truth = None

@@ -1,4 +1,4 @@
-"""The best plain time-domain sum beside the spectral imager: bistatic, compiled, single precision, vectorised by LLVM.
+"""The best plain time-domain sum, a rival of the spectral imager: bistatic, compiled, vectorised by LLVM.
 
 Samples at a few frequencies become an oversampled range profile per position and RX (one FFT); every pixel reads every
 profile at its own excess path (TX to pixel to RX, less the direct path from TX to RX) by linear interpolation and turns

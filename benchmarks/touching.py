@@ -56,7 +56,7 @@ class GapFigures:
     # Plates of all scenes, and how many of them are separate.
     plates: int
     separate: int
-    # Patches that are no plate.
+    # Patches that are not a plate.
     strays: int
 
     @property
@@ -145,7 +145,7 @@ def _draw_uneven_light(rng: np.random.Generator, shape: tuple[int, ...]) -> NDAr
 
 
 def count_separate(scene: PlateScene) -> tuple[int, int]:
-    """Return how many plates are patches of their own, and how many patches are no plate."""
+    """Return how many plates are patches of their own, and how many patches are not a plate."""
     patches = [patch.mask for patch in segment(scene.h, scene.v, scene.x_m, scene.y_m).patches]
     if not patches:
         return 0, 0

@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         del rows
         plain = Published(rig, files, False)
         tuned = Published(rig, files, True)
-        # Our processing, each in a process of its own: of a whole scan, and as beside a running one.
+        # Our processing, each in a process of its own: of a whole scan, and as during a running one.
         batch = Chain(folder, "batch", {"scan": str(scan)})
         live = Chain(folder, "live", {"scan": str(scan)})
         ours = []

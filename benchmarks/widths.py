@@ -1,7 +1,7 @@
 """Are the error bars as narrow as the data allow? Beside a rival that learnt from the nuisances' own generator.
 
 The narrowest honest error bar of a plate follows from all nuisances, marginalised over the prior that they are drawn
-from. That bound has no closed form here, so a rival stands for it: it is told which nuisance a scene has, and learns
+from. That bound has no closed form here, so a rival stands for it: it is given the nuisance of each scene, and learns
 the error of the plain estimate from other scenes of the same generator. The plain estimate is Eq. 3 of the POLySIGHT
 paper (a half space's permittivity by H / V) of a plate's mean H and V relative to copper, the measured leakage removed.
 The rival learns by gradient boosted quantiles (scikit-learn) over the means, slopes and scatter of all plates, widened

@@ -156,7 +156,7 @@ class PatchFigures:
 class SceneFigures:
     """One judged scene: the verdict's level and reasons, its patches without the metal, and how they were found.
 
-    `missed` plates were not found, `stray` patches are no plate; both 0 with given boxes.
+    `missed` plates were not found, `stray` patches are not plates; both 0 with given boxes.
     """
 
     nuisance: str
@@ -427,7 +427,7 @@ class MetalFigures:
     seed: int
     # Level of the verdict.
     level: str
-    # True if the program found that the declared metal is none.
+    # True if the program found that the declared metal is not metal.
     withdrawn: bool
     # Names that the result gives, without "unknown".
     names: tuple[str, ...]

@@ -60,7 +60,7 @@ def _write(path: Path, out: Path, body: str) -> Path:
     pages = {*site_pages(), *NOTEBOOKS.glob("*.ipynb")}
 
     def turn(link: re.Match[str]) -> str:
-        """Return a link as it is from the page; a linked file that is no page is copied beside the pages."""
+        """Return a link relative to the page; a linked file that is not a page is copied to the pages' folder."""
         target = (path.parent / link[2]).resolve()
         if target in pages:
             place = Path(os.path.relpath(out / target.relative_to(ROOT).with_suffix(".html"), page.parent))

@@ -90,7 +90,7 @@ def _without_runner(words: list[str]) -> list[str]:
     while words and (words[0] in _BEFORE or re.fullmatch(r"[A-Za-z_]+=.*|-\w*|\$|!", words[0])):
         runner, words = words[0], words[1:]
         if runner == "ssh":
-            # The first word that is no option is the machine.
+            # The first word that is not an option is the machine.
             words = words[next((n for n, word in enumerate(words) if not word.startswith("-")), 0) + 1 :]
         elif runner in ("-u", "-n", "timeout"):
             words = words[1:]
@@ -98,7 +98,7 @@ def _without_runner(words: list[str]) -> list[str]:
 
 
 def _module(words: list[str]) -> tuple[str, list[str]] | None:
-    """Our module that a command runs and its arguments; None when it is no program of ours."""
+    """Our module that a command runs and its arguments; None when it is not a program of ours."""
     program = Path(words[0]).name
     if program in PROGRAMS:
         return PROGRAMS[program], words[1:]
@@ -120,7 +120,7 @@ def command_faults(line: str) -> list[str]:
     try:
         commands = simple_commands(line)
     except ValueError as e:
-        return [f"{line!r} is no shell command: {e}"]
+        return [f"{line!r} is not a shell command: {e}"]
     faults: list[str] = []
     for words in commands:
         if Path(words[0]).name == "make":
@@ -189,7 +189,7 @@ def _walk(module: str, words: list[str]) -> list[str]:
 
 
 def _make_faults(words: list[str]) -> list[str]:
-    """Targets and variables of `make`, in the Makefile of the folder it is told."""
+    """Targets and variables of `make`, for the Makefile of the folder that `-C` gives."""
     folder = ROOT / (words[words.index("-C") + 1] if "-C" in words else "")
     texts = [p.read_text(encoding="utf-8") for p in (folder / "Makefile", *folder.glob("*.mk")) if p.exists()]
     targets = {t for text in texts for t in re.findall(r"^([a-z][a-z-]*):", text, re.MULTILINE)}
@@ -197,7 +197,7 @@ def _make_faults(words: list[str]) -> list[str]:
     faults: list[str] = []
     skip = False
     for word in words:
-        # `-C`, and the folder behind it.
+        # `-C`, and the folder that follows it.
         if skip or word == "-C":
             skip = not skip
         elif "=" in word:

@@ -45,7 +45,7 @@ def block_faults(block: Block) -> list[tuple[int, str]]:
         ]
         return marks + [(n, fault) for n, command in block.commands() for fault in command_faults(command)]
     if block.language == "":
-        # What a program prints, or an indented example: a command may have a remark behind two spaces.
+        # What a program prints, or an indented example: a command may have a remark after two spaces.
         return [
             (n, f)
             for n, text in enumerate(block.text.splitlines(), block.line)

@@ -64,7 +64,7 @@ class Block:
         return taken
 
     def commands(self) -> list[tuple[int, str]]:
-        """Its commands, joined over line ends in quotes and behind a backslash; no comments, no here-documents."""
+        """Its commands, joined over line ends in quotes and after a backslash; no comments, no here-documents."""
         commands: list[tuple[int, str]] = []
         goes_on, end_of_document = False, ""
         for number, text in self.shell_lines():
@@ -108,7 +108,7 @@ def all_pages(root: Path = ROOT) -> list[Path]:
 
 
 def _is_open(command: str) -> bool:
-    """Whether a quotation goes on behind the line."""
+    """True if a quotation continues on the next line."""
     try:
         shlex.split(command, comments=True)
     except ValueError:

@@ -59,7 +59,7 @@ def script_of(page: Page) -> str:
 
 
 def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
-    """Run a page's commands in `copy`, beside a simulated rig where a block asks for one."""
+    """Run a page's commands in `copy`, with a simulated rig running where a block asks for one."""
     began = time.monotonic()
     work = copy.parent / "work"
     shutil.rmtree(work, ignore_errors=True)

@@ -147,7 +147,7 @@ class RadarScan(StandardReadable, Flyable, Preparable, Stageable, Stoppable, Eve
         self._check_result(await scanning)
 
     async def stop(self, success: bool = True) -> None:
-        """Stop the scan after the current row; at once if the run has failed."""
+        """Stop the scan after the current row; immediately if the run has failed."""
         # A second request aborts the row.
         self._stop.request()
         if not success:

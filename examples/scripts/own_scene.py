@@ -2,7 +2,7 @@
 # # Your own scene
 #
 # Describes what lies on the plane (`examples/own-scene.toml`: copy and change it), simulates a scan of it with every
-# disturbance of a real rig, and processes it to a report beside the truth.
+# disturbance of a real rig, and processes it to a report that shows the truth.
 
 # %%
 from pathlib import Path

@@ -42,7 +42,7 @@ OUT = Path("out/surfaces")
 # Paths over the fronts of objects and over the table behind them.
 GATE_M = (1.45, 2.2)
 
-# %% The scene: the rig looks down on a table, on which a bottle, a pipe and a box lie beside each other in y. The
+# %% The scene: the rig looks down on a table, on which a bottle, a pipe and a box lie side by side in y. The
 # simulation knows no shadows and no echoes from one object to another. Lengths are metres: centre, then radius and
 # length, or width and height; a stack is layers of (permittivity, thickness) on what lies below.
 x, y = map(float, published_rig().centre_m)

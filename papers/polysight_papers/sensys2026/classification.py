@@ -108,7 +108,7 @@ def _list_angles_deg(task: str) -> tuple[float, ...]:
 
 
 def accuracy_over_draws(quick: bool) -> Table:
-    """Return the discriminant's accuracy over further draws of the same noise, beside the Bayes limit."""
+    """Return the discriminant's accuracy over further draws of the same noise, and the Bayes limit."""
     seeds = OTHER_DRAWS
     if quick:
         seeds = OTHER_DRAWS[:2]
@@ -185,7 +185,7 @@ class TaskScores:
         return TaskScores(task, *scores)
 
     def row(self) -> tuple[str, ...]:
-        """Return a line of the table, published shares beside simulated ones."""
+        """Return a line of the table, published and simulated shares."""
         name, _, two_angles = self.task.partition(", ")
         published_h = None
         if not two_angles:

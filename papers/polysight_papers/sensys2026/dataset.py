@@ -36,7 +36,7 @@ IMAGES = "images made here"
 # Least correlation of two images of one scan; chosen.
 _ALIKE = 0.35
 
-# Words that do not tell materials apart.
+# Words that do not distinguish materials.
 _FILLING = {"with", "w", "in", "on", "mm", "percent", "sample", "sheet", "plate", "the", "of", "box", "container"}
 # Other spellings and words, in the data set's names and in Table 2's, to the one that is compared.
 _ALIASES = {"fibre": "fiber", "fiberglass": "fiber glass", "plywood": "wood", "soya": "soy", "salts": "salt"}
@@ -90,9 +90,10 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
     Parameters
     ----------
     folder
-        Holds `materials/`, `labels/`, or both; `unsynced/` or `raw/` beside them tell the labelled scans' angles.
+        Holds `materials/`, `labels/`, or both; `unsynced/` or `raw/` in the same folder give the labelled scans'
+        angles.
     config
-        Rig file, for what the files do not tell.
+        Rig file, for what the files do not contain.
     images
         Folder with what `polysight process` made of its scans, `<scan>/image.npz`.
     names

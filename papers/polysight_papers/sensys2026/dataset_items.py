@@ -128,7 +128,7 @@ def select_repeated(samples: Samples) -> Samples | None:
 
 
 def _split_one_scan(samples: Samples) -> Samples:
-    """Return pixels of one scan as if of two, every other pixel each; those of several scans as they are.
+    """Return the pixels of one scan as two scans of every other pixel; those of several scans unchanged.
 
     Only for the split by pixel, which lets a patch know itself in any case.
     The halves of a patch are two patches: weights are fitted to a few pixels of each patch, among which both must be.
@@ -270,7 +270,7 @@ def authors_fig18(judge: Judgements) -> Item:
 
 
 def _draw_confusion(knn: Score, discriminant: Score) -> Figure:
-    """Draw the confusion of the paper's KNN by H beside the discriminant's, by pixels and by patches."""
+    """Draw the confusion of the paper's KNN by H, and the discriminant's, by pixels and by patches."""
     by_pixel = percent(discriminant.pixels)
     by_patch = percent(discriminant.by_patch)
     panels = [
@@ -544,7 +544,7 @@ def _collect_pixels(data: AuthorsData, source: str, m: Published) -> tuple[Compl
 
 @dataclass(frozen=True)
 class Estimate:
-    """Permittivities of a material from one source: by Eq. 3 as it is, without leakage, and by the authors' recipe."""
+    """Permittivities of a material from one source: by Eq. 3 unchanged, without leakage, and by the authors' recipe."""
 
     material: Published
     angle_deg: float
@@ -561,7 +561,7 @@ class Estimate:
 
 
 def authors_table2(data: AuthorsData) -> Item:
-    """Tabulate each source's permittivities by Eq. 3 as it is, without leakage, and by the authors' recipe.
+    """Tabulate each source's permittivities by Eq. 3 unchanged, without leakage, and by the authors' recipe.
 
     Raises
     ------
@@ -632,7 +632,7 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
 
 
 def _format_row(e: Estimate) -> tuple[str, ...]:
-    """Return the cells of a material's row; published, estimated as it is, clean and by the recipe."""
+    """Return the cells of a material's row; published, estimated unchanged, clean and by the recipe."""
     m = e.material
     std = e.clean.real_std
     # Table 2 gives no loss for number 23, cork.

@@ -1,4 +1,4 @@
-"""Fig. 21 from the published files: concentration of sugar in water, beside the POLySIGHT paper's errors."""
+"""Fig. 21 from the published files: concentration of sugar in water, and the POLySIGHT paper's errors."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ SETS: dict[str, tuple[int, ...]] = {
     "liquids": (27, 25, 24, 26),
     "powders": (33, 34, 35, 36),
 }
-"""Rows of Table 2 beside the metal reference."""
+"""Rows of Table 2 without the metal reference."""
 FIG13 = (13, 12, 18, 3, 14, 6)
 FIG13_DISTANCE_MM = 598.0
 """Distance of the object plane with 50 degrees of incidence at the rig file's boards."""
@@ -219,7 +219,7 @@ def draw_row(fig: Any, axes: Any, view: ScanView, name: str) -> None:
 
 
 def ratio_table(views: dict[str, ScanView]) -> Table:
-    """Return a table of each plate's ratio in each view, beside Fresnel's."""
+    """Return a table of each plate's ratio in each view, and Fresnel's."""
     rows = []
     for name, view in views.items():
         theta = float(np.mean(view.result.theta_rad))

@@ -1,4 +1,4 @@
-"""Structure of a reproduced table or figure of the POLySIGHT paper, and the published numbers beside it.
+"""Structure of a reproduced table or figure of the POLySIGHT paper, and the published numbers.
 
 These are in `table2.json` and `published.json`.
 """

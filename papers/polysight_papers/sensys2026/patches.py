@@ -10,7 +10,7 @@ the first half alone and is shared by all patches of a scan. The standard deviat
 of synchronisation (POLySIGHT). That of a is not in it: it is set, for each group of materials, so that the paper's KNN
 on |H| alone, judged by the paper's split by pixel, reaches the published accuracy of H alone. Nothing else is set.
 
-`spread_table` shows the effect of the spread of specimens on names, beside the Bayes limit (a table of Fig. 18).
+`spread_table` shows the effect of the spread of specimens on names, and the Bayes limit (a table of Fig. 18).
 """
 
 from __future__ import annotations

@@ -274,7 +274,7 @@ def fig17(run: item.Run) -> item.Item:
 def _make_fig17_item(
     true: dict[str, complex], pixels: dict[str, list[Complex]], centres: list[dict[str, Any]]
 ) -> item.Item:
-    """Draw the permittivity of each pixel and tabulate its variance, beside the published one.
+    """Draw the permittivity of each pixel and tabulate its variance, with the published one.
 
     `true` has the permittivity of each material, `pixels` those of each placement, `centres` the plates' places in mm.
     """
@@ -398,7 +398,7 @@ def _draw_line(ax: Axes, library: Library, percent_by_name: Mapping[str, float],
 def _draw_permittivity(
     ax: Axes, library: Library, percent_by_name: Mapping[str, float], published_eps: Mapping[float, float]
 ) -> None:
-    """Draw the real part by Eq. 3 against concentration, beside the published values."""
+    """Draw the real part by Eq. 3 against concentration, with the published values."""
     eps = [
         np.median(permittivity_from_ratio(e.p.astype(np.complex128), np.radians(e.incidence_deg)).real)
         for e in library.entries

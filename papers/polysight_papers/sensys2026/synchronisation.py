@@ -111,7 +111,7 @@ def sync_scan(run: Run) -> SyncScan:
                 # The first chirp of each burst, [rx, position, sample].
                 mixed = raw[:, :: rig.burst.pulses] * np.exp(-2j * np.pi * carrier * np.arange(chirp.samples))
                 # All samples of the chirp, where synchronised rows are decimated; and no estimate of the phase's turn
-                # from position to position, so that motion in the bursts stays as it is.
+                # from position to position, so that motion in the bursts is not changed.
                 unsynchronised = replace(
                     synced, samples=mixed.astype(np.complex64), sweep_hz=sample_frequencies_hz(chirp), turn=None
                 )
@@ -124,7 +124,7 @@ def sync_scan(run: Run) -> SyncScan:
         # The first receiver is that of H; the other results of `image` are its footprint and a notice.
         images = [np.abs(b.boards[board].image()[0]).astype(np.float32) for b in (builder_before, builder_after)]
         grid = builder_after.grid
-    # At a path of c / hz_per_sample the IF is the sample rate, which cannot be told from 0.
+    # At a path of c / hz_per_sample the IF is the sample rate, which cannot be distinguished from 0.
     range_m = np.arange(_RANGE_BINS) / _RANGE_BINS * SPEED_OF_LIGHT_M_S / chirp.hz_per_sample
     bins = int((range_m < _SHOWN_M).sum())
     x = (grid.x_m[[0, -1]] - grid.x_m[[0, -1]].mean()) * 1e3
@@ -250,7 +250,7 @@ def _draw_stages(ax: Axes, summary: Mapping[str, Any], quantity: str, published:
 
 
 def _tabulate_stages(summary: Mapping[str, Any], published: Mapping[str, float]) -> tuple[tuple[str, ...], ...]:
-    """Return table lines for each board and stage, with the published values beside the last stage."""
+    """Return table lines for each board and stage, with the published values in the line of the last stage."""
     rows = []
     for board, content in summary.items():
         for name, s in content["stages"].items():
@@ -308,7 +308,7 @@ def _sweep_start_frequencies(run: Run, chirp: Chirp) -> tuple[npt.NDArray, npt.N
         if offset == USUAL_HZ:
             example = chirps[:, valid]
     if_hz, amplitude = (np.concatenate(part) for part in zip(*swept, strict=True))
-    # Of aliases beyond the receiver's passband, and of tones near zero, the filter tells nothing; chosen.
+    # Of aliases beyond the receiver's passband, and of tones near zero, the filter says nothing; chosen.
     in_band = (if_hz > 0.05 * chirp.sample_rate_hz) & (if_hz < 0.9 * chirp.sample_rate_hz)
     return if_hz[in_band], amplitude[in_band], example
 

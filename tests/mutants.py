@@ -103,7 +103,7 @@ def judge(mutant: Mutant, copy: Path) -> str:
     try:
         compile(mutated, path, "exec")
     except SyntaxError:
-        # Two stars before a dictionary are no power, but the operator takes them for one.
+        # Two stars before a dictionary are not a power, but the operator takes them for one.
         return "invalid"
     path.write_text(mutated, encoding="utf-8")
     try:

@@ -53,7 +53,7 @@ def rig(monkeypatch):
 def receivers(monkeypatch):
     """Process ids of the receivers that this test's scans have started, by board; a later scan's replace them.
 
-    As told by the scan itself: the list of processes changes while it is read, and process ids begin again.
+    As reported by the scan itself: the list of processes changes while it is read, and process ids are used again.
     """
     pids = {}
 

@@ -136,7 +136,7 @@ CASES = {
     "a frame dropped inside": ("drop_frames",),
     "spurious edge, a lost packet": ("spurious", "lose"),
     "endless radar, end lost": ("spurious", "endless", "lose_tail"),
-    "counters anew": ("reset_early",),
+    "counters again": ("reset_early",),
     "missed and spurious edge": ("missed", "spurious"),
     "twin alone": ("twin_alone",),
 }

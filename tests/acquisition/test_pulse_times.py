@@ -62,7 +62,7 @@ def place_missed(missed: list[int], seed: int, load: Load = QUIET, drift: float 
     st.sets(st.integers(0, ALL * FRAME // PAYLOAD), max_size=8),
 )
 def test_every_frame_of_a_short_row_is_at_its_pulse_or_masked(missed, load, seed, drift, lost):
-    """Pulses missed here and there, in a run, or the first of many bursts; with packets lost beside them."""
+    """Pulses missed here and there, in a run, or the first of many bursts; packets are lost, too."""
     place_missed(sorted(missed), seed, load, drift, frozenset(lost))
 
 

@@ -1,4 +1,4 @@
-"""Boards that send nothing although bursts were sent are told once bursts enough to fill two packets are long past."""
+"""A board that sends nothing is reported some time after enough bursts to fill two of its packets."""
 
 import time
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ NS_PER_S = 1_000_000_000
 
 
 def find_silent(rig, received: dict[str, int], bursts: int, age_s: float) -> list[str]:
-    """Boards told as silent, of a row whose bursts came at one moment, that long ago."""
+    """Boards reported as silent in a row whose bursts were all sent at one moment, so long ago."""
     progress = {name: SimpleNamespace(received=count) for name, count in received.items()}
     check = _SilenceCheck(rig, SimpleNamespace(reports=lambda: progress))
     event = SimpleNamespace(received_ns=time.monotonic_ns() - int(age_s * NS_PER_S))

@@ -258,7 +258,7 @@ CONFIGURE = int(Code.CONFIGURE_FPGA)
 class LateCard(FakeCard):
     """A card that keeps a row's last short packet for a while, as the real one does, or until the record's stop.
 
-    Sends full packets at once; the rest and the status `TAIL_S` later, or `lag_s` after the reply to a stop.
+    Sends full packets immediately; the rest and the status `TAIL_S` later, or `lag_s` after the reply to a stop.
     """
 
     def __init__(self, board: Board, row_bytes: int, lag_s: float) -> None:

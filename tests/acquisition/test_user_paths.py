@@ -18,7 +18,7 @@ FORMS = ["../out/a scan", "./../out/./a scan", "a scan/../a scan/", "../out/link
 
 @pytest.fixture
 def home(tmp_path, monkeypatch) -> Path:
-    """The folder in which commands are run, with a link to it beside `a scan`."""
+    """The folder in which commands are run, with a link to it next to `a scan`."""
     out = tmp_path / "out"
     out.mkdir()
     (out / "link").symlink_to(out)

@@ -1,4 +1,4 @@
-"""Functions beside a scan: labels kept by the maths, plan, simulate, compare, label, train."""
+"""Functions on scans: labels kept by the maths, plan, simulate, compare, label, train."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_reflection_coefficients_broadcast_by_name():
 
 @pytest.mark.parametrize("which", ["permittivities", "thicknesses"])
 def test_an_array_with_labels_is_one_medium(which):
-    """Its dimension is no list of media, whether or not it stands in a list."""
+    """Its dimension is not a list of media, whether or not it stands in a list."""
     if which == "permittivities":
         eps = xarray.DataArray([2.1 - 0.01j, 2.9 - 0.03j, 6 - 0.3j], dims="kind")
         thickness_m = 1e-3

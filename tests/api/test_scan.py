@@ -197,7 +197,7 @@ def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     assert "SIMULATED" in repr(opened)
     assert opened.rows.missing == ()
     assert opened.rows.planned == (31 if by_columns else 27)
-    command("process", data, "--out", tmp_path / "out")  # with the instrument.toml beside the data
+    command("process", data, "--out", tmp_path / "out")  # with the instrument.toml of the data's folder
     same_image(opened.image(), tmp_path / "out" / "image.npz")
     assert open_scan(tmp_path / "out").rows == opened.rows
     shutil.copytree(tmp_path / "out", data / "products")

@@ -1,4 +1,4 @@
-"""The time-domain sum beside our imager makes the image that a direct sum makes, so that comparing times is fair."""
+"""The time-domain sum of the benchmark makes the image of a direct sum, so that the comparison of times is fair."""
 
 from __future__ import annotations
 

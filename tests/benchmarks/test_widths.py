@@ -1,4 +1,4 @@
-"""The rival of `benchmarks widths`: its intervals follow the noise of each row, and what its features tell."""
+"""The rival of `benchmarks widths`: its intervals follow the noise of each row, and the information in its features."""
 
 import numpy as np
 import pytest

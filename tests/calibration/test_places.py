@@ -29,7 +29,7 @@ def laid(points):
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory, make_rig, scan_of):
-    """A scan of a displaced rig whose manifest contains the rig file as it is."""
+    """A scan of a displaced rig whose manifest contains the same rig file."""
 
     def shift_boards(table):
         for board in table["boards"]:

@@ -127,7 +127,7 @@ class Rows(RuleBasedStateMachine):
 
     @rule()
     def resume(self):
-        """The host's program is started anew: it knows nothing, and resets the card."""
+        """The host's program is started again: it has no state, and resets the card."""
         self.card.reset_by_host()
         self.past = Past.after_reset()
         self.sure = True

@@ -46,7 +46,7 @@ def test_configures_as_seen_on_a_real_card(scripted_card):
 
 @pytest.mark.parametrize("source_port", [1024, 4098, 0])
 def test_replies_and_status_count_from_any_source_port(scripted_card, source_port):
-    """Only the address tells a card: the sockets have no peer."""
+    """Only the address identifies a card: the sockets have no peer."""
     client, _ = scripted_card(
         lambda code, _: [reply(Code.STATUS, Status.NO_LVDS_DATA), reply(code, 0x0402)], source_port=source_port
     )
@@ -77,7 +77,7 @@ def test_lost_reply_is_retried(scripted_card):
 
 
 def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_card, monkeypatch):
-    """The program is held behind its request, or the machine sleeps: the time is over, and the reply is there."""
+    """The program is held after its request, or the machine sleeps: the time is over, and the reply is there."""
     client, sent_to = scripted_card(lambda code, _: [reply(code)])
     requests = []
     clock_s = itertools.count(0.0, 1e6)

@@ -21,7 +21,7 @@ NEW_MAC = "12:34:56:78:90:13"
 
 @pytest.fixture
 def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended]:
-    """Runs `polysight card ...` beside the rig file."""
+    """Runs `polysight card ...` in the folder of the rig file."""
 
     def run(*words: str, typed: str = "") -> Ended:
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
@@ -147,12 +147,12 @@ def test_reset(cards, card):
     assert (done.status, "armed again" in done.out) == (0, True)
     assert running_cards.endpoints["RH"].card._packetiser.sequence == 77
     done = card("reset", "RH")
-    assert (done.status, "configures it anew" in done.out) == (0, True), done
+    assert (done.status, "configures it again" in done.out) == (0, True), done
     assert running_cards.endpoints["RH"].card._packetiser.sequence == 1
 
 
 def test_listening_ends_with_a_row_and_without_loss_wherever_the_last_record_ended(cards, card, rig):
-    """The card is reset first: behind counters that went on nobody knows where its record begins.
+    """The card is reset first: if its counters continue, the beginning of its record is not known.
 
     The radars send more than a row, and no more than the receive buffer holds.
     """

@@ -16,7 +16,7 @@ OWN_NAMES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "d
 
 
 def others_than(counts: PacketCounts, *names: str) -> dict[str, int]:
-    """Anomalies that were counted and are none of these."""
+    """Anomalies that were counted and are not among these."""
     return {name: n for name in OWN_NAMES if name not in names and (n := getattr(counts, name))}
 
 
@@ -49,7 +49,7 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
 
 @given(at=st.integers(2, 85), lost=st.sampled_from([1, 2, 5]))
 def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_arrival(at, lost):
-    """Its counters began anew twice: nothing tells which bytes follow which."""
+    """Its counters started again twice: nothing shows which bytes follow which."""
     size = 91 * 4096
     record = Card(size).record(resets=(at,))
     placed, _ = place(size, record.packets[: len(record.packets) - lost], Counters(0, 1), 4096)
@@ -58,7 +58,7 @@ def test_frames_of_a_first_row_that_was_cut_by_a_reset_are_not_placed_by_their_a
 
 
 def test_frames_of_a_row_with_conflicts_are_not_moved():
-    """Only a row about which nothing else is unclear is written anew."""
+    """Only a row about which nothing else is unclear is written again."""
     size = 62 * 4096
     frame = 4096
     start = Counters(70_000, 9)

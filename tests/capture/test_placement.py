@@ -26,7 +26,7 @@ from polysight.capture.dca1000 import Counters, PacketLog
 from polysight.capture.placement import Evidence, Losses, Past, place_record
 from polysight.capture.row_files import read_packets, write_packets
 
-# A busy machine is no fault
+# A busy machine is not a fault
 SLOW = [HealthCheck.too_slow]
 COUNT = 1 << 48
 SEQUENCE = 1 << 32

@@ -1,4 +1,4 @@
-"""One place of a scan, and two scans compared: what is told is what the images hold."""
+"""One place of a scan, and two scans compared: the values are those of the images."""
 
 from __future__ import annotations
 

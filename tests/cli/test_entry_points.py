@@ -26,7 +26,7 @@ PROGRAMS = [
         for name in ("cards", "radars", "rig", "stage", "uno", "wires")
     ),
 ]
-# The words after `env` are the same, and `env` is no program of ours.
+# The words after `env` are the same, and `env` is not a program of ours.
 REAL = ("env",)
 
 

@@ -106,7 +106,7 @@ def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
 
 
 def folder(tmp_path):
-    """A folder to run in, and beside it the one of the runner."""
+    """A folder to run in, and the runner's folder next to it."""
     copy = tmp_path / "scratch/copy"
     copy.mkdir(parents=True)
     return copy

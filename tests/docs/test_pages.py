@@ -1,4 +1,4 @@
-"""README and docs as they are: their links lead somewhere, and the commands they show exist."""
+"""README and docs: their links lead somewhere, and the commands they show exist."""
 
 from __future__ import annotations
 

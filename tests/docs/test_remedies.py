@@ -36,7 +36,7 @@ ACTIONS = ("calibrate", "card", "radar")
 
 @cache
 def list_texts(path: Path) -> list[tuple[int, str]]:
-    """Strings of a file that are no docstrings, with their lines; a value that is put in is PLACEHOLDER."""
+    """Strings of a file that are not docstrings, with their lines; a value that is put in is PLACEHOLDER."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     # Docstrings, and the pieces of a string with values in it.
     others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}

@@ -1,4 +1,4 @@
-"""The bytes that the pages show are what the pages say: decoded, or made anew, by the code."""
+"""The bytes that the pages show are what the pages say: decoded, or made again, by the code."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def rows(page: str, heading: str) -> list[list[str]]:
 
 
 def shown_bytes(page: str, *labels: str) -> bytes:
-    """The bytes behind a label (a line's first words) in a text block of a page."""
+    """The bytes after a label (a line's first words) in a text block of a page."""
     label = " +".join(map(re.escape, labels))
     match = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", text(page), re.MULTILINE)
     assert match, labels
@@ -60,7 +60,7 @@ READERS = {
 
 
 def wire_examples() -> list[tuple[str, bytes, dict[str, object]]]:
-    """(kind, bytes, content) of each `hex` block and the `json` block behind it."""
+    """(kind, bytes, content) of each `hex` block and the `json` block that follows it."""
     blocks = read_page(SPEC / "wire.md").blocks
     pairs = [(a, b) for a, b in itertools.pairwise(blocks) if a.language == "hex"]
     return [(a.info[1], bytes.fromhex(a.text), json.loads(b.text)) for a, b in pairs]

@@ -187,7 +187,7 @@ def test_only_checks_that_depend_on_a_failed_one_are_skipped(monkeypatch, failin
 
 @pytest.mark.parametrize(("lost", "verdict"), [((0, 0, 0), "ok"), ((0, 0, 50), "ok"), ((0, 5, 50), "warning")])
 def test_receivers_must_keep_up_with_the_configured_rate_of_the_cards(tmp_path, lost, verdict):
-    """Loss at a rate that only faster cards reach is shown, but is no fault."""
+    """Loss at a rate that only faster cards reach is shown, but is not a fault."""
 
     def measure(_rig, rates):
         return [LoadResult(r, r, 100, n) for r, n in zip(rates, lost, strict=True)], "nice -5"

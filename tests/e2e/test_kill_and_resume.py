@@ -1,4 +1,4 @@
-"""A scan that is interrupted, or whose Pi has a full disk, resumes, and its committed rows stay as they are.
+"""A scan that is interrupted, or whose Pi has a full disk, resumes, and its committed rows are not changed.
 
 Kills are in test_killed_processes.py.
 """

@@ -151,7 +151,7 @@ class Killed:
         )
 
     def strike(self, kill: Kill, folder: Path) -> None:
-        """Begin a scan, kill as told, and wait until nothing of it runs any more."""
+        """Begin a scan, kill its processes as given, and wait until none of them runs any more."""
         places = [kill.place] if kill.place else []
         if kill.pi and places:
             self.restart_pi(places)
@@ -264,7 +264,7 @@ def test_killed(killed_rig: Killed, number: int, record_property):
 
 
 def test_every_kind_of_place_is_reached(killed_rig: Killed):
-    """Else its kills are none: a file has another name by now, or is written in another way."""
+    """Otherwise nothing is killed: a file has another name by now, or is written in another way."""
 
     def never(program: str, places: Sequence[Place]) -> list[Place]:
         return [place for place in list_kinds(places) if not killed_rig.met[f"{program} {place[0]}:{place[1]}"]]
@@ -298,7 +298,7 @@ def test_products_of_a_killed_scan(killed_rig: Killed):
 
 
 def test_pi_is_lost_with_its_journal(killed_rig: Killed):
-    """Without a Pi the error says so; a Pi with an empty card goes on behind what the host has, and the host tells."""
+    """Without a Pi the error says so; a Pi with an empty card continues after the host's last event, with a notice."""
     folder = killed_rig.rig.folder / "lost"
     # It dies by itself: on a busy machine the scan may end before a test that looks at its rows kills it.
     killed_rig.restart_pi([("fsync", ".journal", 6)])

@@ -1,4 +1,4 @@
-"""The operator's page beside the simulated rig, in a real browser: plan, start, pause, stop, resume, a dying server."""
+"""The operator's page with the simulated rig, in a real browser: plan, start, pause, stop, resume, a dying server."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def test_control_servers_arm_each_row_once(bench):
 
 
 def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
-    """`[burst] pulses = 1, chirps = 4`; the manifest has what the radars were told and what they answered."""
+    """`[burst] pulses = 1, chirps = 4`; the manifest has the commands to the radars and their answers."""
     burst = {"pulses": 1, "chirps": CHIRPS, "chirp_us": 228.51, "period_us": 1500.0}
     native = {board: {"usb_serial": board} for board in PORTS}
     result = scan_three_rows(bench, {"control": "native", "native": native}, burst)

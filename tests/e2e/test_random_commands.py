@@ -37,7 +37,7 @@ CASES_LONG = 500  # for each command
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A processed scan, and files that are none of ours."""
+    """A processed scan, and files that are not ours."""
     folder = tmp_path_factory.mktemp("random")
     shutil.copy(RIG_FILE, folder)
     (folder / "scene.toml").write_text(small_scene(12, 4, pixels=30, pixel_mm=5.0, seed=1))
@@ -111,7 +111,7 @@ def check_end(words: list[str]) -> None:
     assert isinstance(status, int), words
     assert output.strip() or status == 0, words
     assert "Traceback" not in output, words
-    # A note says what was written into it; the last line of a list of scans names the folder as it was given.
+    # A note says what was written into it; the last line of a list of scans names the folder as it was typed.
     told = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
     numbers = {word.strip("(),;:+-").lower() for word in told.split()}
     assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())

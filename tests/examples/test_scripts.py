@@ -1,4 +1,4 @@
-"""The examples run as they are, one after another, in a folder of their own."""
+"""The examples run unchanged, one after another, in a folder of their own."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ def test_no_module_is_taken_from_behind_a_front():
                 past.append(f"{file.relative_to(ROOT)}:{line} a relative import")
             elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (find_room(file), *ENTERED_BY_MODULE):
                 room = HOST / parts[1]
-                # A module at the root, such as pipeline.py, is no room.
+                # A module at the root, such as pipeline.py, is not a room.
                 if not room.is_dir():
                     continue
                 named = {name for *_, taken in read_facts(room / "__init__.py").imports for name in taken}

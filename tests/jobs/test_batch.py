@@ -1,4 +1,4 @@
-"""Many scans at once: each on its own, finished ones passed over, a failing one alone, a table at the end."""
+"""Batch processing: scans do not affect each other, finished ones are skipped, and a table ends the output."""
 
 import json
 import os
@@ -145,7 +145,7 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
 
 @pytest.mark.usefixtures("worker")
 def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothing_else(tmp_path):
-    """Notes, programs of the page, exports and labels are no data; manifest, rows, calibration and truth are."""
+    """Notes, programs of the page, exports and labels are not data; manifest, rows, calibration and truth are."""
     folder = write_scan(tmp_path / "in" / "scan")
     sample_file = folder / "samples" / "RH.npy"
     batch.process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
@@ -275,7 +275,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 
 @pytest.mark.usefixtures("worker")
 def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
-    """A Dask worker that is killed behind the mark has its scan sent to another one."""
+    """A Dask worker that is killed after the mark has its scan sent to another one."""
     scans(tmp_path / "in", "a")
     (job,) = jobs(tmp_path / "in", "a")
     assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3

@@ -123,7 +123,7 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert list(boxes(products).boxes) == ["metal", "PET", "PET#2"]
     assert boxes(products).metal == "metal"
     assert "named PET 80 %" in questions[1]
-    # Pet beside PET
+    # Pet and PET
     assert "the name pet" in capsys.readouterr().out
     assert label(products, Edits(), ask=answering("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
     assert boxes(products).metal == "glass"
@@ -135,7 +135,7 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
 
 
 def test_without_a_terminal_patches_are_listed(products, capsys):
-    # Pytest's stdin is no terminal
+    # Pytest's stdin is not a terminal
     assert main(["label", str(products)]) == 0
     answer = capsys.readouterr().out
     assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in answer

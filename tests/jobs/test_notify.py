@@ -1,4 +1,4 @@
-"""Whom the rig file names is told of a scan's end; it costs the scan nothing, and no record has it."""
+"""The addressees in the rig file are notified of a scan's end; this does not disturb the scan, and is not recorded."""
 
 from __future__ import annotations
 

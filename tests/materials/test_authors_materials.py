@@ -1,4 +1,4 @@
-"""The published material files: read as they are, and never run."""
+"""The published material files are read as text, and never run."""
 
 import os
 import pickle

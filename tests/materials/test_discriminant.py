@@ -116,7 +116,7 @@ def test_a_stranger_does_not_shift_the_others():
 
 
 def with_metal(samples, stray):
-    """The same scans with metal beside: no error of scan or patch, and one stray pixel a patch, the first or last."""
+    """The same scans with a metal patch: no error of scan or patch, and one stray pixel a patch, the first or last."""
     rng = np.random.default_rng(7)
     scans = np.unique(samples.groups)
     n = int((samples.patches == 0).sum())
@@ -164,7 +164,7 @@ def test_two_angles_are_independent_and_tell_more():
 
 
 def with_lonely(samples, scans=1):
-    """The same scans with another material beside, in the first few of them, unlike all others."""
+    """The same scans; the first few have an additional material that is unlike all others."""
     only = drawn(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
     names = np.full(len(only.x), "lonely")
     lonely_samples = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)

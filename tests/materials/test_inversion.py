@@ -328,7 +328,7 @@ def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_p
 
 @pytest.mark.parametrize("eps", [2.5 - 0.08j, 2.75 - 0.01j, 5.3 - 0.36j])
 def test_plates_of_one_foreign_material_do_not_turn_the_boards(eps):
-    """Six plates of gypsum, PVC or concrete beside a library that has none of them; leakage measured, nothing moved.
+    """Six plates of gypsum, PVC or concrete and a library that has none of them; leakage measured, nothing moved.
 
     As six independent plates they turned the boards until they were of the library: 0, 67 and 0 % of regions held.
     """

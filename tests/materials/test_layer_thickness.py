@@ -29,7 +29,7 @@ COMMON = 3e-3
 
 
 def shared_covariance(own=OWN, common=COMMON, bands=4):
-    """An error that all bands share beside one of each."""
+    """An error that all bands share, in addition to one of each."""
     place = common * np.tile(np.eye(2), (bands, 1))
     return own**2 * np.eye(2 * bands) + place @ place.T
 

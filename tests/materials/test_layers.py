@@ -1,4 +1,4 @@
-"""A layer within a stack: what was put in comes back, error bars tell the truth, ambiguity is said."""
+"""A layer within a stack: its parameters are recovered, error bars are right, and ambiguity is reported."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def test_error_bars_are_those_of_repeated_measurements():
 
 
 def test_ambiguity_is_said():
-    """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep tells them apart."""
+    """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep distinguishes them."""
     eps = 7.0 - 0.1j
     sheet = [Layer("sheet", None, 2e-3)]
     band = Spectrum(np.array([[76.3e9]]), np.array([[1.0]]))
@@ -144,7 +144,7 @@ def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept(
     )
     assert any("does not explain" in words for words in fit.warnings())
     assert not any("does not explain" in words for words in replace(fit, chi2=24.0).warnings())
-    # Two sheets that the data tell apart only as far as the model fits them.
+    # Two sheets that the data distinguish only as far as the model fits them.
     sheet = [Layer("sheet", 4 - 0.1j, 3e-3)]
     q, _ = predict(sheet, BANDS, THETA)
     stiff = fit_layer(Bands(BANDS, q * 1.08, np.full(q.size, 0.02)), [Layer("sheet", None, 3e-3)], THETA)

@@ -67,7 +67,7 @@ def test_evidence_of_a_dielectric_reference_does_not_depend_on_the_paint_of_meta
 
 @pytest.mark.parametrize("plates", [7])
 def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plates, scenes):
-    """Without a direct path: the other patches alone tell it."""
+    """Without a direct path only the other patches are evidence."""
     doubted = []
     for seed in range(max(5, scenes // 2)):
         for metal in (True, False):

@@ -1,4 +1,4 @@
-"""`patches.npz`: what names a scan again later knows of its errors what naming it at once did."""
+"""`patches.npz`: a scan that is named again later has the same errors as when it was first named."""
 
 from __future__ import annotations
 

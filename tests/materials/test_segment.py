@@ -41,7 +41,7 @@ WEAK_AND_STRONG = {
 
 
 def found_right(synthetic, seeds, **scene_facts):
-    """Plates whose box is found within 6 mm, of all, and patches that are none."""
+    """Plates whose box is found within 6 mm, of all, and patches that are not plates."""
     right = extra = plates = 0
     for seed in seeds:
         scene = synthetic(seed, **scene_facts)

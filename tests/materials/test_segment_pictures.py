@@ -18,7 +18,7 @@ SIDE = 150
 AXIS = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_MM / 1e3
 COPPER = 1.0 + 0j
 PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
-"""Folder of the published rig's own picture and its boxes, which is no part of the repository."""
+"""Folder of the published rig's own picture and its boxes, which is not part of the repository."""
 
 
 def ripple(rng, amplitude, phase_rad):

@@ -46,7 +46,7 @@ def drawn(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True
 
 
 def test_the_effect_of_a_specimen_is_what_eq_2_says():
-    """Stretched a little, a material looks as its effect tells, under both angles together."""
+    """A material that is changed a little looks as the effect predicts, under both angles together."""
     angles = [np.radians(55.0), np.radians(60.0)]
     for eps in KINDS.values():
         log_h, t = features(eps, angles)
@@ -64,7 +64,7 @@ def test_the_spread_is_found():
 
 
 def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
-    """Its patch is its mean: a residual of zero is none."""
+    """Its patch is its mean: a residual of zero does not count."""
     samples = drawn((0.03, 0.2), 6)
     repeated = np.isin(samples.names, ["a", "b", "c"])
     once = ~repeated & (samples.groups == samples.groups[0])

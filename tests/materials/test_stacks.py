@@ -1,4 +1,4 @@
-"""Plates that are no half space do not move the rig's errors: liquids behind glass reflect as no medium alone does."""
+"""Plates that are not half spaces do not change the estimated errors of the rig, for example liquids behind glass."""
 
 from __future__ import annotations
 

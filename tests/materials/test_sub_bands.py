@@ -91,7 +91,7 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, analys
 
 
 def test_brightness_that_a_sub_band_changes_over_a_plate_is_an_error_of_that_band(scene, analysis):
-    """Echoes of the surroundings that change both channels alike leave V / H and its error as they are."""
+    """Echoes of the surroundings that change both channels alike do not change V / H and its error."""
     everywhere = np.ones(scene.h.shape, bool)
     ripple = 1 + 0.05 * np.sin(2 * np.pi * scene.x_m / 0.025)
     images = channels(scene, everywhere)

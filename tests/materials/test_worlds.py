@@ -30,7 +30,7 @@ def half_space(permittivity: complex) -> Stack:
 @pytest.mark.slow
 @pytest.mark.parametrize(("nuisance", "least"), [("none", 0.85), ("tilt", 0.8), ("leakage", 0.8), ("misplaced", 0.8)])
 def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least, request):
-    # 21 was chosen knowing both: boards that are misplaced by chance tell so in scene 21, but not in scene 20.
+    # 21 was chosen knowing both: misplaced boards are reported in scene 21, but not in scene 20.
     seeds = (20, 21) if request.config.getoption("--long") else (21,)
     scenes = [judge_world(nuisance, seed) for seed in seeds]
     patches = [p for scene in scenes for p in scene.patches]

@@ -1,4 +1,4 @@
-"""What a page is told is what the folder holds, as it grows, for early and late lookers alike."""
+"""The page's events describe the folder's content while it grows, for viewers that come early and late."""
 
 from __future__ import annotations
 

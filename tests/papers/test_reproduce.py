@@ -1,4 +1,4 @@
-"""The page and its files: every item beside the published value, and everything called simulated."""
+"""The page and its files: every item has the published value, and everything is called simulated."""
 
 import csv
 import json

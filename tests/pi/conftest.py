@@ -130,7 +130,7 @@ def host(pi: Running) -> HostSide:
 
 @pytest.fixture
 def host_in_row(host: HostSide, stage: FakeStage) -> HostSide:
-    """The same during row 0, which stays behind its second point until `stage.stays_after` changes."""
+    """The same during row 0; the stage stops after its second point until `stage.stays_after` changes."""
     stage.stays_after = 2
     host.start_row()
     host.wait(m.Capture)

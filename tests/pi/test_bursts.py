@@ -313,7 +313,7 @@ def test_a_record_bounds_what_the_controller_did(late_ns):
     assert abs(record.first_ns - first) <= record.jitter_ns
     assert record.last_ns - record.first_ns == 15 * 1_500_000
     assert 1000 <= record.width_max_ns <= 1010
-    # Half of what the call took beyond the burst: it may have been spent before the burst or behind it.
+    # Half of the call's time beyond the burst: it may have been spent before the burst or after it.
     assert record.jitter_ns <= late_ns / 2 + burst.bit_ns
 
 

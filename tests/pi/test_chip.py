@@ -275,7 +275,7 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
 
 @pytest.mark.slow
 def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(start_homed, hub):
-    """A run whose bursts exceed spidev's `bufsiz` is refused at once; the next one runs."""
+    """A run whose bursts exceed spidev's `bufsiz` is refused immediately; the next one runs."""
     _, host = start_homed(hub, bufsiz="640")
     refused = host.ask(msgspec.structs.replace(host.begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
     assert isinstance(refused, m.Refused)

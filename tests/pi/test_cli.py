@@ -1,4 +1,4 @@
-"""`polysight-pi`: starting, ending, dying; commands beside the service and without it; errors and their exit status."""
+"""`polysight-pi`: starting, ending, dying; commands with and without a running service; errors and exit status."""
 
 import json
 import os

@@ -169,7 +169,7 @@ def draw_fault(rng: random.Random, recorder: Recorder, interval_ns: int) -> tupl
         edges.append(first_ns - round(interval_ns * rng.uniform(0.992, 1.008)))
     elif kind == "late from here on":
         begin = rng.randrange(1, len(edges))
-        # A shorter delay cannot be told from a longer wait in a hold.
+        # A shorter delay cannot be distinguished from a longer wait in a hold.
         late_ns = 50_000_000 + round(0.5 * interval_ns * rng.random())
         edges[begin:] = [t_ns + late_ns for t_ns in edges[begin:]]
     elif kind == "shifted":

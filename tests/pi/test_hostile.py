@@ -262,7 +262,7 @@ LONG = 2
 COMMAND = 4
 # A client that could send so much was not stopped
 ENOUGH_BYTES = 2 << 30
-TURNS_A_SECOND = 400  # of 600 kB: twice what a Pi's network carries; loopback fills a busy machine's memory at once
+TURNS_A_SECOND = 400  # of 600 kB: twice what a Pi's network carries; loopback fills a busy machine's memory immediately
 # MemoryMax of the unit is 512 MiB
 HIGHEST_BYTES = 400 << 20
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)

@@ -1,4 +1,4 @@
-"""A jog from the host: the stage moves to its place while the host lives, and no further than it was told."""
+"""A jog from the host: the stage moves to its target while the host lives, and no further."""
 
 from __future__ import annotations
 

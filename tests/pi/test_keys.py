@@ -110,7 +110,7 @@ def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, which):
         assert not refused()
         assert listener.poll(HANG_S * 1e3)
         return
-    if which != "another Pi's key":  # which cannot be told from silence
+    if which != "another Pi's key":  # which cannot be distinguished from silence
         wait_for(refused, "the refusal")
     assert not listener.poll(300)
     assert not client.poll(0)
@@ -201,7 +201,7 @@ def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served_pi, context)
     for name in HOST_KEYS:
         shutil.copy(tmp_path / "keys" / name, tmp_path / "host")
     port = served_pi.command_address.rpartition(":")[2]
-    # The kernel takes any of this machine's own addresses; 0.0.0.0 is none of the loopback ones.
+    # The kernel takes any of this machine's own addresses; 0.0.0.0 is not one of the loopback addresses.
     client = requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
     client.send(m.pack(m.Hello()))
     assert client.poll(HANG_S * 1e3)

@@ -124,7 +124,7 @@ def test_a_row_whose_stage_counts_other_trigger_pulses_is_no_row(extra_pulses):
 @pytest.mark.parametrize("held", [False, True])
 @given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
 def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):
-    """From its last sign of life to outputs dead and the stage told to stop, in virtual time."""
+    """Virtual time from its last sign of life until the outputs are off and the stage has been sent a stop."""
     bench = Bench().begin_and_home()
     bench.machine.command("BeginRun", heartbeat_ms)
     bench.start()

@@ -147,7 +147,7 @@ def test_another_machine_does_not_take_a_pi_whose_host_lives(bench):
     refused = bench.begin("other")
     assert (refused.number, bool(refused.remedy)) == (PiFault.NOT_READY, True)
     assert (bench.state, bench.executor.status.scan_id) == ("ready", "s"), "nothing has changed"
-    assert isinstance(bench.begin("s"), m.Accepted), "its own host may begin anew"
+    assert isinstance(bench.begin("s"), m.Accepted), "its own host may begin again"
     bench.t += LIMIT_S
     assert isinstance(bench.begin("other"), m.Accepted), "a host that died keeps nobody out"
 
@@ -177,7 +177,7 @@ def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
 
 @pytest.fixture
 def owner_in_row(pi, stage):
-    """The host that owns the run, during row 0, which stays behind its second point."""
+    """The host that owns the run, during row 0; the stage stops after its second point."""
     host = pi.host
     host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")

@@ -18,7 +18,7 @@ SIZES = pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 
 @pytest.fixture
 def view(pi, instrument, write_config, tmp_path) -> Iterator[Served]:
-    """A page beside a Pi and its stage, which is not homed."""
+    """A page with a Pi and its stage, which is not homed."""
     server = pi.service.server
     addresses = msgspec.structs.replace(
         instrument.pi, command_address=server.command_address, event_address=server.event_address

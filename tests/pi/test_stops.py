@@ -71,7 +71,7 @@ def disk(monkeypatch) -> Iterator[FrozenDisk]:
 
 @pytest.fixture
 def owned_run(pi, stage):
-    """A begun run with an owner; the stage is homed, a row stays behind its second point."""
+    """A begun run with an owner; the stage is homed, and stops in a row after its second point."""
     pi.host.must_accept(pi.host.begin(owner=OWNER))
     pi.host.home(OWNER)
     stage.stays_after = 2
@@ -262,7 +262,7 @@ context.term()
 
 
 def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, request, record_testsuite_property):
-    """libzmq cleans up behind them inside the publisher's next send, for long."""
+    """libzmq cleans up after them inside the publisher's next send, which then lasts long."""
     is_campaign = request.config.getoption("--long")
     program, host = start(instrument, "--wires", hub)
     host.must_accept(host.begin(owner=OWNER))

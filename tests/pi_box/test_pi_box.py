@@ -1,6 +1,6 @@
 """A Raspberry Pi 3B in a box: Debian's kernel and its GPIO driver, the real installation, the emulated UNO on USB.
 
-`make test-pi` runs these and prints figures; docs/how-to/hardware-tests.md tells what is real and what QEMU lacks.
+`make test-pi` runs these and prints figures; docs/how-to/hardware-tests.md says what is real and what QEMU lacks.
 The tests share one Pi and run in this order; each leaves the service running.
 """
 
@@ -123,8 +123,8 @@ def test_home_brings_the_motors_to_zero(pi: InstalledPi):
 def test_a_bench_burst_is_made_of_one_rise_and_one_fall_a_pulse(pi: InstalledPi, homed_host: HostSide):
     """The kernel's driver writes as many pulses to the chip's registers, seen from outside the Pi, as are reported.
 
-    Clearing a line that is low is no edge: the program does so to be quick. An emulated processor may be so late that a
-    pulse would come too early for a radar: the burst ends there, and says so.
+    Clearing a line that is low makes no edge: the program does so to be quick. An emulated processor may be so late
+    that a pulse would come too early for a radar: the burst ends there, and says so.
     """
     assert (pi.box.function(SYNC_OUT), pi.box.level(SYNC_OUT)) == (OUTPUT, 0)
     i = pi.rig.burst

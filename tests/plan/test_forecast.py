@@ -53,7 +53,7 @@ def test_noise_falls_with_chirps_and_positions(rig):
 
 
 def test_image_noise_is_that_of_a_weighted_sum(rig):
-    """Noise through taper and window, summed as the imager sums, beside a point's sum."""
+    """Noise through taper and window, summed as the imager sums, relative to a point's sum."""
     small = Changes(columns=16, rows=12).apply(rig)
     aperture, taper = describe_aperture(small)
     rng = np.random.default_rng(1)

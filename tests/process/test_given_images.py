@@ -141,7 +141,7 @@ def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented
 
 
 def test_exchanged_images_are_told_and_give_no_permittivity(save_images, pair, rig):
-    """Eq. 3 gives the same permittivity for P and 1 / P: only the passivity of half spaces tells both apart."""
+    """Eq. 3 gives the same permittivity for P and 1 / P: only the passivity of half spaces distinguishes them."""
     exchanged = read_given_images(save_images(h=pair["v"], v=pair["h"]), rig)
     inputs = Inputs(labels=Labels(BOXES, metal="copper"))
     scan = analyse_given_images(exchanged, Settings(model="none"), inputs, rig)[0]
@@ -269,7 +269,7 @@ def test_all_images_of_a_folder_are_found(labels_folder):
 
 
 PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
-"""Folder of the published rig's own picture and its boxes, which is no part of the repository."""
+"""Folder of the published rig's own picture and its boxes, which is not part of the repository."""
 
 
 @pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")

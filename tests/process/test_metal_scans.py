@@ -104,7 +104,7 @@ def reference(scan) -> PlaneReference:
 
 @pytest.mark.parametrize("name", STACKS)
 def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, name):
-    """Water behind 3 mm of glass within 10 % in both parts; thin sheets within 5 %; Eq. 3 is beside in every row."""
+    """Water behind 3 mm of glass within 10 % in both parts; thin sheets within 5 %; rows have Eq. 3's values, too."""
     layers, truth = STACKS[name]
     pipeline, images = form_scan_images(scan(name), Settings(bands=BANDS, incidence="pixel"))
     (row,) = pipeline.find_materials(images, KnownScene(metal=reference)).rows()
@@ -177,7 +177,7 @@ def test_amplitude_and_sub_bands_resolve_an_ambiguous_layer(products, capsys):
     # A chi-square of 9 is the limit. With |H| to 10 % noise puts the whole sweep's rival at 9 to 11; 8 % leave none.
     assert all(rival["chi2"] - single_band["chi2"] > 8 for rival in single_band["rivals"])
     assert fit("--amplitude", "8")["rivals"] == []
-    # Bands tell more than the whole sweep, but share what metal and edges are off by.
+    # Bands give more information than the whole sweep, but share the errors of metal and edges.
     assert 0.25 < three["std_real"] / single_band["std_real"] < 2
     for layers in (single_band, three):
         assert abs(layers["permittivity"][0] - 4.0) < 3 * layers["std_real"]

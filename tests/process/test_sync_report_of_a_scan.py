@@ -77,7 +77,8 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
         two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
         assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
         assert stages["received"]["phase_rad_std"] == pytest.approx(np.pi / np.sqrt(3), rel=0.15)
-        # What is left is noise, once the filter is taken out as it is: its slope would turn frequency into amplitude.
+        # What is left is noise, once the filter's true response is taken out: its slope would turn frequency into
+        # amplitude.
         for stage in ("aligned", "averaged", "referenced"):
             assert stages[stage]["amplitude_std"] < 0.004
             assert stages[stage]["phase_rad_std"] < 1.5 * stages[stage]["phase_rad_bound"] < 0.01

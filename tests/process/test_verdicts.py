@@ -123,7 +123,7 @@ def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
         return
     inversion = findings.analysis.inversion
     if findings.verdict.level == "good":
-        # The plates tell the leakage well enough by themselves
+        # The plates determine the leakage well enough by themselves
         assert all(
             p.permittivity.real_std < 0.05 * p.permittivity.value.real for p in findings.analysis.patches if p.verdict
         )

@@ -1,4 +1,4 @@
-"""Files of products are written whole or not at all, and read back as they were."""
+"""Files of products are written completely or not at all, and read back unchanged."""
 
 import json
 from dataclasses import replace

@@ -141,7 +141,7 @@ def test_a_file_that_is_no_image_is_refused_without_opening_a_board(rig_file, op
     image.write_text("not firmware")
     for options in ((), ("--flash",)):
         assert run(rig_file(), "firmware", "RH", str(image), *options) == 2
-        assert "is no firmware" in capsys.readouterr().err
+        assert "is not firmware" in capsys.readouterr().err
     assert opened_boards == []
 
 

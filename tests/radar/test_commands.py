@@ -40,7 +40,7 @@ OTHER = c.Profile(
     rf_gain_target_db=36,
     tx_backoff_db=3,
 )
-# What TI's mmWaveLink library writes to its SPI driver for these parameters (run beside this project).
+# What TI's mmWaveLink library writes to its SPI driver for these parameters (run apart from this project).
 VECTORS: list[tuple[c.Command, str]] = [
     (c.DEVICE_CONFIGURATION, "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"),
     (c.RF_POWER_UP, "3412214305801400001400000100e56b00400400f1e663c9"),

@@ -46,7 +46,7 @@ RECEIVED = {
 
 
 class Sent:
-    """A device that says given messages: one after each command, or all at once."""
+    """A device that says given messages: one after each command, or all together."""
 
     def __init__(self, *messages: bytes) -> None:
         self.messages = list(messages)

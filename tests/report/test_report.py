@@ -303,9 +303,9 @@ def test_the_imaging_table_has_a_column_for_each_board_and_says_what_is_unknown(
 
 
 def with_every_number(content, value):
-    """The content with each number that is no count replaced."""
+    """The content with each number that is not a count replaced."""
     if isinstance(content, dict):
-        # What is made of a number that is none has no permittivity and no ratio.
+        # A result of a value that is not a number has no permittivity and no ratio.
         required = ("permittivity", "ratio", "seconds_per_stage")
         return {key: item if key in required else with_every_number(item, value) for key, item in content.items()}
     if isinstance(content, list):

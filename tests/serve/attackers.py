@@ -1,4 +1,4 @@
-"""Clients that ask a server all at once, as a program: `PORT STREAMS READERS WRONG_TOKENS CONNECTIONS ABORTS VIEWS`.
+"""Concurrent clients of a server, as a program: `PORT STREAMS READERS WRONG_TOKENS CONNECTIONS ABORTS VIEWS`.
 
 Every second a line says how many connections were opened in all, and how many requests were reset before their answer.
 """
@@ -50,7 +50,7 @@ async def read_pages(port: int, views: int) -> None:
 
 
 async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, request: str) -> bool:
-    """Send a request, and read its answer; False if the server closes the connection behind it."""
+    """Send a request, and read its answer; False if the server closes the connection after it."""
     writer.write(request.encode())
     head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1").lower()
     for line in head.split("\r\n"):

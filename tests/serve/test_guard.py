@@ -34,7 +34,7 @@ READ = ("scan", "result", "thumbnail", "state", "map/h_amplitude", "file/image.n
 
 @pytest.fixture
 def scans(finished: Path, tmp_path: Path) -> Path:
-    """A folder with a scan that was processed, beside a file that nobody may see."""
+    """A folder with a scan that was processed, next to a file that must not be served."""
     shutil.copytree(finished, tmp_path / "scans" / "one")
     judged_products(tmp_path / "scans" / "one" / "products", "care")
     (tmp_path / "secret.txt").write_text(SECRET)
@@ -151,7 +151,7 @@ def test_open_connections_and_unread_answers_lock_nobody_out(scans):
 
 
 def test_of_too_many_connections_those_without_a_request_are_closed(scans, monkeypatch):
-    """Neither one that is answered, nor one whose request lies unread; who comes anew finds room."""
+    """Neither an answered connection nor one whose request lies unread blocks new clients."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 20)
     with served_folder(scans, TOKEN) as view, ExitStack() as clients:
         operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
@@ -172,7 +172,7 @@ def test_of_too_many_connections_those_without_a_request_are_closed(scans, monke
 
 
 def test_a_connection_with_unread_bytes_is_not_closed():
-    """Whatever comes behind it, a request that was sent is read."""
+    """A request that was sent is read, whatever follows it."""
 
     class Connection:
         def __init__(self, unread: bool) -> None:

@@ -514,7 +514,7 @@ def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, s
     page.browser.fill("#token-field", f"http://127.0.0.1/#token={TOKEN}")
     page.browser.value("document.querySelector('#token-bar button').click()")
     page.browser.wait(
-        "!document.getElementById('token-bar') && document.getElementById('name')?.innerText", "the page anew"
+        "!document.getElementById('token-bar') && document.getElementById('name')?.innerText", "the page again"
     )
     page.browser.fill("#notes-text", "mine")
     page.browser.click("#save-notes")

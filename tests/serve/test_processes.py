@@ -48,7 +48,7 @@ class Server:
         # One may end while it is looked at.
         with suppress(FileNotFoundError, ProcessLookupError):
             for pid in map(int, " ".join(path.read_text() for path in children).split()):
-                # The tracker of the standard library's shared resources is no process of the server.
+                # The tracker of the standard library's shared resources is not a process of the server.
                 if b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     continue
                 if is_wanted(os.getpriority(os.PRIO_PROCESS, pid) - own):
@@ -193,7 +193,7 @@ def test_an_interrupt_at_a_fork_is_not_lost(tmp_path, fork):
 
 
 def test_an_interrupt_of_new_processes_is_left_to_the_server(tmp_path):
-    """Ctrl-C reaches all processes of a terminal, and those that begin are no server yet."""
+    """Ctrl-C reaches all processes of a terminal, and those that begin are not a server yet."""
     status, said = serve_interrupted("12", "after_in_child", tmp_path)
     assert status == 128 + signal.SIGINT
     assert "Traceback" not in said

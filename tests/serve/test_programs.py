@@ -1,4 +1,4 @@
-"""Programs that a page starts: found again by another server, never signalled, and told from others."""
+"""Programs that a page starts: found again by another server, never signalled, and distinguished from others."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from polysight_shared.errors import DeviceError, ScanError
 
 
 class Rig:
-    """Starts what it is told to, unless it is busy or out of order; `states` has scans that did not finish."""
+    """Starts what it is asked to, unless it is busy or broken; `states` has scans that did not finish."""
 
     def __init__(self) -> None:
         self.started: list[str] = []

@@ -129,7 +129,7 @@ def test_connections_end_with_their_server(request_head):
         wait_for(lambda: len(server.server_state.connections) == 1, "the server has the connection")
         server.should_exit = True
         thread.join(HANG_S)
-        # Whatever is still open is told as a ResourceWarning, which fails the test.
+        # Whatever is still open is reported as a ResourceWarning, which fails the test.
         gc.collect()
         assert not server.server_state.connections
 

@@ -38,7 +38,7 @@ WORDS: dict[str, Any] = {
 
 
 class StillWatch:
-    """A live view that shows what it is told to."""
+    """A live view that shows the state that a test sets."""
 
     def __init__(self, folder: Path, history: ScanHistory) -> None:
         self.folder = folder

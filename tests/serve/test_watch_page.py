@@ -18,7 +18,7 @@ PICTURES = "[...document.querySelectorAll('.view img')]"
 
 
 def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
-    """The page, told what there is; without a token, for who was never there."""
+    """The page; without a token, for a visitor who was never there."""
     if not token:
         browser.forget(view.address)
     browser.visit(view.address + (f"/#token={token}" if token else "/"), size)

@@ -33,7 +33,7 @@ def test_metal_receives_what_the_image_of_the_transmitter_sends(rise_deg):
 
 @pytest.mark.parametrize("permittivity", [None, 4.0 - 0.4j, 2.6 - 0.01j])
 def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
-    """V / H of a plate at +-1 degree over that of a level one, beside the independent generator of fields."""
+    """V / H of a plate at +-1 degree over that of a level one, compared with the independent generator of fields."""
     x_m, y_m = map(float, published_rig().centre_m)
     stack = METAL
     material = {"metal": True}

@@ -26,7 +26,7 @@ def check_row(wires, x0: int, pitch: int, points: int, y: int, width_us: int):
     falling = [e for e in edges(wires) if not e.value]
     assert len(rising) == len(falling) == points
     assert [f.t_ns - r.t_ns for r, f in zip(rising, falling, strict=True)] == [width_us * 1000] * points
-    # The motion told just before each rising edge, at the same time, is at the exact step count.
+    # The motion reported just before each rising edge, at the same time, is at the exact step count.
     for i, edge in enumerate(rising):
         motion = [m for m in motions(wires[: wires.index(edge)]) if m.t_ns == edge.t_ns][-1]
         assert (motion.x_um, motion.y_um) == ((x0 + i * pitch) * UM, y * UM)
@@ -63,7 +63,7 @@ def test_random_rows(stage, seed: int):
         sign = 1 if pitch > 0 else -1
         assert all(m.vx_um_s == sign * rate * UM for m in cruise)
         assert cruise[0].x_um == (x0 - pitch) * UM
-        # At rest the motion told is where the stage says it is.
+        # At rest the reported motion is where the stage says it is.
         last = motions(wires)[-1]
         assert (last.vx_um_s, last.x_um, last.y_um) == (0, done.integer("x") * UM, y * UM)
     done, wires = stage.motion("MOVE", 0, 0, 10_000)

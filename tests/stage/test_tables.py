@@ -138,7 +138,7 @@ def test_no_floating_point_anywhere(built: tuple[Path, str]):
 
 
 def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path: Path):
-    """The IDE's own builder opens the folder as it is, and its image is ours byte for byte."""
+    """The IDE's own builder compiles the same folder to the same image, byte for byte."""
     if shutil.which("arduino-builder") is None:
         pytest.skip("no IDE builder: `sudo apt-get install arduino-builder` runs this too")
     command = ["arduino-builder", "-compile", "-fqbn", "arduino:avr:uno", "-tools", "/usr/bin", "-hardware"]
@@ -152,7 +152,7 @@ def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path:
 
 
 def test_sketch_folder_is_what_the_arduino_ide_wants():
-    """The .ino has its folder's name and its sources beside it: of subfolders the IDE compiles only src/."""
+    """The .ino has its folder's name and its sources in the same folder: of subfolders the IDE compiles only src/."""
     assert [p.name for p in SKETCH.glob("*.ino")] == [f"{SKETCH.name}.ino"]
     assert not (SKETCH / "src").exists()
     for source in [*SKETCH.glob("*.cpp"), *SKETCH.glob("*.h"), *SKETCH.glob("*.ino")]:

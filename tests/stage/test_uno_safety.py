@@ -197,7 +197,7 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
     host.uno.rest()
     host.replies()
     lowest = min(e.x for e in host.uno.edges)
-    # Steps behind the closing point, 200 of which are 1 mm.
+    # Steps after the closing point, 200 of which are 1 mm.
     assert -250 <= lowest <= 0
     assert host.motion("ROW", 6000, 200, 3, 500, 1000).integer("points") == 3
 

@@ -126,7 +126,7 @@ def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
 
 
 def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
-    """What validate cannot tell by the form, it tells by the digest; what is not readable comes from the journal."""
+    """Faults that validate cannot see in the format, it sees by the digest; unreadable events come from the journal."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     committed = facts_of(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
     for bit in sample(range(8 * committed), 16):
@@ -146,7 +146,7 @@ def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
 def test_journal_of_the_pi(undisturbed_scan, tmp_path, sample, record, tail):
-    """The journal is shorter than the host's event log: the sequence goes on behind what the host has."""
+    """The journal is shorter than the host's event log: the sequence continues after the host's last event."""
     path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
@@ -184,7 +184,7 @@ def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, left):
 
 
 def check_resumed_journal(scan: SmallScan, undisturbed_scan, lost: int, rows: set[int] = frozenset()) -> None:
-    """Resume: the host is told how much the journal lost, and keeps all it had."""
+    """Resume: the host gets the number of events that the journal lost, and keeps all it had."""
     log_before = (scan.path / "events.msgpack").read_bytes()
     assert resume(scan, undisturbed_scan) == rows
     assert any(f"ends {lost} events before" in text for text in scan.messages)

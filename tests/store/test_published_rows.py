@@ -96,7 +96,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             missing_positions = skipped[board, row.index]
             missing = len(missing_positions) * BURST + sum(b - a for a, b in losses[board, row.index])
             assert mask.reshape(plan.columns, -1)[sorted(missing_positions)].all()
-            # The transmitter's board was never missing: it tells all places
+            # The transmitter's board was never missing: it gives all places
             assert mask.sum() in (missing, mask.size)
             assert mask.sum() == missing or len(missing_positions) > plan.columns - 3
     answer = scan.recording_facts()["recording"].boards

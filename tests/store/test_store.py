@@ -192,7 +192,7 @@ def test_notes_damage_nothing(whole_scan):
 
 
 def test_a_scan_that_is_being_recorded_has_not_ended(whole_scan):
-    """Rows to come, the row that is recorded now and a line half written are no faults; a damaged row is one."""
+    """Rows to come, the row that is recorded now and a line half written are not faults; a damaged row is one."""
     lines = (whole_scan / "manifest.jsonl").read_bytes().splitlines(keepends=True)
     (whole_scan / "manifest.jsonl").write_bytes(b"".join(lines[:3]))
     (whole_scan / "raw/RH/0002.part").write_bytes(b"half")

@@ -269,7 +269,7 @@ def moved_up(file: int) -> int:
 
 
 def become(request: Request, files: list[int], starter: int) -> None:
-    """Take over files, arguments, environment and folder; tell the process number, and wait for the adoption."""
+    """Take over files, arguments, environment and folder; report the process number, and wait for the adoption."""
     os.closerange(0, FIRST_SPARE)
     for file, number in zip(files, request.descriptors, strict=True):
         os.dup2(file, number)

@@ -85,7 +85,7 @@ def worker_group(node_id: str) -> str:
 
 
 def longest_first(items: list[pytest.Item]) -> None:
-    """Sort tests in place: those of the longest files first, the others as they were."""
+    """Sort tests in place: those of the longest files first, the others in the old order."""
     place = {file: n for n, file in enumerate(FIRST)}
     items.sort(key=lambda item: place.get(worker_group(item.nodeid), len(place)))
 

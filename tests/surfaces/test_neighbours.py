@@ -1,4 +1,4 @@
-"""Objects side by side: the echoes of a window that hardly resolves them are told apart, in H and in V."""
+"""Objects side by side: the echoes of a window that hardly resolves them are separated, in H and in V."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_known_paths_of_a_window_are_measured_apart():
 
 
 def test_half_a_wave_is_one_echo():
-    """The edge of a plate cuts its wave: two waves of opposite sign would fit it better, and are no objects."""
+    """The edge of a plate cuts its wave: two waves of opposite sign would fit it better, and are not objects."""
     scan, _ = scan_two((0.0, 0.0, 0.0), 0.5)
     column = np.arange(scan.valid.shape[1])
     step = 1 / (1 + np.exp((column - column.mean()) / 3))

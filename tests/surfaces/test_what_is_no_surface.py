@@ -289,7 +289,7 @@ def test_points_of_a_wall_say_how_far_they_may_lie_off(least, most):
 
 
 def test_a_radius_says_where_curvatures_and_normals_disagree(metal, optics):
-    """A wall's two faces bend paths otherwise than they turn normals: one told 75 mm for 42 without a word."""
+    """A wall's two faces bend paths otherwise than they turn normals: one gave 75 mm for 42 mm without a warning."""
     shape = find_shape(metal.h, optics)
     sound = describe_segment(0, shape)
     assert sound.radius_mm == pytest.approx(125, rel=0.02)

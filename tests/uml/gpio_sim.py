@@ -40,7 +40,7 @@ class SimChip:
         (TRACING / "buffer_size_kb").write_text("8192")
         (TRACING / "events/gpio/gpio_value/enable").write_text("1")
         self._trace = os.open(TRACING / "per_cpu/cpu0/trace_pipe_raw", os.O_RDONLY | os.O_NONBLOCK)
-        # The record has the kernel's global numbers: the chip's first line tells where they begin.
+        # The record has the kernel's global numbers: the chip's first line says where they begin.
         output = gpiod.LineSettings(direction=gpiod.line.Direction.OUTPUT)
         with gpiod.request_lines(f"/dev/{name}", {0: output}) as request:
             request.set_value(0, gpiod.line.Value.INACTIVE)

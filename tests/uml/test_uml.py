@@ -1,6 +1,6 @@
 """The chain on a kernel's own GPIO chip: emulated UNO, serial port, trigger wire, libgpiod, the Pi's program, SYNC_IN.
 
-`make test-uml` runs these; docs/decisions/0005-firmware.md tells what is real in it. Figures are printed.
+`make test-uml` runs these; docs/decisions/0005-firmware.md says what is real in it. Figures are printed.
 """
 
 from __future__ import annotations

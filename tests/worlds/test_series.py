@@ -78,7 +78,7 @@ def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
     assert series.scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(exchanged, rel=1e-9)
 
 
-# What creeps around metal is no part of a smooth integrand.
+# What creeps around metal is not part of a smooth integrand.
 @pytest.mark.parametrize(("permittivity", "tolerance"), [(None, 0.01), (4 - 0.4j, 0.005)])
 @pytest.mark.parametrize("places", [((-0.25, 0.3, -0.5), (0.3, -0.2, -0.5)), ((-0.4, 0.05, -0.4), (0.4, -0.05, -0.4))])
 @pytest.mark.parametrize(("sent", "received"), [(S_AXIS, S_AXIS), (P_AXIS, P_AXIS), (S_AXIS, P_AXIS)])

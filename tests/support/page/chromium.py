@@ -146,7 +146,7 @@ class Browser:
     def visit(self, url: str, size: tuple[int, int, bool] = DESK) -> None:
         """Go to a page, without the errors and requests of the one before."""
         self.size(*size)
-        # A page that differs by its fragment only is not loaded anew
+        # A page that differs by its fragment only is not loaded again
         self.open("about:blank")
         self.wait("location.href == 'about:blank'", "an empty page")
         self.errors.clear()

@@ -150,7 +150,7 @@ class FakeStage:
 
     Wrong behaviour on request: `deaf` (answers nothing), `lose` (swallow so many lines), `damage` (garble so many
     answers), `lose_end` (swallow so many done or alarm lines), `skip` (points without a trigger), `stays_after` (a row
-    stays behind so many points until that changes), `alarm_at` (alarm number at a point), `lost` (steps that homing
+    stops after so many points until that changes), `alarm_at` (alarm number at a point), `lost` (steps that homing
     finds lost), `row_end` (where a row ends), `pace_s` (wall time from point to point).
     """
 

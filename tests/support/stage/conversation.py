@@ -31,7 +31,7 @@ class Conversation:
         self.stage.rx(b"".join([self._bytes(text) for text in texts]))
 
     def _bytes(self, text: str) -> bytes:
-        """Return the bytes of a text to send: a byte by name, a string as it is or sealed, `again`, or a command."""
+        """Return the bytes of a text to send: a byte's name, a string, `sealed` and a string, `again` or a command."""
         if text.startswith("<"):
             return Immediate[text.strip("<>")].sent
         if text.startswith("sealed "):

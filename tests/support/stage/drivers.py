@@ -339,7 +339,7 @@ class PortDriver(Driver):
         pytest.skip(f"a hand on the motors is needed ({dx}, {dy} steps)")
 
     def reset(self) -> None:
-        """Opening the port anew does it (a board by DTR, a pseudo terminal by itself)."""
+        """Opening the port again does it (a board by DTR, a pseudo terminal by itself)."""
         self._port.close()
         self.received = self._partial = self._sent = b""
         self._port.open()

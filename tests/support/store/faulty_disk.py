@@ -45,7 +45,7 @@ class FaultyDisk:
         The program ends before it, or in the middle of it.
     power cut
         The same, and what was not synced may be lost: a file may have its old size or its new one, and each of its
-        sectors may be old, new or, behind the old end, zero; names made, moved or removed may be as before. Bytes that
+        sectors may be old, new or, beyond the old end, zero; names made, moved or removed may be as before. Bytes that
         were synced and not written again are always there.
     worst power cut
         The same, and all that was not synced is lost.

@@ -106,7 +106,7 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     divided = np.array([method.offsets(np.swapaxes(burst, 0, 1))[0] for burst in bursts])
     half_bin = 0.5 / (b - a)
 
-    def errors(estimated: NDArray[np.float64]) -> tuple[float, int]:
+    def errors(estimated: NDArray[np.floating]) -> tuple[float, int]:
         """Return rms error in Hz and number of gross errors of frequencies in cycles a sample [position, chirp]."""
         # Only differences within a burst count.
         e = estimated - truth

@@ -224,8 +224,9 @@ def draw_scene(seed: int, kind: str = "full") -> Scene:
 
 def _draw_materials(rng: np.random.Generator) -> dict[str, tuple[float, float]]:
     """Draw a material for each place: real part uniform, loss tangent uniform in its logarithm."""
-    real = rng.uniform(*WIDE_REAL, len(PLACES))
-    tangent = np.exp(rng.uniform(*np.log(WIDE_LOSS_TANGENT), len(PLACES)))
+    least_tangent, largest_tangent = np.log(WIDE_LOSS_TANGENT).tolist()
+    real = rng.uniform(*WIDE_REAL, size=len(PLACES))
+    tangent = np.exp(rng.uniform(least_tangent, largest_tangent, size=len(PLACES)))
     return {f"drawn {i}": (float(real[i]), float(real[i] * tangent[i])) for i in range(len(PLACES))}
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.data import RIG, SCENE
 from benchmarks.sparse_scans import predict_image
 from polysight.capture.dca1000 import row_words
-from polysight.imaging import ImageBuilder, Images
+from polysight.imaging import Image, ImageBuilder, Images
 from polysight.imaging.sparse import reconstruct
 from polysight.materials import (
     SIMULATED_LIBRARY,
@@ -101,7 +101,7 @@ def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     images = builder.finish()
     for name, board in builder.boards.items():
         board.valid[:] = valid[name]
-    if not rebuilt:
+    if not rebuilt or all_images.illumination is None:
         return images
     # As `ImageBuilder` makes h and v of the raw images.
     h, v = (
@@ -111,10 +111,17 @@ def image_every_nth(builder: ImageBuilder, every: int, rebuilt: bool) -> Images:
     return replace(all_images, h=h, v=v, h_raw=raw[0], v_raw=raw[1])
 
 
+def raw_images(images: Images) -> tuple[Image, Image]:
+    """Return H and V as `ImageBuilder` leaves them, not divided by the illumination."""
+    if images.h_raw is None or images.v_raw is None:
+        raise ValueError("these images were not made from a scan's samples")
+    return images.h_raw, images.v_raw
+
+
 def image_error(images: Images, ideal: Images) -> float:
     """Return the relative error of both channels' images after the complex factor that fits best."""
     errors = []
-    for image, ideal_image in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
+    for image, ideal_image in zip(raw_images(images), raw_images(ideal), strict=True):
         factor = np.vdot(image, ideal_image) / np.vdot(image, image)
         errors.append(float(np.linalg.norm(factor * image - ideal_image) / np.linalg.norm(ideal_image)))
     return float(np.mean(errors))

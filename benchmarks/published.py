@@ -106,12 +106,13 @@ class Synchroniser:
         # As published: samples near zero are replaced before the division.
         reference[np.abs(reference) < 0.1] = 0.1
         points = UPSCALE * self._samples
+        spectra: NDArray[np.complexfloating]
         if self._tuned:
             spectra = np.asarray(scipy.fft.fft(channel / reference, points))
             peaks = (spectra.real**2 + spectra.imag**2).argmax(axis=1)
             frequency = np.where(peaks < points // 2, peaks, peaks - points) / points
         else:
-            spectra = np.fft.fftshift(np.fft.fft(channel / reference, points), -1)
+            spectra = np.asarray(np.fft.fftshift(np.fft.fft(channel / reference, points), -1))
             peaks = np.abs(spectra).argmax(axis=1)
             frequency = (peaks - points / 2) / points
         return frequency, np.angle(spectra[np.arange(len(peaks)), peaks])

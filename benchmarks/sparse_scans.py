@@ -79,10 +79,10 @@ def measure(folder: Path, iterations: int) -> list[tuple[str, float, float, floa
     valid = [b.valid.copy() for b in boards]
     full_images = [b.image()[0] for b in boards]
     weights = [b.weights for b in boards]
-    minutes = scan_minutes(pipeline.source.instrument)
+    rig = pipeline.source.instrument
+    minutes = scan_minutes(rig)
     out = []
-    rows, columns = valid[0].shape
-    for name, is_scanned, share in patterns(rows, columns):
+    for name, is_scanned, share in patterns(rig.grid.rows, rig.grid.columns):
         errors = []
         for board, good, full, weight in zip(boards, valid, full_images, weights, strict=True):
             board.valid[:] = good

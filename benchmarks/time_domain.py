@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-import numba
+import numba  # pyright: ignore[reportMissingImports]  # of the group `bench`, which few install
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray

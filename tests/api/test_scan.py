@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from msgspec.structs import replace
 from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 
 import polysight
 from polysight import open_scan, read_netcdf
+from polysight.jobs import surface as jobs_surface
 from polysight.products.processed import read_image
 from polysight.store import MANIFEST, ScanFolder, manifest
 from polysight_shared.config import load_instrument
@@ -208,10 +210,20 @@ def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     assert open_scan(data).rig == open_scan(data, rig=load_instrument(REPO / "instrument.toml")).rig
 
 
-def test_the_published_layout_has_surfaces_with_the_rig_that_it_was_opened_with(tmp_path):
+def test_the_published_layout_has_surfaces_with_the_rig_that_it_was_opened_with(tmp_path, monkeypatch):
     data = simulate_plates(tmp_path / "data", COPPER, PET, layout="authors")
-    rig = load_instrument((data / "instrument.toml").rename(tmp_path / "rig.toml"))
+    rig_file = (data / "instrument.toml").rename(tmp_path / "rig.toml")
+    rig = replace(load_instrument(rig_file), name="rig of this test")
+    used_rigs = []
+    find_surfaces = jobs_surface.make_surface
+
+    def record_rig(folder, instrument, reference):
+        used_rigs.append(instrument)
+        return find_surfaces(folder, instrument, reference)
+
+    monkeypatch.setattr(jobs_surface, "make_surface", record_rig)
     assert open_scan(data, rig=rig).surface().sizes["point"] > 0
+    assert used_rigs == [rig]
 
 
 # --- rows, laziness, side effects -------------------------------------------------------------------------------------

@@ -17,14 +17,13 @@ from threading import Event
 
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, PolysightError
-from polysight_shared.program import die_with_parent
+from polysight_shared.errors import ConfigError
 from polysight_shared.wires import WireClient
 from polysight_simulators.cards.card import SimulatedCard
 from polysight_simulators.cards.server import CardServer
 from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.faults import read_faults
-from polysight_simulators.process import announce_ready, command_line, count_from_zero, stop_requested
+from polysight_simulators.process import announce_ready, command_line, count_from_zero, run_until_stopped
 from polysight_simulators.radars import LineServer, RadarSocket
 from polysight_simulators.scene import (
     Disturbances,
@@ -98,8 +97,8 @@ def _make_source(
     return radars
 
 
-def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
-    """Run the cards until `stop`; what has to be closed goes into `open_things`. Raises PolysightError."""
+def _run(args: argparse.Namespace, stop: Event) -> None:
+    """Run the cards until `stop`. Raises PolysightError."""
     rig = load_instrument(args.config)
     board_names = tuple(b.name for b in rig.boards)
     names = _check_arguments(args, board_names)
@@ -122,43 +121,44 @@ def _run(args: argparse.Namespace, stop: Event, open_things: ExitStack) -> None:
     power_cycle = Event()
     signal.signal(signal.SIGUSR1, lambda _signal, _frame: power_cycle.set())
     cards: list[SimulatedCard] = []
-    open_things.callback(lambda: _report(cards, args.report))
-    for name in names:
-        card = SimulatedCard(
+    with ExitStack() as open_things:
+        open_things.callback(lambda: _report(cards, args.report))
+        for name in names:
+            card = SimulatedCard(
+                rig=rig,
+                board=rig.by_name(name),
+                source=source,
+                faults=faults[name],
+                seed=seed,
+                time_scale=args.time_scale,
+                clock_s=time.monotonic,
+                wait_for_receiver=not args.no_wait,
+            )
+            cards.append(card)
+        lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
+        wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
+        track = StageTrack(rig, disturbances.burst_motion, disturbances.backlash_mm)
+        chips = _open_chips(rig, cards, open_things)
+        control: list[LineServer] = []
+        if rig.radar.control == "line_server":
+            for card in cards:
+                name = card.board.name
+                control.append(LineServer(rig.radar.servers[name], card.rearm, faults[name]))
+                open_things.callback(control[-1].close)
+        server = CardServer(
             rig=rig,
-            board=rig.by_name(name),
-            source=source,
-            faults=faults[name],
-            seed=seed,
+            cards=cards,
+            wires=wires,
             time_scale=args.time_scale,
             clock_s=time.monotonic,
-            wait_for_receiver=not args.no_wait,
+            track=track,
+            power_cycle=power_cycle,
+            control=control,
+            chips=chips,
         )
-        cards.append(card)
-    lines = tuple(sorted({card.line for card in cards} | {rig.pi.trigger_in}))
-    wires = open_things.enter_context(closing(WireClient(args.wires, lines, motion=True)))
-    track = StageTrack(rig, disturbances.burst_motion, disturbances.backlash_mm)
-    chips = _open_chips(rig, cards, open_things)
-    control: list[LineServer] = []
-    if rig.radar.control == "line_server":
-        for card in cards:
-            name = card.board.name
-            control.append(LineServer(rig.radar.servers[name], card.rearm, faults[name]))
-            open_things.callback(control[-1].close)
-    server = CardServer(
-        rig=rig,
-        cards=cards,
-        wires=wires,
-        time_scale=args.time_scale,
-        clock_s=time.monotonic,
-        track=track,
-        power_cycle=power_cycle,
-        control=control,
-        chips=chips,
-    )
-    open_things.callback(server.close)
-    announce_ready(", ".join(f"{c.board.name} at {c.board.card_address}" for c in cards))
-    server.serve(stop)
+        open_things.callback(server.close)
+        announce_ready(", ".join(f"{c.board.name} at {c.board.card_address}" for c in cards))
+        server.serve(stop)
 
 
 def _open_chips(rig: Instrument, cards: list[SimulatedCard], open_things: ExitStack) -> list[RadarSocket]:
@@ -185,15 +185,7 @@ def _report(cards: list[SimulatedCard], path: Path | None) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run the cards until SIGTERM or SIGINT."""
     args = _make_parser().parse_args(argv)
-    stop = stop_requested()
-    die_with_parent()
-    try:
-        with ExitStack() as open_things:
-            _run(args, stop, open_things)
-    except PolysightError as e:
-        sys.stderr.write(f"error: {e}\n")
-        return e.exit_status
-    return 0
+    return run_until_stopped(lambda stop: _run(args, stop))
 
 
 if __name__ == "__main__":

@@ -6,12 +6,12 @@ traced board. Format of the trace: docs/spec/mmwavelink.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from polysight_simulators.process import command_line
 from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
@@ -81,12 +81,7 @@ def _list_words(text: str) -> list[int]:
 
 def main() -> int:
     """Return 0 if the simulated board answers the same, 1 if not, 2 if the trace cannot be read."""
-    parser = argparse.ArgumentParser(
-        prog="python -m polysight_simulators.radars",
-        description=__doc__,
-        epilog="example:\n  python -m polysight_simulators.radars first-day.jsonl",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = command_line("polysight_simulators.radars", str(__doc__), "first-day.jsonl")
     parser.add_argument("trace", type=Path, metavar="TRACE", help="file of `polysight radar check BOARD --trace FILE`")
     parser.add_argument("--empty-flash", action="store_true", help="simulate a new board")
     args = parser.parse_args()

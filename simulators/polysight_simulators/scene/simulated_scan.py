@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from polysight_shared.config import Board, Instrument
+from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError
 from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
@@ -167,55 +167,41 @@ def simulate(
     if started_s is None:
         started_s = time.time()
     scan_id = layouts.make_scan_id(scene.name)
-    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id}
     if layout == "own":
         stamp = datetime.fromtimestamp(started_s, UTC).isoformat(timespec="seconds")
-        own_layout = layouts.OwnLayout(out, rig, plan, scan_id, stamp)
-        return _write_scan(
-            writer=own_layout,
-            radar=radar,
-            plan=plan,
-            boards=rig.recorded,
+        boards = rig.recorded
+        writer: layouts.OwnLayout | layouts.AuthorsLayout = layouts.OwnLayout(out, rig, plan, scan_id, stamp)
+    else:
+        boards = rig.boards
+        writer = layouts.AuthorsLayout(
+            path=out,
+            rig=rig,
+            scan_id=scan_id,
+            started_s=started_s,
+            zero_filling=zero_filling,
             by_columns=by_columns,
-            progress=progress,
-            facts=facts,
+            skipped=skipped,
         )
-    authors = layouts.AuthorsLayout(
-        path=out,
-        rig=rig,
-        scan_id=scan_id,
-        started_s=started_s,
-        zero_filling=zero_filling,
-        by_columns=by_columns,
-        skipped=skipped,
-    )
-    _write_scan(
-        writer=authors, radar=radar, plan=plan, boards=rig.boards, by_columns=by_columns, progress=progress, facts=facts
-    )
-    # The authors' files contain neither geometry nor filter nor leakage.
-    (authors.folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
-    return authors.folder
-
-
-def _write_scan(
-    writer: layouts.OwnLayout | layouts.AuthorsLayout,
-    radar: SimulatedRig,
-    plan: RasterPlan,
-    boards: Sequence[Board],
-    by_columns: bool,
-    progress: Progress | None,
-    facts: dict[str, Any],
-) -> Path:
-    """Write a scan with its truth.json of these facts; return its folder."""
     layouts.require_empty(writer.folder)
     # Before the first file: a scene that cannot be simulated leaves no folder.
     radar.prepare()
     writer.start()
-    _write_rows(writer, radar, plan, boards, by_columns, progress)
-    content = {**facts, "samples_clipped": radar.clipped}
-    (writer.folder / "truth.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    for row in plan:
+        x, y = row_offsets_mm(radar, row)
+        if by_columns:
+            x, y = y, x
+        first_chirp = row.index * len(x)
+        payloads = {b.name: radar.chirps(b.name, x, y, first_chirp) for b in boards}
+        writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
+        if progress is not None:
+            progress(row.index + 1, plan.rows)
+    facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
+    (writer.folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     # Last: whatever ends the program before leaves an unfinished scan.
     writer.end()
+    if layout == "authors":
+        # The authors' files contain neither geometry nor filter nor leakage.
+        (writer.folder / "instrument.toml").write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
     return writer.folder
 
 
@@ -240,26 +226,6 @@ def _check_row_size(rig: Instrument, grid: Grid) -> None:
             "lower grid.columns, burst.pulses or burst.chirps",
             code=ErrorCode.VALUES_CONFLICT,
         )
-
-
-def _write_rows(
-    writer: layouts.Layout,
-    radar: SimulatedRig,
-    plan: RasterPlan,
-    boards: Sequence[Board],
-    by_columns: bool,
-    progress: Progress | None,
-) -> None:
-    """Write every row of the plan for these boards; `by_columns`: the stage runs along y."""
-    for row in plan:
-        x, y = row_offsets_mm(radar, row)
-        if by_columns:
-            x, y = y, x
-        first_chirp = row.index * len(x)
-        payloads = {b.name: radar.chirps(b.name, x, y, first_chirp) for b in boards}
-        writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
-        if progress is not None:
-            progress(row.index + 1, plan.rows)
 
 
 def _transpose_grid(grid: Grid) -> Grid:

@@ -107,7 +107,7 @@ def test_confusions_stand_in_the_order_of_table_2():
 
     group = groups()["powders"]
     scores = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT)
-    figure = confusion_figure(group.materials, [(scores, scores.confusion, "title")])
+    figure = confusion_figure(group.materials, scores, scores)
     labels = [t.get_text() for t in figure.axes[0].get_xticklabels()]
     assert labels == [str(m.number) for m in group.materials]
     matrix = figure.axes[0].images[0].get_array()

@@ -215,16 +215,9 @@ class TaskScores:
     def picture(self) -> Picture:
         """Return the confusion matrices of H alone, and of the discriminant for pixels and patches; scans left out."""
         task = self.task
-        h = self.h
-        best = self.discriminant
-        panels = (
-            (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
-            (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
-            (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
-        )
         angle = " and ".join(f"{a:.0f}°" for a in _list_angles_deg(task))
         return Picture(
-            confusion_figure(groups()[task.partition(", ")[0]].materials, panels),
+            confusion_figure(groups()[task.partition(", ")[0]].materials, self.h, self.discriminant),
             f"{task[0].upper()}{task[1:]} at {angle}, whole scans left out. Rows are the truth and add up to 100 %; the"
             " numbers are those of Table 2.",
         )
@@ -334,8 +327,13 @@ def fig20(run: Run) -> Item:
     )
 
 
-def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) -> Figure:
-    """Draw one panel for each score and matrix, with its title: three at most."""
+def confusion_figure(materials: Sequence[Published], h: Score, best: Score) -> Figure:
+    """Draw the confusion of the paper's KNN by H alone beside the discriminant's, by pixels and by patches."""
+    panels: tuple[Panel, ...] = (
+        (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
+        (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
+        (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
+    )
     n = len(materials)
     if n > 12:
         # Large matrices stand two by two, and leave room for a list of confusions.
@@ -349,7 +347,7 @@ def confusion_figure(materials: Sequence[Published], panels: Sequence[Panel]) ->
         axes[3].text(0.02, 0.98, _list_confusions(panels[1:]), va="top", fontsize=9, color=INK, linespacing=1.5)
     else:
         fig = new_figure(11.5, 4.5)
-        axes = fig.subplots(1, len(panels), squeeze=False).ravel()
+        axes = fig.subplots(1, len(panels))
         leftmost = (axes[0],)
         size = 8.0
         letters_a_line = 36

@@ -35,7 +35,7 @@ from polysight.materials import (
 )
 from polysight.polarimetry import permittivity_from_ratio
 from polysight.report import INK, PALETTE
-from polysight_papers.sensys2026.classification import confusion_figure, published_percent
+from polysight_papers.sensys2026.classification import SECOND_ANGLE_DEG, TASKS, confusion_figure, published_percent
 from polysight_papers.sensys2026.dataset import IMAGES, AuthorsData, read_authors
 from polysight_papers.sensys2026.dataset_sugar import authors_fig21
 from polysight_papers.sensys2026.item import (
@@ -54,9 +54,6 @@ from polysight_papers.sensys2026.run import Origin, make_folder, make_items
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError
 
-# The second angle of the task of two angles, in the paper.
-SECOND_ANGLE_DEG = 55.0
-TASKS = ("solids", "solids, two angles", "liquids", "powders")
 JUDGED_PIXELS = 1500
 PATCH_PIXELS = 6
 """About JUDGED_PIXELS of a task are judged, equally many of each patch but not fewer than PATCH_PIXELS, if it has them.
@@ -258,7 +255,8 @@ def authors_fig18(judge: Judgements) -> Item:
             continue
         key = f"{task}-{source}".replace(", ", "-").replace(" ", "-").replace("/", "")
         caption = f"{task[0].upper()}{task[1:]}, {source}, {split}. Rows are the truth, adding to 100 %."
-        pictures[key] = Picture(_draw_confusion(h, discriminant), caption)
+        named = [m for m in table2() if m.name in discriminant.names]
+        pictures[key] = Picture(confusion_figure(named, h, discriminant), caption)
     return Item(
         "fig18",
         "Fig. 18: classification of solids, liquids and powders",
@@ -267,18 +265,6 @@ def authors_fig18(judge: Judgements) -> Item:
         pictures,
         content,
     )
-
-
-def _draw_confusion(knn: Score, discriminant: Score) -> Figure:
-    """Draw the confusion of the paper's KNN by H, and the discriminant's, by pixels and by patches."""
-    by_pixel = percent(discriminant.pixels)
-    by_patch = percent(discriminant.by_patch)
-    panels = [
-        (knn, knn.confusion, f"H alone: {percent(knn.pixels)}\n{PAPER}"),
-        (discriminant, discriminant.confusion, f"H, V and P, pixels alone: {by_pixel}\n{DISCRIMINANT}"),
-        (discriminant, discriminant.patch_confusion, f"H, V and P, by patch: {by_patch}\n{DISCRIMINANT}"),
-    ]
-    return confusion_figure([m for m in table2() if m.name in discriminant.names], panels)
 
 
 def authors_fig20(judge: Judgements) -> Item:

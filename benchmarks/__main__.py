@@ -3,8 +3,6 @@
 `plans`, `sparse_scans` and `static_chirps` are not among them: each is a program of its own.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import sys

@@ -4,8 +4,6 @@ Trials of the estimators on simulated signals of known truth, compared with Cram
 against a matched filter over all samples in double precision.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

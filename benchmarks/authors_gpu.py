@@ -4,8 +4,6 @@
 first with compilation of kernels, and writes the last image, [ny, nx].
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import sys

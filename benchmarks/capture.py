@@ -1,7 +1,5 @@
 """Two capture cards together, paced, into real row files, while rows are processed."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

@@ -14,8 +14,6 @@ line with the rows done so far and its CPU seconds.
 Answers are lines of JSON.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -11,8 +11,6 @@ Nothing of it is imported here: SciPy's signal and statistics, which it needs, w
 instrument.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

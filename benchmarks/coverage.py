@@ -6,8 +6,6 @@ scenes start from samples as perfect synchronisation leaves them (`synced_cube`)
 by simulators that share nothing with the host's optics; for a real rig the figures are an expectation.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

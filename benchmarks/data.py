@@ -1,7 +1,5 @@
 """Simulated data of the published rig: a few recorded rows, whole scans made of them, synchronised cubes."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """CPU seconds of the demo's scan, mean per row by kind of process (host, Pi, ...), and of `process`."""
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import subprocess

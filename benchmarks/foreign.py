@@ -9,8 +9,6 @@ said at 0.5, how many of them are of values within 15 % of the truth, possible l
 whose 99 % region misses while it claims to be known within 10 % (95 %).
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor

@@ -5,8 +5,6 @@ for a geometry and keeps them in memory: with them it is warm, without them cold
 uniform mirror. Limits are chosen; what the project asks for is in docs/benchmarks.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import statistics

@@ -9,8 +9,6 @@ of sheets free in a stated range. All is simulated, by simulators that share not
 says of a real rig is an expectation.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import json

@@ -1,7 +1,5 @@
 """How everything here is measured: one core, jobs in turn, medians, the machine named; helper processes; the tables."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """The Pi half at 10 positions/s on a stand-in GPIO chip: CPU, memory, edge to first pulse, period, width."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

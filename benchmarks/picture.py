@@ -8,8 +8,6 @@ library is Table 2 as half spaces, all of it or the materials of these plates al
 ten lines stand beside ours (`weigh_ratio_alone`).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -9,8 +9,6 @@ Raw data is made row by row and thrown away. Half an hour of one core; with
 `--coarser 2 1`, every second column, half of it (and 3 dB more noise).
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator

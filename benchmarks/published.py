@@ -9,8 +9,6 @@ FFT of every position, and the kernel of a bin holds the phase of every pixel wh
 are summed over the bins before one inverse transform an RX. More points make finer bins, and more convolutions.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.fft
 import scipy.signal

@@ -1,7 +1,5 @@
 """Time and memory of the processing at 1/4 to 4 times the published grid; two threads compared with one."""
 
-from __future__ import annotations
-
 import argparse
 import statistics
 from pathlib import Path

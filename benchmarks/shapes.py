@@ -13,8 +13,6 @@ information for a sixteenth of the CPU.
 campaign may be stopped and run on, in as many slices as one likes. Its tables are those of all objects in the file.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

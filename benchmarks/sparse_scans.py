@@ -6,8 +6,6 @@ missing positions matter. Then rows or columns are masked, and the image is made
 channels' mean; a reconstruction is compared through the samples it predicts.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from collections.abc import Iterator

@@ -6,8 +6,6 @@ on the published rig, at the noise that the paper's figures imply: errors of 138
 and phase are the Cramer-Rao bounds of one tone of 192 samples, at the rig file's sample rate, at 7.2 dB.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import replace

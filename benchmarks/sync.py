@@ -1,7 +1,5 @@
 """Synchronisation of recorded rows, against the published method on the same file and core."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -8,8 +8,6 @@ made these pictures, and neither the simulator nor the host's imaging takes part
 A plate counts as separate if one patch covers most of it, nothing else covers it, and this patch covers no other plate.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import asdict, dataclass

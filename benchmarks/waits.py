@@ -1,7 +1,5 @@
 """Waiting times of a user: last row to image and report, another plane from kept samples, lists of scans, commands."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -4,8 +4,6 @@ Beside it the published method (`published.py`). Limits are those in the column 
 of the ratio is chosen.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import statistics

@@ -14,8 +14,6 @@ times too wide (tests/benchmarks/test_widths.py), and errors that only the inver
 turned boards) it hardly learns. A linear model learnt first, of all rows together, is worse in mild rows.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from concurrent.futures import ProcessPoolExecutor

@@ -8,8 +8,6 @@ parts, the relative half width, the error, and how many names are right; how man
 hold under those, and in how many scenes a reason names the nuisance, among the first two or at all.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

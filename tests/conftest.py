@@ -1,7 +1,5 @@
 """Options of the whole test suite, and the fixtures that many folders share."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

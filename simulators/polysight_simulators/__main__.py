@@ -1,7 +1,5 @@
 """`simulate SCENE.toml --out DIR` writes the raw data of a scene and its truth; `check` validates scene files."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """Compile programs on demand and cache them by their sources and command, such as the sketch for this machine."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

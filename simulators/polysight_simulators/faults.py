@@ -1,7 +1,5 @@
 """The `[faults]` table of simulated capture cards: the faults, and reading them from files and options."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any

@@ -3,8 +3,6 @@
 The last byte of every card and host address is kept (.180, .181, .182, .30), as in the real rig.
 """
 
-from __future__ import annotations
-
 import random
 import socket
 from contextlib import ExitStack

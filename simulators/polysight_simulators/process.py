@@ -1,7 +1,5 @@
 """Options and life of a simulator process: print `ready`, end on SIGTERM or SIGINT, and end with the parent process."""
 
-from __future__ import annotations
-
 import argparse
 import signal
 import sys

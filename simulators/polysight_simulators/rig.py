@@ -9,8 +9,6 @@ SIGTERM, SIGINT or the end of a process ends all of them; SIGUSR1 switches all c
 clock of the simulated signals: wall time times the time scale.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -12,8 +12,6 @@ Lines of a client reach every subscriber in order, and none is dropped, unless a
 are queued up to a limit; a client that exceeds it is disconnected with a message.
 """
 
-from __future__ import annotations
-
 import selectors
 import socket
 import sys

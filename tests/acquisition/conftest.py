@@ -1,7 +1,5 @@
 """A fake Pi with fake capture cards on a loopback subnet of their own."""
 
-from __future__ import annotations
-
 import pytest
 import tomli_w
 import zmq

@@ -3,8 +3,6 @@
 Real receivers over sockets, retakes, rows kept incomplete, resumes. `--long` takes 100 scans.
 """
 
-from __future__ import annotations
-
 import random
 import time
 from pathlib import Path

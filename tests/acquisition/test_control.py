@@ -1,7 +1,5 @@
 """Commands from other programs to a running scan: obeyed once, never by a later scan, and never at the scan's cost."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -4,8 +4,6 @@ Each take goes the way of a scan's: placed by counters, its frames compared with
 else kept as with `--keep-incomplete`. 250 takes; `--long` takes 10,000 (MANGLED_FIRST: the first seed of a piece).
 """
 
-from __future__ import annotations
-
 import os
 import random
 from collections.abc import Iterator

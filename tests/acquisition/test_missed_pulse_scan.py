@@ -1,7 +1,5 @@
 """Scans in which boards miss pulses: the row is retaken, or kept with each frame at its pulse or masked."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.support.acquisition.fake_rig import PI_AHEAD_NS, FakeRig

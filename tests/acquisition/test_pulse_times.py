@@ -1,7 +1,5 @@
 """Whatever a row suffered, its frames are at their pulses or masked, never shifted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

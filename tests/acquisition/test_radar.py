@@ -1,7 +1,5 @@
 """Radars that are re-armed for each row: the line server's client, its errors, and a scan that depends on it."""
 
-from __future__ import annotations
-
 import shutil
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Before the first row: homing, disk space, a Pi with the same [stage]; after the last: lost steps."""
 
-from __future__ import annotations
-
 import shutil
 from types import SimpleNamespace
 from typing import Any

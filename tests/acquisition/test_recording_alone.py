@@ -1,7 +1,5 @@
 """A scan that is only recorded loads and runs nothing of the processing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """docs/spec/row.md agrees with the code: states, transitions, messages."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

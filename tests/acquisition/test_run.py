@@ -1,7 +1,5 @@
 """A scan against a fake Pi and fake cards: every end of a row and of a scan."""
 
-from __future__ import annotations
-
 import hashlib
 import socket
 import subprocess

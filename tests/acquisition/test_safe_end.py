@@ -1,7 +1,5 @@
 """Every end of a scan leaves the rig at rest; nothing moves without a request; errors name the rows that are safe."""
 
-from __future__ import annotations
-
 import errno
 import io
 import os

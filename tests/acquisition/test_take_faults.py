@@ -1,7 +1,5 @@
 """Faults of takes in the manifest: a kind and a board for programs beside the reasons for people."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Time left: the duration of rows without pauses between them, the same in the terminal and on the page."""
 
-from __future__ import annotations
-
 import io
 import re
 import statistics

@@ -1,7 +1,5 @@
 """The folder that a user names: every form of its path means the same to scan, resume, validate and process."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The scan waits between rows for processing and disk instead of losing data, and stops on request."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -1,7 +1,5 @@
 """One small simulated scan, and what the commands make of it."""
 
-from __future__ import annotations
-
 import shutil
 from contextlib import redirect_stdout
 from io import StringIO

@@ -1,7 +1,5 @@
 """The check plate: its distance from what is known of it, the verdict, the command and the chart."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """Functions on scans: labels kept by the maths, plan, simulate, compare, label, train."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import fields
 from typing import assert_type

@@ -1,7 +1,5 @@
 """The notebooks run from their first cell to their last, in an empty folder, and carry no outputs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

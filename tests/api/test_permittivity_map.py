@@ -1,7 +1,5 @@
 """Maps of permittivity: they agree with the patches, are free of the estimated leakage, and know their errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Processing, notebooks and results need no module of POSIX systems: laptops with Windows have none."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import textwrap

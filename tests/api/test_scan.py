@@ -1,7 +1,5 @@
 """Laws of `polysight.open_scan`: what it gives is what the commands write, described, and nothing is left behind."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Types of the public interface: every parameter and result has one, and it says something."""
 
-from __future__ import annotations
-
 import inspect
 import re
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Scenes that the benchmarks draw are scenes that can be simulated."""
 
-from __future__ import annotations
-
 import pytest
 from benchmarks import coverage, layers
 

@@ -1,7 +1,5 @@
 """The published method, as the benchmarks run it, really synchronises and images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.data import RIG

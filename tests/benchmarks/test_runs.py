@@ -1,7 +1,5 @@
 """Every benchmark of the processing runs on a tiny grid, and writes its figures with the machine's name."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The benchmark of surfaces judges what it says, on one small scan of a drawn object."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.shapes import ScanKind, angles_deg, judge_object, squared_distances

@@ -1,7 +1,5 @@
 """The time-domain sum of the benchmark makes the image of a direct sum, so that the comparison of times is fair."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.data import published_scene

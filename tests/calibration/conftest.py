@@ -1,7 +1,5 @@
 """Small simulated scans of rigs that differ from their rig file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

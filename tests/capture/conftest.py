@@ -1,7 +1,5 @@
 """Simulated capture cards on a loopback subnet of their own."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack

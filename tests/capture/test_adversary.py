@@ -4,8 +4,6 @@ A state machine takes record after record, each through drawn troubles; what one
 next. 2,000 records; `--long` takes 20,000 and draws new ones.
 """
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

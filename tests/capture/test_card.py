@@ -1,7 +1,5 @@
 """The control client against a card that answers from another port, late, wrongly, or not at all."""
 
-from __future__ import annotations
-
 import itertools
 import select
 import time

@@ -1,7 +1,5 @@
 """`polysight card` against simulated cards: the hop that does not work, and writing the EEPROM."""
 
-from __future__ import annotations
-
 import io
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The card's bytes, against vectors seen from a real card."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st

@@ -1,7 +1,5 @@
 """Errors of a silent card name the hop: no route, no link, no device, a mute card, a radar that does not stream."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Recordings are described by their layout; the real packet capture is read through the receiver's placement."""
 
-from __future__ import annotations
-
 import functools
 import io
 import json

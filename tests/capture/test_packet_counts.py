@@ -1,7 +1,5 @@
 """Every anomaly of a row is counted under its own name, and under no other."""
 
-from __future__ import annotations
-
 from hypothesis import assume, given, strategies as st
 from tests.support.capture.records import FULL, Card, encode_packet, is_original_or_masked, place
 

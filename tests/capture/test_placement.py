@@ -1,7 +1,5 @@
 """Placement of packets by byte count: data is original or masked, and the mask equals what was lost."""
 
-from __future__ import annotations
-
 import random
 import sys
 from dataclasses import dataclass

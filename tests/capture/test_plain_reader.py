@@ -1,7 +1,5 @@
 """Files of the project are readable without it: with numpy.fromfile, json and msgpack alone."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import socket

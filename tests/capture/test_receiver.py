@@ -1,7 +1,5 @@
 """The receiver process over real sockets: bit-exact rows, masked losses, clear errors, a clean end."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Core and priority of a receiver, the receive buffer, and warnings if the system grants less."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 

@@ -1,7 +1,5 @@
 """A row's file: reused memory, a full disk, a damaged index."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One place of a scan, and two scans compared: the values are those of the images."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The list of scans: what is in it, in what state, and that looking at it costs next to nothing."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Command lines that would do less than they say are refused, and numbers are asked for in words."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import functools

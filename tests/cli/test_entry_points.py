@@ -1,7 +1,5 @@
 """Each program of ours starts for real, and the fork that other tests get of it behaves as the program does."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

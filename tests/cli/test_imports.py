@@ -1,7 +1,5 @@
 """No command waits for a package it does not use: numpy loads for 0.2 s, matplotlib or scipy.stats for a second."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

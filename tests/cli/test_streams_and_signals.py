@@ -1,7 +1,5 @@
 """Life of a command: closed or full output, Ctrl-C at any moment. One message, no traceback, an exit status."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The checker finds what is wrong with a page, says where, and stays silent where nothing is."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every command line has help with an example that it would take, and README names every command."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Iterator

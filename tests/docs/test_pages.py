@@ -1,7 +1,5 @@
 """README and docs: their links lead somewhere, and the commands they show exist."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 

@@ -1,7 +1,5 @@
 """Pages that errors name are there, in the repository and in what is installed."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The API reference: every public name has its text in it, and its links are checked."""
 
-from __future__ import annotations
-
 import html
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Commands in messages: each names a command and options that there are; one with its arguments, pasted, is parsed."""
 
-from __future__ import annotations
-
 import argparse
 import ast
 import re

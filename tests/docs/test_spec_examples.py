@@ -1,7 +1,5 @@
 """The bytes that the pages show are what the pages say: decoded, or made again, by the code."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

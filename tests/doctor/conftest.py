@@ -1,7 +1,5 @@
 """The simulated rig as processes, once for a module, and a rig file without a rig."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The bundle has findings, versions, logs and manifests, and neither raw data nor keys."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The whole simulated rig as real processes, and the commands of both halves run as a user runs them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path

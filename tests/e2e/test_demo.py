@@ -1,7 +1,5 @@
 """`polysight demo` ends cleanly when it is interrupted, and the rig runs where there is no C++ compiler."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest

@@ -3,8 +3,6 @@
 Kills are in test_killed_processes.py.
 """
 
-from __future__ import annotations
-
 import hashlib
 
 import pytest

@@ -1,7 +1,5 @@
 """The operator's page with the simulated rig, in a real browser: plan, start, pause, stop, resume, a dying server."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The Pi half runs with nothing but its own dependencies: no numpy, no scipy; no gpiod where lines are simulated."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

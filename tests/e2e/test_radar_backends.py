@@ -3,8 +3,6 @@
 The rig plays a counting pattern.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

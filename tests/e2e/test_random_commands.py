@@ -1,7 +1,5 @@
 """Random command lines: whatever is given, a command ends with a status and a message, never with a traceback."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import random

@@ -4,8 +4,6 @@ Commands of the host run in this process. That a program's exit status and stder
 `test_rig_file`, which starts both programs, and by what is interrupted.
 """
 
-from __future__ import annotations
-
 import os
 import pty
 import shutil

@@ -1,7 +1,5 @@
 """The examples run unchanged, one after another, in a folder of their own."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil

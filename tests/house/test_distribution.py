@@ -1,7 +1,5 @@
 """The tests themselves: how they are handed out to workers."""
 
-from __future__ import annotations
-
 from tests.support.paths import REPO
 from tests.support.suite import FIRST, ROOMS, TOGETHER
 

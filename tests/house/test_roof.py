@@ -1,7 +1,5 @@
 """Laws of the roof: six projects, each a folder with its package inside; no links, one import name for each class."""
 
-from __future__ import annotations
-
 import importlib
 import subprocess
 import tomllib

@@ -1,7 +1,5 @@
 """Laws of the house: files and functions have a size, rooms a front door, the root of host nothing but the flow."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

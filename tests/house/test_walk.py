@@ -1,7 +1,5 @@
 """docs/architecture.md is the way from a packet to a name: every stop exists, and a scan passes them in order."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

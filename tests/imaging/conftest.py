@@ -1,7 +1,5 @@
 """Synchronised rows of point targets, on a small grid."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import msgspec

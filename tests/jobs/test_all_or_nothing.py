@@ -3,8 +3,6 @@
 Every operation on the disk fails once. Then the command is repeated, and does what it was asked for.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`polysight demo` around its programs: what it says at the end. Whole demos are in e2e."""
 
-from __future__ import annotations
-
 import contextlib
 
 import pytest

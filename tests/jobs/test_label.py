@@ -1,7 +1,5 @@
 """`polysight label`: boxes from options and from answers, what is written, and what is refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A wheel that is not installed ends a command with one message that names it, not with a traceback."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

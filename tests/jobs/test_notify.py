@@ -1,7 +1,5 @@
 """The addressees in the rig file are notified of a scan's end; this does not disturb the scan, and is not recorded."""
 
-from __future__ import annotations
-
 import json
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer

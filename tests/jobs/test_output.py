@@ -1,7 +1,5 @@
 """Progress is shown before a step begins, also without a terminal."""
 
-from __future__ import annotations
-
 import pytest
 
 from polysight.cli.main import main

@@ -1,7 +1,5 @@
 """What the operator's page does, as commands."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A user's own material, end to end: scans without a truth are labelled, taught, and the name comes back."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

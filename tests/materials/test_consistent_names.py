@@ -1,7 +1,5 @@
 """Names, probabilities and refusals agree with each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.support.refusals import refused

@@ -1,7 +1,5 @@
 """Boxes with names: which are refused, and what a label file holds."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`patches.npz`: a scan that is named again later has the same errors as when it was first named."""
 
-from __future__ import annotations
-
 import io
 import json
 

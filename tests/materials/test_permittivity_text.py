@@ -1,7 +1,5 @@
 """The text of a complex permittivity: loss is minus, gain is plus, and it reads back."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

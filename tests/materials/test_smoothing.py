@@ -1,7 +1,5 @@
 """Total variation and outlines against scikit-image's, which would load scipy.stats and scipy.signal."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Plates that are not half spaces do not change the estimated errors of the rig, for example liquids behind glass."""
 
-from __future__ import annotations
-
 import numpy as np
 from tests.support.rigs import published_rig
 

@@ -1,7 +1,5 @@
 """A segment of a surface is named by its permittivity alone, with the same library as the patches of an image."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`polysight materials`, `permittivity`, `report` and `classify` of judged products, as typed."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a scan's files say about it."""
 
-from __future__ import annotations
-
 import pytest
 from msgspec import structs
 from tests.support.page.live_view import add_fact, begin_history

@@ -1,7 +1,5 @@
 """The Pi is heard and never asked."""
 
-from __future__ import annotations
-
 import select
 import socket
 

@@ -1,7 +1,5 @@
 """Pictures and range profiles show what is in the data."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 

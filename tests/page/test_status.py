@@ -1,7 +1,5 @@
 """The headline: the worst thing first, always with what to do about it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page's events describe the folder's content while it grows, for viewers that come early and late."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

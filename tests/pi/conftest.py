@@ -1,7 +1,5 @@
 """A rig without hardware for the Pi's tests: a small stage behind a pty, a wire hub, and the host's sockets."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing

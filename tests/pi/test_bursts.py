@@ -1,7 +1,5 @@
 """Laws of bursts, by the program and by the SPI controller, and of the trigger loop, on clocks that tests turn."""
 
-from __future__ import annotations
-
 import itertools
 import queue
 import random

@@ -1,7 +1,5 @@
 """GPIO and SPI lines without a chip, and `polysight-pi check`: each fault is found, named, and has a remedy."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket

@@ -4,8 +4,6 @@ The stand-ins are built from the kernel's headers and drivers, in C. Every wait 
 asserted on the wall clock.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

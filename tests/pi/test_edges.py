@@ -1,7 +1,5 @@
 """Rows are judged by place and time: those of the simulated stage (the arithmetic of the sketch), with drawn faults."""
 
-from __future__ import annotations
-
 import random
 from typing import Any, NamedTuple
 

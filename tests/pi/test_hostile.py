@@ -3,8 +3,6 @@
 The clients that send without end speak ZMTP 3.0 (RFC 23) by hand, byte by byte.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import os

@@ -1,7 +1,5 @@
 """What goes onto a Pi: the installation script, the systemd unit, the udev rules."""
 
-from __future__ import annotations
-
 import configparser
 import os
 import re

@@ -1,7 +1,5 @@
 """A jog from the host: the stage moves to its target while the host lives, and no further."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

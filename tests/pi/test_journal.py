@@ -1,7 +1,5 @@
 """Laws of the journal: after any cut or damage, the records read back are a prefix of those written."""
 
-from __future__ import annotations
-
 import errno
 import os
 from types import SimpleNamespace

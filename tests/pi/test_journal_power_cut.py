@@ -1,7 +1,5 @@
 """Power is lost at each disk operation: everything synced is on the disk, and the disk has a prefix of the events."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -1,7 +1,5 @@
 """CURVE keys: only allowed clients connect, keys are found by the rig file, and the Pi's secret stays on the Pi."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Laws of the state machine and of the checks before and during a row, on a clock that tests turn."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """The serial link against a pty, and a port whose opening resets an UNO (DTR)."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue

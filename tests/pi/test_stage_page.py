@@ -1,7 +1,5 @@
 """Home and jog on the operator's page: what is pressed moves, within the limits, and can be stopped."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

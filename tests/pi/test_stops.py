@@ -3,8 +3,6 @@
 The campaign (`--long`) measures the time to STOP at a hundred moments.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import random

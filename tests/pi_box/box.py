@@ -1,7 +1,5 @@
 """A Raspberry Pi 3B on QEMU: its power switch, ssh, its USB socket, and its GPIO registers seen from outside."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

@@ -1,7 +1,5 @@
 """A Pi 3B on QEMU with this release installed as docs/how-to/install.md says, and its host outside."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

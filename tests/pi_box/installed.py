@@ -1,7 +1,5 @@
 """An installed Pi: what a person does on it and from its host, as docs/how-to/install.md says."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -4,8 +4,6 @@
 The tests share one Pi and run in this order; each leaves the service running.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import time

@@ -1,7 +1,5 @@
 """The emulated UNO with the real machine code, at a serial port, and where its motors really stand."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`polysight plan`: exit status, text and JSON; noise and standstill from options and from a scan (`--like`)."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Laws of a plan's noise, motion and aliases, each compared with an independent computation."""
 
-from __future__ import annotations
-
 import re
 
 import msgspec

@@ -1,7 +1,5 @@
 """Warnings about the plates of a scene, before it is scanned or simulated."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 import warnings

@@ -1,7 +1,5 @@
 """The estimated time of a scan equals the simulated stage's own clock, and adds up row by row."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st

@@ -1,7 +1,5 @@
 """Small simulated scans, shared by the tests of this folder."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

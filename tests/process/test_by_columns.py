@@ -1,7 +1,5 @@
 """A scan recorded column by column: sub-bands and the rig in scan.json have the same axes as the images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tomli_w

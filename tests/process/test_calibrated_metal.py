@@ -1,7 +1,5 @@
 """A scan is divided by its metal calibration pixel by pixel, and masked where the calibration has no metal."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows, frames and positions compared with the plan: missing rows count as lost, columns in every direction."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """An RX without a signal is left out of synchronisation and images, and the verdict says so and nothing false."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A truth.json of another program is ignored with a note; training, which needs the truth, refuses it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

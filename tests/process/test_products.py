@@ -1,7 +1,5 @@
 """`polysight process` and `image`: images are written first and stay; old products stay until new ones are complete."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Kept samples: images formed from them equal those from raw data; damaged or outdated samples are not used."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """`polysight sync-report` recovers known disturbances, and agrees with the residuals in quality.json."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.support.processes import read_output

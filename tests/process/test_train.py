@@ -1,7 +1,5 @@
 """`polysight train`: scans with known plates, and scenes that the command simulates, give the same library."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import tomli_w

@@ -1,7 +1,5 @@
 """A figure of a patch is declared once: tables, exports, datasets and the report show it without further code."""
 
-from __future__ import annotations
-
 import csv
 from typing import Annotated
 

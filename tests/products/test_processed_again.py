@@ -1,7 +1,5 @@
 """Processing again: inputs are checked before anything is changed, and a failure leaves the old products."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A folder of products is replaced atomically: after any failure it holds the old products or the new ones."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

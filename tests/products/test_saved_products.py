@@ -1,7 +1,5 @@
 """Products are written completely and read back; they are evaluated with their own rig, not the current folder's."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """The verdict `none` withholds results; signs of the errors of a permittivity; products of earlier releases."""
 
-from __future__ import annotations
-
 import csv
 import json
 

@@ -1,7 +1,5 @@
 """Boards under native control, in virtual time."""
 
-from __future__ import annotations
-
 import pytest
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 

@@ -1,7 +1,5 @@
 """A board's states: each is entered only after a report of the radar; each fatal event is a fault with its reason."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """Saving and restoring the calibration of a board; reading back settings."""
 
-from __future__ import annotations
-
 import json
 import struct
 

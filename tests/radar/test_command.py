@@ -1,7 +1,5 @@
 """`polysight radar`: the plan without a board, a board checked step by step, firmware, traces and their replay."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Commands are encoded as by TI's library; codes are the nearest; values that exceed their field are refused."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 

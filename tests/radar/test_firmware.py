@@ -1,7 +1,5 @@
 """Firmware downloads cannot brick a board: checked before, verified after, recoverable when interrupted anywhere."""
 
-from __future__ import annotations
-
 import zlib
 
 import pytest

@@ -1,7 +1,5 @@
 """mmWaveLink messages: round trip, every flipped bit noticed."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

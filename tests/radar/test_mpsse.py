@@ -1,7 +1,5 @@
 """The byte stream for the FT4232H."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused

@@ -1,7 +1,5 @@
 """All boards of a rig under native control: armed and done together, reset and reopened after faults, reported."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Bytes of real devices, published by their users (TI E2E forum), with their meaning.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The simulated rig under native control: its rig file, its signals, and its chip behind a socket."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

@@ -1,7 +1,5 @@
 """Messages over words: every way in which one is lost, damaged or overtaken."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig

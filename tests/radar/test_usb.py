@@ -1,7 +1,5 @@
 """Opening the USB chip with the real pyftdi on a simulated bus: modes, replug, late plug, short reads, paths."""
 
-from __future__ import annotations
-
 import errno
 import sys
 

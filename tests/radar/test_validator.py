@@ -1,7 +1,5 @@
 """Each named constraint: it holds for the published chirp, and is broken and named by a value outside it."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """Products as `polysight process` leaves them, of a small made-up image."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

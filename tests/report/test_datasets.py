@@ -1,7 +1,5 @@
 """NetCDF of a folder of products, read back by xarray."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import h5py

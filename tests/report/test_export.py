@@ -1,7 +1,5 @@
 """What is exported is what was saved: every format is read back by its own library."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The table of materials, number by number: what a patch of materials.json becomes in every format."""
 
-from __future__ import annotations
-
 import csv
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Names in any script: figures draw them without warnings, and the page has every one of them in full."""
 
-from __future__ import annotations
-
 import warnings
 from html import unescape
 

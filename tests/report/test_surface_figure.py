@@ -1,7 +1,5 @@
 """The picture of a surface: what is nearer to the eye hides what is behind it."""
 
-from __future__ import annotations
-
 import io
 
 import matplotlib

@@ -1,7 +1,5 @@
 """The report with a verdict: what is withheld, ellipses that hold their share, labels that can be read."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from html import unescape

@@ -1,7 +1,5 @@
 """Answers of the server without a browser: errors with codes, names of scans, the icon, comparisons."""
 
-from __future__ import annotations
-
 import errno
 import http.client
 import itertools

@@ -3,8 +3,6 @@
 The server runs as its command. How long each abort takes is said (`-s` shows it); only that it works is asserted.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

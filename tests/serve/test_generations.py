@@ -1,7 +1,5 @@
 """The page of a scan goes from one generation of products to the next at once: no moment shows parts of two."""
 
-from __future__ import annotations
-
 import json
 
 from tests.support.page.asking import TOKEN

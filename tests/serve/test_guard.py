@@ -1,7 +1,5 @@
 """Who is let in, from where, how much and how slowly; what is refused changes nothing and locks nobody out."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import shutil

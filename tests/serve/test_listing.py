@@ -1,7 +1,5 @@
 """Changes of the list: whoever applies them has the list of the server, whatever it had before."""
 
-from __future__ import annotations
-
 import random
 
 from tests.support.page.asking import get

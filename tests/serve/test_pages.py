@@ -1,7 +1,5 @@
 """Result, probe, label, library and comparison in a real browser, at a desk's width and at a phone's."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """The processes of `polysight serve`: commands are answered whatever becomes of the others, and after a restart."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

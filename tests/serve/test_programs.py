@@ -1,7 +1,5 @@
 """Programs that a page starts: found again by another server, never signalled, and distinguished from others."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

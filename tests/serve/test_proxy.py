@@ -1,7 +1,5 @@
 """The documented reverse proxy in front of a server, in a real browser: what is read, what moves, what is asked for."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

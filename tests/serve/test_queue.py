@@ -1,7 +1,5 @@
 """Scans that wait for the rig: one after another, in order, and never past one that did not finish."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What POST requests ask for, without a browser: limits just inside and outside, and the command line of each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

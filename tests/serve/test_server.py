@@ -1,7 +1,5 @@
 """The server: who may ask, who may look, and that a page can be as slow as it likes."""
 
-from __future__ import annotations
-
 import gc
 import hmac
 import json

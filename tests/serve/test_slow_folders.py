@@ -1,7 +1,5 @@
 """A folder that does not answer, such as a network drive that is gone, stops the reads of no other."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor

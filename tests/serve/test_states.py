@@ -1,7 +1,5 @@
 """Every state of the table in a real browser: its words, its colour, its buttons, and nothing that it must not say."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

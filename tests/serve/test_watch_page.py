@@ -1,7 +1,5 @@
 """The page in a real browser, at a desk's width and at a phone's."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """What an error advises can be pasted into a shell."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

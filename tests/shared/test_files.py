@@ -1,7 +1,5 @@
 """Errors of files name the file."""
 
-from __future__ import annotations
-
 import errno
 import re
 

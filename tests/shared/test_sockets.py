@@ -1,7 +1,5 @@
 """Sockets of host and Pi: an address that cannot be bound is refused with the likely cause."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Sockets that are closed after the test, and a rig on addresses of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 

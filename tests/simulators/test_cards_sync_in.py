@@ -1,7 +1,5 @@
 """SYNC_IN of the simulated radars: the pulses that start frames, and the stage's position at each."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

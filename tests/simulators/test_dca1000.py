@@ -1,7 +1,5 @@
 """Laws of the simulated DCA1000: packets carry the LVDS stream, counters count, replies are the real card's."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given, strategies as st
 

@@ -1,7 +1,5 @@
 """Faults of the simulated card: from a seed, independent of grouping, counted, and as configured."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Any order of commands, LVDS data and waiting: the card sends the stream that it was given."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

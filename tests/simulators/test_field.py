@@ -1,7 +1,5 @@
 """The simulated field: interpolation, cache, sums and leakage; physical optics of a large mirror equals its image."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 The keys and their limits are read from the scene's own types, so that a new key is drawn without a change here.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Shapes of scene files: through an entry point, in the simulator's own convention, up to recorded rows."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

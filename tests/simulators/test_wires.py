@@ -1,7 +1,5 @@
 """Laws of the wires hub: per-sender order, nothing lost, nothing sent back, nothing unasked for."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing

@@ -1,7 +1,5 @@
 """Fixtures: stages to talk to. `stage` is one in virtual time with simulated wires, `talker` any of them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Callable, Iterator

@@ -16,8 +16,6 @@ must be sent before something happens there goes in one go, or it has seconds to
 Behind them: no flipped bit, lost byte or random bytes make any of these stages move.
 """
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every simulated stage as a process in its own time: port, banner, wires, signals."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -3,8 +3,6 @@
 Firmware and Python stand-in obey them, and send the same bytes and edges at the same ticks.
 """
 
-from __future__ import annotations
-
 import itertools
 import random
 

@@ -1,7 +1,5 @@
 """Constants in firmware, Python and the interface page agree; the sketch fits a board and is flashed onto it."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Laws of the compiled sketch on an emulated UNO, in lockstep: counts and times are exact on any machine."""
 
-from __future__ import annotations
-
 import itertools
 import random
 

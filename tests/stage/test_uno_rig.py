@@ -1,7 +1,5 @@
 """A scan with a whole simulated rig whose stage is the sketch's machine code on the emulated UNO."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The test turns the emulator's clock (`run_ms`); times are cycles of its processor.
 """
 
-from __future__ import annotations
-
 import random
 
 import pytest

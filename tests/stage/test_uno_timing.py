@@ -1,7 +1,5 @@
 """Speed and reaction time of the compiled sketch on an emulated UNO, in lockstep: exact on any machine."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

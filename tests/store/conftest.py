@@ -1,7 +1,5 @@
 """A small scan without any fault, as the reference for others."""
 
-from __future__ import annotations
-
 import random
 import shutil
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The chain of a manifest: count and digest of the line before in every line, so that missing lines are found."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

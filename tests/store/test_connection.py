@@ -1,7 +1,5 @@
 """A scan resumes with a rig file that differs in the connection settings only."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from typing import Any

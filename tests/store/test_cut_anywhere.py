@@ -4,8 +4,6 @@ Each time `validate` names what is wrong, or nothing is, and after `resume`, wit
 and the image are those of the undisturbed scan.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgpack

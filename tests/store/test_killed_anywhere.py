@@ -3,8 +3,6 @@
 In one process, with the code that writes in the instrument; tests/e2e kills real ones.
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Raw data is dropped only if saved products were made from it, and recorded in the manifest before."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

@@ -1,7 +1,5 @@
 """The host reads the files of the simulators: two independent programs, one format."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rows placed again from their packets: different results are committed, equal ones not touched."""
 
-from __future__ import annotations
-
 import gc
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Manifest, scan folder, events and their validation, damaged in every way."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Read errors of the disk are errors, never a reason to retake a row; a disk without locks is not a scan in use."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

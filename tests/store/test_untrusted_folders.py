@@ -1,7 +1,5 @@
 """Untrusted scan folders and files: no path leads out of the folder, and no small file takes much memory."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

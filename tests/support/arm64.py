@@ -1,7 +1,5 @@
 """The compiled loops of synchronisation on ARM64, in QEMU: the vector code of that wheel, on any machine."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import subprocess

@@ -1,7 +1,5 @@
 """Made-up calibration files, and the leakage that remains after a correction."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

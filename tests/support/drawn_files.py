@@ -3,8 +3,6 @@
 Their images and pixels are not imaged but drawn: Fresnel reflection of each box with speckle and phase errors.
 """
 
-from __future__ import annotations
-
 import json
 import pickle
 from collections.abc import Mapping, Sequence

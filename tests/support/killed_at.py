@@ -7,8 +7,6 @@ before it, but a write is half done. This finds the instants that chance hardly 
 its line OPERATION:SUFFIX to the file HITS; with NTH 0 that is all.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

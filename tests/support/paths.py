@@ -1,7 +1,5 @@
 """Where things are."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Process a source up to its last row."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from polysight.pipeline import Pipeline

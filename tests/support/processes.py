@@ -1,7 +1,5 @@
 """Commands of both halves, run as a user runs them: as processes, or in this one where the process does not matter."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

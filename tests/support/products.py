@@ -1,7 +1,5 @@
 """Made-up products of a judged scan: a metal reference, a named patch, a refused one; and reports without rendering."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The published rig, and rigs that differ from it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Scene files small enough for a test: few positions, and a metal plate in the middle or nothing at all."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import tomli_w

@@ -1,7 +1,5 @@
 """The whole simulated rig as processes, with its Pi."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path

@@ -8,8 +8,6 @@ Costs (`--costs`) are processor times of a test's own process and of all program
 still run or that nobody awaited, such as a browser's. On a busy machine they change less than the clock.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import resource

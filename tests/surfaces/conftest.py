@@ -1,7 +1,5 @@
 """Scenes of the worlds as the surfaces take them; simulated, no code shared with the estimator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """H / V of a point: both receivers see it from places and under angles of their own. Judge: the series of a sphere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Objects side by side: the echoes of a window that hardly resolves them are separated, in H and in V."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tests.surfaces.test_paths import BEHIND, FRONT_M, empty_scan, with_echo

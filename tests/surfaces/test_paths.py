@@ -1,7 +1,5 @@
 """The path of an echo over a window: what was put in comes out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

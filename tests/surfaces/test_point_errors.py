@@ -1,7 +1,5 @@
 """Errors of single points: their regions hold where the segment is quiet and where edges or other echoes ripple."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

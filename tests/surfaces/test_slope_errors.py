@@ -1,7 +1,5 @@
 """Errors of slopes: windows that overlap share data, so a fit to neighbours takes part of their common errors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

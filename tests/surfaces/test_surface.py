@@ -1,7 +1,5 @@
 """Drawn shapes: place, normal and permittivity come out within what is asked, or no figure is given."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A surface that twists in the plane of incidence mixes s and p; the exact series of a cylinder is the judge."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Edges and thin walls: no figure comes from them, and normals are those of the surface."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Small test signals of known truth: direct path, echoes, noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

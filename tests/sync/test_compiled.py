@@ -1,7 +1,5 @@
 """The compiled loops and their NumPy form give equal results, for every vector width of the processor."""
 
-from __future__ import annotations
-
 import _ctypes
 import logging
 import os

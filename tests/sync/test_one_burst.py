@@ -1,7 +1,5 @@
 """Bursts of one pulse with many chirps are synchronised like bursts of many pulses (simulated)."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

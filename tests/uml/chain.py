@@ -4,8 +4,6 @@ Executes the only row of the rig file that is its argument, and prints `RESULT {
 of the lines recorded by the kernel. conftest.py passes PYTHONPATH, with the repository, on the kernel's command line.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import signal

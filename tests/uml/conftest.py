@@ -1,7 +1,5 @@
 """User-mode Linux: built on demand, started with a program in it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

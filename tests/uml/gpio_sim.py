@@ -1,7 +1,5 @@
 """A simulated GPIO chip of the kernel (gpio-sim): inputs driven from outside, and every setting of its outputs."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 `make test-uml` runs these; docs/decisions/0005-firmware.md says what is real in it. Figures are printed.
 """
 
-from __future__ import annotations
-
 import itertools
 import sys
 from statistics import quantiles

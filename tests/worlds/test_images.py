@@ -1,7 +1,5 @@
 """Images of drawn scenes: what is true stands in them, and each nuisance does something."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Reflection at layers against closed forms, and laws of energy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st

@@ -1,7 +1,5 @@
 """Fields of facets against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

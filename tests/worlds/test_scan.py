@@ -1,7 +1,5 @@
 """The convolutions against the direct sum over facets, and the rig against the published numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

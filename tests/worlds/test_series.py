@@ -1,7 +1,5 @@
 """Exact series against closed forms, laws and physical optics."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Drawn scenes of shapes and the disturbances of their scans."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import kstest

@@ -1,7 +1,5 @@
 """Shapes: what is true of them, and echoes against geometrical optics, facets and each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -4,8 +4,6 @@ Writes the arrays h, v, x_m, y_m, incidence_deg, simulated and, beside them, a J
 disturb the scan: noise, leakage, errors of position and others.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -7,8 +7,6 @@ one along it, and one at 45 degrees. Series minus physical optics at two radii g
 those of a plane (radius without end) for antennas at a finite distance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -4,8 +4,6 @@ The processing knows the nominal rig only. Each sample is divided by the direct 
 length), the range gate is the sum over frequencies, and the image a matched filter on the object plane.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 

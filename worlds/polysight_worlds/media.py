@@ -4,8 +4,6 @@ Fields vary as exp(+j omega t), so a lossy permittivity is eps' - j eps''. Both 
 field's tangential part: metal has r_s = r_p = -1, and P = r_s / r_p = 1, at every angle.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

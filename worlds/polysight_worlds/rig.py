@@ -6,8 +6,6 @@ a mirror, as the authors state: the turn of 22.5 degrees in the mounts of both r
 pictures have no such mixture. A stage offset of zero is the middle of the grid.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -6,8 +6,6 @@ Height differences delta (tilt, waviness, roughness) multiply by exp(-jk c(d) de
 varies; what varies is a short Taylor series. Slopes of a rough surface turn the local normal, to first order.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

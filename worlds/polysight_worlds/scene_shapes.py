@@ -3,8 +3,6 @@
 The only things that pass are plain tables, as a scene file and a rig file hold them, and arrays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

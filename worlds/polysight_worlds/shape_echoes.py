@@ -9,8 +9,6 @@ by facet at every position.
 `places` are the parameters (a, b) of the specular points on a shape, each [offsets], see `shapes.find_specular`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

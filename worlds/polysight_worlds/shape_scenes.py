@@ -7,8 +7,6 @@ Boards (places, axes, leakage), gains, noise and scene have random streams of th
 (`[seed, 11]`), and what is switched off is drawn, too: switching one disturbance on does not change the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Worlds: plates, sheets, dishes and a table behind them, and the nuisances under which they are scanned."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 

@@ -4,8 +4,6 @@ Each source is judged separately. Materials get the names of Table 2's rows, if 
 `train_authors` makes one library of the first two sources for `polysight train`.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 import zipfile

@@ -9,8 +9,6 @@ A source is `materials/`, `labels/` or the images made here; a task is the name 
 ", two angles" after it for two incidence angles.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

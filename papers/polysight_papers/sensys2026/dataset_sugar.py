@@ -1,7 +1,5 @@
 """Fig. 21 from the published files: concentration of sugar in water, and the POLySIGHT paper's errors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any

@@ -3,8 +3,6 @@
 Of the POLySIGHT paper: Fig. 4 (front-on and steep), Fig. 13 and 19 (materials), Fig. 14 (phase).
 """
 
-from __future__ import annotations
-
 import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence

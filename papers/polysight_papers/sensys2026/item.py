@@ -3,8 +3,6 @@
 These are in `table2.json` and `published.json`.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from functools import cache

@@ -13,8 +13,6 @@ on |H| alone, judged by the paper's split by pixel, reaches the published accura
 `spread_table` shows the effect of the spread of specimens on names, and the Bayes limit (a table of Fig. 18).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple

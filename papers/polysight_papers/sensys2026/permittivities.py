@@ -5,8 +5,6 @@ with plates at other places, Fig. 21 the concentration of a sugar solution by re
 Table 2 goes through Eq. 3 (permittivity from the ratio of H to V) with pixels drawn at its own values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict
 from itertools import combinations

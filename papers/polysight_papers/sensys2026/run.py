@@ -1,7 +1,5 @@
 """`polysight reproduce`: make items (tables and figures of the POLySIGHT paper), write their files, then the page."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

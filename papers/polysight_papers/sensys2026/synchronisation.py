@@ -4,8 +4,6 @@ They are of the POLySIGHT paper. The first two come from one scan of metal plate
 the direct path alone, received at ten start frequencies.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache

@@ -4,8 +4,6 @@ Each rising edge on a board's SYNC_IN line starts one frame; while its card reco
 packets from the card's address on loopback. Specification: docs/spec/simulated-rig.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import signal

@@ -6,8 +6,6 @@ Each packet's record stays known: `Arrival.record`. A record is what the card se
 are the radar's, each started by a pulse on SYNC_IN. Probabilities, counts and pauses in here are chosen.
 """
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ of every packet, one for corrupt packets, one for pulses and one for overflows. 
 another; draws do not depend on how packets, frames or pulses are grouped into calls.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections import Counter
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Run all cards and radars of one process on one set of wires: SYNC_IN edges in, frames out as UDP."""
 
-from __future__ import annotations
-
 import selectors
 from collections.abc import Sequence
 from threading import Event

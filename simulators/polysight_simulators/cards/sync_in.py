@@ -1,7 +1,5 @@
 """Decide which SYNC_IN edges start a frame, and where the stage is then."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from typing import NamedTuple
 

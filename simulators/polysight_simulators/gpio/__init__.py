@@ -5,8 +5,6 @@ on the GPIO character device and on spidev; the lines are connected to the simul
 compiled on demand; :func:`missing` lists the packages needed.
 """
 
-from __future__ import annotations
-
 import shutil
 import signal
 from pathlib import Path

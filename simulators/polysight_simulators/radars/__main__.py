@@ -4,8 +4,6 @@ Prints where the simulated board answers differently from the traced one: a limi
 traced board. Format of the trace: docs/spec/mmwavelink.md.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable

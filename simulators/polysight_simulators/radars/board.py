@@ -5,8 +5,6 @@ answers with a 16-bit CRC, refusals with message id 0, a harmless main core faul
 data 1 ms after the interrupt. The clock is a parameter; `RadarBoard.inject` sets faults. Real timing is not known.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections import deque

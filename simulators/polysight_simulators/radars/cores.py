@@ -9,8 +9,6 @@ RF core after it, CRC-32 at the end. A part has its ROM version at offset 56 and
 build, debug, year, month, day.
 """
 
-from __future__ import annotations
-
 import binascii
 import struct
 import zlib

@@ -9,8 +9,6 @@ complex factor, common to all rows, channels and samples, and by less than 1 % R
 motion within a burst, of the filter, and of the object in the host's direct path. The noise power agrees within 5 %.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ The latter are `unsynced/<scan>` folders and `raw/` cubes, simulated echoes afte
 follow docs/spec/scan-folder.md and the description of the data set, implemented here independently of the host.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

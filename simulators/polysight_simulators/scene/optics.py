@@ -11,8 +11,6 @@ Amplitudes are relative to the direct path: a free path of length R has amplitud
 RX1. Antenna patterns are modelled only by one constant, the scene's `object_gain`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

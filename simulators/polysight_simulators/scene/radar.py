@@ -12,8 +12,6 @@ The effects of a receiving board (:class:`Receiver`) are timing, crystal, chirp 
 :class:`PatternSource` gives frames with a counting pattern, for bit-exact tests.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol

@@ -5,8 +5,6 @@ point `polysight.shape_echoes`: this project's is `worlds/`, which shares no cod
 tables and arrays; `polysight_worlds.scene_shapes.simulate_echoes` says which.
 """
 
-from __future__ import annotations
-
 from importlib.metadata import entry_points
 from typing import Any
 

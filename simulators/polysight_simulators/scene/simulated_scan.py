@@ -1,7 +1,5 @@
 """Simulate a whole scan without sockets: raw data in either layout, with truth.json."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

@@ -4,8 +4,6 @@ The field at stage offset u is the sum over object points v of the object times 
 is computed along each axis as a product of spectra, and interpolated from an oversampled grid of u.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ It is the sketch's own code, compiled for this machine (arduino_stage/pc); witho
 a stand-in with the same dialogue and the same step times.
 """
 
-from __future__ import annotations
-
 import argparse
 import ctypes
 import os

@@ -1,7 +1,5 @@
 """Commands of the Python stand-in of the stage: legs, homing, hold, stop, alarms (as arduino_stage/stage.cpp)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import Enum
 

@@ -5,8 +5,6 @@ compare; arduino_stage/motion.h explains the arithmetic. Here the steps at const
 at once (:meth:`StepEngine.skip`), because Python is too slow to make each.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

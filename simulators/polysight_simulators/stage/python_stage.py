@@ -3,8 +3,6 @@
 The tests run it and the firmware's own code and compare them line by line and tick by tick.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from typing import NamedTuple

@@ -5,8 +5,6 @@ for a heartbeat. Use at most 2 with a program that sends `status` four times per
 would come too late. On a machine that cannot keep up, the simulated world runs slower than asked for.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

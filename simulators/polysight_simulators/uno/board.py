@@ -3,8 +3,6 @@
 Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` lists missing packages.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

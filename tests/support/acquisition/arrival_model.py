@@ -1,7 +1,5 @@
 """Model of a row's way from SYNC_IN edges to arrival times: frames, a card that queues, stalls, lost packets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

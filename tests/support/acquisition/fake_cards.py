@@ -1,7 +1,5 @@
 """Capture cards that only answer commands and send made-up rows, over UDP on loopback."""
 
-from __future__ import annotations
-
 import functools
 import socket
 import struct

@@ -1,7 +1,5 @@
 """A fake Pi that only speaks the wire protocol, with fake capture cards, on a loopback subnet of their own."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Capture cards, simulated or with scripted answers, served by a thread of the test's process."""
 
-from __future__ import annotations
-
 import select
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Recordings made by formula: rows of both layouts, and packet captures."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The simulated rig as processes for the doctor, and a fake Pi that only answers requests."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Requests to a served site: whole ones, raw ones, and hostile ones."""
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import json

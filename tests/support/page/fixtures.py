@@ -1,7 +1,5 @@
 """Small scans to look at, and watches: fixtures of the rooms `page` and `serve`."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing

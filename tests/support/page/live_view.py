@@ -1,7 +1,5 @@
 """Helpers for tests of the live view: scans that grow on demand, and servers on free ports."""
 
-from __future__ import annotations
-
 import shutil
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Stand-ins around the Pi's program: a stage, its driver, and trigger lines on a clock that tests turn."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

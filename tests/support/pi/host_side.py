@@ -1,7 +1,5 @@
 """A minimal host: its end of the Pi's sockets."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

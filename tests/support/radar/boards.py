@@ -1,7 +1,5 @@
 """A rig under native control, virtual time, and simulated boards behind words."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

@@ -6,8 +6,6 @@ of 512-byte packets, each packet from the chip begins with two status bytes, a r
 chip that was pulled fails every transfer of handles opened before; plugged in again it has another address.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 from array import array

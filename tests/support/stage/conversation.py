@@ -1,7 +1,5 @@
 """Plays a written conversation (syntax: test_dialogues.py) with a stage."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Simulated stages as processes, with a listener at their wires or a hub."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import subprocess

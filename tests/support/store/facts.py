@@ -1,7 +1,5 @@
 """The facts of a scan as its file has them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

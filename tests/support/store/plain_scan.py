@@ -1,7 +1,5 @@
 """A scan folder of constant bytes, written without any rig."""
 
-from __future__ import annotations
-
 import zlib
 from pathlib import Path
 

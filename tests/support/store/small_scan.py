@@ -4,8 +4,6 @@ Everything that is written to a disk is written by the code that writes it in th
 time are left out. A whole scan takes some milliseconds.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections.abc import Iterator

@@ -21,11 +21,7 @@ import numpy as np
 
 from polysight.data import find_packaged
 from polysight.imaging import PlaneEstimate
-from polysight.materials import (
-    UNKNOWN,
-    match_truth,
-    truth_plates,
-)
+from polysight.materials import UNKNOWN, match_truth, truth_plates
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import NO_INPUTS, Findings, Inputs

@@ -11,14 +11,7 @@ import pytest
 from tests.support.paths import REPO
 
 from polysight.capture.dca1000 import Status
-from polysight.capture.network import (
-    Hop,
-    neighbour_mac,
-    route_interface,
-    silent_card,
-    silent_hop,
-    silent_radar,
-)
+from polysight.capture.network import Hop, neighbour_mac, route_interface, silent_card, silent_hop, silent_radar
 from polysight.capture.receiver import RowCapture
 from polysight_shared.config import Board
 

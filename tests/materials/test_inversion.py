@@ -6,22 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from polysight.materials.inversion import (
-    SOURCES,
-    RigPrior,
-    SceneLikelihood,
-    invert,
-    sample_posterior,
-    true_ratio,
-)
-from polysight.materials.kinds import (
-    Kind,
-    Kinds,
-    PatchMeasurement,
-    literature,
-    permittivity_slope,
-    probability_of_same,
-)
+from polysight.materials.inversion import SOURCES, RigPrior, SceneLikelihood, invert, sample_posterior, true_ratio
+from polysight.materials.kinds import Kind, Kinds, PatchMeasurement, literature, permittivity_slope, probability_of_same
 from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.materials.result import ratio_error
 from polysight.polarimetry import permittivity_from_ratio

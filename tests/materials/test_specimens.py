@@ -7,13 +7,7 @@ from polysight.materials import MODELS, Classifier, Entry, Library, specimens
 from polysight.materials.classify import DISCRIMINANT
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.names import add_explanation
-from polysight.materials.specimens import (
-    PUBLISHED_SPREAD,
-    effect,
-    features,
-    fit_spread,
-    relative,
-)
+from polysight.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative
 from polysight.polarimetry import fresnel
 from polysight_papers.sensys2026.patches import Errors, draw, groups
 

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from polysight.polarimetry import (
-    brewster_angle_rad,
-    fresnel,
-    permittivity_from_ratio,
-    ratio_from_permittivity,
-)
+from polysight.polarimetry import brewster_angle_rad, fresnel, permittivity_from_ratio, ratio_from_permittivity
 
 real_part = st.floats(1.05, 60.0)
 loss = st.floats(0.0, 40.0)

@@ -7,13 +7,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.calibration_data import (
-    ALL,
-    RESTORED,
-    CalibrationFiles,
-    InitCalibrations,
-    RestoreCalibration,
-)
+from polysight.radar.calibration_data import ALL, RESTORED, CalibrationFiles, InitCalibrations, RestoreCalibration
 from polysight.radar.commands import program
 from polysight_shared.error_codes import ErrorCode
 

@@ -7,15 +7,7 @@ import re
 import pytest
 
 from polysight.results import rules
-from polysight.results.verdict import (
-    Coverage,
-    NoResult,
-    Verdict,
-    join_reasons,
-    percent,
-    read_verdict,
-    reason,
-)
+from polysight.results.verdict import Coverage, NoResult, Verdict, join_reasons, percent, read_verdict, reason
 from polysight_shared.findings import Finding
 
 GAINS = Finding("error", "a gain", "leakage", "measure it")

@@ -22,12 +22,4 @@ from polysight_worlds.shape_scenes import (
     scan_shapes,
 )
 from polysight_worlds.shapes import Shape, cylinder, plate, sphere
-from polysight_worlds.world import (
-    NUISANCES,
-    TABLE_2,
-    Body,
-    Plate,
-    World,
-    draw_nuisances,
-    draw_world,
-)
+from polysight_worlds.world import NUISANCES, TABLE_2, Body, Plate, World, draw_nuisances, draw_world

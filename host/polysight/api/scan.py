@@ -20,13 +20,7 @@ from polysight.catalogue import Pixels
 from polysight.data import find_packaged
 from polysight.imaging import Images
 from polysight.jobs.label import save_labels
-from polysight.materials import (
-    MODELS,
-    SHORT,
-    Labels,
-    find_truth,
-    format_permittivity,
-)
+from polysight.materials import MODELS, SHORT, Labels, find_truth, format_permittivity
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import Incidence
 from polysight.products import (

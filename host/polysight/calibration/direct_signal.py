@@ -22,12 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight import sync
-from polysight.calibration.files import (
-    BoardFilter,
-    BoardStart,
-    board_rows,
-    places_crc32,
-)
+from polysight.calibration.files import BoardFilter, BoardStart, board_rows, places_crc32
 from polysight.radar import direct_if_hz
 from polysight.store import RawSource
 from polysight_shared.config import Board, Instrument

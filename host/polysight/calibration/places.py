@@ -27,11 +27,7 @@ from numpy.typing import NDArray
 from polysight.calibration import files
 from polysight.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
 from polysight.store import RawSource
-from polysight.sync import (
-    BoardSetup,
-    HighPass,
-    synchronise_row,
-)
+from polysight.sync import BoardSetup, HighPass, synchronise_row
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError

@@ -6,16 +6,7 @@ tags of a scan. Of a processed scan, `read_result` gives the results for a page,
 """
 
 from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes, write_notes
-from polysight.catalogue.pictures import (
-    AMPLITUDE,
-    PHASE,
-    Picture,
-    Pixels,
-    colour_bar,
-    draw,
-    draw_products,
-    thumbnail,
-)
+from polysight.catalogue.pictures import AMPLITUDE, PHASE, Picture, Pixels, colour_bar, draw, draw_products, thumbnail
 from polysight.catalogue.results import (
     DIFFERENCE,
     EXPORT,

@@ -32,15 +32,7 @@ from polysight.materials import (
     no_box,
     pack_labels,
 )
-from polysight.products import (
-    IMAGE,
-    LABELS,
-    LABELS_PICTURE,
-    ProcessedScan,
-    find_labels,
-    find_products,
-    label_folder,
-)
+from polysight.products import IMAGE, LABELS, LABELS_PICTURE, ProcessedScan, find_labels, find_products, label_folder
 from polysight.store import MANIFEST
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DataError, quote

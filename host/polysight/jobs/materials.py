@@ -42,14 +42,7 @@ from polysight.materials import (
     match_patches,
     read_materials,
 )
-from polysight.products import (
-    MATERIALS,
-    REPORT,
-    SCAN,
-    ProcessedScan,
-    find_products,
-    read_products,
-)
+from polysight.products import MATERIALS, REPORT, SCAN, ProcessedScan, find_products, read_products
 from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_line, to_plain
 from polysight.store import is_source
 from polysight_shared.config import Chirp, load_instrument

@@ -38,14 +38,7 @@ from polysight.process import (
     save_materials,
     why_unnamed,
 )
-from polysight.products import (
-    IMAGE,
-    REPORT,
-    check_products_folder,
-    making_products,
-    raw_dropped,
-    write_json,
-)
+from polysight.products import IMAGE, REPORT, check_products_folder, making_products, raw_dropped, write_json
 from polysight.results import one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw

@@ -37,16 +37,9 @@ from polysight.materials.classify import (
     Classifier as Classifier,
     classifier_sentence as classifier_sentence,
 )
-from polysight.materials.copies import (
-    find_copies as find_copies,
-)
-from polysight.materials.discriminant import (
-    REJECTED as REJECTED,
-    ErrorDiscriminant as ErrorDiscriminant,
-)
-from polysight.materials.kinds import (
-    permittivity_slope as permittivity_slope,
-)
+from polysight.materials.copies import find_copies as find_copies
+from polysight.materials.discriminant import REJECTED as REJECTED, ErrorDiscriminant as ErrorDiscriminant
+from polysight.materials.kinds import permittivity_slope as permittivity_slope
 from polysight.materials.labels import (
     METALS as METALS,
     SPECIMEN as SPECIMEN,
@@ -70,11 +63,7 @@ from polysight.materials.labels import (
     specimen_seed as specimen_seed,
     truth_plates as truth_plates,
 )
-from polysight.materials.layers import (
-    METAL as METAL,
-    Layer as Layer,
-    LayerFit as LayerFit,
-)
+from polysight.materials.layers import METAL as METAL, Layer as Layer, LayerFit as LayerFit
 from polysight.materials.library import (
     CHANNELS as CHANNELS,
     SAME_ANGLE_DEG as SAME_ANGLE_DEG,
@@ -93,9 +82,7 @@ from polysight.materials.measure import (
     Permittivity as Permittivity,
     estimate_permittivity as estimate_permittivity,
 )
-from polysight.materials.metal import (
-    WEAK_V_DB as WEAK_V_DB,
-)
+from polysight.materials.metal import WEAK_V_DB as WEAK_V_DB
 from polysight.materials.names import (
     LAYER as LAYER,
     UNKNOWN as UNKNOWN,
@@ -155,22 +142,16 @@ from polysight.materials.train import (
     score as score,
     score_unseen_materials as score_unseen_materials,
 )
-from polysight.materials.training_advice import (
-    accuracy_lines as accuracy_lines,
-)
+from polysight.materials.training_advice import accuracy_lines as accuracy_lines
 
 if TYPE_CHECKING:
-    from polysight.materials.paper_knn import (
-        PaperKNeighborsClassifier as PaperKNeighborsClassifier,
-    )
+    from polysight.materials.paper_knn import PaperKNeighborsClassifier as PaperKNeighborsClassifier
 
 
 def __getattr__(name: str) -> Any:
     """Import the estimator when it is first used: it imports scikit-learn, which most commands do not need."""
     if name != "PaperKNeighborsClassifier":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from polysight.materials.paper_knn import (
-        PaperKNeighborsClassifier as PaperKNeighborsClassifier,
-    )
+    from polysight.materials.paper_knn import PaperKNeighborsClassifier as PaperKNeighborsClassifier
 
     return PaperKNeighborsClassifier

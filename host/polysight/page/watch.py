@@ -41,16 +41,7 @@ from polysight.page.status import (
 from polysight.pipeline import Pipeline
 from polysight.products import QUALITY, find_products
 from polysight.results import Verdict
-from polysight.store import (
-    EVENTS,
-    MANIFEST,
-    Fact,
-    Manifest,
-    OtherFact,
-    ScanFolder,
-    ScanStarted,
-    parse_events,
-)
+from polysight.store import EVENTS, MANIFEST, Fact, Manifest, OtherFact, ScanFolder, ScanStarted, parse_events
 from polysight.sync import SyncedRow
 from polysight_shared import messages as m
 from polysight_shared.config import Chirp, Instrument

@@ -7,19 +7,8 @@ the reduced samples in the scan folder, so that images can be formed again witho
 on the result; `save_images` and `save_materials` write the products. `polysight/pipeline.py` calls them in this order.
 """
 
-from polysight.process.given_images import (
-    analyse_given_images,
-    is_given_images,
-    make_reference,
-    read_given_images,
-)
-from polysight.process.inputs import (
-    NO_INPUTS,
-    Inputs,
-    boxes_as_patches,
-    load_classifier,
-    why_unnamed,
-)
+from polysight.process.given_images import analyse_given_images, is_given_images, make_reference, read_given_images
+from polysight.process.inputs import NO_INPUTS, Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.quality import Quality, judge
 from polysight.process.rows import KeptSamples, Use, cores, map_boards, map_rows
 from polysight.process.save import (

@@ -7,15 +7,7 @@ from pathlib import Path
 
 import numpy.typing as npt
 
-from polysight.materials import (
-    SAME_ANGLE_DEG,
-    SIMULATED_LIBRARY,
-    Classifier,
-    KnownScene,
-    Labels,
-    Library,
-    check_labels,
-)
+from polysight.materials import SAME_ANGLE_DEG, SIMULATED_LIBRARY, Classifier, KnownScene, Labels, Library, check_labels
 from polysight.polarimetry import PlaneReference
 from polysight.settings import Settings
 from polysight_shared.config import Instrument

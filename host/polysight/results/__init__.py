@@ -7,9 +7,7 @@
 joins what they find. `to_plain` converts all of it to JSON types.
 """
 
-from polysight.results import (
-    rules as rules,
-)
+from polysight.results import rules as rules
 from polysight.results.check_plate import (
     ACTION_SIGMAS as ACTION_SIGMAS,
     WARNING_SIGMAS as WARNING_SIGMAS,

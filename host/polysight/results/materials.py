@@ -17,18 +17,7 @@ from functools import lru_cache, partial
 from itertools import count
 from pathlib import Path
 from types import NoneType
-from typing import (
-    Annotated,
-    Any,
-    Generic,
-    NamedTuple,
-    Self,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
-    overload,
-)
+from typing import Annotated, Any, Generic, NamedTuple, Self, TypeVar, get_args, get_origin, get_type_hints, overload
 
 import msgspec
 import numpy as np

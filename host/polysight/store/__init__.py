@@ -66,10 +66,4 @@ from polysight.store.scan_folder import (
     with_connection,
 )
 from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
-from polysight.store.validation import (
-    damaged_rows,
-    describe_damage,
-    to_json,
-    to_text,
-    validate,
-)
+from polysight.store.validation import damaged_rows, describe_damage, to_json, to_text, validate

@@ -19,16 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from polysight.materials import (
-    CHANNELS,
-    DISCRIMINANT,
-    PAPER,
-    REJECTED,
-    Samples,
-    Score,
-    score,
-    score_unseen_materials,
-)
+from polysight.materials import CHANNELS, DISCRIMINANT, PAPER, REJECTED, Samples, Score, score, score_unseen_materials
 from polysight.polarimetry import fresnel
 from polysight.report import INK, PALETTE
 from polysight_papers.sensys2026.item import (

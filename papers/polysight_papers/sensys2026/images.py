@@ -21,13 +21,7 @@ from matplotlib.patheffects import withStroke
 
 from polysight.jobs.demo import run_simulator
 from polysight.jobs.train import EDGE_MM
-from polysight.materials import (
-    KnownScene,
-    MaterialsResult,
-    TruthPlate,
-    patches_from_plates,
-    read_truth,
-)
+from polysight.materials import KnownScene, MaterialsResult, TruthPlate, patches_from_plates, read_truth
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import ratio_from_permittivity
 from polysight.products import ProcessedScan

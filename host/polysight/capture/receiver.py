@@ -320,16 +320,16 @@ class ReceiverProcess:
     def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
         self.board = board
         self._progress = Progress(-1, 0, 0, False, 0)
-        ours, theirs = socket.socketpair()
-        with theirs:
+        host_socket, receiver_socket = socket.socketpair()
+        with receiver_socket:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "polysight.capture.receiver_process", str(theirs.fileno())],
-                pass_fds=[theirs.fileno()],
+                [sys.executable, "-m", "polysight.capture.receiver_process", str(receiver_socket.fileno())],
+                pass_fds=[receiver_socket.fileno()],
                 stdin=subprocess.DEVNULL,
                 # Only the host handles Ctrl-C.
                 start_new_session=True,
             )
-        self._connection = Connection(ours.detach())
+        self._connection = Connection(host_socket.detach())
         try:
             # Without a core of its own the receiver may run on any.
             core_number = None

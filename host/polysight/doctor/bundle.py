@@ -17,7 +17,7 @@ from dataclasses import asdict
 from importlib.metadata import distributions
 from pathlib import Path
 
-from polysight.doctor.context import DoctorOptions, finding_facts, read_interface
+from polysight.doctor.context import DoctorOptions, finding_to_json, read_interface
 from polysight.store import MANIFEST, utc_now, versions
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError, DeviceError
@@ -122,10 +122,10 @@ def _collect_contents(
     options: DoctorOptions, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield name and text of every file."""
-    about = {"utc": utc_now(), "lines": _LINES, "scans": _SCANS, "kilobytes": _TAIL_BYTES >> 10, "traces": _TRACES}
-    yield "README.txt", README.format(hidden=HIDDEN, **about)
+    limits = {"utc": utc_now(), "lines": _LINES, "scans": _SCANS, "kilobytes": _TAIL_BYTES >> 10, "traces": _TRACES}
+    yield "README.txt", README.format(hidden=HIDDEN, **limits)
     yield "findings.txt", text
-    yield "findings.json", json.dumps([finding_facts(f) for f in findings], indent=1)
+    yield "findings.json", json.dumps([finding_to_json(f) for f in findings], indent=1)
     yield "versions.json", json.dumps(_list_versions(), indent=1)
     yield "kernel.txt", _describe_kernel(root)
     yield "network.json", json.dumps(_describe_network(root), indent=1)
@@ -139,26 +139,26 @@ def _collect_contents(
         with suppress(OSError, DataError):
             lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()
             yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_LINES:]) + "\n"
-    places = [options.config.parent, options.config.parent / "logs", options.out, options.out / "logs"]
-    yield from _collect_files("logs", _find_newest(places, "*.log", _LOGS), _TAIL_BYTES)
+    log_folders = [options.config.parent, options.config.parent / "logs", options.out, options.out / "logs"]
+    yield from _collect_files("logs", _find_newest(log_folders, "*.log", _LOGS), _TAIL_BYTES)
     if rig is not None and rig.radar.trace_dir:
         yield from _collect_files("traces", _find_newest([Path(rig.radar.trace_dir)], "*", _TRACES), _TRACE_BYTES)
 
 
-def _collect_files(folder: str, paths: Sequence[Path], most: int) -> Iterator[tuple[str, str]]:
-    """Yield name in `folder` and the last `most` bytes of each file, numbered so that equal names do not collide."""
+def _collect_files(folder: str, paths: Sequence[Path], max_bytes: int) -> Iterator[tuple[str, str]]:
+    """Yield name in `folder` and the end of each file. Names are numbered, so that equal ones do not collide."""
     for number, path in enumerate(paths):
-        if (text := _read_tail(path, most)) is not None:
+        if (text := _read_tail(path, max_bytes)) is not None:
             yield f"{folder}/{number}-{path.name}", text
 
 
-def _read_tail(path: Path, most: int) -> str | None:
-    """Return at most the last `most` bytes of a file as text; None if it cannot be read."""
+def _read_tail(path: Path, max_bytes: int) -> str | None:
+    """Return at most the last `max_bytes` bytes of a file as text; None if it cannot be read."""
     try:
         with path.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(0, size - most))
-            return file.read(most).decode("utf-8", "replace")
+            file.seek(max(0, size - max_bytes))
+            return file.read(max_bytes).decode("utf-8", "replace")
     except OSError:
         return None
 

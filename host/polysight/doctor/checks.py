@@ -12,7 +12,7 @@ import msgspec
 
 from polysight.doctor import rig_checks
 from polysight.doctor.bundle import write_bundle
-from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_facts, not_checked, verdict
+from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_to_json, not_checked, verdict
 from polysight_shared.config import Board
 from polysight_shared.errors import PolysightError, no_such, os_error
 from polysight_shared.findings import Finding
@@ -42,25 +42,25 @@ class Check:
 CHECKS = (
     Check("config", rig_checks.check_config),
     Check("host clock", rig_checks.check_host_clock),
-    Check("keys", rig_checks.check_keys, ("config",)),
-    Check("pi", rig_checks.check_pi, ("keys",)),
-    Check("pi clock", rig_checks.check_pi_clock, ("pi",)),
-    Check("rig is free", rig_checks.check_free, ("pi",)),
-    Check("calibration", rig_checks.check_calibration, ("config",)),
-    Check("library", rig_checks.check_library, ("config",)),
-    Check("stage", rig_checks.check_stage, ("pi",)),
-    Check("card", rig_checks.check_card, ("config",), ("rig is free",), each_board=True),
-    Check("network", rig_checks.check_network, ("config",), each_board=True),
-    Check("buffer", rig_checks.check_buffer, ("card",), each_board=True),
-    Check("receivers", rig_checks.check_receivers, ("config",), ("rig is free",)),
-    Check("disk", rig_checks.check_disk, ("config",), ("rig is free",)),
-    Check("scan time", rig_checks.check_time, ("config",)),
-    Check("trigger line", rig_checks.check_trigger, ("rig is free", "stage")),
-    Check("pulses", rig_checks.check_pulses, ("pi", "rig is free")),
-    Check("radar", rig_checks.check_radar, ("buffer", "pulses"), each_board=True),
-    Check("level", rig_checks.check_level, ("radar",), each_board=True),
-    Check("direct path", rig_checks.check_direct_path, ("level",), each_board=True),
-    Check("trigger skew", rig_checks.check_skew, ("direct path",)),
+    Check("keys", rig_checks.check_keys, needs=("config",)),
+    Check("pi", rig_checks.check_pi, needs=("keys",)),
+    Check("pi clock", rig_checks.check_pi_clock, needs=("pi",)),
+    Check("rig is free", rig_checks.check_free, needs=("pi",)),
+    Check("calibration", rig_checks.check_calibration, needs=("config",)),
+    Check("library", rig_checks.check_library, needs=("config",)),
+    Check("stage", rig_checks.check_stage, needs=("pi",)),
+    Check("card", rig_checks.check_card, needs=("config",), unless=("rig is free",), each_board=True),
+    Check("network", rig_checks.check_network, needs=("config",), each_board=True),
+    Check("buffer", rig_checks.check_buffer, needs=("card",), each_board=True),
+    Check("receivers", rig_checks.check_receivers, needs=("config",), unless=("rig is free",)),
+    Check("disk", rig_checks.check_disk, needs=("config",), unless=("rig is free",)),
+    Check("scan time", rig_checks.check_time, needs=("config",)),
+    Check("trigger line", rig_checks.check_trigger, needs=("rig is free", "stage")),
+    Check("pulses", rig_checks.check_pulses, needs=("pi", "rig is free")),
+    Check("radar", rig_checks.check_radar, needs=("buffer", "pulses"), each_board=True),
+    Check("level", rig_checks.check_level, needs=("radar",), each_board=True),
+    Check("direct path", rig_checks.check_direct_path, needs=("level",), each_board=True),
+    Check("trigger skew", rig_checks.check_skew, needs=("direct path",)),
 )
 
 
@@ -145,7 +145,7 @@ def run_doctor(
     if simulated:
         summary += f" ({rig_checks.SIMULATED})"
     if as_json:
-        document = {"ok": not failed, "simulated": simulated, "findings": [finding_facts(f) for f in findings]}
+        document = {"ok": not failed, "simulated": simulated, "findings": [finding_to_json(f) for f in findings]}
         sys.stdout.write(json.dumps(document, indent=1) + "\n")
     else:
         sys.stdout.write(f"{summary}\n")

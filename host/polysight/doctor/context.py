@@ -259,7 +259,7 @@ def verdict(finding: Finding) -> str:
     return finding.level
 
 
-def finding_facts(finding: Finding) -> dict[str, Any]:
+def finding_to_json(finding: Finding) -> dict[str, Any]:
     """Return a finding as `doctor --json` prints it."""
     return {
         "verdict": verdict(finding),

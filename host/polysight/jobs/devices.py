@@ -23,7 +23,7 @@ from polysight.radar import (
     Image,
     RadarBoard,
     ReplayedWords,
-    Row,
+    StepResult,
     SystemClock,
     WordLink,
     check_board,
@@ -291,9 +291,9 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
 
 def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], WordLink], as_json: bool) -> int:
     """Check a board on the link that `open_words` opens; print each step as it ends, or all of them as JSON."""
-    rows: list[Row] = []
+    rows: list[StepResult] = []
 
-    def tell(row: Row) -> None:
+    def print_result(row: StepResult) -> None:
         rows.append(row)
         if not as_json:
             sys.stdout.write(_format_step(name, row))
@@ -301,25 +301,34 @@ def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[]
 
     firmware = read_firmware(rig)
     transmits = rig.transmitter.name == name
-    board = check_board(open_words, lambda w: radar_board(rig, name, w, clock, firmware), transmits, tell)
+    board = check_board(open_words, lambda w: radar_board(rig, name, w, clock, firmware), transmits, print_result)
     report = {}
     if board:
         report = board.report()
         board.close()
     if as_json:
-        steps = [row._asdict() for row in rows]
+        steps = [
+            {
+                "step": row.step,
+                "holds": row.passed,
+                "expected": row.expected,
+                "came": row.outcome,
+                "do": row.remedy,
+            }
+            for row in rows
+        ]
         print_json({"board": name, "steps": steps, "report": report})
     else:
         for line in report.get("warnings", []):
             sys.stdout.write(f"      note: {line}\n")
-    return exit_status(all(row.holds for row in rows))
+    return exit_status(all(row.passed for row in rows))
 
 
-def _format_step(name: str, row: Row) -> str:
+def _format_step(name: str, row: StepResult) -> str:
     """Return a step of a board's check as a line; a failed one with what was expected and what to do."""
-    lines = [f"{name}  {row.step:12} {_WORDS[row.holds]:6}  {row.came}"]
-    if not row.holds:
-        lines += [f"      expected: {row.expected}", f"      do: {row.do}"]
+    lines = [f"{name}  {row.step:12} {_WORDS[row.passed]:6}  {row.outcome}"]
+    if not row.passed:
+        lines += [f"      expected: {row.expected}", f"      do: {row.remedy}"]
     return "\n".join(lines) + "\n"
 
 

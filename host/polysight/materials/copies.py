@@ -68,8 +68,8 @@ def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pix
     ]
     if len(visible_patches) < len(copies.labels):
         return False
-    again = _find_copies_in_channel(patches, other, pixel_mm)
-    return again is None or not set(copies.labels) & set(again.labels)
+    copy_in_other = _find_copies_in_channel(patches, other, pixel_mm)
+    return copy_in_other is None or not set(copies.labels) & set(copy_in_other.labels)
 
 
 def _find_copies_in_channel(patches: Sequence[Patch], amplitude: np.ndarray, pixel_mm: float) -> Copies | None:

@@ -569,17 +569,17 @@ def _anneal(
     return z, log_evidence
 
 
-def _choose_step(gain: Real, most: float) -> float:
-    """Return the largest step of the temperature, up to `most`, that leaves half of the particles effective."""
+def _choose_step(gain: Real, largest_step: float) -> float:
+    """Return the largest step of the temperature, up to `largest_step`, that leaves half of the particles effective."""
 
     def effective_share(step: float) -> float:
         weight = np.exp(step * (gain - gain.max()))
         return float(weight.sum() ** 2 / np.sum(weight**2)) / gain.size
 
-    if effective_share(most) >= 0.5:
-        return most
+    if effective_share(largest_step) >= 0.5:
+        return largest_step
     low = 0.0
-    high = most
+    high = largest_step
     for _ in range(30):
         middle = (low + high) / 2
         if effective_share(middle) >= 0.5:

@@ -480,15 +480,15 @@ def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
 
     The rest are patches of no kind of the library. `sheets` is the share of thin plates in it.
     """
-    ours = np.array([kind.source == "library" for kind in kinds])
-    metal = np.array([kind.permittivity is None for kind in kinds]) & ~ours
-    literature = ~ours & ~metal
+    in_library = np.array([kind.source == "library" for kind in kinds])
+    metal = np.array([kind.permittivity is None for kind in kinds]) & ~in_library
+    literature = ~in_library & ~metal
     share_literature = LITERATURE_SHARE if literature.any() else 0.0
     out = np.zeros(len(kinds))
-    for mask, share in ((ours, 1.0), (metal, METAL_SHARE), (literature, share_literature)):
+    for mask, share in ((in_library, 1.0), (metal, METAL_SHARE), (literature, share_literature)):
         if mask.any():
             out[mask] = share / mask.sum()
-    out[~ours] *= 1 - sheets
+    out[~in_library] *= 1 - sheets
     return out, (1 - METAL_SHARE - share_literature) * (1 - sheets)
 
 

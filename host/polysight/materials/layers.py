@@ -546,8 +546,8 @@ class _Model:
         # known one index and loss, the index in steps that the phase needs.
         axes = [np.geomspace(low, high, INDEX_STEPS), np.array(LOSS_TANGENTS)]
         if self.fits_thickness:
-            most = 2 * self.wavenumber * self.range_mm[1] * high
-            axes.append(np.linspace(0.0, most, int(most / START_PHASE_RAD) + 2)[1:])
+            max_phase_rad = 2 * self.wavenumber * self.range_mm[1] * high
+            axes.append(np.linspace(0.0, max_phase_rad, int(max_phase_rad / START_PHASE_RAD) + 2)[1:])
         else:
             steps = max(INDEX_STEPS, int(2 * self.wavenumber * known_mm * (high - low) / START_PHASE_RAD))
             axes[0] = np.linspace(low, high, steps)

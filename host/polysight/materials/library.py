@@ -464,13 +464,13 @@ class Samples:
         Raises DataError if no material was seen under both angles.
         """
         rng = np.random.default_rng(0)
-        ours = np.unique(self.groups)
-        theirs = np.unique(other.groups)
-        common = np.intersect1d(ours, theirs)
+        own_groups = np.unique(self.groups)
+        other_groups = np.unique(other.groups)
+        common = np.intersect1d(own_groups, other_groups)
         if common.size:
             pairs = zip(common, common, strict=True)
         else:
-            pairs = zip(ours, theirs, strict=False)
+            pairs = zip(own_groups, other_groups, strict=False)
         our_rows = []
         their_rows = []
         groups = []

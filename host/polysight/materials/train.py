@@ -296,10 +296,10 @@ def read_material(path: Path) -> Entry:
     Raises DataError as :func:`read_pickle`, or if keys are missing or arrays are invalid.
     """
     raw = read_pickle(path)
-    most = path.stat().st_size
+    file_bytes = path.stat().st_size
     try:
-        p, h, v = (_read_pixels(x, most) for x in raw["values"])
-        ref_p, ref_h, ref_v = (_read_pixels(x, most) for x in raw["ref_values"])
+        p, h, v = (_read_pixels(x, file_bytes) for x in raw["values"])
+        ref_p, ref_h, ref_v = (_read_pixels(x, file_bytes) for x in raw["ref_values"])
         name = str(raw["name"])
         angle = float(raw["incident_angle"])
         scan = str(raw["collection_name"])
@@ -349,16 +349,16 @@ def read_materials(folder: Path) -> Library:
     return Library(tuple(read_material(f) for f in files), {}, f"{len(files)} material files of {folder.name}")
 
 
-def _read_pixels(values: Any, most: int) -> npt.NDArray[np.complex128]:
-    """Return the numbers of a file of `most` bytes. Raises ValueError: nested references can expand to any size."""
+def _read_pixels(values: Any, file_bytes: int) -> npt.NDArray[np.complex128]:
+    """Return the numbers of a file of that size. Raises ValueError if nested references expand to more."""
     is_plain = isinstance(values, list | tuple) and all(isinstance(v, int | float | complex) for v in values)
     if isinstance(values, np.ndarray):
         size = values.nbytes
     elif is_plain:
         size = len(values)
     else:
-        size = most + 1
-    if size > most:
+        size = file_bytes + 1
+    if size > file_bytes:
         raise ValueError("pixels are not an array or list of numbers, or of more numbers than the file has bytes")
     return np.asarray(values, np.complex128).ravel()
 

@@ -207,11 +207,11 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
         return
     for period in {rig.burst.period_us, min(rig.burst.period_us, shortest_period_us(rig))}:
         for speed in _list_speeds(rig, minutes):
-            # Two pulses stand in: the most that fit do not depend on their number.
+            # The plan has two pulses for now: the largest number that fits does not depend on it.
             plan = _set_burst(rig, speed, 2, period)
-            most = _find_max_pulses(plan)
-            with_short_last_packet = (n for n in range(most, 1, -1) if not fills_whole_packets(plan, n))
-            pulses = next(with_short_last_packet, most)
+            max_pulses = _find_max_pulses(plan)
+            with_short_last_packet = (n for n in range(max_pulses, 1, -1) if not fills_whole_packets(plan, n))
+            pulses = next(with_short_last_packet, max_pulses)
             # A faster stage leaves time for still fewer pulses.
             if pulses < 2:
                 break

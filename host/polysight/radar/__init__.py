@@ -19,6 +19,6 @@ from polysight.radar.control import (
     radar_control,
     read_firmware,
 )
-from polysight.radar.diagnosis import ReplayedWords, Row, check_board, trace_words
+from polysight.radar.diagnosis import ReplayedWords, StepResult, check_board, trace_words
 from polysight.radar.firmware import Image, read_image
 from polysight.radar.usb import Clock, SystemClock, WordLink

@@ -37,24 +37,24 @@ JUMPERS = """\
 VOLTAGE_MONITOR_BIT = 57
 
 
-class Row(NamedTuple):
+class StepResult(NamedTuple):
     """Printed result of one step.
 
-    `holds`: True if the step passed; `came`: its outcome, or the error; `do`: the remedy, empty after a success.
+    `passed`: True if the step succeeded; `outcome`: its result, or the error; `remedy`: empty after a success.
     """
 
     step: str
-    holds: bool
+    passed: bool
     expected: str
-    came: str
-    do: str = ""
+    outcome: str
+    remedy: str = ""
 
 
 def check_board(
     open_words: Callable[[], WordLink],
     make_board: Callable[[WordLink], RadarBoard],
     transmits: bool,
-    on_row: Callable[[Row], None],
+    on_result: Callable[[StepResult], None],
 ) -> RadarBoard | None:
     """Bring up a board from USB to one frame; stop at the first step that fails.
 
@@ -66,7 +66,7 @@ def check_board(
         Open the USB chip that leads to the board, and create the board with that link.
     transmits
         True if the board transmits.
-    on_row
+    on_result
         Called with the result of each step.
 
     Returns
@@ -78,17 +78,17 @@ def check_board(
     try:
         words = open_words()
     except PolysightError as error:
-        on_row(Row("USB", False, opening, error.what, f"{error.why}; {error.remedy}"))
+        on_result(StepResult("USB", False, opening, error.what, f"{error.why}; {error.remedy}"))
         return None
-    on_row(Row("USB", True, opening, "opened"))
+    on_result(StepResult("USB", True, opening, "opened"))
     board = make_board(words)
     done: list[Step] = []
 
     def on_step(step: Step, outcome: str) -> None:
         done.append(step)
-        on_row(Row(step.name, True, step.expected, outcome))
+        on_result(StepResult(step.name, True, step.expected, outcome))
         if step.name == "reset":
-            on_row(_judge_supplies(board))
+            on_result(_judge_supplies(board))
 
     try:
         board.configure(on_step)
@@ -96,52 +96,56 @@ def check_board(
         failed_step = None
         if len(done) < len(board.steps):
             failed_step = board.steps[len(done)]
-        on_row(_describe_failure(failed_step, error))
+        on_result(_describe_failure(failed_step, error))
         return board
-    _check_frame(board, transmits, on_row)
+    _check_frame(board, transmits, on_result)
     return board
 
 
-def _check_frame(board: RadarBoard, transmits: bool, on_row: Callable[[Row], None]) -> None:
+def _check_frame(board: RadarBoard, transmits: bool, on_result: Callable[[StepResult], None]) -> None:
     """Run one frame of a configured board, then read back its settings; report both."""
     expected = "frame end, 1 frame"
     if transmits:
         expected += " (this board transmits)"
     try:
-        on_row(Row("one frame", True, expected, board.run_one_frame()))
+        on_result(StepResult("one frame", True, expected, board.run_one_frame()))
     except PolysightError as error:
-        on_row(Row("one frame", False, expected, error.what, f"{error.why}; {error.remedy}"))
+        on_result(StepResult("one frame", False, expected, error.what, f"{error.why}; {error.remedy}"))
         return
     expected = "profile, chirp and frame as sent"
     try:
         differences = board.read_back()
         if differences:
             remedy = "compare the fields with docs/spec/mmwavelink.md; a reserved field that differs is harmless"
-            on_row(Row("read back", False, expected, "; ".join(differences), remedy))
+            on_result(StepResult("read back", False, expected, "; ".join(differences), remedy))
         else:
-            on_row(Row("read back", True, expected, "as sent"))
+            on_result(StepResult("read back", True, expected, "as sent"))
     except PolysightError as error:
-        on_row(Row("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
+        on_result(StepResult("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
 
 
-def _describe_failure(step: Step | None, error: PolysightError) -> Row:
+def _describe_failure(step: Step | None, error: PolysightError) -> StepResult:
     """Return the result of the step that failed; None: all steps had passed when the error came."""
     if step is None:
-        return Row("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
+        return StepResult("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
     picture = ""
     if step.name == "reset":
         picture = f"\n{JUMPERS}"
-    return Row(step.name, False, step.expected, error.what, f"{error.why}; {error.remedy or step.remedy}{picture}")
+    return StepResult(
+        step.name, False, step.expected, error.what, f"{error.why}; {error.remedy or step.remedy}{picture}"
+    )
 
 
-def _judge_supplies(board: RadarBoard) -> Row:
+def _judge_supplies(board: RadarBoard) -> StepResult:
     """Judge the supplies by the main core's power-up and the report of its voltage monitor."""
     boot_errors = (board.facts.boot or {}).get("boot_errors", 0)
     expected = "the core runs, no error of the voltage monitor"
     if isinstance(boot_errors, int) and boot_errors >> VOLTAGE_MONITOR_BIT & 1:
         remedy = "measure the RF supplies (1.3 V or 1.0 V), 1.8 V and 3.3 V"
-        return Row("power rails", False, expected, "the main core runs; its voltage monitor reports an error", remedy)
-    return Row("power rails", True, expected, "the main core runs; no error reported")
+        return StepResult(
+            "power rails", False, expected, "the main core runs; its voltage monitor reports an error", remedy
+        )
+    return StepResult("power rails", True, expected, "the main core runs; no error reported")
 
 
 # Version of the file format of traces.
@@ -151,7 +155,7 @@ INTERRUPT = "HOST_INTR"
 RESET = "NRST"
 # Largest file that is read as a trace, bytes (chosen).
 MAX_BYTES = 2**26
-# Latest time in a trace, about four months: a later one is no time of a run.
+# Latest time in a trace, about four months: a line with a later one is damaged.
 _MAX_S = 1e7
 
 
@@ -182,14 +186,14 @@ class TracedWords:
         # The interrupt's level in the log; None before the first query.
         self._level: bool | None = None
         # Queries of the interrupt since the last line, all with the same level.
-        self._looks = 0
+        self._queries = 0
         self.file = file
         self.ended = ""
         self._write({"trace": TRACE_VERSION, **facts})
 
     def write(self, words: Sequence[int]) -> None:
         """Shift words out. Raises DeviceError."""
-        self._put(out=_format_hex(words))
+        self._log_action(out=_format_hex(words))
         with self._log_errors():
             self._words.write(words)
 
@@ -197,7 +201,7 @@ class TracedWords:
         """Shift words in. Raises DeviceError."""
         with self._log_errors():
             words = self._words.read(count)
-        self._put(**{"in": _format_hex(words)})
+        self._log_action(**{"in": _format_hex(words)})
         return words
 
     def interrupt(self) -> bool:
@@ -205,15 +209,15 @@ class TracedWords:
         with self._log_errors():
             level = self._words.interrupt()
         if level is self._level:
-            self._looks += 1
+            self._queries += 1
         else:
             self._level = level
-            self._put(line=INTERRUPT, level=int(level), looks=self._looks)
+            self._log_action(line=INTERRUPT, level=int(level), looks=self._queries)
         return level
 
     def reset(self, held: bool) -> None:
         """Set the reset line. Raises DeviceError."""
-        self._put(line=RESET, level=int(not held))
+        self._log_action(line=RESET, level=int(not held))
         with self._log_errors():
             self._words.reset(held)
 
@@ -230,13 +234,13 @@ class TracedWords:
         try:
             yield
         except DeviceError as e:
-            self._put(error=e.what)
+            self._log_action(error=e.what)
             raise
 
-    def _put(self, **what: object) -> None:
+    def _log_action(self, **action: object) -> None:
         """Log one action with its time."""
-        self._looks = 0
-        self._write({"t": round(self._clock.now() - self._began, 6), **what})
+        self._queries = 0
+        self._write({"t": round(self._clock.now() - self._began, 6), **action})
 
     def _write(self, line: dict[str, object]) -> None:
         """Write a line, unless the log has ended."""
@@ -255,11 +259,11 @@ def trace_words(words: WordLink, clock: Clock, file: Path, rig: Instrument, boar
     Its first line has the board, its USB chip as the rig file gives it (serial number or path), the rig's name, the
     version of this program and the Unix time.
     """
-    place = rig.radar.native[board].place
+    usb_chip = rig.radar.native[board].place
     now = round(time.time(), 3)
     facts: dict[str, object] = {
         "board": board,
-        "place": place,
+        "place": usb_chip,
         "rig": rig.name,
         "polysight": __version__,
         "unix_s": now,
@@ -312,11 +316,11 @@ class ReplayedWords:
     def __init__(self, file: Path) -> None:
         self.facts, self._lines = read_trace(file)
         # Index of the next line of the trace.
-        self._at = 0
+        self._next_line = 0
         self._time = 0.0
         self._level = False
         # Queries of the interrupt since the last replayed line.
-        self._looks = 0
+        self._queries = 0
 
     def now(self) -> float:
         """Return the trace's time, seconds; each query advances it by 1 us, so that a loop with a deadline ends."""
@@ -330,30 +334,32 @@ class ReplayedWords:
     @property
     def done(self) -> bool:
         """True if the whole trace was replayed."""
-        return self._at >= len(self._lines)
+        return self._next_line >= len(self._lines)
 
     def write(self, words: Sequence[int]) -> None:
         """Compare the words with those of the trace. Raises DeviceError."""
         written = _format_hex(words)
-        self._take(f"out {written}", lambda line: line.out == written)
+        self._replay_action(f"out {written}", lambda line: line.out == written)
 
     def read(self, count: int) -> list[int]:
         """Return the board's words in the trace. Raises DeviceError."""
         # Each word is four digits.
-        line = self._take(f"reads {count} words", lambda line: line.read is not None and len(line.read) == 4 * count)
+        line = self._replay_action(
+            f"reads {count} words", lambda line: line.read is not None and len(line.read) == 4 * count
+        )
         words = line.read or ""
         return list(struct.unpack(f"<{count}H", bytes.fromhex(words)))
 
     def interrupt(self) -> bool:
         """Return the level at this query or, if the trace does not count them, at this time. Raises DeviceError."""
-        self._looks += 1
+        self._queries += 1
         while self._is_interrupt():
-            line = self._lines[self._at]
+            line = self._lines[self._next_line]
             if line.looks is None:
-                later = line.t > self.now()
+                is_later = line.t > self.now()
             else:
-                later = line.looks >= self._looks
-            if later:
+                is_later = line.looks >= self._queries
+            if is_later:
                 break
             self._play_level()
             # A counted change is what this query saw; changes by time may be several since the query before.
@@ -365,34 +371,34 @@ class ReplayedWords:
     def reset(self, held: bool) -> None:
         """Compare the reset with that of the trace. Raises DeviceError."""
         level = int(not held)
-        self._take(f"level {level}", lambda line: line.level == level)
+        self._replay_action(f"level {level}", lambda line: line.level == level)
 
     def close(self) -> None:
         """Do nothing."""
 
     def _is_interrupt(self) -> bool:
-        return not self.done and self._lines[self._at].line == INTERRUPT
+        return not self.done and self._lines[self._next_line].line == INTERRUPT
 
     def _play_level(self) -> None:
         """Take over the interrupt's level of the next line."""
-        self._level = bool(self._lines[self._at].level)
-        self._step()
+        self._level = bool(self._lines[self._next_line].level)
+        self._advance()
 
-    def _step(self) -> TraceLine:
+    def _advance(self) -> TraceLine:
         """Return the next line, and move to the one after it; the clock advances to its time."""
-        line = self._lines[self._at]
+        line = self._lines[self._next_line]
         self._time = max(self._time, line.t)
-        self._at += 1
-        self._looks = 0
+        self._next_line += 1
+        self._queries = 0
         return line
 
     def _raise_error(self) -> None:
         """Raise the error that the next line has, if it has one."""
-        if not self.done and self._lines[self._at].error is not None:
-            line = self._step()
+        if not self.done and self._lines[self._next_line].error is not None:
+            line = self._advance()
             raise DeviceError(line.error or "", "as in the trace", "see the error of the traced run")
 
-    def _take(self, action: str, agrees: Callable[[TraceLine], bool]) -> TraceLine:
+    def _replay_action(self, action: str, agrees: Callable[[TraceLine], bool]) -> TraceLine:
         """Replay up to the next line that is no change of the interrupt, and return it.
 
         Raises DeviceError if `agrees` is False for that line, or the trace ends before it, and errors of the trace.
@@ -402,18 +408,18 @@ class ReplayedWords:
         self._raise_error()
         if self.done:
             raise DeviceError("the trace ends here", "the traced run ended or was killed", "")
-        if not agrees(self._lines[self._at]):
+        if not agrees(self._lines[self._next_line]):
             raise self._difference_error(action)
-        line = self._step()
+        line = self._advance()
         self._raise_error()
         return line
 
     def _difference_error(self, action: str) -> DeviceError:
         """Return the error for an action that the trace's next line does not have."""
-        recorded = msgspec.json.encode(self._lines[self._at]).decode()
+        recorded = msgspec.json.encode(self._lines[self._next_line]).decode()
         return DeviceError(
             # Lines count from 1, and the first has the facts.
-            f"line {self._at + 2} of the trace: the host does {action}, the trace has {recorded}",
+            f"line {self._next_line + 2} of the trace: the host does {action}, the trace has {recorded}",
             "another version of this program, another rig file or board, or another trace",
             "replay it with the rig file and the version of the traced run",
         )
@@ -468,5 +474,5 @@ def _invalid_error(file: Path, what: str) -> ConfigError:
 
 
 def _format_hex(words: Sequence[int]) -> str:
-    """Return words as the digits of `Words`."""
+    """Return 16-bit words as hexadecimal digits, as the type `Words` describes."""
     return struct.pack(f"<{len(words)}H", *words).hex()

@@ -285,13 +285,13 @@ def _reference_cube(
     # sign: it is searched for in the band of complex 2x.
     near_zero = bool(abs(np.median(centre)) < 0.4)
     if near_zero:
-        done = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x"))
+        estimate = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x"))
     else:
-        done = reference(aligned, path, chirp)
+        estimate = reference(aligned, path, chirp)
     # `reference` found how the IF drifts along a chirp: a phase that grows with the square of time, removed here too.
     time = np.arange(samples) - middle
-    steering = path.steering * np.exp(-0.5j * done.drift * time**2)
-    residual_cycles = (done.frequency - centre + 0.5) % 1.0 - 0.5
-    turn = phasor(-residual_cycles, -np.angle(done.amplitude), samples, middle) * done.found[:, None]
+    steering = path.steering * np.exp(-0.5j * estimate.drift * time**2)
+    residual_cycles = (estimate.frequency - centre + 0.5) % 1.0 - 0.5
+    turn = phasor(-residual_cycles, -np.angle(estimate.amplitude), samples, middle) * estimate.found[:, None]
     referenced = (mixed * steering[:, None] * turn).astype(np.complex64)
-    return referenced, done.found, done.frequency * chirp.sample_rate_hz, np.abs(done.amplitude)
+    return referenced, estimate.found, estimate.frequency * chirp.sample_rate_hz, np.abs(estimate.amplitude)

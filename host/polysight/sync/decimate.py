@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from polysight_shared.config import Chirp
 
 FOLD = 4
-"""Samples of a block."""
+"""Samples of a block, which become one decimated sample."""
 TAPS = 10
 """Samples that `fold` weights for a block: three before it, its own, three after it."""
 FLAT = 9
@@ -35,18 +35,18 @@ SEARCH_FFT = 256
 _BESIDE = (TAPS - FOLD) // 2
 _EDGE = FLAT // 2
 # Half the passband, cycles per sample: 13 range bins of 192 samples, 1.1 m of path with the published chirp.
-_PASS = 13 / 192
+_PASSBAND = 13 / 192
 # Within this distance of the middle, where the scene is, the filters are ten or twenty times as exact.
-_SCENE = 6 / 192
+_SCENE_BAND = 6 / 192
 
 # Weight of small taps for the first block, in the least squares fit (chosen): less noise there for a worse fit.
-_SMALL = 0.08
+_TAP_WEIGHT = 0.08
 
 
 def whole_blocks(linear: tuple[int, int]) -> tuple[int, int]:
     """Return the linear samples that fill whole blocks of `FOLD`; estimates count time from their middle."""
-    a, b = linear
-    return a, b - (b - a) % FOLD
+    first, end = linear
+    return first, end - (end - first) % FOLD
 
 
 class Decimator(NamedTuple):
@@ -74,41 +74,41 @@ def decimator() -> Decimator:
     inner = _design_low_pass()
     first = np.zeros(TAPS)
     first[_BESIDE:-_BESIDE] = 1 / FOLD
-    cycles = np.linspace(-_PASS, _PASS, 121)
-    weight = np.where(np.abs(cycles) < _SCENE, 10.0, 1.0)
-    # `turns @ taps` is the response of `fold`, [cycle].
-    turns = np.exp(2j * np.pi * np.outer(cycles, np.arange(TAPS) - (TAPS - 1) / 2))
+    cycles = np.linspace(-_PASSBAND, _PASSBAND, 121)
+    weight = np.where(np.abs(cycles) < _SCENE_BAND, 10.0, 1.0)
+    # `phasors @ taps` is the response of `fold` [cycle]: its sum over the samples at each frequency.
+    phasors = np.exp(2j * np.pi * np.outer(cycles, np.arange(TAPS) - (TAPS - 1) / 2))
     # `flatten` of each of the first blocks, and of an inner one: taps over `FLAT` blocks whose response, together with
     # that of `fold`, is 1 in the passband.
     flat = []
     for block in range(_EDGE + 1):
         lags = FOLD * (np.arange(FLAT) - block)
-        passed = np.exp(2j * np.pi * np.outer(cycles, lags)) * (turns @ inner)[:, None]
+        passed = np.exp(2j * np.pi * np.outer(cycles, lags)) * (phasors @ inner)[:, None]
         if block < _EDGE:
-            passed[:, 0] *= (turns @ first) / (turns @ inner)
+            passed[:, 0] *= (phasors @ first) / (phasors @ inner)
         model = weight[:, None] * passed
         # Real taps: real and imaginary parts are equations of their own. At the very end, large taps would raise noise.
-        weight_of_taps = _SMALL if block == 0 else 0.0
-        small = weight_of_taps * np.eye(FLAT)
+        tap_weight = _TAP_WEIGHT if block == 0 else 0.0
+        small = tap_weight * np.eye(FLAT)
         equations = np.concatenate([model.real, model.imag, small])
-        goal = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
-        flat.append(np.linalg.lstsq(equations, goal, rcond=None)[0])
+        target_response = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
+        flat.append(np.linalg.lstsq(equations, target_response, rcond=None)[0])
     # Both filters of an inner block as one, over the samples: noise is amplified by the sum of its squares.
     combined_taps = np.zeros(FOLD * (FLAT - 1) + TAPS)
-    for k, part in enumerate(flat[-1]):
-        combined_taps[FOLD * k : FOLD * k + TAPS] += part * inner
+    for block, weight_of_block in enumerate(flat[-1]):
+        combined_taps[FOLD * block : FOLD * block + TAPS] += weight_of_block * inner
     taps = np.stack([first, inner, first]).astype(np.float32)
     return Decimator(taps, np.stack(flat).astype(np.float32), float((combined_taps**2).sum()))
 
 
 def _design_low_pass() -> NDArray[np.float64]:
     """Return symmetric taps of sum 1 with the least response where decimation would move echoes into the passband."""
-    aliases = [np.linspace(0.25 - _PASS, 0.25 + _PASS, 61), np.linspace(0.5 - _PASS, 0.5, 31)]
+    aliases = [np.linspace(0.25 - _PASSBAND, 0.25 + _PASSBAND, 61), np.linspace(0.5 - _PASSBAND, 0.5, 31)]
     cycles = np.concatenate(aliases)
     # Distance from the scene's middle after decimation, which moves 1/4 and 1/2 cycle per sample to 0.
     off_middle = np.minimum(np.abs(cycles - 0.25), np.abs(cycles - 0.5))
     # Outside the scene the response may be twenty times as high.
-    weight = np.where(off_middle < _SCENE, 1.0, 0.05)
+    weight = np.where(off_middle < _SCENE_BAND, 1.0, 0.05)
     # Response of each pair of equal taps, half a sample, one and a half... before and after the middle.
     pairs = 2 * np.cos(2 * np.pi * np.outer(cycles, np.arange(TAPS // 2) + 0.5))
     # The sum of the taps is 1, so the last tap is what the others leave.
@@ -128,8 +128,8 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
     weights = np.repeat(taps[1][:, None], blocks, axis=1)
     weights[:, 0] = taps[0]
     weights[:, -1] = taps[2]
-    for q in range(TAPS):
-        folded += weights[q] * padded[..., q : q + FOLD * (blocks - 1) + 1 : FOLD]
+    for tap in range(TAPS):
+        folded += weights[tap] * padded[..., tap : tap + FOLD * (blocks - 1) + 1 : FOLD]
     return folded
 
 
@@ -157,7 +157,7 @@ def _make_flat_matrix(blocks: int) -> NDArray[np.float32]:
 def decimation(samples: int, middle: float) -> NDArray[np.complex128]:
     """Return the decimation of samples whose band has its middle at `middle`, cycles per sample: [block, sample].
 
-    The blocks are turned back, so that an echo keeps its frequency.
+    The phase of the mixing is restored in the blocks, so that an echo keeps its frequency.
     """
     time = np.arange(samples) - (samples - 1) / 2
     # Row k is a chirp whose sample k alone is 1, mixed down.
@@ -173,8 +173,8 @@ def sample_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
 
 def block_frequencies_hz(chirp: Chirp) -> NDArray[np.float64]:
     """Return the transmit frequency in the middle of every block of linear samples, Hz [block]."""
-    a, b = whole_blocks(chirp.linear_samples)
-    return sample_frequencies_hz(chirp)[a:b].reshape(-1, FOLD).mean(axis=1)
+    first, end = whole_blocks(chirp.linear_samples)
+    return sample_frequencies_hz(chirp)[first:end].reshape(-1, FOLD).mean(axis=1)
 
 
 def search_window(blocks: int) -> NDArray[np.float32]:

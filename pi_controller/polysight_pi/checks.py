@@ -34,7 +34,7 @@ from polysight_shared.sockets import is_loopback, make_server_context, publisher
 JOURNAL_BYTES = 100 << 20
 # Number of SPI transfers that are timed; chosen, the shortest counts.
 TRANSFERS = 5
-# Longest duration of a bit relative to the nominal one, as `MIN_PART` is the shortest: the system call adds some 100 us
+# Longest duration of a bit relative to the nominal one (`MIN_PART` is the shortest): the system call adds about 100 us
 # to a transfer of 22 ms.
 MAX_PART = 1.05
 # Number of pulses whose two system calls (set the line, clear it) are timed; chosen.
@@ -47,18 +47,18 @@ MODEL = Path("/proc/device-tree/model")
 MODULES = Path("/sys/module")
 # Remedy for a kernel that does not release outputs.
 STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
-# Words of the command's output, by level.
+# Verdict in the command's output for each level of a finding.
 VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}
 
 
 def to_json(finding: Finding) -> dict[str, Any]:
-    """Return a finding in the form that `check --json` prints."""
+    """Return a finding as the object that `check --json` prints."""
     text = finding.what + (f" ({finding.why})" if finding.why else "")
     return {"name": finding.where, "verdict": VERDICTS[finding.level], "found": text, "remedy": finding.do}
 
 
 def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
-    """Run `check(*args)`. Text that it returns becomes a finding of level `ok`, an error that it raises one of `error`.
+    """Run `check(*args)`. A text it returns becomes a finding of level `ok`, an error it raises one of level `error`.
 
     `name` is what the finding is about.
     """
@@ -95,8 +95,8 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
 
 def _check_plan(instrument: Instrument) -> str:
     check_burst_fits(instrument.grid, instrument.burst, instrument.stage)
-    b = instrument.burst
-    return f"burst of {b.pulses} x {b.period_us:g} us ends before the next point"
+    burst = instrument.burst
+    return f"burst of {burst.pulses} x {burst.period_us:g} us ends before the next point"
 
 
 def _check_wires(instrument: Instrument, wires: Path) -> str:
@@ -109,13 +109,13 @@ def _check_real_time() -> Finding:
     # Process and thread may be refused the same right: it is named once.
     refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
-        do = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
-        return Finding("warning", "; ".join(refused), do=do, where="real time")
+        remedy = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
+        return Finding("warning", "; ".join(refused), do=remedy, where="real time")
     return Finding("ok", "SCHED_FIFO and locked memory are permitted", where="real time")
 
 
 def _check_stage(instrument: Instrument) -> str:
-    """Greet the stage and ask where it is; the port's opening may reset it."""
+    """Connect to the stage and read its position. Opening the port may reset it."""
     with BenchStage(instrument.stage) as stage:
         x_mm, y_mm = stage.position()
         return f"{instrument.stage.port} answers, firmware {stage.firmware or '?'}, at {x_mm:.2f}, {y_mm:.2f} mm"
@@ -140,16 +140,16 @@ def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
         raise DeviceError(f"{secret} is missing", "keys were not made yet", "polysight-pi keys")
     if secret.stat().st_mode & 0o077:
         summary = f"{secret} can be read by others than its owner"
-        do = f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`"
-        return Finding("warning", summary, do=do, where="keys")
+        remedy = f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`"
+        return Finding("warning", summary, do=remedy, where="keys")
     return f"{secret}"
 
 
-def _check_address(make: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
-    """Check that a socket of the service can be bound; `make` creates it."""
+def _check_address(make_socket: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:
+    """Check that a socket of the service can be bound; `make_socket` creates it."""
     context = make_server_context()
     try:
-        make(context, address, key_dir).close()
+        make_socket(context, address, key_dir).close()
     finally:
         context.destroy(linger=0)
     if is_loopback(address):
@@ -190,8 +190,8 @@ def _check_chip(pi: Pi) -> str:
     """Return path and label of the GPIO chip. Raises DeviceError if it cannot be opened."""
     path = find_chip(pi.gpio_chip)
     try:
-        with load_gpiod().Chip(path) as c:
-            return f"{path} is {c.get_info().label!r}"
+        with load_gpiod().Chip(path) as chip:
+            return f"{path} is {chip.get_info().label!r}"
     except OSError as e:
         raise DeviceError(f"{path}: {e.strerror}", "no such device, or no right", "set pi.gpio_chip; group gpio") from e
 
@@ -213,7 +213,7 @@ def _check_spi(pi: Pi) -> str:
 
 
 def measure_width(instrument: Instrument) -> str | Finding:
-    """Time the system calls of a pulse; instead of setting SYNC_IN the first clears it, too. Raises DeviceError."""
+    """Time the two system calls of a pulse; both clear SYNC_IN, so that no pulse is sent. Raises DeviceError."""
     lines = GpiodLines(instrument.pi)
     widths_ns: list[int] = []
     try:
@@ -238,8 +238,8 @@ def measure_clock(instrument: Instrument) -> str | Finding:
     summary = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
     if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
         return summary + " (SPI controller, measured now with the line low)"
-    do = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
-    return Finding("error", summary, do=do, where="pulse width")
+    remedy = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
+    return Finding("error", summary, do=remedy, where="pulse width")
 
 
 def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
@@ -249,15 +249,15 @@ def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
     """
     widths_ns = sorted(widths_ns)
     median_us = widths_ns[len(widths_ns) // 2] / 1e3
-    high_ns = widths_ns[-1]
-    summary = f"two system calls take {median_us:.1f} us (median), {high_ns / 1e3:.1f} us (longest)"
+    longest_ns = widths_ns[-1]
+    summary = f"two system calls take {median_us:.1f} us (median), {longest_ns / 1e3:.1f} us (longest)"
     if one_shot:
         return f"{summary}; a one-shot sets the width"
-    if high_ns <= MAX_WIDTH_NS:
+    if longest_ns <= MAX_WIDTH_NS:
         return f"{summary} (measured now with the line low)"
     summary += f": the radar accepts {WIDTH_TEXT}; rows would end with fault 105"
-    do = 'fit a one-shot and set one_shot = true, or wire SYNC_IN to MOSI and set wiring = "spi"'
-    return Finding("error", summary, do=f"{do} (docs/how-to/wiring.md)", where="pulse width")
+    remedy = 'fit a one-shot and set one_shot = true, or wire SYNC_IN to MOSI and set wiring = "spi"'
+    return Finding("error", summary, do=f"{remedy} (docs/how-to/wiring.md)", where="pulse width")
 
 
 def _check_release(modules: Path) -> Finding:
@@ -268,5 +268,5 @@ def _check_release(modules: Path) -> Finding:
         if parameter.exists():
             if parameter.read_text().strip() != "Y":
                 return Finding("ok", "lines become inputs again when their program ends", where="line release")
-            summary = f"{module} keeps outputs as they were: a program killed during a pulse leaves them high"
+            summary = f"{module} keeps the level of outputs: a program killed during a pulse leaves them high"
     return Finding("warning", summary, do=STRICT, where="line release")

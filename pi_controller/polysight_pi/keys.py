@@ -17,16 +17,17 @@ from polysight_shared.errors import ConfigError
 from polysight_shared.sockets import HOST_KEYS
 
 # Names of the two pairs of keys that `make_keys` makes.
-PARTIES = ("pi", "host")
+KEY_PAIRS = ("pi", "host")
 # File with the list of allowed clients.
 ALLOWED = "allowed_clients"
 # Length of a public key of 32 bytes in Z85 (ZeroMQ RFC 32: 5 characters for 4 bytes).
 KEY_CHARACTERS = 40
+# Instruction in messages after keys were made.
 COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"
 
 
 class AllowedKeys:
-    """The clients that may connect, by the list in the key folder; a list that was changed is read again when asked."""
+    """The clients that may connect, by the list in the key folder; a changed list is read again at the next query."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -72,7 +73,7 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
     Only the host is allowed then: keys of other clients leave the list. Returns the files. Raises ConfigError if there
     are keys already, unless `replace`.
     """
-    existing = [p for name in PARTIES if (p := folder / f"{name}.key_secret").exists()]
+    existing = [p for name in KEY_PAIRS if (p := folder / f"{name}.key_secret").exists()]
     if existing and not replace:
         raise ConfigError(
             f"{existing[0]} exists",
@@ -81,7 +82,7 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
             code=ErrorCode.FILE_EXISTS,
         )
     folder.mkdir(parents=True, exist_ok=True)
-    files = [path for name in PARTIES for path in _create(folder, name)]
+    files = [path for name in KEY_PAIRS for path in _create_pair(folder, name)]
     _write_allowed(folder, {_derive_public(folder, "host"): "host"})
     return files
 
@@ -91,14 +92,18 @@ def allow(folder: Path, name: str) -> list[Path]:
 
     Raises ConfigError if the name is taken or not valid.
     """
-    if not name.replace("-", "").replace("_", "").isalnum() or name in PARTIES or name in read_allowed(folder).values():
+    if (
+        not name.replace("-", "").replace("_", "").isalnum()
+        or name in KEY_PAIRS
+        or name in read_allowed(folder).values()
+    ):
         raise ConfigError(
             f"client {name!r} cannot be added",
             "its name is taken, or has characters other than letters, digits, - and _",
             "choose another name, or revoke that client first",
             code=ErrorCode.NAME_TAKEN,
         )
-    files = _create(folder, name)
+    files = _create_pair(folder, name)
     _write_allowed(folder, read_allowed(folder) | {_derive_public(folder, name): name})
     return files
 
@@ -118,8 +123,8 @@ def _derive_public(folder: Path, name: str) -> str:
     return load_certificate(folder / f"{name}.key")[0].decode("ascii")
 
 
-def _create(folder: Path, name: str) -> list[Path]:
-    """Create the public and the secret key file of a party; the secret one is readable by the owner only."""
+def _create_pair(folder: Path, name: str) -> list[Path]:
+    """Create a pair of key files, public and secret; the secret one is readable by the owner only."""
     public, secret = map(Path, create_certificates(folder, name))
     secret.chmod(0o600)
     return [public, secret]

@@ -64,9 +64,9 @@ def compile_once(product: str, sources: Iterable[Path], command: Sequence[str], 
 def _run(command: list[str], product: str, on_failure: tuple[str, str]) -> None:
     """Run the compiler. Raises DeviceError with its messages, and `on_failure` as cause and remedy, if it fails."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        message = done.stderr.strip()
-        failed = done.returncode != 0
+        process = subprocess.run(command, capture_output=True, text=True, check=False)
+        message = process.stderr.strip()
+        failed = process.returncode != 0
     except OSError as e:
         message = str(e)
         failed = True

@@ -416,7 +416,7 @@ class CardEndpoint:
         """Send data packets through the faults of the network; a twin sends the payload reversed."""
         self.counts["packets_made"] += len(packets.rows)
         self.counts["bytes_made"] += packets.payload_bytes
-        for rows in self._network_faults.carry(packets.rows):
+        for rows in self._network_faults.transmit(packets.rows):
             self.sender.put_packets(rows)
         if self._twin is not None:
             reversed_payload = packets.rows[:, dca1000.DATA_HEADER_BYTES :].reshape(-1)[::-1]

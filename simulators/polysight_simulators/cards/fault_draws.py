@@ -1,8 +1,9 @@
 """Draw the faults of a simulated capture card, reproducibly from a seed.
 
-Every board has its own generators: one for lost, reordered, truncated and duplicated packets, which take a number each
-of every packet, one for corrupt packets, one for pulses and one for overflows. So the rate of one fault does not shift
-another; draws do not depend on how packets, frames or pulses are grouped into calls.
+Every board has its own generators: one for the network (loss, reordering, truncation and duplication draw
+one number each for every packet), one for corrupt packets, one for pulses and one for overflows. So the rate of one
+fault does not change the draws of another, and draws do not depend on how packets, frames or pulses are grouped into
+calls.
 """
 
 import zlib
@@ -21,7 +22,7 @@ Rows = NDArray[np.uint8]
 
 
 def fault_generator(seed: int, board_name: str, generator_name: str) -> np.random.Generator:
-    """Return the generator of one board for the faults of one name."""
+    """Return one board's random generator of that name."""
     return np.random.default_rng([seed, zlib.crc32(f"{board_name}/{generator_name}".encode())])
 
 
@@ -40,41 +41,41 @@ class NetworkFaults:
         # Packets held back, [1, size] each, until the next packet has overtaken them.
         self._held: list[Rows] = []
 
-    def carry(self, rows: Rows) -> list[Rows]:
+    def transmit(self, rows: Rows) -> list[Rows]:
         """Return packets [n, size] in the order of arrival, as arrays of packets of one size."""
-        f = self._faults
-        if not f.disturbs_network or not len(rows):
+        faults = self._faults
+        if not faults.disturbs_network or not len(rows):
             return [rows]
         rows = self._corrupt(rows)
         draws = self._rng.random((len(rows), 4))
-        suffers = np.any(draws < (f.loss, f.reorder, f.truncate, f.duplicate), axis=1)
+        is_faulty = np.any(draws < (faults.loss, faults.reorder, faults.truncate, faults.duplicate), axis=1)
         # A packet with a fault is a part by itself, and so is the next one, which may overtake it.
         cuts = {0, len(rows)}
         if self._held:
             cuts.add(1)
-        for number in np.flatnonzero(suffers):
+        for number in np.flatnonzero(is_faulty):
             cuts |= {min(int(number) + k, len(rows)) for k in (0, 1, 2)}
         arrived: list[Rows] = []
         for first, end in pairwise(sorted(cuts)):
             overtaken = self.drain()
             part = rows[first:end]
-            arrived += self._carry_one(part, draws[first]) if suffers[first] else [part]
+            arrived += self._transmit_faulty(part, draws[first]) if is_faulty[first] else [part]
             arrived += overtaken
         return arrived
 
-    def _carry_one(self, packet: Rows, draws: NDArray[np.float64]) -> list[Rows]:
+    def _transmit_faulty(self, packet: Rows, draws: NDArray[np.float64]) -> list[Rows]:
         """Return what arrives of one packet [1, size]; `draws` [4] are those for loss, reorder, truncate, duplicate."""
-        f = self._faults
+        faults = self._faults
         loss, reorder, truncate, _ = draws
-        if loss < f.loss:
+        if loss < faults.loss:
             self._counts["lost"] += 1
             self._counts["lost_bytes"] += packet.size - DATA_HEADER_BYTES
             return []
-        if reorder < f.reorder:
+        if reorder < faults.reorder:
             self._counts["reordered"] += 1
             self._held.append(packet)
             return []
-        if truncate < f.truncate:
+        if truncate < faults.truncate:
             # Half of a short packet may be less than its header, of which no byte counts as lost.
             half = packet[:, : packet.shape[1] // 2]
             self._counts["truncated"] += 1
@@ -104,7 +105,7 @@ class NetworkFaults:
 
 
 class PulseFaults:
-    """SYNC_IN pulses that one radar misses (`missed`: their number), and edges that nobody sent."""
+    """SYNC_IN pulses that one radar misses (`missed`: their number), and spurious edges."""
 
     def __init__(self, faults: Faults, seed: int, board_name: str) -> None:
         self._probability = faults.missed_pulse
@@ -114,7 +115,7 @@ class PulseFaults:
         self.missed = 0
 
     def select_seen(self, pulses: list[Pulse]) -> list[Pulse]:
-        """Return the edges that the radar sees; one that nobody sent has the number of the pulse that it follows."""
+        """Return the edges that the radar sees; a spurious one has the number of the pulse that it follows."""
         draws = self._rng.random(len(pulses))
         seen_pulses = [
             p for p, draw in zip(pulses, draws, strict=True) if p.number not in self._miss and draw >= self._probability
@@ -122,15 +123,15 @@ class PulseFaults:
         self.missed += len(pulses) - len(seen_pulses)
         for pulse in pulses:
             if pulse.number in self._spurious:
-                behind_ms = self._spurious[pulse.number]
-                seen_pulses.append(pulse._replace(t_ns=pulse.t_ns + round(behind_ms * 1e6)))
+                delay_ms = self._spurious[pulse.number]
+                seen_pulses.append(pulse._replace(t_ns=pulse.t_ns + round(delay_ms * 1e6)))
         if self._spurious:
             return sorted(seen_pulses, key=lambda p: p.t_ns)
         return seen_pulses
 
 
 class LvdsRun(NamedTuple):
-    """LVDS data, int16 of any shape in the order of sending, and the bytes lost at its end."""
+    """LVDS data of the card's input (int16, in the order of sending), and the number of bytes lost after them."""
 
     data: NDArray[np.int16]
     lost_bytes: int

@@ -50,7 +50,7 @@ class Fault(Enum):
 
 
 class RadarBoard:
-    """A board.
+    """One simulated board: its lines, its words and its executed commands (`cores`).
 
     Parameters
     ----------
@@ -111,9 +111,9 @@ class RadarBoard:
         self.powered = True
         self._faults: deque[Fault] = deque()
         self._pulses_seen = 0
-        # Levels of the reset line (True: in reset) and of the sense-on-power lines
-        self._held = True
-        self._mode = 0
+        # Level of the reset line (True: in reset), and levels of the sense-on-power lines as the bits of a number
+        self._is_in_reset = True
+        self._sense_lines = 0
         self._forget()
 
     @property
@@ -145,11 +145,11 @@ class RadarBoard:
         # Messages that are sent later, with their times
         self._later: list[tuple[float, bytes]] = []
         # True while the host interrupt is raised for a message
-        self._offered = False
+        self._interrupt_raised = False
         # Time from which the words of `_out` can be read
-        self._ready_at = 0.0
+        self._readable_from = 0.0
         # Sequence number of the last command, and its answer, for a retry
-        self._last: tuple[int, bytes] = (-1, b"")
+        self._last_answer: tuple[int, bytes] = (-1, b"")
         # Time of the pulse that started the last frame
         self._pulse_s = float("-inf")
         # Commands that come before this time are ignored
@@ -160,38 +160,38 @@ class RadarBoard:
         """Set the faults of the next answers, one each; earlier ones are discarded."""
         self._faults = deque(faults)
 
-    # lines
+    # --- lines: supply, reset, sense-on-power, host interrupt, SYNC_IN ------------------------------------------------
 
     def power(self, on: bool) -> None:
         """Switch the board's supply, not that of its USB chip; the flash keeps its content."""
         self._forget()
         self.powered = on
-        if on and not self._held:
+        if on and not self._is_in_reset:
             self._boot()
 
     def sense(self, mode: int) -> None:
         """Set the sense-on-power lines, which are read at the release of the reset."""
-        self._mode = mode
+        self._sense_lines = mode
 
     def reset(self, held: bool) -> None:
         """Drive the reset line."""
         if held:
             self._forget()
-        elif self._held:
+        elif self._is_in_reset:
             self._boot()
-        self._held = held
+        self._is_in_reset = held
 
     def _boot(self) -> None:
         """Boot if supply, jumpers and sense lines allow it."""
-        if self._mode == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
+        if self._sense_lines == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
             self.cores.boot()
 
     @property
     def interrupt(self) -> bool:
         """Level of the host interrupt line. Raises DeviceError if unplugged."""
-        self._check()
+        self._check_plugged()
         self._deliver()
-        return self._offered
+        return self._interrupt_raised
 
     @property
     def ready_for_triggers(self) -> bool:
@@ -201,7 +201,7 @@ class RadarBoard:
         return self.cores.armed and self.cores.frames_left != 0
 
     def trigger(self, pulse_s: float | None = None) -> bool:
-        """Give a rising edge on SYNC_IN, now or at a time of the pulses' clock; return True if it starts a frame.
+        """Receive a rising edge on SYNC_IN, now or at a time of the pulses' clock; return True if it starts a frame.
 
         An edge that follows the edge of the last frame by less than `dead_s` causes a fault, after which pulses are
         ignored. So does one that is earlier by less than that; a time still earlier is taken for one of another clock.
@@ -216,7 +216,8 @@ class RadarBoard:
             time_s = pulse_s
         period = cores.period_s()
         # 1 ns for the rounding of times.
-        too_soon = abs(time_s - self._pulse_s) < (period if self._dead_s is None else self._dead_s) - 1e-9
+        shortest_s = period if self._dead_s is None else self._dead_s
+        too_soon = abs(time_s - self._pulse_s) < shortest_s - 1e-9
         if too_soon or self._pulses_seen - 1 in self._fault_pulses:
             cores.armed = False
             # Type (firmware error), code (not triggered by a pulse), line of the firmware (made up), reserved bytes.
@@ -230,16 +231,17 @@ class RadarBoard:
             self._send_event(FRAME_END, b"", period)
         return True
 
-    def say(self, number: int, data: bytes = b"") -> None:
+    def send_event(self, number: int, data: bytes = b"") -> None:
         """Send an event now."""
         self._send_event(number, data, 0.0)
 
-    # words: a message is a sync word (4 bytes), a header (12: opcode, length without the sync word, flags, remaining
-    # messages, number of sub-blocks, checksum), sub-blocks (number, length with these 4 bytes, data) and a CRC
+    # --- words --------------------------------------------------------------------------------------------------------
+    # A message is a sync word (4 bytes), a header (12: opcode, length without the sync word, flags, remaining
+    # messages, number of sub-blocks, checksum), sub-blocks (number, length with these 4 bytes, data) and a CRC.
 
     def write_word(self, word: int) -> None:
         """Receive a word from the host. Raises DeviceError if unplugged."""
-        self._check()
+        self._check_plugged()
         self._deliver()
         self._in += word.to_bytes(2, "little")
         while len(self._in) >= 4 and self._in[:4] not in (TO_DEVICE, READY):
@@ -247,10 +249,10 @@ class RadarBoard:
         # READY: the host asks for the message that the interrupt announced.
         if self._in[:4] == READY and len(self._in) >= 16:
             del self._in[:16]
-            self._offered = False
+            self._interrupt_raised = False
             if self._waiting:
                 self._out = bytearray(self._waiting.popleft())
-                self._ready_at = self.now() + DATA_S
+                self._readable_from = self.now() + DATA_S
         elif self._in[:4] == TO_DEVICE and len(self._in) >= 16:
             length = int.from_bytes(self._in[6:8], "little")
             if ones_sum(bytes(self._in[4:16])) != 0xFFFF:
@@ -263,17 +265,18 @@ class RadarBoard:
 
     def read_word(self) -> int:
         """Send a word to the host; all ones if there is none yet. Raises DeviceError if unplugged."""
-        self._check()
+        self._check_plugged()
         self._deliver()
-        if not self._out or self.now() < self._ready_at - 1e-9:
+        if not self._out or self.now() < self._readable_from - 1e-9:
             return 0xFFFF
         word = int.from_bytes(self._out[:2], "little")
         del self._out[:2]
         return word
 
-    # inside
+    # --- messages -----------------------------------------------------------------------------------------------------
 
-    def _check(self) -> None:
+    def _check_plugged(self) -> None:
+        """Raise DeviceError if the USB cable is unplugged."""
         if not self.plugged:
             raise DeviceError(
                 "the simulated radar is unplugged", "a test unplugged it", "plug it in", code=ErrorCode.NO_ANSWER
@@ -286,16 +289,16 @@ class RadarBoard:
                 self._later.remove((due_s, raw))
                 self._waiting.append(raw)
         if self._waiting and not self._out:
-            self._offered = True
+            self._interrupt_raised = True
 
     def _send(self, raw: bytes, delay_s: float) -> None:
         self._later.append((self.now() + delay_s, raw))
 
     def _send_event(self, number: int, data: bytes, delay_s: float) -> None:
         """Send an event after a delay; numbers from 0x4000 on are the main core's, others the RF core's."""
-        main = number >= 0x4000
+        from_main_core = number >= 0x4000
         # Wide: with a CRC of 32 bits.
-        if main:
+        if from_main_core:
             wide = self.cores.crc32_events
         else:
             wide = not self.cores.first_generation
@@ -304,7 +307,13 @@ class RadarBoard:
         # of its message times 32, and its own.
         self._send(
             frame(
-                direction=6 if main else 2, kind=EVENT, number=number // 32, body=block, count=1, sequence=0, wide=wide
+                direction=6 if from_main_core else 2,
+                kind=EVENT,
+                number=number // 32,
+                body=block,
+                count=1,
+                sequence=0,
+                wide=wide,
             ),
             delay_s,
         )
@@ -330,11 +339,11 @@ class RadarBoard:
             )
             return
         is_retry = flags & 3 == 3
-        if is_retry and self._last[0] == sequence and self._last[1]:
+        if is_retry and self._last_answer[0] == sequence and self._last_answer[1]:
             # Repeat the answer, without executing the command again
-            self._send(self._last[1], 0.0)
+            self._send(self._last_answer[1], 0.0)
             return
-        delay = ANSWER_S
+        delay_s = ANSWER_S
         error = 0
         body = raw[12 : length - 4]
         blocks = b""
@@ -346,16 +355,16 @@ class RadarBoard:
                 # "Error while processing the command".
                 error = 6
                 data = b""
-                extra = 0.0
+                extra_s = 0.0
             else:
-                error, data, extra = self.cores.execute(block, body[4:size], remaining)
+                error, data, extra_s = self.cores.execute(block, body[4:size], remaining)
             if error:
                 break
-            delay += extra
+            delay_s += extra_s
             if data:
                 blocks += struct.pack("<HH", block, len(data) + 4) + data
             body = body[size:]
-        self._busy_until = self.now() + delay
+        self._busy_until = self.now() + delay_s
         # A message of the host asks for one sub-block at most (docs/spec/mmwavelink.md, "Answers").
         sub_blocks = int(bool(blocks))
         if error:
@@ -375,8 +384,8 @@ class RadarBoard:
             sequence=sequence,
             wide=wide,
         )
-        self._last = (sequence, answer)
-        self._answer(answer, fault, delay)
+        self._last_answer = (sequence, answer)
+        self._answer(answer, fault, delay_s)
 
     def _answer(self, answer: bytes, fault: Fault | None, delay_s: float) -> None:
         """Send an answer after a delay, damaged by the fault."""

@@ -38,22 +38,22 @@ def main(argv: list[str]) -> int:
     modules = {name: importlib.import_module(f"benchmarks.{name}") for name in NAMES}
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--out", type=Path, default=None, help="folder for each benchmark's figures as NAME.json")
-    names = parser.add_subparsers(dest="name", metavar="NAME")
+    subparsers = parser.add_subparsers(dest="name", metavar="NAME")
     for name, module in modules.items():
-        words = (module.__doc__ or "").splitlines()[0]
-        module.add_arguments(names.add_parser(name, help=words, description=words))
+        summary = (module.__doc__ or "").splitlines()[0]
+        module.add_arguments(subparsers.add_parser(name, help=summary, description=summary))
     args = parser.parse_args(argv)
     if args.name is None:
-        chosen = {name: parser.parse_args([name]) for name in NAMES}
+        options_by_name = {name: parser.parse_args([name]) for name in NAMES}
     else:
-        chosen = {args.name: args}
+        options_by_name = {args.name: args}
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
-    for name, options in chosen.items():
-        # Only benchmarks that have the option, and unless it was given.
+    for name, options in options_by_name.items():
+        # Benchmarks without the option `json` have no such attribute; a file that was given stays.
         if args.out is not None and getattr(options, "json", "") is None:
             options.json = args.out / f"{name}.json"
-    return max(modules[name].run(options) for name, options in chosen.items())
+    return max(modules[name].run(options) for name, options in options_by_name.items())
 
 
 if __name__ == "__main__":

@@ -177,8 +177,8 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     signal = (direct + np.exp(1j * between)[:, None, None] * echo) * turn[:, None]
     received = (signal + _draw_noise(rng, signal.shape, snr_db)).astype(np.complex64)
     aligned = align_row(_quantise_bursts(received[:, None]), np.ones((trials, 1), bool), chirp.linear_samples)
-    done = reference(aligned, prepare(rig, board), chirp)
-    error = np.angle(done.amplitude * np.exp(-1j * phase))[done.found]
+    referenced = reference(aligned, prepare(rig, board), chirp)
+    error = np.angle(referenced.amplitude * np.exp(-1j * phase))[referenced.found]
     # Without the direct path's own phase, which is constant.
     error = np.angle(np.exp(1j * (error - np.angle(np.exp(1j * error).mean()))))
     rms = float(np.sqrt((error**2).mean()))
@@ -329,7 +329,7 @@ def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
     ratios = [a.ours_hz / a.division_hz for a in aligned]
     chirps = sum(a.chirps for a in aligned)
     gross = sum(a.ours_gross for a in aligned)
-    theirs = sum(a.division_gross for a in aligned)
+    published_errors = sum(a.division_gross for a in aligned)
     return [
         Line(
             "alignment at 0-5 dB: frequency error over division's",
@@ -344,7 +344,7 @@ def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
         Line(
             "gross errors of alignment at 0-5 dB",
             f"{gross} of {chirps}",
-            f"{theirs} of {chirps}",
+            f"{published_errors} of {chirps}",
             gross,
             0,
             0,

@@ -154,8 +154,8 @@ class Synchroniser:
         near = scipy.signal.ZoomFFT(linear.shape[1], [best - 1, best + 1], ZOOM, fs=RANGE_BINS)
         frequency = (best + 2 * int(np.abs(self._beam @ near(linear)).argmax()) / ZOOM - 1) / RANGE_BINS
         moved = (mean * np.exp(-2j * np.pi * frequency * (self._n - self._a))).astype(np.complex64)
-        again = self._beam @ np.fft.fft(moved[:, self._a : self._b], RANGE_BINS)
-        phase = float(np.angle(again[0]))
+        back_to_range = self._beam @ np.fft.fft(moved[:, self._a : self._b], RANGE_BINS)
+        phase = float(np.angle(back_to_range[0]))
         return moved * (self._beam * np.exp(-1j * phase)).astype(np.complex64)[:, None], phase
 
     def row(self, payload: NDArray[np.uint8], positions: int) -> Complex:

@@ -428,10 +428,13 @@ def run(args: argparse.Namespace) -> int:
                 with args.campaign.open("a", encoding="utf-8") as campaign:
                     campaign.write(json.dumps(asdict(judged)) + "\n")
             if judged.error is None:
-                said = "no permittivity"
+                statement = "no permittivity"
             else:
-                said = f"permittivity within {100 * judged.error:.1f} %"
-            print(f"{judged.kind} {judged.seed}, {judged.disturbance}: {judged.points} points, {said}", file=sys.stderr)
+                statement = f"permittivity within {100 * judged.error:.1f} %"
+            print(
+                f"{judged.kind} {judged.seed}, {judged.disturbance}: {judged.points} points, {statement}",
+                file=sys.stderr,
+            )
     print(__doc__)
     print_tables(figures)
     if figures:

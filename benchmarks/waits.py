@@ -80,25 +80,25 @@ def time_list(scan: Path, products: Path, root: Path, count: int) -> tuple[Secon
         )
         shutil.copy(scan / MANIFEST, root / f"scan-{n}")
     first = Seconds()
-    again = Seconds()
+    next_seconds = Seconds()
     for _ in range(REPEATS):
         scans = Scans(root)
-        for took in (first, again):
+        for took in (first, next_seconds):
             with took.time_block():
                 if len(scans.list()) != count:
                     raise RuntimeError("scans are missing in the list")
-    return first, again
+    return first, next_seconds
 
 
 def command(words: list[str]) -> tuple[float, float]:
     """Run `polysight WORDS`; return its CPU and wall seconds. Raises RuntimeError if it fails."""
     start = os.times()
     began = time.perf_counter()
-    done = subprocess.run([sys.executable, "-m", "polysight", *words], cwd=ROOT, capture_output=True, check=False)
+    process = subprocess.run([sys.executable, "-m", "polysight", *words], cwd=ROOT, capture_output=True, check=False)
     wall = time.perf_counter() - began
     end = os.times()
-    if done.returncode:
-        raise RuntimeError(f"polysight {' '.join(words)}: {done.stderr.decode()}")
+    if process.returncode:
+        raise RuntimeError(f"polysight {' '.join(words)}: {process.stderr.decode()}")
     return end.children_user + end.children_system - start.children_user - start.children_system, wall
 
 
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         after_last_row = [rows_then_products(folder / "scan", folder / f"out{n}") for n in range(repeats)]
         same, other_seconds = from_samples(folder / "scan", repeats)
         products = small_products(folder)
-        first, again = time_list(folder / "scan", products, folder / "many", scans_in_list)
+        first, next_seconds = time_list(folder / "scan", products, folder / "many", scans_in_list)
         command_times = {
             name: [command(name.format(made=products).split()) for _ in range(repeats)] for name in COMMANDS
         }
@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
         lines.append(
             _report_seconds(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1)
         )
-    for name, took in (("first look", first), ("later", again)):
+    for name, took in (("first look", first), ("later", next_seconds)):
         note = f"{took.median_wall:.2f} s wall"
         lines.append(
             _report_seconds(

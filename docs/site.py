@@ -92,8 +92,8 @@ def _from_markdown(path: Path) -> str:
     used: dict[str, int] = {}
     for number, token in enumerate(tokens):
         if token.type == "heading_open":
-            said = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
-            token.attrSet("id", slug_of(said, used))
+            heading = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
+            token.attrSet("id", slug_of(heading, used))
     return parser.renderer.render(tokens, parser.options, {})
 
 

@@ -127,8 +127,8 @@ def command_faults(line: str) -> list[str]:
             faults += _make_faults(words[1:])
         elif "pytest" in words[:3]:
             faults += _pytest_faults(words[words.index("pytest") + 1 :])
-        elif (ours := _module(words)) is not None:
-            faults += _parse_faults(*ours)
+        elif (our_module := _module(words)) is not None:
+            faults += _parse_faults(*our_module)
     return faults
 
 
@@ -140,13 +140,13 @@ def _parse_faults(module: str, arguments: list[str]) -> list[str]:
         return [str(e)]
     if parser is None:
         return [f"{module} takes no arguments"] if arguments else []
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+    messages = io.StringIO()
+    with contextlib.redirect_stderr(messages), contextlib.redirect_stdout(io.StringIO()):
         try:
             parser.parse_args(arguments)
         except SystemExit as e:
             if e.code:
-                return [said.getvalue().strip().splitlines()[-1]]
+                return [messages.getvalue().strip().splitlines()[-1]]
     return []
 
 
@@ -159,9 +159,9 @@ def mention_faults(text: str) -> list[str]:
         return []
     faults: list[str] = []
     for words in commands:
-        ours = _module(words)
-        if ours is not None and not (Path(words[0]).name in PROGRAMS and len(words) == 1):
-            faults += _walk(*ours)
+        our_module = _module(words)
+        if our_module is not None and not (Path(words[0]).name in PROGRAMS and len(words) == 1):
+            faults += _walk(*our_module)
         elif words[0] == "make" and len(words) > 1 and re.fullmatch(r"[a-z-]+", words[1]):
             faults += _make_faults(words[1:])
     return faults

@@ -157,6 +157,6 @@ def read_page(path: Path) -> Page:
             elif part.type == "code_inline":
                 spans.append((line, part.content))
         if token.type == "heading_open":
-            said = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
-            anchors.add(slug_of(said, used))
+            heading = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
+            anchors.add(slug_of(heading, used))
     return Page(path, tuple(links), frozenset(anchors), tuple(blocks), tuple(spans))

@@ -98,8 +98,8 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
                 _end(rig)
                 shutil.copy(ROOT / "instrument.toml", copy)
         output.seek(0)
-        said = output.read()
-    return PageRun(max(1, int(at.read_text())) if status else 0, time.monotonic() - began, said[-3000:])
+        output_text = output.read()
+    return PageRun(max(1, int(at.read_text())) if status else 0, time.monotonic() - began, output_text[-3000:])
 
 
 def _start_rig(copy: Path, work: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
@@ -109,8 +109,8 @@ def _start_rig(copy: Path, work: Path, environment: dict[str, str]) -> subproces
     rig = subprocess.Popen(
         command, cwd=copy, env=environment, stdout=subprocess.PIPE, text=True, start_new_session=True
     )
-    said = rig.stdout.readline() if rig.stdout else ""
-    if not said.startswith("ready "):
+    output_text = rig.stdout.readline() if rig.stdout else ""
+    if not output_text.startswith("ready "):
         _end(rig)
         raise RuntimeError(f"the simulated rig did not start; its logs are in {work / 'rig/logs'}")
     shutil.copy(work / "rig/instrument.toml", copy)

@@ -85,7 +85,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
 
 
 UNRENDERED = ("calibration", "house", "jobs", "plan", "process", "products", "store")
-"""Rooms whose tests process whole scans and look at no figure; those that do are report, api, papers and e2e."""
+"""Rooms whose tests process whole scans but do not examine figures, as report, api, papers and e2e do."""
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,9 +1,9 @@
-"""`python -m tests.mutants --count 100`: change the code at random places, and see whether a test notices.
+"""`python -m tests.mutants --count 100`: change the code at random places, and report if a test notices.
 
 Each mutant is one change by an operator of cosmic-ray (a comparison, a number, an arithmetic sign, a condition) in a
 scratch copy of the repository. The tests of its room run against it, then, if all pass, the whole suite but its slowest
-tests; it is killed when one fails or hangs. A survivor is a law that no test states, or a change without effect: read
-it, and write the law. A test that has nothing to do with the mutant it killed fails by itself. 100 mutants take some
+tests; it is killed when one fails or hangs. A survivor shows a law that no test states, or a change without effect:
+read it, and write the law. A test that is unrelated to the mutant it killed fails by chance. 100 mutants take some
 hours.
 """
 
@@ -119,14 +119,14 @@ def find_failure(copy: Path, selection: Sequence[str]) -> str:
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-n", "4", "--no-header", *selection]
     environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command, cwd=copy, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return "a timeout"
-    if done.returncode == 0:
+    if process.returncode == 0:
         return ""
-    failures = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    failures = [line for line in process.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
     return failures[0].split()[1] if failures else "an import"
 
 

@@ -17,7 +17,7 @@ __all__ = ["finished", "samples"]
 
 @pytest.fixture
 def rig(monkeypatch):
-    """A started `FakeRig`. A command times out where its Pi loses the reply or a card is mute, and nowhere else."""
+    """A started `FakeRig`. A command times out only if its Pi loses the reply or a card is silent."""
     fake = FakeRig(small_instrument())
 
     class Pi(PiClient):

@@ -1,4 +1,4 @@
-"""Scans with every trouble of cards and network: every committed byte is right or masked, the exit status correct.
+"""Scans with all faults of cards and network: every committed byte is right or masked, the exit status is right.
 
 Real receivers over sockets, retakes, rows kept incomplete, resumes. `--long` takes 100 scans.
 """
@@ -87,8 +87,8 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
             mask = np.zeros(want.size, dtype=bool) if data.mask is None else data.mask
             assert (data.payload[~mask] == want[~mask]).all(), (row, name)
             assert not mask.any() or row in incomplete
-            again = place_again(folder / board.file)
-            assert again.by_pulses or again.placed.missing == again.missing_before
+            placed_again = place_again(folder / board.file)
+            assert placed_again.by_pulses or placed_again.placed.missing == placed_again.missing_before
 
 
 def test_committed_bytes_are_right_or_masked(request, tmp_path):

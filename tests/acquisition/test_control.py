@@ -1,4 +1,4 @@
-"""Commands from other programs to a running scan: obeyed once, never by a later scan, and never at the scan's cost."""
+"""Commands from other programs to a running scan: executed once, not by a later scan, and without disturbing it."""
 
 import os
 import socket
@@ -55,7 +55,7 @@ def test_commands_are_obeyed_once(control):
 
 
 def test_a_sender_waits_until_its_command_is_obeyed(tmp_path):
-    """The scan's thread is held on its way from the command's file to the stop request."""
+    """The scan's thread stops between reading the command's file and the stop request."""
     still_waiting = []
 
     class HeldRequest(StopRequest):
@@ -119,7 +119,7 @@ def test_after_the_rows_no_command_is_obeyed(tmp_path):
 
 
 def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):
-    """Also if its process number belongs to another process by now."""
+    """Also if another process has its process number now."""
     (tmp_path / CONTROL).mkdir()
     lives = [
         (Life(os.getpid(), read_start_ticks(os.getpid()) or 0, socket.gethostname()), False),

@@ -1,7 +1,7 @@
-"""Takes of rows with every trouble of radar, wires, card and network: what is kept is right or masked.
+"""Takes of rows with all faults of radar, wires, card and network: stored data is right or masked.
 
-Each take goes the way of a scan's: placed by counters, its frames compared with the pulses, committed if it is whole,
-else kept as with `--keep-incomplete`. 250 takes; `--long` takes 10,000 (MANGLED_FIRST: the first seed of a piece).
+Each take is processed as in a scan: placed by counters, its frames compared with the pulses, committed if complete,
+otherwise kept as with `--keep-incomplete`. 250 takes; `--long` takes 10,000 (MANGLED_FIRST: the first seed of a piece).
 """
 
 import os
@@ -34,7 +34,7 @@ MAX_MASKED = 0.005
 
 @dataclass
 class Kept:
-    """A row as a scan keeps it."""
+    """A row as a scan stores it."""
 
     placed: Placed
     frames: PlacedFrames | None
@@ -45,7 +45,7 @@ class Kept:
 
 
 def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
-    """Place a take and decide what is kept of it, as acquisition does."""
+    """Place a take and decide which of its data is stored, as acquisition does."""
     log = log_packets(sent, pulses.size * frame, 64)
     placed, out = place_record(log, frame, past, int(pulses[0, 0]) - 5 * MS)
     frames = None
@@ -69,7 +69,7 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
 
 
 def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent]]:
-    """One to three takes of a rig, each with up to three troubles."""
+    """One to three takes of a rig, each with up to three faults."""
     chance = random.Random(seed)
     points, count, frame = GRIDS[seed % len(GRIDS)]
     card = Adversary(chance, frame, 0, 1)
@@ -92,9 +92,9 @@ def wrong_bytes(kept: Kept, sent: Sent) -> int:
 
 
 def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
-    """Committed as whole or kept incomplete: what is not certain is masked, and little else.
+    """Whether the take is committed or kept incomplete: uncertain data is masked, and little else.
 
-    A frame without a packet at its pulse's time, as of a network that holds packets, is not certain.
+    A frame is uncertain if no packet came at its pulse's time, for example because the network delayed packets.
     """
     right = masked = 0
     first = int(os.environ.get("MANGLED_FIRST", "0"))

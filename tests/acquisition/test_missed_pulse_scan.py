@@ -20,7 +20,7 @@ PULSES = 6
 def timed_rig(make_instrument, monkeypatch, request):
     """Rows of 8 points and 6 pulses; the parameter: a row's retakes.
 
-    Data and events carry the times at which they would arrive: when this machine gets round to them says nothing.
+    Data and events carry their times of arrival, so that the load of this machine has no influence.
     """
     retakes = getattr(request, "param", 1)
     fake = FakeRig(make_instrument(columns=POINTS, rows=2, pulses=PULSES, row_retakes=retakes))

@@ -1,4 +1,4 @@
-"""Whatever a row suffered, its frames are at their pulses or masked, never shifted."""
+"""After any fault of a row its frames are at their pulses or masked, never shifted."""
 
 from pathlib import Path
 
@@ -135,9 +135,9 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     none = dict.fromkeys(RowCapture.__struct_fields__, 0)
     row = {"expected": 30 * frame, "missing": [(0, 30 * frame)], "located": False, "reason": "", "holes": holes}
     capture = rewrite_row(path, RowCapture(**{**none, **row}), frames, frame)
-    got = np.fromfile(path, dtype=np.uint8)
-    np.testing.assert_array_equal(got, want)
-    np.testing.assert_array_equal(make_mask(got.size, capture.missing), want == 0)
+    stored_bytes = np.fromfile(path, dtype=np.uint8)
+    np.testing.assert_array_equal(stored_bytes, want)
+    np.testing.assert_array_equal(make_mask(stored_bytes.size, capture.missing), want == 0)
     facts, arrivals = read_index(path.with_suffix(".idx"))
     assert [tuple(x) for x in facts["missing"]] == capture.missing
     assert facts["pulses_missed"] == sorted(missed)

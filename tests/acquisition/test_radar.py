@@ -22,7 +22,7 @@ from polysight_shared.tables import decode, to_builtins
 
 
 class Server:
-    """A control server of the test's own, on a free port."""
+    """A control server for a test, on a free port."""
 
     def __init__(self) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
@@ -109,7 +109,7 @@ def test_unknown_host_is_named():
     assert "no-such-host.invalid:5000" in e.value.what
 
 
-HALF_OPEN = """
+HALF_OPEN_PROGRAM = """
 import socket, subprocess
 from polysight.radar.control import LineServers
 from polysight_shared.errors import DeviceError
@@ -129,17 +129,22 @@ def test_half_open_connection_is_noticed():
     """The peer's machine disappears: here the network of a separate namespace is switched off."""
     if shutil.which("ip") is None or subprocess.run(["unshare", "-rn", "true"], check=False).returncode:
         pytest.skip("needs iproute2 and user namespaces")
-    done = subprocess.run(
-        ["unshare", "-rn", sys.executable, "-c", HALF_OPEN], capture_output=True, text=True, check=True, timeout=HANG_S
+    process = subprocess.run(
+        ["unshare", "-rn", sys.executable, "-c", HALF_OPEN_PROGRAM],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=HANG_S,
     )
-    assert "did not acknowledge the line within 0.5 s" in done.stdout
-    assert "half-open" in done.stdout
+    assert "did not acknowledge the line within 0.5 s" in process.stdout
+    assert "half-open" in process.stdout
 
 
-# --- the rig file ---
+# --- radars in the rig file ---
 
 
 def with_radar(instrument: Instrument, **radar) -> dict:
+    """The settings of a rig whose table [radar] has these values."""
     return {**to_builtins(instrument), "radar": radar}
 
 
@@ -163,7 +168,7 @@ def test_backend_is_that_of_the_rig_file(make_instrument):
     assert make_instrument().radar == Radar()
 
 
-# --- rows that depend on it ---
+# --- rows that depend on the radars ---
 
 
 class Native(RadarControl):
@@ -191,7 +196,7 @@ class Native(RadarControl):
         self.closed = True
 
 
-def reasons(scan: ScanFolder) -> list[str]:
+def rejection_reasons(scan: ScanFolder) -> list[str]:
     return [reason for fact in facts_of(scan, "row_rejected") for reason in fact["reasons"]]
 
 
@@ -231,11 +236,11 @@ def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars, progress=progress)
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert "aborting" in calls
-    assert any("RF core fault 7" in r for r in reasons(result.folder))
+    assert any("RF core fault 7" in r for r in rejection_reasons(result.folder))
 
 
 def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
-    """Also the transmitter, of which nothing is recorded."""
+    """This holds for the transmitter too, whose data is not recorded."""
     radars = Native(RadarState.ARMED)
     radars.waiting = {2: ["LS"]}
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
@@ -270,8 +275,5 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
         run_scan(msgspec.structs.replace(rig.instrument, radar=radar), tmp_path / "s")
     lines = [server.accept().recv(1000) for _ in rig.instrument.boards]
     assert lines == [LINE * 3] * 3
-    rejected = reasons(ScanFolder.load(tmp_path / "s"))
+    rejected = rejection_reasons(ScanFolder.load(tmp_path / "s"))
     assert any("may not have obeyed" in r for r in rejected)
-
-
-# --- the simulated server ---

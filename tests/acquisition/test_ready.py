@@ -64,7 +64,7 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
 
 @pytest.mark.parametrize(("state", "asked"), [("idle", 2), ("ready", 2), ("homing", 1)])
 def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
-    """A stage that is still `ready` has not begun: its lost steps would be those of the homing before."""
+    """A stage that is still `ready` has not begun to home: its lost steps would be those of an earlier homing."""
     sent = []
     pi: Any = SimpleNamespace(_owner="",
         _timeout_s=1.0, _send_once=lambda *given: sent.append(given), _ask=lambda *given: sent.append(given),
@@ -136,7 +136,7 @@ def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_ol
 
 
 def test_a_pi_that_does_not_report_its_stage_is_a_warning(rig, tmp_path):
-    """A Pi of an older release: the wire's version is the same."""
+    """A Pi of an older release, with the same version of the protocol."""
     rig.pi.stage = {}
     result = run_scan(rig.instrument, tmp_path / "s")
     assert result.exit_status == "success"
@@ -155,8 +155,11 @@ def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
     right = rig.pi.stage
     rig.pi.stage = {}
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
-    again = StopRequest()
-    assert STAGE_NOT_REPORTED in resume_scan(tmp_path / "s", on_row=lambda _: again.request(), stop=again).warnings
+    next_request = StopRequest()
+    assert (
+        STAGE_NOT_REPORTED
+        in resume_scan(tmp_path / "s", on_row=lambda _: next_request.request(), stop=next_request).warnings
+    )
     rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     result = resume_scan(tmp_path / "s")
     assert result.folder.complete

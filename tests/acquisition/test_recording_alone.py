@@ -1,4 +1,4 @@
-"""A scan that is only recorded loads and runs nothing of the processing."""
+"""A scan that is only recorded does not load or run the processing."""
 
 import json
 import subprocess
@@ -24,11 +24,11 @@ open(sys.argv[1], "w").write(json.dumps([status, loaded]))
 
 
 def modules_after(*words: object, note: Path) -> list[str]:
-    """Run a command of `polysight` in a process of its own; return the modules of ours that it loaded."""
+    """Run a command of `polysight` in a new process; return those of our modules that it loaded."""
     command = [sys.executable, "-c", PROGRAM, str(note), *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False)
+    process = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False)
     status, loaded = json.loads(note.read_text())
-    assert status == 0, done.stderr
+    assert status == 0, process.stderr
     return loaded
 
 

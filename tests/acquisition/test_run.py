@@ -1,4 +1,4 @@
-"""A scan against a fake Pi and fake cards: every end of a row and of a scan."""
+"""A scan with a fake Pi and fake cards: every way in which a row or a scan can end."""
 
 import hashlib
 import socket
@@ -321,7 +321,7 @@ def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tm
 
 
 def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path):
-    """It lost power for a moment: it replies again, but its configuration is lost."""
+    """The card lost power for a moment: it replies again, but its configuration is lost."""
     card = rig.cards["RH"]
 
     def answer(p) -> None:
@@ -334,7 +334,7 @@ def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path)
 
 
 def test_a_scan_is_not_resumed_with_the_cards_of_two_boards_exchanged(rig, tmp_path, monkeypatch):
-    """Nothing in a packet says whose it is: the manifest has the MAC address of each row's card, from the kernel."""
+    """Packets do not identify their card, so the manifest has the MAC address of each row's card, from the kernel."""
     macs = {rig.cards[name].board.card_address: f"12:34:56:78:90:{name}" for name in ("RH", "RV")}
     monkeypatch.setattr(card, "neighbour_mac", macs.get)
     stop = StopRequest()

@@ -35,7 +35,7 @@ def commands(pi) -> list[type]:
 
 
 class MovingPi(PiClient):
-    """A client of a Pi whose stage passes through `states` while `scan_id` runs, a state an answer."""
+    """A client of a Pi whose stage passes through `states` while `scan_id` runs: each answer has the next state."""
 
     def __init__(self, scan_id: str, states: list[str]) -> None:
         self._scan_id = "mine"
@@ -70,7 +70,7 @@ def test_a_run_of_another_host_is_not_aborted(other):
 
 
 def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
-    """Progress opens its control folder; a warning of the rig is not always there to do so."""
+    """The progress callback opens the control folder, because not every rig has a warning that opens it."""
     first = []
 
     def note(p) -> None:

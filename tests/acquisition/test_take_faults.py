@@ -1,4 +1,4 @@
-"""Faults of takes in the manifest: a kind and a board for programs beside the reasons for people."""
+"""Faults of takes in the manifest: a kind and a board for programs, and reasons for people."""
 
 import re
 
@@ -36,7 +36,7 @@ def held(rig) -> None:
 
 
 def make_unlocated(rig) -> None:
-    """The first packet is lost, and the record ends neither where it should nor at a whole packet."""
+    """The first packet is lost, and the record ends too early, within a packet."""
     rig.cards["RV"].drop[0, 1] = {0}
     rig.cards["RV"].short[0, 1] = 5 * rig.instrument.frame_bytes // 2
 

@@ -123,17 +123,17 @@ def make_progress(n: int, left_s: float | None) -> ScanProgress:
 
 
 def test_a_line_at_every_tenth_of_the_scan():
-    said = show_progress(
+    progress_text = show_progress(
         *(make_progress(n, 60.0 * (ROWS - n)) for n in range(1, ROWS + 1)), terminal=False
     ).splitlines()
-    assert said[0] == "1 of 20 rows, 19:00 left"
-    assert said[1:] == [f"{n} of 20 rows, {ROWS - n}:00 left" for n in range(2, ROWS + 1, 2)]
+    assert progress_text[0] == "1 of 20 rows, 19:00 left"
+    assert progress_text[1:] == [f"{n} of 20 rows, {ROWS - n}:00 left" for n in range(2, ROWS + 1, 2)]
 
 
 def test_notices_are_shown_and_steps_are_not():
     step = {"rows": ROWS, "committed": 3, "row": 4, "take": 1}
     answer = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
-    said = show_progress(
+    progress_text = show_progress(
         *(ScanProgress(phase, f"so {phase}", **step) for phase in (*answer, "row", "state")), terminal=False
     )
-    assert said.splitlines() == [f"{phase}: so {phase}" for phase in answer]
+    assert progress_text.splitlines() == [f"{phase}: so {phase}" for phase in answer]

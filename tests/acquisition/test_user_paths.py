@@ -1,4 +1,4 @@
-"""The folder that a user names: every form of its path means the same to scan, resume, validate and process."""
+"""The folder that a user names: scan, resume, validate and process take every form of its path."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The scan waits between rows for processing and disk instead of losing data, and stops on request."""
+"""Between rows the scan waits for processing and disk, so that it loses no data, and stops on request."""
 
 import os
 import resource
@@ -181,7 +181,7 @@ def test_a_report_that_comes_as_the_time_is_up_ends_the_row(rig, monkeypatch):
 
 
 def test_a_report_that_comes_while_the_program_is_held_ends_the_row(rig, monkeypatch):
-    """The loop finds nothing, and is held until long after the row's time limit."""
+    """The loop finds no events, and is delayed until long after the row's time limit."""
     reports = [None, "the Pi's report"]
     monkeypatch.setattr(row, "time", SimpleNamespace(monotonic=lambda: 0.0 if len(reports) == 2 else 1e6))
     monkeypatch.setattr(row, "row_limit_s", lambda *_: 60.0)
@@ -199,7 +199,7 @@ def test_a_report_that_comes_while_the_program_is_held_ends_the_row(rig, monkeyp
 
 
 def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
-    """Its limit passes at every reading of the clock, which stands still before it is held and after its end."""
+    """The limit passes at every reading of the clock, which stands still before the delay and after the loop's end."""
     rig.pi.hang_at = {1}
     rig.pi.hang_held = True
     readings_s = []

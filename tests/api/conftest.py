@@ -20,7 +20,7 @@ PET = {"name": "PET", "centre_mm": [45.0, 0.0], "size_mm": [45.0, 45.0], "permit
 
 
 def simulate_plates(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
-    """A scan of plates on the grid of examples/own-scene.toml, of nothing on a coarse one; `more` as of `simulate`."""
+    """A scan of plates on the grid of examples/own-scene.toml, or an empty one on a coarse grid."""
     columns, rows, step_mm = (31, 27, (10.0, 6.0)) if plates else (15, 17, (14.0, 8.0))
     image = {"columns": 90, "rows": 60, "pixel_mm": 2.0}
     scene = scene_of(*plates, columns=columns, rows=rows, step_mm=step_mm, image=image)
@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `polysight process` makes of a copy of it, in which it keeps the samples."""
+    """Products of `polysight process` for a copy of that scan folder; the samples are kept."""
     products_folder = tmp_path_factory.mktemp("processed")
     command("process", shutil.copytree(folder, products_folder / "scan"), "--out", products_folder / "products")
     return products_folder / "products"

@@ -1,4 +1,4 @@
-"""The check plate: its distance from what is known of it, the verdict, the command and the chart."""
+"""The check plate: its distance from its known permittivity, the verdict, the command and the chart."""
 
 import json
 import shutil

@@ -80,7 +80,7 @@ def test_a_classifier_is_an_estimator(library, model):
     ],
 )
 def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, others):
-    """The checks have 1 to 10 columns; the discriminant gets them with as many more as make whole angles."""
+    """The checks have 1 to 10 columns; the discriminant gets additional columns, so that all angles are complete."""
 
     def fill_angle(X):
         return ratio_columns(np.pad(X, ((0, 0), (0, -X.shape[1] % 4)), constant_values=1.0))

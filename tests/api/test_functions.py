@@ -139,7 +139,7 @@ def test_what_is_no_box_is_refused_by_name(products, tmp_path, box):
 
 
 def test_one_path_is_one_scan(products):
-    """Not a scan for each letter of it."""
+    """A text is one scan, not one for each of its letters."""
     with pytest.raises(DataError, match=r"products|1 scan"):
         polysight.train(str(products))
 

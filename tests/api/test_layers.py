@@ -24,7 +24,7 @@ def done(tmp_path):
 
 
 def test_the_unknown_layer_of_each_patch(done):
-    """Nothing is said of the metal reference."""
+    """The metal reference has no values."""
     layers = layer_dataset(done, CHIRP, ["sheet,?,1.7"], None, 10.0)
     assert layers["patch"].values.tolist() == [1, 2]
     eps = layers["permittivity"].values

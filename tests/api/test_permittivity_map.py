@@ -1,4 +1,4 @@
-"""Maps of permittivity: they agree with the patches, are free of the estimated leakage, and know their errors."""
+"""Maps of permittivity agree with the patches, are corrected for the estimated leakage, and have correct errors."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -107,7 +107,7 @@ def test_no_pixel_is_more_certain_than_its_patch(scan):
 
 
 def test_the_mask_holds_no_value_that_a_half_space_cannot_have(scan):
-    """Not the edges of the metal, either."""
+    """The edges of the metal have no values, either."""
     eps = scan.permittivity_map()
     shown = eps["permittivity"].values[eps["mask"].values]
     errors = eps["permittivity_real_standard_error"].values[eps["mask"].values]

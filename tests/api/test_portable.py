@@ -1,4 +1,4 @@
-"""Processing, notebooks and results need no module of POSIX systems: laptops with Windows have none."""
+"""Processing, notebooks and results need no module of POSIX systems, so that they run on Windows."""
 
 import subprocess
 import sys
@@ -49,11 +49,11 @@ def run_hidden(program: str, *arguments: object) -> str:
     Windows' locks are a stand-in.
     """
     code = HIDDEN + textwrap.dedent(program)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
 def test_every_public_name_is_imported_without_posix():

@@ -1,4 +1,4 @@
-"""Laws of `polysight.open_scan`: what it gives is what the commands write, described, and nothing is left behind."""
+"""Laws of `polysight.open_scan`: its results are those of the commands, with descriptions; no files remain."""
 
 import shutil
 import subprocess
@@ -58,7 +58,7 @@ def test_images_have_named_dimensions_and_places_from_the_centre(scan):
 
 
 def test_a_place_on_the_command_line_is_the_same_pixel_in_python(scan):
-    """The frames differ by 75 mm here: a place in the other one would be another pixel, or none."""
+    """The two frames differ by 75 mm here: the same coordinates in the other frame are another pixel, or none."""
     image = scan.image()
     assert abs(image.attrs["image_centre_y_m"]) > 0.05
     plate = image.sel(x_mm=PET["centre_mm"][0], y_mm=PET["centre_mm"][1], method="nearest")

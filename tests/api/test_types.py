@@ -1,4 +1,4 @@
-"""Types of the public interface: every parameter and result has one, and it says something."""
+"""Types of the public interface: every parameter and result has one that is not `Any` without reason."""
 
 import inspect
 import re
@@ -16,7 +16,7 @@ NOT_TYPED = {
     "PaperKNeighborsClassifier.kneighbors": "scikit-learn's",
     "PaperKNeighborsClassifier.metric": "scikit-learn's",
 }
-"""Names that may say `Any`, and why."""
+"""Names whose type may be `Any`, and the reason."""
 
 
 def functions_of(cls: type) -> Iterator[tuple[str, Callable[..., Any]]]:

@@ -1,4 +1,4 @@
-"""Scenes that the benchmarks draw are scenes that can be simulated."""
+"""Drawn scenes of the benchmarks can be simulated."""
 
 import pytest
 from benchmarks import coverage, layers

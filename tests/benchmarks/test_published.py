@@ -1,4 +1,4 @@
-"""The published method, as the benchmarks run it, really synchronises and images."""
+"""The published method of the benchmarks synchronises and makes images."""
 
 import numpy as np
 import pytest
@@ -86,7 +86,7 @@ def test_imager_makes_the_matched_filters_image(
 
 @pytest.mark.parametrize("tuned", [False, True])
 def test_synchroniser_looks_at_one_channel_in_single_precision(world: tuple[Instrument, Scene], tuned: bool) -> None:
-    """As the authors' code does; four channels in double precision cost 2.4 times as much and flatter us."""
+    """The authors' code does the same. Double precision in four channels would make it 2.4 times as slow."""
     rig, scene = world
     radar = SimulatedRig(rig, scene)
     method = Synchroniser(rig, rig.by_name("RH"), tuned)

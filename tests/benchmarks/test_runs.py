@@ -44,7 +44,7 @@ def test_quick_trial(
 def test_the_capture_trial_counts_as_lost_only_what_the_kernel_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """In each row: those after the first one were counted as lost. A busy machine may drop packets."""
+    """Packets after the first row were once counted as lost. A busy machine may drop packets."""
     main(["capture", "--seconds", "0.5", "--rate", "20000", "--alone", "--no-compare", "--folder", str(tmp_path)])
     columns = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("    20000")]
     assert len(columns) == 2

@@ -1,4 +1,4 @@
-"""The benchmark of surfaces judges what it says, on one small scan of a drawn object."""
+"""The benchmark of surfaces judges one small scan of a drawn object as it claims to."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Calibration files read back, a scan uses its own copies, and unsuitable or changed files are refused."""
+"""Calibration files are read back, a scan uses its own copies, and unsuitable or changed files are refused."""
 
 from dataclasses import replace
 
@@ -159,10 +159,10 @@ def test_a_missing_file_is_refused_before_the_scan_is_created(tmp_path, rig_nami
 def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
     reference = metal_reference(make_rig())
     path = write_metal(reference, SOURCES, tmp_path)
-    again = load_calibration({"metal": path}).reference()
+    reloaded = load_calibration({"metal": path}).reference()
     for name in ("h", "v", "valid", "x_m", "y_m"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(reference, name))
-    assert (again.spread, again.how) == (reference.spread, reference.how)
+        np.testing.assert_array_equal(getattr(reloaded, name), getattr(reference, name))
+    assert (reloaded.spread, reloaded.how) == (reference.spread, reference.how)
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".npz", ".toml"]
     assert read_calibration(path, MetalFile, "metal").ratio_variation_deg > 1
 

@@ -16,7 +16,7 @@ TRUE_KHZ = (235.0, 700.0)
 
 @pytest.fixture(scope="module")
 def scans(tmp_path_factory, make_rig, scan_of):
-    """One power cycle of a rig with other filters than its rig file says, at several start frequencies."""
+    """One power cycle of a rig whose filters differ from its rig file, at several start frequencies."""
     folder = tmp_path_factory.mktemp("sweep")
     folders = []
     for k, offset_hz in enumerate(OFFSETS_HZ):

@@ -174,7 +174,7 @@ def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
 
 
 def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, scan_of, tmp_path):
-    """V moved between the two scans: the axes are the same, the phases are not."""
+    """The board V moved between the two scans: its axes are the same, but not its phases."""
     other_scan = scan_of(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
     out = tmp_path / "out"
     assert main(["process", str(other_scan), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3

@@ -21,7 +21,7 @@ TURN_DEG = 0.5
 
 
 def laid(points):
-    """Where a target's points come to lie."""
+    """Measured positions of a target's points."""
     c = np.cos(np.radians(TURN_DEG))
     s = np.sin(np.radians(TURN_DEG))
     return [(c * x - s * y + LAID_MM[0], s * x + c * y + LAID_MM[1]) for x, y in points]
@@ -123,7 +123,7 @@ def few_echoes(case):
 
 
 def test_an_undetermined_unknown_stays_near_the_rig_file(case, few_echoes):
-    """A prior far tighter than the data holds everything: its standard errors never exceed it."""
+    """A prior that is much tighter than the data determines the result: standard errors do not exceed it."""
     prior = Prior(0.001, 0.001)
     fit = fit_places(few_echoes, case[2], [TargetPoint(p) for p in POINTS], prior)
     assert np.all(np.abs(fit.values[:7]) < 0.1)

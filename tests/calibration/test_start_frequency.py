@@ -1,4 +1,4 @@
-"""The estimated start frequencies put the direct path in the middle of the IF band, wherever it was."""
+"""The estimated start frequencies move the direct path to the middle of the IF band, from anywhere."""
 
 import msgspec
 import numpy as np
@@ -40,7 +40,7 @@ def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_midd
 
 @pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
 def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_mode):
-    """Law: wrapped into the band and unwrapped again, IFs are what they were, whole sample rates apart at most."""
+    """Law: IFs that are wrapped into the band and unwrapped again differ at most by a multiple of the sample rate."""
     rig = make_rig(chirp={"if_mode": if_mode})
     rate = rig.chirp.sample_rate_hz
     rng = np.random.default_rng(5)

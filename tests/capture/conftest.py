@@ -36,13 +36,13 @@ def rig(tmp_path: Path) -> Instrument:
 
 @pytest.fixture
 def board(rig: Instrument) -> Board:
-    """A receiving board whose card and host have addresses that nobody else uses."""
+    """A receiving board whose card and host have unused addresses."""
     return rig.by_role("receive_h")
 
 
 @pytest.fixture
 def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
-    """Starts cards of the named boards (or of other boards given whole)."""
+    """Starts cards of boards by name, or of the boards in `more`."""
     with ExitStack() as stack:
 
         def start(*names: str, streamed_bytes: int = 0, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
@@ -60,8 +60,7 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
 def scripted_card(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, ScriptedCard]]]:
     """Makes a client and a card with scripted answers, of board RV.
 
-    An attempt's time is over when the card has left it `unanswered` (code and count, as for the answers), and never
-    before.
+    An attempt times out only if it is in `unanswered` (code and count, as for the answers). Others never time out.
     """
     board = rig.by_name("RV")
     with ExitStack() as stack:

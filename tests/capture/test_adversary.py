@@ -1,6 +1,6 @@
-"""Rows with every trouble of a card and a network: data is original or masked, and not masked without reason.
+"""Rows with all faults of a card and a network: data is original or masked, and not masked without reason.
 
-A state machine takes record after record, each through drawn troubles; what one record leaves behind comes with the
+A state machine takes one record after another, each with drawn faults; leftovers of a record come with the
 next. 2,000 records; `--long` takes 20,000 and draws new ones.
 """
 
@@ -42,7 +42,7 @@ def wrong_bytes(sent: Sent, placed: Placed, out: np.ndarray) -> int:
 
 
 class Rows(RuleBasedStateMachine):
-    """A receiver behind a card at its worst."""
+    """A receiver and a card with all faults."""
 
     @initialize(
         grid=st.sampled_from(GRIDS),
@@ -89,7 +89,7 @@ class Rows(RuleBasedStateMachine):
         return sent, placed
 
     def check_mask(self, sent: Sent, placed: Placed) -> None:
-        """Where the start is known and the card sent one whole record, the mask is what did not come."""
+        """If the start is known and the card sent one complete record, exactly the lost bytes are masked."""
         if placed.complete:  # and right, as was seen before
             return
         spoils = {"truncate", "turn_header_bit", "two_paths", "reset_between"}
@@ -114,7 +114,7 @@ class Rows(RuleBasedStateMachine):
 
     @rule(batch=st.sampled_from([1, 7, 64]))
     def perfect(self, batch):
-        """Nothing happens to this record; leftovers may still come among its packets."""
+        """A record without faults of its own; leftovers of others may come among its packets."""
         sure = self.sure and self.past.start is not None and self.card.resets == 0
         sent, placed = self.take((), batch, pulses_known=True)
         alone = all(a.record == sent.number or a.t_ns < sent.not_before_ns for a in sent.arrivals)

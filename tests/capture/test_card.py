@@ -1,4 +1,4 @@
-"""The control client against a card that answers from another port, late, wrongly, or not at all."""
+"""The control client with a card that answers from another port, late, wrongly, or not at all."""
 
 import itertools
 import select
@@ -75,7 +75,7 @@ def test_lost_reply_is_retried(scripted_card):
 
 
 def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_card, monkeypatch):
-    """The program is held after its request, or the machine sleeps: the time is over, and the reply is there."""
+    """The program is delayed after its request, or the machine sleeps: it reads the reply after the timeout."""
     client, sent_to = scripted_card(lambda code, _: [reply(code)])
     requests = []
     clock_s = itertools.count(0.0, 1e6)
@@ -96,7 +96,7 @@ def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_car
 
 
 def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripted_card, monkeypatch):
-    """The socket is never empty; the clock stands at the end of the time."""
+    """The socket is never empty; the clock shows the end of the timeout."""
     client, _ = scripted_card(lambda *_: [])
     datagrams = itertools.repeat((reply(Code.VERSION), (client.board.card_address, 1024)))
     flood = SimpleNamespace(
@@ -138,7 +138,7 @@ def test_command_port_in_use(scripted_card):
 
 @pytest.mark.parametrize("between", [True, False])
 def test_end_of_the_record_before_is_not_that_of_this_one(scripted_card, between):
-    """It came after the stop: before the next start was sent, or between that and its reply."""
+    """The status came after the stop: before the next start was sent, or between that and its reply."""
     late = [reply(Code.STATUS, Status.RECORD_COMPLETED)]
     client, card = scripted_card(
         lambda code, n: [*(late if between and code == Code.RECORD_START and n == 2 else []), reply(code)]
@@ -263,7 +263,7 @@ def test_a_card_that_could_not_write_it(scripted_card, status, answer, unanswere
     ("asked_again", "answers", "alone"), [(0, 1, True), (0, 2, False), (1, 2, True), (1, 3, False)]
 )
 def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, asked_again, answers, alone):
-    """The first request's answer comes with the second's: one card has answered both."""
+    """The answer to the first request comes with that to the second one: one card has answered both."""
     client, _ = scripted_card(
         lambda code, _: [reply(code, 0x0402)] * answers,
         unanswered=[(Code.VERSION, n) for n in range(1, 1 + asked_again)],
@@ -277,7 +277,7 @@ def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, 
 
 
 def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch):
-    """Both answer one request. The second answer is waited for as long as it takes; of one card there is none."""
+    """Both cards answer one request. The client waits until the second answer comes; one card alone sends none."""
     names = [board.name for board in rig.boards]
     cards(*names[1:], **dict.fromkeys(names[2:], Faults(twin=True)))
     with CardClient(rig.boards[1], HANG_S) as client:
@@ -288,7 +288,7 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
 
 
 def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_card, monkeypatch):
-    """Cards were exchanged, or a second one with this address answers now; what the kernel forgot says nothing."""
+    """Cards were exchanged, or a second one answers now. It is no error if the kernel has forgotten the address."""
     client, _ = scripted_card(lambda code, _: [reply(code, 0)])
     known = {"mac": "12:34:56:78:90:12"}
     monkeypatch.setattr(card, "neighbour_mac", lambda _: known["mac"])

@@ -28,20 +28,20 @@ def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended
     return run
 
 
-def verdicts(done: Ended) -> dict[str, dict[str, dict[str, str]]]:
+def verdicts(process: Ended) -> dict[str, dict[str, dict[str, str]]]:
     """Hops by board and name."""
-    return {s["name"]: {hop["hop"]: hop for hop in s["hops"]} for s in json.loads(done.out)}
+    return {s["name"]: {hop["hop"]: hop for hop in s["hops"]} for s in json.loads(process.out)}
 
 
 def test_every_hop_of_every_card(cards, card):
     cards("LS", "RH", "RV")
-    done = card("--json")
-    assert done.status == 0, done.err
-    surveys = json.loads(done.out)
+    process = card("--json")
+    assert process.status == 0, process.err
+    surveys = json.loads(process.out)
     assert [(s["name"], s["ok"], s["fpga_version"], s["silent_hop"]) for s in surveys] == [
         (name, True, "2.8", "") for name in ("LS", "RH", "RV")
     ]
-    for name, hops in verdicts(done).items():
+    for name, hops in verdicts(process).items():
         for hop in ("host", "route", "link", "card"):
             assert hops[hop]["verdict"] == "ok"
         received = "not checked" if name == "LS" else "ok"
@@ -75,34 +75,36 @@ def test_every_hop_of_every_card(cards, card):
 def test_refused_commands_write_nothing(cards, card, words, says):
     running_cards = cards("RH")
     state_before = running_cards.endpoints["RH"].card.network
-    done = card(*words)
-    assert done.status == 2, done
-    assert says in done.err
-    assert "\n  do: " in done.err
+    process = card(*words)
+    assert process.status == 2, process
+    assert says in process.err
+    assert "\n  do: " in process.err
     running_cards.power_cycle("RH")
     assert running_cards.endpoints["RH"].card.network == state_before
 
 
 def program_card(power_cycle: Callable[[], None], folder: Path, typed: str, *words: str) -> str:
-    """What `polysight card program` says while the card is switched off and on once it asks for that."""
+    """Output of `polysight card program` while the card is switched off and on at its request."""
     answer = folder / "told.txt"
     with answer.open("w") as out:
         command = [str(POLYSIGHT), "card", "program", *words, "--mac", NEW_MAC, "--wait", str(HANG_S)]
-        done = subprocess.Popen(
+        process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=out, stderr=subprocess.STDOUT, text=True, cwd=folder
         )
-        assert done.stdin is not None
-        with done.stdin:
-            done.stdin.write(typed + "\n")
-        wait_for(lambda: done.poll() is not None or "looking for it" in answer.read_text(), "the search for the card")
-        assert done.poll() is None, answer.read_text()
+        assert process.stdin is not None
+        with process.stdin:
+            process.stdin.write(typed + "\n")
+        wait_for(
+            lambda: process.poll() is not None or "looking for it" in answer.read_text(), "the search for the card"
+        )
+        assert process.poll() is None, answer.read_text()
         power_cycle()
-        assert done.wait(HANG_S) == 0, answer.read_text()
+        assert process.wait(HANG_S) == 0, answer.read_text()
     return answer.read_text()
 
 
 def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
-    """From the address all cards are sold with to the board's own, typed, and seen there after a power cycle."""
+    """The card's default address is changed to the board's, with confirmation, and checked after a power cycle."""
     old = rig.by_name("LS")
     board = rig.by_name("RV")
     running_cards = cards(more=(old,))
@@ -121,15 +123,15 @@ def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp
     endpoint = running_cards.endpoints["RH"]
     monkeypatch.setattr(devices, "_ASK_S", HANG_S)
     options = ("--mac", NEW_MAC, "--yes", "--wait", "1")
-    done = card("program", "RH", *options)
-    assert done.status == 5
-    assert "written, but the card was not switched off" in done.err
+    process = card("program", "RH", *options)
+    assert process.status == 5
+    assert "written, but the card was not switched off" in process.err
     options = ("--mac", NEW_MAC, "--yes", "--wait", "0")
-    done = card("program", "RH", *options)
-    assert (done.status, "`polysight card` tells" in done.out) == (0, True)
+    process = card("program", "RH", *options)
+    assert (process.status, "`polysight card` tells" in process.out) == (0, True)
 
     def power_cycle() -> None:
-        """The card is off until a whole round of requests, three of them, is lost."""
+        """The card is off until three requests, a complete round, are lost."""
         running_cards.power_cycle("RH")
         wait_for(lambda: endpoint.counts["requests_unheard"] > 3, "requests to a card that is off")
         endpoint._boots_until_s = 0.0
@@ -141,26 +143,26 @@ def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp
 def test_reset(cards, card):
     running_cards = cards("RH")
     running_cards.endpoints["RH"].card._packetiser.sequence = 77
-    done = card("reset", "RH", "--radar")
-    assert (done.status, "armed again" in done.out) == (0, True)
+    process = card("reset", "RH", "--radar")
+    assert (process.status, "armed again" in process.out) == (0, True)
     assert running_cards.endpoints["RH"].card._packetiser.sequence == 77
-    done = card("reset", "RH")
-    assert (done.status, "configures it again" in done.out) == (0, True), done
+    process = card("reset", "RH")
+    assert (process.status, "configures it again" in process.out) == (0, True), process
     assert running_cards.endpoints["RH"].card._packetiser.sequence == 1
 
 
 def test_listening_ends_with_a_row_and_without_loss_wherever_the_last_record_ended(cards, card, rig):
     """The card is reset first: if its counters continue, the beginning of its record is not known.
 
-    The radars send more than a row, and no more than the receive buffer holds.
+    The radars send more than a row, but not more than the receive buffer holds.
     """
     running_cards = cards("LS", "RH", "RV", streamed_bytes=rig.row_bytes + rig.card.payload_bytes)
     packetiser = running_cards.endpoints["RH"].card._packetiser
     packetiser.sequence = 77_777
     packetiser.byte_count = 77_776 * packetiser.payload_bytes
     # Twice the time after which a test has hung.
-    done = card("--listen", "3600", "--json")
+    process = card("--listen", "3600", "--json")
     for name in ("RH", "RV"):
-        radar = verdicts(done)[name]["radar"]
+        radar = verdicts(process)[name]["radar"]
         assert radar["verdict"] == "ok", radar
         assert f"{rig.row_bytes} bytes" in radar["found"]

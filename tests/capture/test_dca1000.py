@@ -1,4 +1,4 @@
-"""The card's bytes, against vectors seen from a real card."""
+"""The card's bytes, compared with recordings of a real card."""
 
 import numpy as np
 import pytest
@@ -72,10 +72,10 @@ def two_lane(x: np.ndarray) -> bytes:
 @given(st.integers(1, 4), st.integers(1, 9), st.sampled_from([1, 2, 4]))
 def test_four_lane_round_trip(frames, samples, rx):
     x = cube(frames, samples, rx)
-    got, valid = decode_row(four_lane(x), (), frames, samples, rx)
-    assert got.dtype == np.complex64
+    decoded, valid = decode_row(four_lane(x), (), frames, samples, rx)
+    assert decoded.dtype == np.complex64
     assert valid.all()
-    assert np.array_equal(got, x)
+    assert np.array_equal(decoded, x)
 
 
 @given(st.integers(1, 4), st.integers(1, 5), st.sampled_from([1, 2, 4]))
@@ -99,10 +99,10 @@ def test_frames_with_a_missing_byte_are_invalid_and_zero(cuts):
     for a, n in cuts:
         mask[a : a + n] = True
     ranges = [(a, min(a + n, size)) for a, n in cuts]
-    got, valid = decode_row(four_lane(x), ranges, 5, 8)
+    decoded, valid = decode_row(four_lane(x), ranges, 5, 8)
     assert np.array_equal(valid, ~mask.reshape(5, -1).any(axis=1))
-    assert not got[:, ~valid].any()
-    assert np.array_equal(got[:, valid], x[:, valid])
+    assert not decoded[:, ~valid].any()
+    assert np.array_equal(decoded[:, valid], x[:, valid])
 
 
 def test_short_data_is_refused():

@@ -1,4 +1,4 @@
-"""Errors of a silent card name the hop: no route, no link, no device, a mute card, a radar that does not stream."""
+"""Errors of a silent card name the hop: no route, no link, no device, a silent card, a radar that does not stream."""
 
 import os
 import shutil
@@ -31,7 +31,7 @@ GATEWAY = "eth0 00000000 0102A8C0 0003 0 0 100 00000000 0 0 0\n"
 
 
 def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str | None = "0x2") -> Path:
-    """A machine's /proc and /sys."""
+    """Files of a machine's /proc and /sys."""
     (root / "proc/net").mkdir(parents=True)
     (root / "proc/net/route").write_text(ROUTES + routes)
     neighbours = f"{CARD} 0x1 {arp} 12:34:56:78:90:12 * eth1\n" if arp else ""
@@ -139,12 +139,12 @@ try mute
 
 
 def test_real_interfaces_tell_the_hops_apart():
-    """A network of its own, made of two virtual ethernet ports: pull the plug, remove the card, mute it."""
+    """A separate network of two virtual ethernet ports: unplug it, remove the card, silence it."""
     tools = [shutil.which(name) for name in ("unshare", "ip", "nsenter", "mount")]
     make = ["unshare", "-rnm", "sh", "-c", "mount -t sysfs s /sys && ip link add c0 type veth peer name c1"]
     if None in tools or subprocess.run(make, capture_output=True, check=False).returncode:
         pytest.skip("no private network namespace with virtual ethernet on this machine")
-    done = subprocess.run(
+    process = subprocess.run(
         ["unshare", "-rnm", "bash", "-c", SCRIPT],
         capture_output=True,
         text=True,
@@ -152,14 +152,14 @@ def test_real_interfaces_tell_the_hops_apart():
         env=os.environ | {"PYTHON": sys.executable},
         cwd=REPO,
     )
-    assert done.returncode == 0, done.stderr
-    said = {line.split(" | ")[0]: line for line in done.stdout.splitlines()}
-    assert "| host | LS commands: 192.168.33.30 is not an address of this machine" in said["no-address"]
+    assert process.returncode == 0, process.stderr
+    line_by_hop = {line.split(" | ")[0]: line for line in process.stdout.splitlines()}
+    assert "| host | LS commands: 192.168.33.30 is not an address of this machine" in line_by_hop["no-address"]
     for name, hop, cause in (
         ("no-route", "route", "| no route"),
         ("no-link", "link", "| no link: network interface c0"),
         ("no-device", "card", "no device has the address 192.168.33.180"),
         ("mute", "card", "the card is mute"),
     ):
-        assert f"| {hop} |" in said[name]
-        assert cause in said[name]
+        assert f"| {hop} |" in line_by_hop[name]
+        assert cause in line_by_hop[name]

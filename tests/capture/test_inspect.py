@@ -1,4 +1,4 @@
-"""Recordings are described by their layout; the real packet capture is read through the receiver's placement."""
+"""Recordings are described by their layout; the real packet capture is placed as a received row."""
 
 import functools
 import io
@@ -233,8 +233,8 @@ def polysight(tmp_path):
 def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
     row(4, False).tofile(tmp_path / "rig.bin")
     row(2, True, samples=128).tofile(tmp_path / "other.bin")
-    done = polysight("rig.bin", "--config", RIG_FILE, "--plot", "rig.png")
-    assert (done.status, "note" in done.out) == (0, False), done
+    process = polysight("rig.bin", "--config", RIG_FILE, "--plot", "rig.png")
+    assert (process.status, "note" in process.out) == (0, False), process
     assert (tmp_path / "rig.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     options = ("--samples", "128", "--lanes", "2", "--q-first", "--json")
     document = json.loads(polysight("other.bin", *options).out)
@@ -246,13 +246,13 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
     each_packet_twice = [packet for packet in encode_packets(row(4, False).tobytes(), 1, 0) for _ in range(2)]
     # Known by its first bytes, not by its name
     write_pcap(tmp_path / "both", each_packet_twice, cards=(CARD, OTHER))
-    done = polysight("both")
-    assert done.status == 3
-    assert "192.168.33.180 and 192.168.33.181" in done.err
+    process = polysight("both")
+    assert process.status == 3
+    assert "192.168.33.180 and 192.168.33.181" in process.err
     options = ("--card", "192.168.33.181", "--config", RIG_FILE, "--plot", "both.png")
-    done = polysight("both", *options)
-    assert done.status == 0, done.err
-    assert "32 chirps x 4 RX x 256 samples" in done.out
+    process = polysight("both", *options)
+    assert process.status == 0, process.err
+    assert "32 chirps x 4 RX x 256 samples" in process.out
     assert (tmp_path / "both.png").exists()
     assert "nothing from a DCA1000 at 192.168.33.7" in polysight("both", "--card", "192.168.33.7").err
 
@@ -261,10 +261,10 @@ def test_a_row_of_a_scan_is_read_with_the_scans_rig_file(polysight, tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(8, 2, metal=False))
     simulate = [sys.executable, "-m", "polysight_simulators", "simulate", tmp_path / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)
-    done = polysight("scan/raw/RV/0001.bin")
-    assert done.status == 0, done.err
-    assert "of a simulated scan" in done.out
-    assert "16 chirps x 4 RX x 256 samples, 4-lane, I first\n" in done.out
+    process = polysight("scan/raw/RV/0001.bin")
+    assert process.status == 0, process.err
+    assert "of a simulated scan" in process.out
+    assert "16 chirps x 4 RX x 256 samples, 4-lane, I first\n" in process.out
     (tmp_path / "scan" / "manifest.jsonl").write_bytes(b"damaged\n")
-    done = polysight("scan/raw/RV/0001.bin")
-    assert (done.status, "of a simulated scan" in done.out) == (0, False)
+    process = polysight("scan/raw/RV/0001.bin")
+    assert (process.status, "of a simulated scan" in process.out) == (0, False)

@@ -1,4 +1,4 @@
-"""Every anomaly of a row is counted under its own name, and under no other."""
+"""Every anomaly of a row is counted once, under its own name."""
 
 from hypothesis import assume, given, strategies as st
 from tests.support.capture.records import FULL, Card, encode_packet, is_original_or_masked, place

@@ -50,15 +50,15 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
     order = sorted(sent, key=lambda kp: kp[0] + (chance.randint(-3, 3) if chance.random() < rate else 0))
     placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
-    got = {k for k, _ in sent}
-    lost_bytes = make_mask(out.size, [record.byte_range(k) for k in range(len(record.packets)) if k not in got])
+    received = {k for k, _ in sent}
+    lost_bytes = make_mask(out.size, [record.byte_range(k) for k in range(len(record.packets)) if k not in received])
     assert placed.received == (~lost_bytes).sum()
-    assert placed.counts.placed == len(got)
-    assert placed.counts.duplicates == len(sent) - len(got)
+    assert placed.counts.placed == len(received)
+    assert placed.counts.duplicates == len(sent) - len(received)
     assert placed.counts.outside == placed.counts.disagreeing == placed.counts.malformed == 0
     mask = make_mask(out.size, placed.missing)
     assert (mask | ~lost_bytes).all()
-    if len(record.packets) - 1 in got:
+    if len(record.packets) - 1 in received:
         assert placed.located
     if placed.located:
         assert (mask == lost_bytes).all()
@@ -72,7 +72,7 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
 
 @dataclass
 class Oracle:
-    """What should become of packets of a record whose start is known, byte by byte."""
+    """Expected result for packets of a record whose start is known, byte by byte."""
 
     size: int
     placed: int = 0
@@ -167,7 +167,7 @@ def test_every_disorder_at_once(
     chance=st.randoms(use_true_random=True),
 )
 def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, sequence, skip, chance: random.Random):
-    """Each record ends with a short packet: sequence and byte count drift apart, and every record is found."""
+    """Each record ends with a short packet: sequence and byte count drift apart, but every record is found."""
     start = Past(Counters(count, sequence))
     for n in range(records):
         record = Record.make(frames * frame, count, sequence, seed=n)
@@ -191,7 +191,7 @@ def test_losses_are_counted_by_kind():
 
 
 def test_logging_allocates_nothing_that_stays():
-    """A packet makes no object: a thousand batches leave as many blocks of memory as ten."""
+    """Packets create no Python objects: a thousand batches use as many blocks of memory as ten."""
     size = 256 * FULL
     batch = 256
     record = Record.make(size, 0, 1)
@@ -232,7 +232,7 @@ def test_lost_head_is_found_from_a_known_start(head, tail, count, sequence):
     count=near_wrap,
 )
 def test_truncated_packet(cut, which, count):
-    """A packet cut short on its way: what it lost is masked, or everything when the end is no longer sure."""
+    """A truncated packet: its lost bytes are masked, or the whole row if the end is no longer certain."""
     record = Record.make(20 * FULL + 700, count, 77)
     packets = list(record.packets)
     packets[which] = packets[which][: max(0, len(packets[which]) - cut)]
@@ -258,7 +258,7 @@ def test_missed_frames_are_never_placed_as_if_nothing_was_missing(missed, count,
 # A position beyond the end of the row
 @example(flip=46, which=10, count=0)
 def test_corrupted_header_damages_nothing(flip, which, count):
-    """One flipped bit anywhere in one packet's counters: its bytes are masked, nobody else's are touched."""
+    """One flipped bit anywhere in one packet's counters: only its bytes are masked."""
     record = Record.make(21 * FULL + 100, count, 500)
     packets = list(record.packets)
     bad = bytearray(packets[which])
@@ -295,7 +295,7 @@ def test_nothing_and_nonsense():
     batch=st.sampled_from([1, 2, 7]),
 )
 def test_last_packet_of_the_previous_record_is_not_the_first_of_this_one(rest, count, sequence, batch):
-    """The record before was stopped early, and what its card still held comes when this one is received already."""
+    """The previous record was stopped early; packets that its card still held come during this one."""
     late = Record.make(rest, count, sequence, seed=1)
     start = Counters((count + rest) % COUNT, (sequence + 1) % SEQUENCE)
     record = Record.make(20 * FULL + 100, start.byte_count, start.sequence)
@@ -323,7 +323,7 @@ SHORT_END = 62 * FRAME
 @pytest.mark.parametrize("lost", [1, 3])
 @pytest.mark.parametrize("dropped", [0, 16, 1440])
 def test_without_its_end_no_record_is_certain(lost, dropped):
-    """What the card drops inside shows only in the record's length."""
+    """Bytes that the card drops internally show only in the record's length."""
     row = Record.make(SHORT_END, 70_000, 9)
     sent = encode_packets(row.data[:5000] + row.data[5000 + dropped :], 9, 70_000)
     for packets in (sent[:-lost], sent):
@@ -375,7 +375,7 @@ def test_a_restart_within_a_row_gives_no_wrong_byte(size, before, start):
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_a_late_packet_of_the_first_record_is_not_a_restart(size):
-    """A card that restarts within a row never counts to its end: these counters are of an earlier record."""
+    """A card that restarts within a row does not reach its end: these counters are of an earlier record."""
     record = Record.make(size, 5 * size, 5 * -(-size // FULL) + 1)
     late = Record.make(size, 0, 1, seed=1).packets[7]
     start = Counters(5 * size, 5 * -(-size // FULL) + 1)
@@ -398,7 +398,7 @@ def test_overlapping_payload_is_compared():
 
 
 def test_a_second_card_with_equal_counters_fills_no_gap():
-    """Two cards with one address that were reset together: where one packet is lost, the other card's is alone."""
+    """Two cards with one address that were reset together: if a packet is lost, only the other card's comes."""
     record = Record.make(40 * FULL + 100, 70_000, 9)
     twin = Record.make(40 * FULL + 100, 70_000, 9, seed=1)
     pairs = enumerate(zip(record.packets, twin.packets, strict=True))
@@ -430,7 +430,7 @@ def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
 
 
 def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
-    """An earlier record's are left over; with counters of the row they are frames that no pulse started."""
+    """Such packets are left over from an earlier record; with counters of this row they are frames without a pulse."""
     record = Record.make(SHORT_END, 70_000, 9)
     for early, located in ((Record.make(2 * FULL, 70_000 - 2 * FULL, 7), True), (record, False)):
         log = make_log(SHORT_END, early.packets[:2], t_ns=1)
@@ -443,7 +443,7 @@ def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
 
 
 def test_a_whole_record_elsewhere_is_not_the_rows():
-    """A second card with the same address sends one whole row, and nothing comes of the own card's."""
+    """A second card with the same address sends one whole row, and the packets of the right card are lost."""
     twin = Card(SHORT_END, 5_000_000, 40_000)
     placed, _ = place(SHORT_END, twin.record().packets, Past(Counters(70_000, 9)), FRAME)
     assert not placed.located

@@ -1,4 +1,4 @@
-"""Files of the project are readable without it: with numpy.fromfile, json and msgpack alone."""
+"""Files of the project can be read without it, with numpy.fromfile, json and msgpack."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ SAMPLES = 256
 
 
 def read_row(path: Path) -> tuple[dict, np.ndarray, np.ndarray]:
-    """Index, arrivals and samples of a row, by the words of docs/spec alone: complex [rx, frame, sample]."""
+    """Index, arrivals and samples of a row, read as docs/spec describes: complex [rx, frame, sample]."""
     words = np.fromfile(path, dtype="<i2").reshape(-1, SAMPLES, 2, 4)
     samples = (words[:, :, 0, :] + 1j * words[:, :, 1, :]).transpose(2, 0, 1)
     with path.with_suffix(".idx").open("rb") as f:
@@ -110,7 +110,7 @@ def test_manifest(tmp_path):
 
 
 def test_whole_scan(tmp_path):
-    """A simulated scan folder, from its first file to its last, by the words of docs/spec alone."""
+    """All files of a simulated scan folder, read as docs/spec describes."""
     folder = simulate(published_rig(), decode_scene(scene_of(COPPER, columns=3, rows=2), "t"), tmp_path / "scan")
     facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
     for fact in facts:

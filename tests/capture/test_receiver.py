@@ -41,7 +41,7 @@ def noise(size: int, seed: int) -> bytes:
 
 
 def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
-    """So few that all fit in the receive buffer, should the receiver not run meanwhile."""
+    """The packets fit in the receive buffer even if the receiver does not run meanwhile."""
     assert len(some) <= usable_packets(1 << 20)
     for packet in some:
         card.sendto(packet, (board.host_address, board.data_port))
@@ -121,9 +121,10 @@ def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
 
 @pytest.mark.parametrize("clock_set_s", [0, 3600])
 def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch, clock_set_s):
-    """However many batches wait in the kernel, whoever sent those in front, and if the wall clock was set meanwhile.
+    """For any number of batches in the kernel, any senders of the first ones, and also if the wall clock was set
+    meanwhile.
 
-    All fits into the buffer that a kernel grants without rights (208 KiB asked, twice that given).
+    The packets fit into the buffer that a kernel grants without rights (208 KiB requested, twice that granted).
     """
     for name in ("take_core", "take_priority"):
         monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
@@ -147,7 +148,7 @@ def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch
 
 
 def _waiting(board: Board) -> int:
-    """Bytes the kernel holds for the data port."""
+    """Number of bytes that wait in the kernel for the data port."""
     for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
         words = line.split()
         if int(words[1].split(":")[1], 16) == board.data_port and words[1].startswith(
@@ -211,7 +212,7 @@ def test_ends_when_its_host_is_killed(board, tmp_path):
 
 
 def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
-    """Two receivers, one swamped while it is stopped: only its row counts drops, and only in the row they fell in."""
+    """Two receivers, one of which is stopped while packets come: only its row counts drops."""
     other_board = Board(
         name="RV",
         role="receive_v",
@@ -256,7 +257,7 @@ def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
 
 
 def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
-    """Frames were missed: the byte count is never reached, and the card's short tail says that nothing follows."""
+    """Frames were missed: the byte count is not reached, and the card's short last packet shows the end."""
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part", after_reset=True)
         send(card, board, encode_packets(noise(36_864, 4), 1, 0))
@@ -286,7 +287,7 @@ def test_a_record_ends_with_whichever_is_first(progress, status, now_s, ended):
 
 
 class SuspendedClocks:
-    """Two clocks of a process that the kernel suspends before some of its readings; see `time`."""
+    """Two clocks of a process that the kernel suspends before some readings; see `time`."""
 
     def __init__(self, difference_ns: int, pauses_ns: list[int]) -> None:
         self._now_ns = 0

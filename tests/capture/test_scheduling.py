@@ -12,6 +12,7 @@ from polysight.capture.receiver import Core, ReceiverProcess, receiver_cores, ta
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
 
+# Payload bytes of a full packet.
 FULL = 1456
 RIGHTS = REPO / "host/rights.sh"
 
@@ -35,19 +36,19 @@ def test_core_and_priority_are_reported(board):
         assert urgent or any("no real-time priority" in w for w in receiver.warnings)
 
 
-@pytest.mark.parametrize(("own", "urgent"), [(True, True), (True, False), (False, True), (False, False)])
-def test_a_shared_core_is_taken_with_priority_only(monkeypatch, own, urgent):
+@pytest.mark.parametrize(("exclusive", "has_priority"), [(True, True), (True, False), (False, True), (False, False)])
+def test_a_shared_core_is_taken_with_priority_only(monkeypatch, exclusive, has_priority):
     taken: list[set[int]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda _pid, cores: taken.append(cores))
-    assert take_core(1, own, urgent) == ((1, "") if own or urgent else (None, ""))
-    assert taken == ([{1}] if own or urgent else [])
+    assert take_core(1, exclusive, has_priority) == ((1, "") if exclusive or has_priority else (None, ""))
+    assert taken == ([{1}] if exclusive or has_priority else [])
 
 
 def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
-    done = subprocess.run(
+    process = subprocess.run(
         ["sh", RIGHTS, "ada"], env={**os.environ, "ROOT": str(tmp_path)}, capture_output=True, text=True, check=False
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (process.returncode, process.stderr) == (0, "")
     limits = (tmp_path / "etc/security/limits.d/60-polysight.conf").read_text()
     assert limits.splitlines()[-2:] == ["ada - rtprio 10", "ada - nice -10"]
     desktop = (tmp_path / "etc/systemd/system/user@.service.d/60-polysight.conf").read_text()
@@ -55,8 +56,8 @@ def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
     assert "LimitNICE=-10" in desktop
     assert f"net.core.rmem_max = {8 << 20}" in (tmp_path / "etc/sysctl.d/60-polysight.conf").read_text()
     for bad in ([], ["a b"], ["ada; reboot"]):
-        refused = subprocess.run(["sh", RIGHTS, *bad], env={**os.environ, "ROOT": str(tmp_path)}, check=False)
-        assert refused.returncode == 2
+        process = subprocess.run(["sh", RIGHTS, *bad], env={**os.environ, "ROOT": str(tmp_path)}, check=False)
+        assert process.returncode == 2
 
 
 def test_missing_permissions_are_warnings(monkeypatch):

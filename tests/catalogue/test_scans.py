@@ -1,4 +1,4 @@
-"""The list of scans: what is in it, in what state, and that looking at it costs next to nothing."""
+"""The list of scans: its entries, their states, and that listing again reads almost nothing."""
 
 import json
 import os
@@ -57,7 +57,7 @@ def test_every_scan_is_listed_with_its_state(root):
 
 
 def test_images_without_materials_are_no_result(root):
-    """As after a kill of `process`, or by `polysight image`."""
+    """Such folders are left by a killed `process`, or made by `polysight image`."""
     (root / "done" / "products" / "materials.json").unlink()
     summary = Scans(root).summary("done")
     assert (summary.processed, summary.images_only, summary.verdict, summary.materials) == (False, True, "", ())
@@ -98,7 +98,7 @@ def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
 
 
 def age_files(root: Path) -> None:
-    """Give all files times that are long ago: what was written a moment ago is read again."""
+    """Set all files' times to long ago, because files that were written a moment ago are read again."""
     for path in root.rglob("*"):
         os.utime(path, (1e9, 1e9))
 
@@ -117,7 +117,7 @@ def test_what_has_not_changed_is_not_read_again_after_a_restart(root, monkeypatc
 
 
 def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
-    """A file that is written twice within the clock's step of its drive keeps its time, and may keep its size."""
+    """A file that is written twice within one step of its drive's clock keeps its time, and may keep its size."""
     index = root / ".polysight" / "list.json"
     age_files(root)
     write_notes(root / "done", Notes("cat"))
@@ -129,7 +129,7 @@ def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
 
 
 def test_a_list_whose_time_is_over_goes_on_with_the_next(root):
-    """The last name comes first, and nothing that was read is lost; an index is written of whole lists only."""
+    """The last name comes first, and entries that were read are kept; the index is written only for complete lists."""
     whole = Scans(root).list()
     last = max(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     index = root.parent / "index.json"
@@ -261,7 +261,7 @@ def test_a_failure_is_the_last_error_in_the_log_or_that_it_was_killed():
 
 
 def test_of_a_huge_record_and_status_only_the_beginning_is_read(tmp_path):
-    """As on a drive with damaged files: sparse ones of 64 MiB."""
+    """Damaged files are replaced by sparse files of 64 MiB."""
     record = {"pid": 0, "ticks": 0, "words": [], "started_utc": ""}
     for name, content in (("scan.json", json.dumps(record)), ("scan.status", "7\n")):
         path = tmp_path / PROGRAM / name

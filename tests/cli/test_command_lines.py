@@ -1,4 +1,4 @@
-"""Command lines that would do less than they say are refused, and numbers are asked for in words."""
+"""Command lines with ineffective options are refused, and messages name the expected numbers."""
 
 import argparse
 import contextlib
@@ -31,7 +31,7 @@ SEGMENTS = [
 
 @pytest.fixture
 def scan(tmp_path) -> Path:
-    """A folder as a scan that was processed, with what these commands read of it."""
+    """A folder with those files of a processed scan that these commands read."""
     products = tmp_path / "scan" / "products"
     write_json(products / "materials.json", {"scan_id": "s7", "simulated": True, "segments": SEGMENTS})
     (products / "report.html").write_text("<p>here</p>")
@@ -60,10 +60,10 @@ def test_options_that_would_do_nothing_are_refused(words, options):
 
 
 def refusal(*words: str) -> str:
-    said = io.StringIO()
-    with contextlib.redirect_stderr(said), pytest.raises(SystemExit):
+    output = io.StringIO()
+    with contextlib.redirect_stderr(output), pytest.raises(SystemExit):
         build_parser().parse_args(words)
-    return said.getvalue().splitlines()[-1]
+    return output.getvalue().splitlines()[-1]
 
 
 @pytest.mark.parametrize("text", ["many", "-1", "1e9", ""])
@@ -155,7 +155,7 @@ def test_a_place_in_the_left_half_is_no_option(place):
 
 
 def list_named_jobs(parser: argparse.ArgumentParser, options: frozenset[str] = frozenset()):
-    """Each job that a command names, with the options of that command and of those above it."""
+    """Each job of a command, with the options of that command and of its parents."""
     options |= {action.dest for action in parser._actions if action.dest not in ("help", "command", "action")}
     options -= {"version"}
     run = parser.get_default("run")

@@ -1,4 +1,4 @@
-"""Each program of ours starts for real, and the fork that other tests get of it behaves as the program does."""
+"""Each of our programs starts as a real process, and the forked process of other tests behaves like it."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""No command waits for a package it does not use: numpy loads for 0.2 s, matplotlib or scipy.stats for a second."""
+"""No command loads a package that it does not use: numpy takes 0.2 s, matplotlib or scipy.stats a second."""
 
 import json
 import subprocess
@@ -38,11 +38,11 @@ sys.stdout.write(json.dumps([status, sorted(sys.modules)]))
 
 
 def loaded_by(*words: str | Path) -> set[str]:
-    """Modules in a new process when a command has succeeded in it."""
+    """Modules that a new process has loaded after a command succeeded in it."""
     command = [sys.executable, "-c", RUN, *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
-    status, modules = json.loads(done.stdout)
-    assert status == 0, done.stderr
+    process = subprocess.run(command, capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
+    status, modules = json.loads(process.stdout)
+    assert status == 0, process.stderr
     return set(modules)
 
 
@@ -53,7 +53,7 @@ def test_help_needs_no_numbers():
 
 @pytest.mark.parametrize("command", [names[0] for names in FAMILIES.values()])
 def test_help_of_a_command_needs_no_numbers(command):
-    """One of each family: a family is one module."""
+    """One command of each family; a family is one module."""
     assert loaded_by(command, "--help") & (NUMBERS | SCIPY | HEAVY) == set()
 
 
@@ -93,8 +93,10 @@ def test_jobs_load_what_they_compute_with_when_they_compute():
         "serve",
     ]
     code = "import sys\n" + "".join(f"import polysight.{m}\n" for m in modules) + "print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
-    assert set(done.stdout.split()) & (HEAVY - {"zmq"}) == set()
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=RIG_FILE.parent
+    )
+    assert set(process.stdout.split()) & (HEAVY - {"zmq"}) == set()
 
 
 @pytest.mark.parametrize("window", ["hann", *TAPERS.values()])

@@ -1,4 +1,4 @@
-"""Life of a command: closed or full output, Ctrl-C at any moment. One message, no traceback, an exit status."""
+"""Commands with a closed or full output, and Ctrl-C at any moment: one message, no traceback, an exit status."""
 
 import os
 import signal
@@ -22,8 +22,10 @@ def products(tmp_path) -> Path:
 def run_in_shell(line: str, folder: Path) -> tuple[int, str]:
     """Exit status and stderr of a line of a shell, in which $P is `polysight`."""
     environment = {**os.environ, "P": POLYSIGHT, "PYTHONUNBUFFERED": ""}
-    done = subprocess.run(["sh", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    return done.returncode, done.stderr
+    process = subprocess.run(
+        ["sh", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    return process.returncode, process.stderr
 
 
 @pytest.mark.parametrize("command", ["materials products", "--help"])
@@ -33,7 +35,7 @@ def test_closed_streams_are_the_null_device(products, command, streams):
 
 
 def test_a_file_never_takes_the_place_of_a_closed_stream(products):
-    """Else what a command prints would be written into the file that it opened first."""
+    """Otherwise the output would be written into the first file that the command opened."""
     assert run_in_shell("$P export products --csv --out o <&- >&- 2>&-", products.parent) == (0, "")
     table = (products.parent / "o" / "materials.csv").read_text()
     assert "PET" in table
@@ -42,11 +44,11 @@ def test_a_file_never_takes_the_place_of_a_closed_stream(products):
 
 @pytest.mark.parametrize("command", ["materials products", "--help"])
 def test_output_that_cannot_be_written_is_an_error(products, command):
-    status, said = run_in_shell(f"$P {command} >/dev/full", products.parent)
+    status, messages = run_in_shell(f"$P {command} >/dev/full", products.parent)
     assert status == 5
-    assert "No space left" in said
-    assert "Traceback" not in said
-    assert "Exception ignored" not in said
+    assert "No space left" in messages
+    assert "Traceback" not in messages
+    assert "Exception ignored" not in messages
 
 
 # A module that takes long to load, as extensions do. It ends when it is interrupted, or when the file `go` is there.
@@ -76,14 +78,14 @@ sys.exit(main(["materials", "x"]))
 def test_an_interrupt_waits_for_the_module_that_is_loading(tmp_path, number):
     """Extensions that are interrupted while they load end in a traceback, or in a segmentation fault."""
     (tmp_path / "slow_module.py").write_text(SLOW_MODULE)
-    said = tmp_path / "said"
-    with said.open("w") as err:
+    messages = tmp_path / "said"
+    with messages.open("w") as err:
         program = subprocess.Popen([sys.executable, "-c", INTERRUPT_WHILE_LOADING], cwd=tmp_path, stderr=err)
-    wait_for(lambda: "loading" in said.read_text(), "the module loads")
+    wait_for(lambda: "loading" in messages.read_text(), "the module loads")
     program.send_signal(number)
     (tmp_path / "go").touch()
     assert program.wait(60) == 128 + signal.SIGINT
-    assert said.read_text() == "loading, loaded, polysight materials: stopped\n"
+    assert messages.read_text() == "loading, loaded, polysight materials: stopped\n"
 
 
 INTERRUPT_AFTER = """
@@ -98,13 +100,13 @@ sys.exit(status)
 
 
 def test_an_interrupt_at_any_moment_ends_in_one_line():
-    """A command is interrupted after growing CPU times, until it is finished before."""
+    """A command is interrupted after growing CPU times, until it ends before the interrupt."""
     ends = []
     for cpu_ms in range(2, 5000, 60):
         command = [sys.executable, "-c", INTERRUPT_AFTER, f"{cpu_ms / 1e3}", "plan", "--config", str(RIG_FILE)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        ends.append((done.returncode, done.stderr))
-        if done.returncode == 0:
+        process = subprocess.run(command, capture_output=True, text=True, check=False)
+        ends.append((process.returncode, process.stderr))
+        if process.returncode == 0:
             break
     assert len(ends) > 1
     assert set(ends[:-1]) == {(128 + signal.SIGINT, "polysight plan: stopped\n")}
@@ -121,5 +123,5 @@ sys.exit(cli.main([]))
 
 def test_an_early_interrupt_on_the_pi_is_no_traceback():
     """Its modules take a second to load on a Pi: they are loaded where Ctrl-C is handled."""
-    done = subprocess.run([sys.executable, "-c", INTERRUPT_THE_PI], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "")
+    process = subprocess.run([sys.executable, "-c", INTERRUPT_THE_PI], capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stderr) == (128 + signal.SIGINT, "")

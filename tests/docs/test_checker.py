@@ -1,4 +1,4 @@
-"""The checker finds what is wrong with a page, says where, and stays silent where nothing is."""
+"""The checker reports faults of a page with their places, and nothing else."""
 
 import signal
 import subprocess
@@ -124,7 +124,7 @@ def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
 
 
 def test_the_commands_of_a_page_end_with_the_check(tmp_path):
-    """A check that is terminated had left them running."""
+    """A terminated check once left them running."""
     pid = tmp_path / "pid"
     page(tmp_path, f"# Page\n\n```sh\necho $$ > {pid}.part\nmv {pid}.part {pid}\nsleep 10000\n```\n")
     check = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Every command line has help with an example that it would take, and README names every command."""
+"""Every command has help with a valid example, and README names every command."""
 
 import argparse
 import re

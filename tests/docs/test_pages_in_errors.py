@@ -1,4 +1,4 @@
-"""Pages that errors name are there, in the repository and in what is installed."""
+"""Pages that errors name exist, in the repository and in the installed package."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""The API reference: every public name has its text in it, and its links are checked."""
+"""The API reference: it contains the text of every public name, and its links are checked."""
 
 import html
 import re
@@ -32,7 +32,7 @@ def test_every_public_name_is_on_the_page_with_its_text(reference):
 
 
 def test_types_of_public_functions_are_read_and_followed(reference):
-    """What a function gives has a page of its own; arrays are called as in the sources."""
+    """Types of results have their own pages; arrays have the type names of the sources."""
     page = (reference / "polysight.html").read_text(encoding="utf-8")
     for name in ("results.html#Verdict", "materials.html#Score", "planning.html#Forecast", "products.html#Rows"):
         assert f'href="polysight/{name}"' in page
@@ -53,7 +53,7 @@ def test_links_between_the_pages_lead_somewhere(reference):
 
 
 def test_pictures_and_linked_files_lie_beside_their_pages(reference):
-    """The folder can be moved: nothing is looked for on the machine that made it."""
+    """The folder can be moved: it does not depend on files of the machine that made it."""
     for page in reference.rglob("*.html"):
         assert '="file:' not in page.read_text(encoding="utf-8"), page
     assert (reference / "docs/images/demo.png").is_file()

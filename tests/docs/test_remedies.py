@@ -1,4 +1,4 @@
-"""Commands in messages: each names a command and options that there are; one with its arguments, pasted, is parsed."""
+"""Commands in messages have existing names and options; with their arguments they can be pasted and are valid."""
 
 import argparse
 import ast

@@ -1,4 +1,4 @@
-"""The bytes that the pages show are what the pages say: decoded, or made again, by the code."""
+"""The bytes on the pages agree with their text: the code decodes them, or makes the same."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""Checks of this machine, each alone, and the order of all checks."""
+"""Single checks of this machine, and the order of all checks."""
 
 import dataclasses
 from pathlib import Path
@@ -217,7 +217,7 @@ def test_the_receivers_are_measured_with_packets_at_each_rate():
     ],
 )
 def test_a_card_is_captured_unless_its_reception_has_an_error(buffer, receiver, verdict):
-    """A scan goes on with a smaller buffer than requested, and so do the checks after it."""
+    """A scan continues with a smaller buffer than requested, and so do the following checks."""
     board = RIG.by_name("RH")
     hops = [Finding(receiver, "receiver", where="receiver"), Finding(buffer, "buffer", where="buffer")]
     context = make_context()

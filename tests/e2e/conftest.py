@@ -48,7 +48,7 @@ def scene_file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def lonely_instrument(tmp_path: Path) -> Instrument:
-    """A rig file's content on a free loopback subnet, where nobody answers."""
+    """A rig file's content with addresses on a free loopback subnet, without devices."""
     pi = {"journal_dir": str(tmp_path / "journal")}
     stage = {"port": str(tmp_path / "ttyNONE")}
     return move_to_free_subnet(rig_with(limits={"command_timeout_s": 0.6}, pi=pi, stage=stage))

@@ -42,7 +42,7 @@ def test_without_a_compiler(rig_without_compiler):
 
 
 def test_from_boards_with_an_empty_flash_to_the_report(bench, scene_file):
-    """The first day: the host loads the boards' firmware, configures and arms them, scans, and reports."""
+    """The first use of a rig: the host loads the boards' firmware, configures and arms them, scans, and reports."""
     options = ("--config", RIG_FILE, "--scene", scene_file, "--out", bench.folder / "demo")
     demo = bench.start("polysight", "demo", *options)
     ended = demo.wait()

@@ -14,7 +14,7 @@ from polysight_shared.messages import RowStarted
 
 @pytest.fixture
 def rig(tmp_path, running_rig):
-    """Slow enough to be met in the middle of a row on a busy machine."""
+    """Slow enough to be interrupted in the middle of a row on a busy machine."""
     with running_rig(tmp_path, time_scale=15.0) as new_rig:
         yield new_rig
 
@@ -26,7 +26,7 @@ def digests(path):
 
 
 def check_whole(rig, before):
-    """The scan is finished, valid, and what was committed before has not changed."""
+    """The scan is finished and valid, and rows that were committed before have not changed."""
     path = rig.folder / "scan"
     digests_after = digests(path)
     assert {file: digests_after[file] for file in before} == before
@@ -39,7 +39,7 @@ def check_whole(rig, before):
 
 @pytest.mark.parametrize("times", [1, 2])
 def test_interrupted(rig, times):
-    """Once: the running row is recorded to its end; twice: it is given up. The scan goes on either way."""
+    """After one request the running row is recorded to its end; after two it is aborted. In both cases it resumes."""
     scan = rig.scan("--no-process")
     rig.wait_mid_row(scan, 1)
     for _ in range(times):

@@ -1,8 +1,8 @@
-"""SIGKILL of the host, the Pi, or both, wherever it hits: the scan goes on, and its image is the undisturbed one's.
+"""SIGKILL of the host, the Pi, or both, at any point: the scan resumes, and its image is that of an undisturbed scan.
 
-Real processes on a simulated rig. Where each kill hits follows from its number: some come after a drawn time, others at
+Real processes on a simulated rig. The number of a kill determines its point: some come after a drawn time, others at
 an exact operation on a file (killed_at.py), in the scan or in the resume after it. `--long` takes 50 of them. Scans
-that nothing kills count these operations: a kind of place that no program comes to would test nothing.
+without kills count these operations: a kind of operation that no program executes would test nothing.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ RESUME_PLACES = [
 
 @dataclass
 class Kill:
-    """One try: who is killed, where, and how its resumes are killed.
+    """One trial: which programs are killed, where, and how its resumes are killed.
 
-    Either after a number of committed rows (-1: none, and maybe before the scan is begun) and a time in seconds, or at
+    Either after `rows` committed rows (-1: none, and possibly before the scan is begun) and `wait_s` seconds, or at
     a place.
     """
 
@@ -97,7 +97,7 @@ class Kill:
 
 
 class Killed:
-    """The rig, its undisturbed scan, and what becomes of each kill."""
+    """The rig, its undisturbed scan, and the check of each kill."""
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
@@ -113,7 +113,7 @@ class Killed:
         self.image = image(rig.folder / "undisturbed")
 
     def start(self, places: Sequence[Place], *command: str | Path) -> tuple[Any, Path]:
-        """A command that kills itself at the first of these places it comes to; and where it writes what it met."""
+        """Start a command that kills itself at the first of these places; return it and its file of reached places."""
         self.armed += 1
         hits = self.rig.folder / f"hits-{self.armed}"
         hits.touch()
@@ -121,7 +121,7 @@ class Killed:
         return self.rig.start(*(["python", KILLED_AT, hits, words] if places else []), *command), hits
 
     def scan(self, folder: Path, places: Sequence[Place] = (), *more: str) -> Any:
-        """Start a scan, or go on with it when its manifest has a first line."""
+        """Start a scan, or resume it if its manifest has a first line."""
         if begun(folder):
             command = ("resume", folder)
         else:
@@ -130,7 +130,7 @@ class Killed:
         return program
 
     def restart_pi(self, places: Sequence[Place] = ()) -> None:
-        """As systemd does. With a place, its next scan kills it."""
+        """Restart the Pi, as systemd does. With places, its next scan kills it there."""
         self.rig.pi.kill()
         wires = self.rig.folder / "rig" / "wires.sock"
         run = ("polysight-pi", "run", "--config", self.rig.config, "--wires", wires)
@@ -138,12 +138,12 @@ class Killed:
         self.rig.pi.wait_ready()
 
     def note(self, who: str, hits: Path) -> None:
-        """Remember what a program came to."""
+        """Remember the places that a program reached."""
         self.met.update(f"{who} {kind}" for kind in hits.read_text().splitlines())
 
     @staticmethod
     def check_died(status: int | None, place: Place, hits: Path) -> None:
-        """A program that came to its place died of it, and any other did not."""
+        """Check that a program died if it reached its place, and only then."""
         operation, suffix, nth = place
         matching_hits = hits.read_text().splitlines().count(f"{operation}:{suffix}")
         assert (status == -signal.SIGKILL) == (matching_hits >= nth), (
@@ -174,7 +174,7 @@ class Killed:
         assert ended.status in ((-signal.SIGKILL, 0) if kill.host else (0, 5, 6)), ended.err
 
     def check(self, kill: Kill) -> list[int]:
-        """Kill, resume, compare. Returns how many rows each resume has taken again."""
+        """Kill, resume, compare. Returns the number of rows that each resume has retaken."""
         folder = self.rig.folder / f"scan-{kill.number}"
         self.strike(kill, folder)
         again = []
@@ -197,7 +197,7 @@ class Killed:
 
 
 def list_kinds(places: Sequence[Place]) -> list[Place]:
-    """Every kind of these places, to be counted: no time of meeting it kills."""
+    """Every kind of these places once, with number 0: it is counted, but never kills."""
     return [(operation, suffix, 0) for operation, suffix in dict.fromkeys(place[:2] for place in places)]
 
 
@@ -213,7 +213,7 @@ def rows(folder: Path) -> dict[str, str]:
 
 
 def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
-    """The committed rows of a scan that was broken off: all good, or there is none."""
+    """SHA-256 of the committed rows of an interrupted scan; all must be good. Empty if the scan is not begun."""
     if not begun(folder):
         return {}
     assert [f for f in validate(folder) if f.level == "error"] == []
@@ -223,7 +223,7 @@ def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
 
 
 def retaken(folder: Path) -> set[int]:
-    """Rows that the last resume has taken again, by the manifest; not those that it rejected itself."""
+    """Rows that the last resume has retaken, by the manifest, without those that it rejected itself."""
     if not begun(folder):
         return set()
     facts = facts_of(folder)
@@ -278,7 +278,7 @@ def test_every_kind_of_place_is_reached(killed_rig: Killed):
 
 
 def test_products_of_a_killed_scan(killed_rig: Killed):
-    """What was processed while the scan ran, and ran again, is what the undisturbed scan is processed into."""
+    """Products of processing during a scan that was killed and resumed are those of the undisturbed scan."""
     folder = killed_rig.rig.folder / "live"
     scan = killed_rig.scan(folder, [("rename", ".bin", 5)], *METAL)
     assert scan.wait().status == -signal.SIGKILL
@@ -324,5 +324,5 @@ def test_pi_is_lost_with_its_journal(killed_rig: Killed):
 
 
 def list_committed(folder: Path) -> list[int]:
-    """Rows that are committed, of a scan that may not be begun."""
+    """Committed rows of a scan; none if it is not begun."""
     return list(ScanFolder.load(folder).committed_rows()) if begun(folder) else []

@@ -32,7 +32,7 @@ class Lab:
         self.serve()
 
     def serve(self) -> None:
-        """Start the server, with a token of its own."""
+        """Start the server with a new token."""
         options = ("--config", self.rig.config, "--port", "0")
         self.server: Program = self.rig.start("polysight", "serve", self.scans, *options)
         self.rig.wait_for(lambda: "token=" in self.server.err, "the server's address")
@@ -51,11 +51,11 @@ class Lab:
             self.browser.fill(f"#{field}", str(value))
 
     def click(self, element: str) -> None:
-        """Press a button that is there."""
+        """Wait for a button, and press it."""
         self.browser.click(f"#{element}")
 
     def start(self, name: str, **changes: Any) -> Path:
-        """Start a scan from the page; its folder."""
+        """Start a scan from the page; return its folder."""
         self.open("/new")
         self.browser.wait("document.querySelector('.time')", "the plan")
         self.fill(name=name, **changes)
@@ -65,16 +65,16 @@ class Lab:
         return self.scans / name
 
     def wait_headline(self, text: str) -> None:
-        """Until the live view says so."""
+        """Wait until the live view shows this text."""
         self.browser.wait(f"document.getElementById('headline')?.innerText == {json.dumps(text)}", text)
 
     def wait_rows(self, folder: Path, rows: int) -> None:
-        """Until so many rows are committed, on the page and on the disk."""
+        """Wait until so many rows are committed, on the page and on the disk."""
         self.browser.wait(f"parseInt(document.getElementById('count')?.innerText) >= {rows}", f"{rows} rows")
         assert len(ScanFolder.load(folder).committed_rows()) >= rows
 
     def wait_end(self, folder: Path) -> None:
-        """Until the program that the page started has ended; the folder is whole."""
+        """Wait until the program that the page started has ended; check the folder."""
         self.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
         assert [f for f in validate(folder) if f.level == "error"] == []
         assert self.browser.errors == []
@@ -110,10 +110,10 @@ def test_a_scan_is_planned_started_and_shown(lab):
     lab.open("/")
     # A card has no text before it is painted.
     lab.browser.wait("document.querySelector('#list li')?.innerText", "the card of the scan")
-    said = lab.browser.text("list")
-    assert "first" in said
-    assert "the first one" in said
-    assert "oak" in said
+    list_text = lab.browser.text("list")
+    assert "first" in list_text
+    assert "the first one" in list_text
+    assert "oak" in list_text
 
 
 def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
@@ -178,7 +178,7 @@ def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
 
 
 def test_the_doctor_is_shown_as_it_looks(lab):
-    """Without a Pi: else it would load all cores to measure the receivers, which tests/doctor shows."""
+    """Without a Pi: otherwise all cores would be loaded to measure the receivers, which tests/doctor covers."""
     lab.rig.pi.end()
     lab.open("/new")
     lab.click("doctor")

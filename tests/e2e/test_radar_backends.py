@@ -22,7 +22,7 @@ PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
 
 
 def scan_three_rows(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
-    """Scan three rows of eight positions; every row is whole and each radar was armed once for it."""
+    """Scan three rows of eight positions; every row is complete and each radar was armed once for it."""
     table = rig_table()
     table["grid"] |= {"columns": COLUMNS, "rows": ROWS}
     table["burst"] |= burst

@@ -1,4 +1,4 @@
-"""Random command lines: whatever is given, a command ends with a status and a message, never with a traceback."""
+"""A command with random arguments ends with a status and a message, never with a traceback."""
 
 import argparse
 import io
@@ -59,7 +59,7 @@ def commands() -> dict[str, argparse.ArgumentParser]:
 
 
 def draw_value(action: argparse.Action, draw: random.Random) -> str:
-    """A value of an option: right now and then, mostly wrong."""
+    """A value of an option, which is sometimes right and mostly wrong."""
     if action.choices and draw.random() < 0.6:
         return str(draw.choice(list(action.choices)))
     kind = draw.choice((FILES, FILES, NUMBERS, BOXES, LAYERS, WORDS, ("scan", "3", "out/x")))
@@ -84,7 +84,7 @@ def draw_words(parser: argparse.ArgumentParser, draw: random.Random) -> Iterator
 
 
 def each_number(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str]]:
-    """Command lines of a command: each option that has a value with each number."""
+    """Command lines of a command that give each number to each option with a value."""
     options = [action for action in parser._actions if action.option_strings and action.nargs != 0]
     places = ["scan" for action in parser._actions if not action.option_strings]
     for option in options:

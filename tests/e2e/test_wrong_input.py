@@ -1,7 +1,7 @@
-"""Whatever is wrong from outside: the exit status is not 0, and one message says what, why and what to do.
+"""For any wrong input the exit status is not 0, and one message says what, why and what to do.
 
-Commands of the host run in this process. That a program's exit status and stderr are those of its `main` is shown by
-`test_rig_file`, which starts both programs, and by what is interrupted.
+Commands of the host run in this process. The tests that show that a program's exit status and stderr are those of its
+`main` are `test_rig_file`, which starts both programs, and those of interrupted commands.
 """
 
 import os
@@ -71,7 +71,7 @@ def test_files_that_are_not_there(bench):
     ],
 )
 def test_scene_file(bench, old, new, words):
-    """Found out before anything is begun: the last demo is still there, and no rig was started."""
+    """The error comes before anything else: an existing demo folder is kept, and no rig was started."""
     scenes = bench.folder / "scenes"
     scenes.mkdir()
     (scenes / "a.toml").write_text(SCENE)
@@ -103,7 +103,7 @@ def test_rig_file_of_a_training(bench):
 
 @pytest.fixture(scope="module")
 def recorded_scan(tmp_path_factory):
-    """A simulated scan of nothing: no metal, no plates."""
+    """A simulated scan of an empty scene: no metal, no plates."""
     folder = tmp_path_factory.mktemp("recorded")
     (folder / "scene.toml").write_text(SCENE)
     command = [sys.executable, "-m", "polysight_simulators", "simulate", folder / "scene.toml", "--config", RIG_FILE]
@@ -164,7 +164,7 @@ def test_out_is_taken(bench, scan):
 
 @pytest.fixture
 def lonely(bench, lonely_instrument):
-    """A rig file, in which nobody answers."""
+    """A rig file without devices."""
     path = bench.folder / "rig.toml"
     path.write_text(tomli_w.dumps(to_builtins(lonely_instrument)))
     return path
@@ -196,7 +196,7 @@ def test_no_stage(bench, lonely, lonely_instrument, wires, silent_pty):
 
 @pytest.fixture
 def silent_pty():
-    """A serial port on whose other end nobody listens."""
+    """A serial port without a device."""
     master, slave = pty.openpty()
     yield os.ttyname(slave)
     os.close(master)
@@ -207,7 +207,7 @@ def silent_pty():
 
 
 def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
-    """The Pi's port takes the connection and never answers: Ctrl-C ends the wait."""
+    """The Pi's port accepts the connection and never answers: Ctrl-C ends the wait."""
     table = to_builtins(lonely_instrument)
     table["limits"]["command_timeout_s"] = HANG_S
     lonely.write_text(tomli_w.dumps(table))

@@ -1,4 +1,4 @@
-"""The tests themselves: how they are handed out to workers."""
+"""The tests themselves: their distribution to workers."""
 
 from tests.support.paths import REPO
 from tests.support.suite import FIRST, ROOMS, TOGETHER

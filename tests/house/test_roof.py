@@ -40,13 +40,13 @@ def test_a_project_holds_its_one_package(folder, package):
 def test_all_projects_have_one_version(folder):
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["version"] == __version__
-    ours = [d for d in project["dependencies"] if d.startswith("polysight")]
-    assert all(d.endswith(f"=={__version__}") for d in ours)
+    our_dependencies = [d for d in project["dependencies"] if d.startswith("polysight")]
+    assert all(d.endswith(f"=={__version__}") for d in our_dependencies)
 
 
 @pytest.mark.parametrize("folder", PROJECTS)
 def test_every_program_and_entry_point_of_a_project_exists(folder):
-    """They are text: nothing else notices when a function gets another name."""
+    """The names are text, so that only this test notices a renamed function."""
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     targets = list(project.get("scripts", {}).values())
     for group in project.get("entry-points", {}).values():

@@ -1,4 +1,4 @@
-"""Laws of the house: files and functions have a size, rooms a front door, the root of host nothing but the flow."""
+"""Laws of the house: size of files and functions, public names of rooms, and the content of the host's root."""
 
 import ast
 import subprocess
@@ -32,7 +32,7 @@ def list_tracked(*suffixes: str) -> list[Path]:
 
 @dataclass
 class FileFacts:
-    """What the laws below want to know of a file: it is parsed once for all of them.
+    """Facts of a file that the laws below use; it is parsed once for all of them.
 
     Each list has lines: of imports with the dots before a relative one, the module, and the names taken from it; of
     functions with their lines of code; of errors for people that lack one of their three parts.
@@ -66,7 +66,7 @@ def test_no_file_is_over_700_lines():
 
 
 def count_code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef, lines: list[str]) -> int:
-    """Lines of a function without its docstring, comments and empty lines, of which a reader wants more."""
+    """Number of lines of a function without its docstring, comments and empty lines, which are welcome."""
     head = function.body[0].lineno - function.lineno
     statements = function.body
     if ast.get_docstring(function) is not None:
@@ -118,8 +118,10 @@ def rooms() -> list[Path]:
 @pytest.mark.parametrize("room", rooms(), ids=lambda p: p.name)
 def test_a_room_says_what_it_is(room):
     tree = ast.parse((room / "__init__.py").read_text(encoding="utf-8"))
-    said = ast.get_docstring(tree) or ""
-    assert 2 <= len(said.splitlines()) <= 14, f"{room.name}/__init__.py: what it takes and gives, in about ten lines"
+    docstring = ast.get_docstring(tree) or ""
+    assert 2 <= len(docstring.splitlines()) <= 14, (
+        f"{room.name}/__init__.py: what it takes and gives, in about ten lines"
+    )
 
 
 def imports(file: Path) -> list[tuple[int, str]]:
@@ -176,7 +178,7 @@ def test_only_simulators_use_simulators():
 
 
 def test_worlds_know_nothing_of_ours():
-    """They judge the instrument: no code and no belief is shared."""
+    """Simulators judge the instrument, so they share no code and no assumption with it."""
     files = (ROOT / "worlds").rglob("*.py")
     used = {module.split(".")[0] for file in files for _, module in imports(file)}
     assert used - set(sys.stdlib_module_names) == {"numpy", "scipy", "polysight_worlds"}

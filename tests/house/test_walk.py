@@ -1,4 +1,4 @@
-"""docs/architecture.md is the way from a packet to a name: every stop exists, and a scan passes them in order."""
+"""docs/architecture.md lists the files from a packet to a name: each exists, and a scan calls them in order."""
 
 import ast
 import re
@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 ROW = re.compile(r"^\| (\d+) \| [^|]+ \| `([^`]+)` \| `([^`]+)` \|$")
 PROCESSED_FROM = 6
-"""The first stop of processing; before it come the processes of a scan, which tests/e2e runs."""
+"""The first file of the processing; those before it run in the processes of a scan, which tests/e2e covers."""
 
 
 def stops() -> list[tuple[int, Path, str]]:
@@ -46,7 +46,7 @@ ROW_TO_NAME = ("add_row", "form_images", "place_plane", "find_materials")
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
     """Functions (file, name) of the host in the order in which processing a small scan first calls them, and the files
-    that are passed within the pipeline's steps from raw row to name.
+    that are called in the pipeline's steps from raw row to name.
     """
     from polysight.jobs.process import process
     from polysight.materials import load_catalogue
@@ -79,8 +79,8 @@ def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
         assert process(folder / "scan", folder / "out", threads=1) == 0
     finally:
         sys.setprofile(None)
-    ours = {f for f in files if "/host/polysight/" in f or "/polysight_shared/" in f}
-    return list(calls), ours
+    our_files = {f for f in files if "/host/polysight/" in f or "/polysight_shared/" in f}
+    return list(calls), our_files
 
 
 def test_a_scan_passes_the_stops_in_their_order(walk):

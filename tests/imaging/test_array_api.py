@@ -64,13 +64,13 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make):
     def put(array):
         return xp.asarray(array, device=device)
 
-    for got, want in (
+    for result, want in (
         (imager.image(put(samples)), plain.image(samples)),
         (imager.constant(put(echo), put(weights)), plain.constant(echo, weights)),
         (imager.samples(put(pixels)), plain.samples(pixels)),
     ):
-        assert type(got) is type(put(samples))
-        assert np.abs(_back(got) - want).max() < 1e-5 * np.abs(want).max()
+        assert type(result) is type(put(samples))
+        assert np.abs(_back(result) - want).max() < 1e-5 * np.abs(want).max()
 
 
 def test_backproject_and_project_run_on_the_library_of_their_samples(library):
@@ -82,8 +82,8 @@ def test_backproject_and_project_run_on_the_library_of_their_samples(library):
     samples = rng.standard_normal((7, 9)) + 1j
     pixels = rng.standard_normal(7) + 1j
     for function, array in ((backproject, samples), (project, pixels)):
-        got = function(xp.asarray(array, device=device), f, *places, reference)
-        np.testing.assert_allclose(_back(got), function(array, f, *places, reference), rtol=1e-9)
+        result = function(xp.asarray(array, device=device), f, *places, reference)
+        np.testing.assert_allclose(_back(result), function(array, f, *places, reference), rtol=1e-9)
 
 
 def test_without_array_api_compat_other_libraries_are_refused(monkeypatch, aperture):

@@ -97,8 +97,8 @@ def test_forward_models_agree(aperture):
     a = aperture(31, 12, 4.0, 4.0, (20, 16), 2.0)
     pixels = _noise(rng, a.grid.shape)
     spectral, rows, direct = (make(a).samples(pixels) for make in IMAGERS)
-    for got in (spectral, rows):
-        assert np.linalg.norm(got - direct) < 3e-5 * np.linalg.norm(direct)
+    for image in (spectral, rows):
+        assert np.linalg.norm(image - direct) < 3e-5 * np.linalg.norm(direct)
 
 
 @pytest.mark.parametrize("make", IMAGERS)
@@ -134,7 +134,7 @@ def test_kernels_computed_again_give_the_same_image(aperture):
 
 
 def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
-    """Memory of transforms is used again, and imagers of one geometry share kernels and the last constant echo."""
+    """Memory of transforms is reused, and imagers of one geometry share kernels and the last constant echo."""
     rng = np.random.default_rng(8)
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
     samples = [_noise(rng, a.shape) for _ in range(2)]
@@ -146,8 +146,8 @@ def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
         alone.append((SpectralImager(a).image(y.copy()), SpectralImager(a).constant(echo, weights)))
     imagers = SpectralImager(a), SpectralImager(a)
     kept = [(imagers[i].image(samples[i]), imagers[i].constant(echoes[i], weights)) for i in (0, 1, 0, 1)]
-    for i, got in enumerate(kept):
-        np.testing.assert_array_equal(got, alone[i % 2])
+    for i, image in enumerate(kept):
+        np.testing.assert_array_equal(image, alone[i % 2])
 
 
 def test_another_geometry_gets_other_kernels(aperture):
@@ -226,9 +226,9 @@ def test_a_micrometre_of_jitter_is_imaged_spectrally(aperture):
     a.offsets_m[..., 0] += rng.uniform(-3e-7, 3e-7, a.offsets_m.shape[:2])
     assert find_irregularity(a) is None
     samples = DirectImager(a).samples(np.eye(10, 12))
-    got = SpectralImager(a).image(samples)
+    image = SpectralImager(a).image(samples)
     exact = DirectImager(a).image(samples)
-    assert np.abs(got - exact).max() < 2e-4 * np.abs(exact).max()
+    assert np.abs(image - exact).max() < 2e-4 * np.abs(exact).max()
 
 
 def test_a_curved_surface_is_imaged_at_its_position(aperture):

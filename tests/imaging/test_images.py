@@ -197,8 +197,8 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
             )
 
     images = _build(rig, disturb).finish()
-    for got, want in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
-        assert abs(np.vdot(got, want)) / np.linalg.norm(got) / np.linalg.norm(want) > 0.98
+    for image, want in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
+        assert abs(np.vdot(image, want)) / np.linalg.norm(image) / np.linalg.norm(want) > 0.98
 
 
 @pytest.mark.parametrize("change", [0.0, 0.2 - 0.3j])
@@ -246,8 +246,8 @@ def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig
         image = plain.finish()
         pairs = [(now.h_raw, image.h_raw), (now.v_raw, image.v_raw)]
         pairs += zip(now.illumination.footprints, image.illumination.footprints, strict=True)
-        for got, want in pairs:
-            assert np.abs(got - want).max() <= 2e-5 * max(np.abs(want).max(), 0.2)
+        for live_image, want in pairs:
+            assert np.abs(live_image - want).max() <= 2e-5 * max(np.abs(want).max(), 0.2)
     for channel in ("h", "v", "valid"):
         np.testing.assert_array_equal(getattr(live.finish(), channel), getattr(plain.finish(), channel))
 
@@ -334,7 +334,7 @@ def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row)
 
 
 def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_within_0_05_rad(make_rig, points_rows):
-    """Place: the peak on a ten times finer grid. Phase: at the true place."""
+    """The place is the peak on a ten times finer grid; the phase is that at the true place."""
     rig = make_rig(61, 41, pixels=(60, 50))
     rng = np.random.default_rng(10)
     grid = image_grid(rig)
@@ -373,7 +373,7 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
     samples = (echo + 1 / antennas.direct_m[:, None, None, None]).astype(np.complex64)
     for row in plan:
         builder.add_row(board.name, row.index, synced_row(samples[:, row.index]))
-    got = builder.boards[board.name].image()[0]
+    image = builder.boards[board.name].image()[0]
 
     window = scipy.signal.get_window("hann", b - a + 2, fftbins=False)[1:-1]
     window /= window.sum()
@@ -386,14 +386,14 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
         all_samples = (echo[rx, ..., a:b] * window).reshape(len(place), -1)
         want += backproject(all_samples, f[a:b], *pairs)
     want /= 4 * plan.positions
-    pixel_values = np.array([got[j, i] for i, j in pixels])
+    pixel_values = np.array([image[j, i] for i, j in pixels])
     assert np.abs(pixel_values - want).max() < 2e-6 * np.abs(want).max()
 
 
 @pytest.mark.parametrize(("offset_m", "moved"), [(4e-4, False), (-6e-4, True), (0.0149, True), (0.0151, False)])
 @pytest.mark.parametrize("transposed", [False, True])
 def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeypatch, offset_m, moved, transposed):
-    """With the dispersion on the same plane, both turned as the images are."""
+    """Also the dispersion is on the same plane, and rotated as the images are."""
     nominal = np.arange(6, dtype=complex).reshape(2, 3)
     axes = np.arange(3.0), np.arange(2.0)
 

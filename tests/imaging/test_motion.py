@@ -29,7 +29,7 @@ def burst_mean(turns, rig):
     ("turns", "centre"), [(-0.4, 0.0), (-0.2, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.0), (0.0, 0.1), (0.35, 0.1)]
 )
 def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
-    """For any part of its phase change that burst alignment has removed."""
+    """The law holds for any part of the phase change that burst alignment has removed."""
     still = np.exp(2j * np.pi * turns * np.arange(COUNT))
     average = burst_mean(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
     valid = np.ones(COUNT, bool)

@@ -52,7 +52,7 @@ def test_the_model_predicts_an_echo_after_the_gate(rig, echo_m):
 
 @pytest.mark.parametrize(("gate_m", "noise"), [(GATE, 5e-3), ((0.2, 0.9), 3e-2)])
 def test_decimated_samples_give_what_all_samples_give(rig, gate_m, noise):
-    """In the gate, of the direct path, of clutter behind it, in noise; and echoes from elsewhere are seen as little."""
+    """It holds for echoes in the gate, the direct path, clutter behind it and noise; other echoes are suppressed."""
     a, b = rig.chirp.linear_samples
     gate = reduction(rig.chirp, gate_m)
     sweep = _sweep(rig.chirp)[a:b]

@@ -1,4 +1,4 @@
-"""Point response: measured widths and sidelobes agree with formulas; missing positions cost what is reported."""
+"""Point response: measured widths and sidelobes agree with formulas, and so does the loss by missing positions."""
 
 import msgspec
 import numpy as np

@@ -1,6 +1,6 @@
-"""What a command writes is there as a whole or not at all, under a full disk, a kill and a power cut, everywhere.
+"""Files of a command are written completely or not at all, after a full disk, a kill or a power cut at any point.
 
-Every operation on the disk fails once. Then the command is repeated, and does what it was asked for.
+Every operation on the disk fails once. Then the command is repeated, and succeeds.
 """
 
 import shutil
@@ -56,7 +56,7 @@ def scan_before(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch) -> None:
-    """Nothing is drawn or compressed again for every fault."""
+    """Figures are not drawn or compressed again for every fault."""
     monkeypatch.setattr(polysight.report, "label_figure", lambda *_: PIXEL)
     drawn = type("Drawn", (), {"png": PIXEL})
     monkeypatch.setattr(polysight.catalogue, "draw_comparison", lambda *_: drawn)

@@ -55,7 +55,7 @@ KILLS_ITS_WORKER = """
 
 @pytest.fixture
 def worker(tmp_path, monkeypatch):
-    """In place of the program that processes a scan: one that does as the scan's name says."""
+    """Replaces the program that processes a scan: it behaves as the scan's name says."""
     file = tmp_path / "worker.py"
     file.write_text(WORKER)
     monkeypatch.setattr(many, "PROGRAM", (sys.executable, str(file)))
@@ -98,8 +98,8 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
     assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
 
-    again = batch.process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
-    assert [o.status for o in again] == ["skipped", "failed", "skipped", "failed"]
+    second_run = batch.process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    assert [o.status for o in second_run] == ["skipped", "failed", "skipped", "failed"]
     assert runs(tmp_path) == sorted([*names, "bad", "killed"])
     assert "2 finished before, 2 to process" in capsys.readouterr().err
 
@@ -280,8 +280,8 @@ def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
     (job,) = jobs(tmp_path / "in", "a")
     assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
-    again = batch.process_many([job], tmp_path / "out", 1, again=True)
-    assert [o.status for o in again] == ["done"]
+    second_run = batch.process_many([job], tmp_path / "out", 1, again=True)
+    assert [o.status for o in second_run] == ["done"]
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\na\n"
 
 
@@ -339,7 +339,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
 
 
 def test_real_scans_end_to_end(tmp_path, capsys):
-    """A simulated scan and a damaged one by the real program; then the mark holds."""
+    """The real program processes a simulated scan and a damaged one; then both are marked as finished."""
     plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
     scene = scene_of(plate, name="plate", columns=13, rows=15, image={"columns": 30, "rows": 30, "pixel_mm": 4.0})
     simulate(published_rig(), decode_scene(scene, "t"), tmp_path, layout="authors")

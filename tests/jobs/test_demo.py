@@ -1,4 +1,4 @@
-"""`polysight demo` around its programs: what it says at the end. Whole demos are in e2e."""
+"""Messages of `polysight demo` at the end of its programs. Whole demos are in e2e."""
 
 import contextlib
 

@@ -1,4 +1,4 @@
-"""What the operator's page does, as commands."""
+"""Commands that do the same as the operator's page."""
 
 import json
 import shutil
@@ -26,7 +26,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def answer(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
-    """What a command prints that works."""
+    """Output of a command that must succeed."""
     capsys.readouterr()
     assert main([str(word) for word in words]) == 0
     return capsys.readouterr().out

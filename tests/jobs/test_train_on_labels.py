@@ -1,4 +1,4 @@
-"""A user's own material, end to end: scans without a truth are labelled, taught, and the name comes back."""
+"""A user's own material, end to end: scans without a truth are labelled, and the trained library names it."""
 
 import json
 from pathlib import Path
@@ -33,7 +33,7 @@ def scene(seed: int) -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def scans(tmp_path_factory) -> list[Path]:
-    """Three scans of copper and a board, without truth.json: what a real rig would leave. All are called alike."""
+    """Three scans of copper and a board without truth.json, as of a real rig. All have the same name."""
     folder = tmp_path_factory.mktemp("own")
     simulated_scans = [simulate(published_rig(), decode_scene(scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)]
     for scan in simulated_scans:

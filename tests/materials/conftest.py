@@ -1,6 +1,6 @@
 """Synthetic image pairs of plates: Fresnel, leakage, gains, band limit with ringing, uneven illumination, noise.
 
-Written for these tests alone; the whole chain from raw data is tested elsewhere.
+Used only by these tests; the whole chain from raw data is tested elsewhere.
 """
 
 import functools
@@ -58,7 +58,7 @@ def smooth_field(rng, shape, correlation_px):
 
 
 def reflect(eps, theta):
-    """r_s, r_p of Eq. 2, written out on its own."""
+    """r_s and r_p by Eq. 2, independent of the code under test."""
     if eps is None:
         return -1.0, -1.0
     n = np.sqrt(eps)
@@ -112,7 +112,7 @@ def synthetic():
 
 @pytest.fixture(scope="session")
 def analyse_placement():
-    """`analyse_placement(seed, angle_deg)`: the materials of a placement of the nine, found once.
+    """`analyse_placement(seed, angle_deg)`: the materials of a placement of the nine, analysed once.
 
     Seeds 1000 to 1005 are those of `library`: tests without a library take them.
     """
@@ -126,7 +126,7 @@ def analyse_placement():
 
 @pytest.fixture(scope="session")
 def name_placement(library):
-    """`name_placement(seed)`: the materials of a placement of the nine, named by the library, found once."""
+    """`name_placement(seed)`: the materials of a placement of the nine, named by the library, analysed once."""
 
     @functools.cache
     def find(seed: int) -> MaterialsResult:
@@ -137,7 +137,7 @@ def name_placement(library):
 
 @pytest.fixture(scope="session")
 def library(analyse_placement) -> Library:
-    """Six placements that no test scene repeats."""
+    """Six placements that differ from all test scenes."""
     return make_library(
         [TrainingScan(f"train-{s}", analyse_placement(s), True, {"made by": "test"}) for s in range(1000, 1006)],
         note="synthetic images",

@@ -1,4 +1,4 @@
-"""The published label folders: boxes become library entries, whichever way the images are stored."""
+"""The published label folders: boxes become library entries, for any orientation of the stored images."""
 
 import json
 

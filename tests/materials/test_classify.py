@@ -1,4 +1,4 @@
-"""The model a library is used with, several incidence angles together, and `polysight classify` as typed."""
+"""The model of a library, several incidence angles together, and the command `polysight classify`."""
 
 import json
 import subprocess
@@ -46,7 +46,7 @@ def two_angles(synthetic, analyse_placement):
 
 @pytest.fixture
 def folders(two_angles, tmp_path):
-    """What `polysight process` leaves of the two scans, as far as naming needs it."""
+    """Those files of `polysight process` for the two scans that naming needs."""
     library, packed = two_angles
     library.save(tmp_path / "library.npz")
     for angle, content in packed.items():
@@ -211,7 +211,7 @@ def test_one_scan_and_wrong_folders_as_typed(folders, capsys):
 
 
 def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
-    """It loads for a second or two, which nobody waits for who does not use it."""
+    """It takes a second or two to load, and is loaded only when it is used."""
     powders.save(tmp_path / "l.npz")
     code = (
         "import sys; from pathlib import Path; from polysight.materials import Classifier, Library;"

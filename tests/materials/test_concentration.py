@@ -1,4 +1,4 @@
-"""A line from polarisation angle to concentration: recovered, judged on what it has not seen, with honest intervals."""
+"""A line from polarisation angle to concentration: recovered, judged on new data, with correct intervals."""
 
 import json
 import pickle
@@ -61,7 +61,7 @@ def test_an_exact_line_is_recovered_and_tells_what_it_has_not_seen():
 
 
 def test_a_concentration_is_judged_without_its_own_patches():
-    """One concentration that lies off the line: the others do not hide it."""
+    """One concentration lies off the line, which the error of the line shows."""
     entries = [*library().entries, *(entry("sugar (9.0%)", 1.25, f"scan{i}") for i in range(3))]
     result = fit_concentration(Library(tuple(entries)), {"water": 0.0})
     judged = [r for r in result.left_out if r.true_percent == 9.0]

@@ -19,7 +19,7 @@ def library() -> Library:
 @pytest.mark.parametrize("ratio", [1.5, 1.5j, -2.0, 0.2 + 0.1j, 30.0])
 @pytest.mark.parametrize("gain", [0.1, 0.7, 1.0, 3.0])
 def test_an_unknown_patch_has_no_likelier_name(library, ratio, gain):
-    """For its distance or by its probability: unknown is then the likeliest of all that is listed."""
+    """A patch is unknown for its distance or its probability; then "unknown" is the likeliest entry of the list."""
     rng = np.random.default_rng(5)
     h = 0.45 * gain * (1 + 0.006 * rng.standard_normal(60))
     p = ratio * (1 + 0.006 * rng.standard_normal(60))

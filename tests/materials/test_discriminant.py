@@ -1,4 +1,4 @@
-"""The discriminant of error sources: it finds their sizes, frees a scan of its reference's error, rejects strangers."""
+"""The discriminant of error sources: it estimates their sizes, corrects scans, and rejects unknown materials."""
 
 import numpy as np
 import pytest
@@ -143,7 +143,7 @@ def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
 
 @pytest.mark.parametrize("stray", [0, 5])
 def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
-    """The reference has no error of its own: whether it is looked at changes nothing of the others."""
+    """The reference has no error of its own, so its patch does not change the results of others."""
     model = ErrorDiscriminant().fit(with_metal(drawn(8), 0))
     test = with_metal(drawn(9, scans=1), stray)
     without_metal = test.take(test.names != "metal")
@@ -173,7 +173,7 @@ def with_lonely(samples, scans=1):
 
 @pytest.mark.parametrize("model", [DISCRIMINANT, PAPER])
 def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
-    """It cannot be learnt from other scans: the accuracy is that of the others, and it is named."""
+    """The material cannot be learnt from other scans: the accuracy is that of the others, and a note names it."""
     some = drawn(12, scans=4, pixels=4)
     without = score(some, model)
     beside = score(with_lonely(some), model)
@@ -200,7 +200,7 @@ def test_the_channels_alone_are_judged_on_the_same_materials():
 
 
 def test_a_material_of_two_scans_among_many_is_judged():
-    """However the scans fall into folds."""
+    """This holds for any split of the scans into folds."""
     assert score(with_lonely(drawn(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
 
 

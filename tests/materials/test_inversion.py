@@ -1,4 +1,4 @@
-"""Laws of the joint inversion: forward and back, error bars that hold, shares that add up, and what shrinks them."""
+"""Laws of the joint inversion: round trip, correct error bars, shares that add up, and data that makes them smaller."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ PUBLISHED = np.array([
     5.24 - 0.01j, 4.15 - 0.81j, 3.56 - 0.18j, 3.52 - 0.82j, 4.26 - 0.21j, 3.79 - 0.34j, 3.65 - 0.7j, 2.61 - 0.01j,
     4.0 - 0.4j, 3.78 - 0.7j, 4.21 - 0.3j, 4.75 - 2.43j, 5.06 - 1.11j, 7.26 - 0.85j, 4.69 - 0.7j, 4.63 - 0.31j,
 ])  # fmt: skip
-"""Of Table 2; the first eight are scanned."""
+"""Materials of Table 2; the first eight are scanned."""
 EPS = np.array([2.6 - 0.01j, 3.5 - 0.8j, 4.0 - 0.4j, 4.7 - 0.7j, 5.1 - 1.1j, 4.75 - 2.4j, 6.3 - 0.2j, 7.5 - 0.3j])
 
 
@@ -28,7 +28,7 @@ def measured_ratio(t, a, b, rho=0j):
 
 
 def world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):
-    """What a rig of this leakage measures of half spaces relative to metal; written out from Eq. 2, on its own."""
+    """Measurement of half spaces relative to metal by a rig of this leakage, by Eq. 2, independent of the code."""
     a, b = leak
     theta = THETA + angle
     q = np.sqrt(eps - np.sin(theta) ** 2)
@@ -244,10 +244,10 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
 def test_images_with_the_other_sign_of_phase_are_told_from_those_with_ours():
     rng = np.random.default_rng(3)
     prior = RigPrior(1e-3, leakage_std=0.01)
-    ours = world(rng, (0.01, -0.01j))
-    theirs, their_prior = mirror_phases(ours, prior)
-    right = invert(ours, prior, KINDS)
-    wrong = invert(theirs, their_prior, KINDS)
+    measurements = world(rng, (0.01, -0.01j))
+    mirrored_measurements, their_prior = mirror_phases(measurements, prior)
+    right = invert(measurements, prior, KINDS)
+    wrong = invert(mirrored_measurements, their_prior, KINDS)
     for prior_probability in (0.1, 0.5, 0.9):
         _, other = join_signs(right, wrong, prior_probability)
         _, other_way_round = join_signs(wrong, right, 1 - prior_probability)
@@ -259,9 +259,9 @@ def test_images_with_the_other_sign_of_phase_are_told_from_those_with_ours():
 def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evidence):
     rng = np.random.default_rng(4)
     prior = RigPrior(1e-3, leakage_std=0.01)
-    ours = world(rng, (0j, 0j))
-    right = invert(ours, prior, KINDS)
-    wrong = replace(invert(*mirror_phases(ours, prior), KINDS), log_evidence=right.log_evidence + evidence)
+    measurements = world(rng, (0j, 0j))
+    right = invert(measurements, prior, KINDS)
+    wrong = replace(invert(*mirror_phases(measurements, prior), KINDS), log_evidence=right.log_evidence + evidence)
     joined, other = join_signs(right, wrong, 0.3)
     for before, mirrored, after in zip(right.patches, wrong.patches, joined.patches, strict=True):
         assert after.permittivity == before.permittivity
@@ -316,7 +316,7 @@ def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_p
 def test_plates_of_one_foreign_material_do_not_turn_the_boards(eps):
     """Six plates of gypsum, PVC or concrete and a library that has none of them; leakage measured, nothing moved.
 
-    As six independent plates they turned the boards until they were of the library: 0, 67 and 0 % of regions held.
+    As six independent plates they turned the boards until they agreed with the library: 0, 67 and 0 % of regions held.
     """
     library = [Kind(f"material {i}", complex(value)) for i, value in enumerate(PUBLISHED)]
     kinds = Kinds([*library, *literature()], float(THETA), with_sheets=True)

@@ -21,7 +21,7 @@ def test_half_spaces_have_a_density_that_adds_up_to_one(std):
 
 
 def test_no_half_space_lies_at_metal():
-    """A density without bound there once drew every metal-like patch, and the leakage with it."""
+    """An unbounded density there once attracted every metal-like patch, and changed the estimated leakage."""
     near = 1 + 0.1 * np.exp(2j * np.pi * np.arange(12) / 12)
     density = KINDS.compute_half_space_density(np.append(near, 1.0), 0.03**2 * np.eye(2))
     everywhere = KINDS.compute_half_space_density(np.array([0.2 - 0.03j]), 0.03**2 * np.eye(2))
@@ -37,7 +37,7 @@ def test_brightness_of_a_half_space_is_that_of_eq_2():
 
 
 def test_materials_that_no_table_has_lie_near_those_that_one_has():
-    """For equal steps of their coordinates they are several times rarer where nothing was ever measured."""
+    """Per step of their coordinates they are several times rarer where no material was ever measured."""
     usual = KINDS.compute_half_space_density(inverse_ratio(np.array([2.5 - 0.02j]), THETA), 0.02**2 * np.eye(2))
     odd = KINDS.compute_half_space_density(inverse_ratio(np.array([2.5 - 4.0j]), THETA), 0.02**2 * np.eye(2))
     slopes = [abs(complex(permittivity_slope(inverse_ratio(eps, THETA), THETA))) for eps in (2.5 - 0.02j, 2.5 - 4.0j)]

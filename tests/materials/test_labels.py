@@ -1,4 +1,4 @@
-"""Boxes with names: which are refused, and what a label file holds."""
+"""Boxes with names: refused ones, and the content of a label file."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""A layer of unknown thickness: what was put in comes back, and what the data leave open is said."""
+"""A layer of unknown thickness: its parameters are recovered, and ambiguity is reported."""
 
 import json
 
@@ -83,7 +83,7 @@ def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
 
 
 def test_differences_between_bands_are_known_better_than_each():
-    """With the same error of each band, the thickness is known better where most of it is common to all."""
+    """With the same error of each band, the thickness is more certain if most of the error is common to all bands."""
     alone = np.eye(8) * (OWN**2 + COMMON**2)
     shared = fit_layer(measure_bands([SHEET], covariance=shared_covariance()), [Layer("sheet")], THETA, NEAR)
     independent = fit_layer(measure_bands([SHEET], covariance=alone), [Layer("sheet")], THETA, NEAR)
@@ -96,9 +96,9 @@ def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
     q, h = predict([SHEET], band, THETA)
     bands = Bands(band, q, np.full(2, 0.003), h, 0.05 * h)
     fit = fit_layer(bands, [Layer("sheet")], THETA, RANGE)
-    again = SHEET.thickness_m + 299792458.0 / 76.35e9 / 2 / np.sqrt(3.4 - np.sin(THETA) ** 2)
+    rival_m = SHEET.thickness_m + 299792458.0 / 76.35e9 / 2 / np.sqrt(3.4 - np.sin(THETA) ** 2)
     sizes = [solution.thickness_m for solution in (fit, *fit.rivals)]
-    for true in (SHEET.thickness_m, again):
+    for true in (SHEET.thickness_m, rival_m):
         assert min(abs(size / true - 1) for size in sizes) < 0.05
     assert fit.ambiguous
     assert any("mm is not excluded" in words for words in fit.warnings())
@@ -138,7 +138,7 @@ def test_other_forms_are_refused_with_those_that_are_known(text, capsys):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Products of a sheet on metal, which one interface has no permittivity of."""
+    """Products of a sheet on metal, which has no permittivity as a single interface."""
     q, h = predict([SHEET, PLATE], BANDS, THETA)
     covariance = shared_covariance()
     ratio = 1 / q
@@ -179,7 +179,7 @@ def test_a_sheet_on_metal_as_typed(folder, capsys):
 
 
 def test_products_without_patches_print_none_and_their_verdict(folder, capsys):
-    """No patch was asked for by its number, so none is missing."""
+    """No patch was requested by its number, so none is missing."""
     (folder / "materials.json").write_text(json.dumps({"segments": []}))
     assert main(["permittivity", str(folder), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == []
@@ -199,7 +199,7 @@ def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder)
 
 
 def test_samples_of_the_posterior_follow_the_valley_of_thickness_times_index():
-    """Its derivatives are those of the conversion: a small step along the valley comes back."""
+    """The derivatives are those of the conversion: a small step along the valley is recovered."""
     model = _Model(measure_bands([SHEET, PLATE]), (Layer("sheet"), PLATE), 0, THETA, RANGE)
     x = np.array([3.4, 0.1, 1.7])
     steps = 1e-6 * np.eye(3)

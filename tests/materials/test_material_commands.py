@@ -1,4 +1,4 @@
-"""`polysight permittivity`, `polysight concentration` and `polysight classify`, as typed."""
+"""The commands `polysight permittivity`, `polysight concentration` and `polysight classify`."""
 
 import json
 

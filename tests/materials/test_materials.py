@@ -24,13 +24,13 @@ THETA = np.radians(55.0)
 
 def test_library_round_trips(tmp_path, library):
     library.save(tmp_path / "l.npz")
-    again = materials.Library.load(tmp_path / "l.npz")
-    assert again.names == library.names
-    assert again.scans == library.scans
-    assert again.fit == json.loads(json.dumps(library.fit))
-    assert again.note == "synthetic images"
-    assert again.simulated
-    for a, b in zip(library.entries, again.entries, strict=True):
+    reloaded = materials.Library.load(tmp_path / "l.npz")
+    assert reloaded.names == library.names
+    assert reloaded.scans == library.scans
+    assert reloaded.fit == json.loads(json.dumps(library.fit))
+    assert reloaded.note == "synthetic images"
+    assert reloaded.simulated
+    for a, b in zip(library.entries, reloaded.entries, strict=True):
         assert (a.name, a.scan, a.permittivity, a.versions) == (b.name, b.scan, b.permittivity, b.versions)
         np.testing.assert_array_equal(a.h, b.h)
         np.testing.assert_array_equal(a.p, b.p)
@@ -113,7 +113,7 @@ def test_without_truth_or_probabilities_no_share_of_right_pixels_is_expected(syn
 
 
 def test_polarimetry_beats_one_channel(library):
-    """The law behind the instrument: P separates what |H| cannot, and all three together are no worse than P."""
+    """The instrument's principle: P separates materials that |H| cannot, and all three together are no worse than P."""
     fit = library.fit["angles"]["55"]
     assert fit["by_channel"]["p"] > fit["by_channel"]["h"] + 0.1
     assert fit["pixel_accuracy"] >= fit["by_channel"]["p"]
@@ -183,7 +183,7 @@ def test_metal_has_no_permittivity():
 
 
 def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
-    """At the Brewster angle the mean of H/V does not exist; the estimate must not care, nor mind a few wild pixels."""
+    """At the Brewster angle the mean of H/V does not exist; the estimate is still right, also with a few outliers."""
     rng = np.random.default_rng(1)
     r_s, r_p = fresnel(2.61 - 0.01j, THETA)
     n = rng.standard_normal((4, 20000)) * 0.03

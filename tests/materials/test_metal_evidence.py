@@ -1,4 +1,4 @@
-"""Metal is shown by the rest of the scene: random scenes of known and unknown materials, with and without metal."""
+"""The other patches show whether one is metal: random scenes of known and unknown materials, with and without metal."""
 
 from types import SimpleNamespace
 
@@ -19,7 +19,7 @@ EPS = [
 
 
 def scene(rng, plates, metal, patterns_db=1.0):
-    """Patches relative to the one that is brightest in both channels, whether it is metal, and its V / H."""
+    """Patches relative to the one that is brightest in both channels; True if that is metal; and its V / H."""
     eps = rng.choice(EPS, plates, replace=False)
     eps = eps.real * np.exp(0.03 * rng.standard_normal(plates)) + 1j * eps.imag * np.exp(
         0.3 * rng.standard_normal(plates)
@@ -47,7 +47,7 @@ def scene(rng, plates, metal, patterns_db=1.0):
 
 @pytest.fixture
 def scenes(request):
-    """How many random scenes of each kind; `--long` takes as many as the stated shares are known from."""
+    """Number of random scenes of each kind; `--long` takes as many as the stated shares were measured with."""
     return 25 if request.config.getoption("--long") else 3
 
 
@@ -128,5 +128,5 @@ def test_the_reference_is_the_best_shown_metal_of_those_that_may_be_one():
 def test_a_declared_metal_is_contradicted_by_its_own_v_over_h_alone_or_with_the_others(
     score, channel_ratio_db, contradicted
 ):
-    """Odd patches alone never contradict it: they may be liquids or sheets."""
+    """Unusual patches do not contradict metal: they may be liquids or sheets."""
     assert MetalEvidence(score, score, 6, channel_ratio_db).against == contradicted

@@ -1,4 +1,4 @@
-"""Classifiers judged on what they have not seen: a split by pixel flatters, a split by scan does not."""
+"""Classifiers judged on data that was left out: a split by pixel is optimistic, a split by scan is not."""
 
 from dataclasses import replace
 
@@ -72,7 +72,7 @@ def test_groups_never_straddle_and_every_pixel_is_judged_once(folds):
 
 
 def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the_same_specimen():
-    """However the groups fall into folds: here the material's two are the smallest, and would go into one."""
+    """It holds for any folds: here the material's two groups are the smallest, and would come into one fold."""
     data = samples(materials=2, groups=10, pixels=20)
     last = np.isin(data.groups, ["s7", "s8", "s9"])
     first_pixels = np.isin(np.arange(data.names.size), np.unique(data.patches, return_index=True)[1])
@@ -85,7 +85,7 @@ def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the
 
 
 def test_scans_are_left_out_if_joined_ones_share_no_material():
-    """Two pairs of scans, each of its own specimen and materials: joined there is nothing to judge, and no nan."""
+    """Two pairs of scans, each of its own specimen and materials: if joined, nothing can be judged, without NaN."""
     data = samples(materials=4, groups=4, pixels=9)
     in_first = np.isin(data.groups, ["s0", "s1"])
     data = data.take(in_first == np.isin(data.names, ["m0", "m1"]))
@@ -112,7 +112,7 @@ def test_a_split_by_pixel_needs_two_pixels_of_a_material():
 
 
 def test_a_split_by_pixel_flatters():
-    """What the pixels of a patch share is learnt by heart when they stand on both sides of the split."""
+    """Common errors of a patch's pixels are memorised if its pixels are on both sides of the split."""
     data = samples(pixels=10, offset=0.03, noise=0.003)
     assert score(data, PAPER, by_pixel=True).pixels > score(data, PAPER).pixels + 0.15
 
@@ -197,11 +197,11 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
 
     data = samples(noise=0.02)
     queries = samples(noise=0.02, seed=9)
-    ours, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(queries.x)
+    our_names, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(queries.x)
     scaled = [d.x[:, :2] * [3.0, 0.7] for d in (data, queries)]
-    theirs = KNeighborsClassifier(7, metric="manhattan").fit(scaled[0], data.names).predict(scaled[1])
+    sklearn_names = KNeighborsClassifier(7, metric="manhattan").fit(scaled[0], data.names).predict(scaled[1])
     # Ties may fall either way
-    assert (ours == theirs).mean() > 0.99
+    assert (our_names == sklearn_names).mean() > 0.99
 
 
 def test_weights_are_fitted_and_turn_from_a_channel_that_tells_nothing():

@@ -1,4 +1,4 @@
-"""Names of the library, of the literature, possible layers: their probabilities and what they are called."""
+"""Names of the library, of the literature and of possible layers: their probabilities and texts."""
 
 from dataclasses import replace
 
@@ -97,7 +97,7 @@ def test_what_is_no_half_space_but_a_thin_plate_is_a_possible_layer():
 def layer_probability(plates: int, brightness_std: float) -> tuple[float, float]:
     """Median probability of a possible layer, of drawn thin plates and of the half spaces of the same ratios.
 
-    The plates are sheets of 0.5 to 3 mm in air, their ratios and brightnesses written out from multilayer's r_s, r_p.
+    The plates are sheets of 0.5 to 3 mm in air, their ratios and brightnesses are from multilayer's r_s and r_p.
     """
     rng = np.random.default_rng(5)
     probabilities = []
@@ -131,7 +131,7 @@ def test_where_plates_are_unevenly_bright_their_brightness_tells_little():
 
 
 def test_a_patch_that_is_a_layer_with_a_chance_of_one_in_four_is_measured_as_no_half_space():
-    """Its 95 % region would leave out a quarter; the same ratio as bright as a half space is measured."""
+    """Its 95 % region would miss a quarter of the truths; the same ratio with a half space's brightness is measured."""
     eps = 3.0 - 0.03j
     r_s, r_p = multilayer([eps, 1.0], [0.9e-3, np.inf], 78e9, ANGLES[0])
     as_bright = RatioEvidence(ANGLES[0], complex(r_p / r_s), 1e-4 * np.eye(2), 0.5, 0.0, 0.05)

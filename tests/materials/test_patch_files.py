@@ -13,23 +13,23 @@ from polysight_shared.error_codes import ErrorCode
 
 
 def named_again(found, scene, classifier, path):
-    """Names of a result's patches, by number, from its file alone."""
+    """Names of a result's patches, by number, from its file."""
     path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
     patches = read_patches(path)
     matched = [m for m in match_patches([patches]) if m.label in patches.evidence]
-    again = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
-    return {m.label: n.verdict for m, n in zip(matched, again, strict=True)}
+    renamed = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
+    return {m.label: n.verdict for m, n in zip(matched, renamed, strict=True)}
 
 
 def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placement, tmp_path):
     scene = synthetic(3)
     classifier = Classifier(library)
     analysis = name_placement(3)
-    again = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
+    renamed = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
     for r in analysis.patches:
         if r.named is not None:
-            assert again[r.patch.label].name == r.named.verdict.name
-            assert again[r.patch.label].probabilities == pytest.approx(r.named.verdict.probabilities, abs=1e-3)
+            assert renamed[r.patch.label].name == r.named.verdict.name
+            assert renamed[r.patch.label].probabilities == pytest.approx(r.named.verdict.probabilities, abs=1e-3)
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.25])
@@ -44,11 +44,11 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(
     factor = np.where(metal, 1.0, gain)
     pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
     analysis = scene.analyse(classifier=classifier, pair=pair)
-    again = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
+    renamed = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
     names = {r.patch.label: r.named.verdict.name for r in plain.patches if r.named is not None}
-    wrong = {n: (names[n], v.name) for n, v in again.items() if n in names and v.name not in (names[n], UNKNOWN)}
+    wrong = {n: (names[n], v.name) for n, v in renamed.items() if n in names and v.name not in (names[n], UNKNOWN)}
     assert not wrong
-    assert sum(v.name == names.get(n) for n, v in again.items()) >= 0.7 * len(names)
+    assert sum(v.name == names.get(n) for n, v in renamed.items()) >= 0.7 * len(names)
 
 
 def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, name_placement, tmp_path):

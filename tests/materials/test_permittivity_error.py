@@ -1,4 +1,4 @@
-"""The error bar of a permittivity: by the slope of Eq. 3, and the same plate elsewhere lies within it."""
+"""The error bar of a permittivity is the slope of Eq. 3, and contains the same plate at other places."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def test_errors_of_a_plate_fall_with_the_root_of_its_independent_places():
 
 
 def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):
-    """Nine plates in random placements with noise: no estimate leaves three of its standard errors."""
+    """Nine plates in random placements with noise: all estimates are within three standard errors."""
     placements = 8 if request.config.getoption("--long") else 3
     z = []
     for seed in range(placements):
@@ -54,7 +54,7 @@ def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):
 
 
 def errors_beside_metal_apart(scene, lit, segmentation):
-    """Patch number to the error of its real part, with metal that was seen at the pixels `lit` alone."""
+    """Patch number to the error of its real part, with metal that was measured only at the pixels `lit`."""
     ones = np.ones(scene.h.shape, complex)
     metal = PlaneReference(ones, ones, lit, scene.x_m, scene.y_m, spread=1e-3, how="drawn")
     patches = scene.analyse(metal=metal, segmentation=segmentation).patches
@@ -62,7 +62,7 @@ def errors_beside_metal_apart(scene, lit, segmentation):
 
 
 def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synthetic):
-    """Metal that was scanned apart was lit by the same aperture, but not beside the edges of these plates."""
+    """Metal of another scan was lit by the same aperture, but not next to the edges of these plates."""
     scene = synthetic(3, noise=0.002)
     segmentation = scene.analyse().segmentation
     everywhere = np.ones(scene.h.shape, bool)
@@ -85,14 +85,14 @@ def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):
 
 
 def test_a_box_over_dark_pixels_has_the_largest_error(synthetic):
-    """Boxes drawn by hand may lie where nothing is lit."""
+    """Boxes drawn by hand may lie in dark parts of the image."""
     scene = synthetic(3)
     patch = scene.analyse().segmentation.patches[0]
     assert border_errors(patch, ~patch.mask, scene.x_m) == (0.2, 0.2)
 
 
 def test_the_error_at_the_end_of_the_aperture_falls_with_the_distance(synthetic):
-    """Most in amplitude near the end; the phase's falls more slowly."""
+    """The effect on the amplitude is largest near the end; that on the phase falls more slowly."""
     scene = synthetic(3)
     patch = scene.analyse().segmentation.patches[0]
     errors = []

@@ -1,4 +1,4 @@
-"""The text of a complex permittivity: loss is minus, gain is plus, and it reads back."""
+"""The text of a complex permittivity: loss has a minus, gain a plus, and the text is parsed back."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What a scene says of its own errors: images that lie apart, a drift, a halo of an overdriven receiver."""
+"""Errors that a scene shows: displaced images, a drift, a halo of an overdriven receiver."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def dimmed(h, v):
 
 
 def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
-    """By the median of V / H, from which root mean squares are some per cent away."""
+    """By the median of V / H, which differs from the root mean square by some per cent."""
     scene = dimmed(*plates())
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     metal = metal_by_label(int(found.labels[30, 30]), found)
@@ -118,7 +118,8 @@ def test_a_drift_over_the_rows_is_followed_within_its_error():
 def test_any_drift_is_within_its_error():
     """An even rise and waves along y, each part its own; slopes as images show them, each with an error of its own.
 
-    Even rises have slopes that all plates share: they were taken for the plates' own, and their errors were too small.
+    Even rises have slopes that all plates share: they were once attributed to the plates, and their errors were too
+    small.
     """
     rng = np.random.default_rng(11)
     rows_m = np.array(PLACES_M)[:, 1]
@@ -216,7 +217,7 @@ def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
 
 
 def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
-    """Whatever is declared as metal: a dielectric does not overdrive the receiver."""
+    """A dielectric that is declared as metal does not overdrive the receiver."""
     h, v = plates()
     patches = segment(h, v, AXIS, AXIS).patches
     by_level = sorted(patches, key=lambda patch: float(np.median(np.abs(v[patch.interior]))))

@@ -1,4 +1,4 @@
-"""Segmentation finds every plate and nothing else; boxes by hand; the metal reference."""
+"""Segmentation finds all plates and no other patches; boxes by hand; the metal reference."""
 
 import numpy as np
 import pytest

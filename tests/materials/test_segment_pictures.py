@@ -211,7 +211,7 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_plate_cut_off_from_a_larger_patch_is_told(seed):
-    """Six plates without gaps: four in a square, two in a row at its corner. The last one was lost without a word."""
+    """Six plates without gaps: four in a square, two in a row at its corner. The last one was once lost."""
     size = 23
     places = [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]
     boxes = [(35 + size * i, 35 + size * j, 35 + size * (i + 1), 35 + size * (j + 1)) for i, j in places]
@@ -268,7 +268,7 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
 
 
 def test_a_dim_plate_that_is_no_patch_is_no_background_but_a_table_is():
-    """A dim plate says nothing of what lies behind the others; a table behind is as dim, but larger than any plate."""
+    """A dim plate is no measure of the background of others; a table behind is as dim, but larger than any plate."""
     usable = np.ones((AXIS.size, AXIS.size), bool)
     patch_mask = np.zeros_like(usable)
     patch_mask[20:45, 20:45] = True

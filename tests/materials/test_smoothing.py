@@ -1,4 +1,4 @@
-"""Total variation and outlines against scikit-image's, which would load scipy.stats and scipy.signal."""
+"""Total variation and outlines, compared with scikit-image's, which would load scipy.stats and scipy.signal."""
 
 import subprocess
 import sys
@@ -40,5 +40,5 @@ def test_segmentation_loads_neither_statistics_nor_signal_processing():
         "assert len(segment(h, h, at, at, np.ones(h.shape, bool)).patches) == 1;"
         "print(sorted({'scipy.stats', 'scipy.signal'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert done.stdout.strip() == "[]"
+    process = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert process.stdout.strip() == "[]"

@@ -1,4 +1,4 @@
-"""Specimens differ: their spread is found, turned into features by Eq. 2, and doubts follow it."""
+"""Specimens differ: their spread is estimated, converted to features by Eq. 2, and included in probabilities."""
 
 import numpy as np
 import pytest
@@ -171,7 +171,7 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
 
 
 def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
-    """However far it is: a person wants to know where to begin."""
+    """It is named for any distance, so that a person knows where to begin."""
     classifier = Classifier(entries(drawn((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
     x = drawn((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})
     named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])

@@ -1,4 +1,4 @@
-"""Sub-bands of patches: only what an image shows counts, and what all bands share does not average out with them."""
+"""Sub-bands of patches: only imaged pixels count, and an error that all bands share does not average out."""
 
 from dataclasses import replace
 
@@ -131,7 +131,7 @@ def test_a_told_error_of_brightness_keeps_the_loss_of_a_sheet_within_its_error()
 
 
 def make_row(ratio, parts):
-    """A segment of materials.json whose every part of the sweep says the same: a thick plate's."""
+    """A segment of materials.json with the same ratio in all parts of the sweep, as of a thick plate."""
     part_row = {
         "first_hz": 0.0,
         "last_hz": 1.0,
@@ -149,8 +149,8 @@ def make_bands(ratio, parts) -> Bands:
 
 
 def test_errors_that_sub_bands_share_do_not_shrink_with_their_number():
-    """Metal, edges and size are off by the same in every band. A thick plate looks the same in all of them, so that
-    its permittivity has one error bar, however many they are."""
+    """Errors by metal, edges and size are the same in every band. A thick plate looks the same in all of them, so that
+    its permittivity has the same error bar for any number of bands."""
     ratio = ratio_from_permittivity(THICK, THETA)
     fits = [fit_layer(make_bands(ratio, parts), [Layer("plate")], THETA) for parts in (1, 2, 4, 8)]
     for fit in fits[1:]:

@@ -1,4 +1,4 @@
-"""A segment of a surface is named by its permittivity alone, with the same library as the patches of an image."""
+"""A segment of a surface is named only by its permittivity, with the same library as the patches of an image."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Boxes drawn by hand may touch, and may lie where nothing was imaged."""
+"""Boxes drawn by hand may touch each other, and may lie outside the valid pixels."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""`train` says if names are too sure, why, and how many specimens a library needs."""
+"""`train` reports if confidences are too high, the cause, and the number of specimens that a library needs."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`polysight materials`, `permittivity`, `report` and `classify` of judged products, as typed."""
+"""The commands `polysight materials`, `permittivity`, `report` and `classify` with judged products."""
 
 import io
 import json

@@ -46,7 +46,7 @@ def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least, reques
 
 @pytest.mark.slow
 def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
-    """One along x, one along y, and a level one beside them."""
+    """One plate along x, one along y, and a level one."""
     stacks = (half_space(3.5 - 0.3j), half_space(4 - 0.4j), half_space(4 - 0.4j))
     copper, level, *tilted = world(*stacks).plates
     along, across = replace(tilted[0], tilt_x_deg=5.0), replace(tilted[1], tilt_y_deg=5.0)
@@ -103,7 +103,7 @@ def test_the_reference_is_bare_metal_though_coated_metal_beside_it_is_brighter(c
 
 @pytest.mark.slow
 def test_a_plate_near_the_brewster_angle_is_not_called_disturbed():
-    """Its V is nearly zero, so that the sidelobes of its neighbours change most of it, and nothing of its value."""
+    """Its V is nearly zero: sidelobes of neighbours change it by a large factor, but by a small value."""
     pair = draw_pair("none", 990015, mixed=True)  # PTFE among eight others
     analysis, plates = analyse_world(pair, leakage=draw_calibration("none", 990015)[0])
     label = next(label for label, plate in plates.items() if "PTFE" in plate.name)

@@ -1,4 +1,4 @@
-"""What a scan's files say about it."""
+"""The history of a scan, read from its files."""
 
 import pytest
 from msgspec import structs

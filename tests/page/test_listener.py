@@ -1,4 +1,4 @@
-"""The Pi is heard and never asked."""
+"""The page listens to the Pi's events and sends no requests."""
 
 import select
 import socket
@@ -21,7 +21,7 @@ OF = {"scan_id": "mine", "t_mono_ns": 1}
 
 @pytest.fixture
 def pi(tmp_path):
-    """The events' end of a Pi, and who listens to it."""
+    """The events' socket of a Pi, and its listener."""
     context = make_server_context()
     events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -111,7 +111,7 @@ PING = b"\x04PING"
 
 
 def test_the_pi_forgets_a_view_that_hangs(tmp_path):
-    """Its queue for that subscriber does not grow for ever. Bytes pass between the two until the view is to hang."""
+    """The queue for that subscriber is limited. A relay passes the bytes until the view should hang."""
     server_context = make_server_context()
     view_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     events = publisher(server_context, "tcp://127.0.0.1:*", tmp_path)
@@ -128,15 +128,15 @@ def test_the_pi_forgets_a_view_that_hangs(tmp_path):
             view_socket = observer(view_context, address, tmp_path)
             view, _ = listener.accept()
             with view, socket.create_connection(("127.0.0.1", port)) as pi:
-                said = b""
+                received = b""
                 # Before its first sign of life the Pi cannot know how often it gives one.
-                while PING not in said:
+                while PING not in received:
                     readable, _, _ = select.select([view, pi], [], [], HANG_S)
                     if pi in readable:
                         view.sendall(pi.recv(65536))
                     if view in readable:
                         part = view.recv(65536)
-                        said += part
+                        received += part
                         pi.sendall(part)
                 wait_for(is_forgotten, "that it is forgotten")
             view_socket.close()

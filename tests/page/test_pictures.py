@@ -1,4 +1,4 @@
-"""Pictures and range profiles show what is in the data."""
+"""Pictures and range profiles agree with the data."""
 
 import io
 from dataclasses import replace

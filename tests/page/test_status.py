@@ -1,4 +1,4 @@
-"""The headline: the worst thing first, always with what to do about it."""
+"""The headline names the most serious problem first, always with a remedy."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -60,7 +60,7 @@ def test_a_dead_program_outranks_everything_but_the_end(history):
 
 
 def test_a_started_program_hangs_once_its_run_has_begun(history):
-    """Before it has written anything, the signs of life are those of the run before."""
+    """Before the program has written anything, the signs of life are those of the previous run."""
     lifeless = replace(LIVELY, alive=False)
     started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
     assert status(history, lifeless, program=started).key == "frozen"
@@ -72,7 +72,7 @@ def test_a_started_program_hangs_once_its_run_has_begun(history):
 
 
 def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
-    """It writes its first sign of life when it does."""
+    """The program writes its first sign of life when it begins."""
     started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
     facts = facts_of(finished)
     history = begin_history(facts[0])
@@ -157,7 +157,7 @@ def test_requests_are_said_with_who_sent_them_until_they_come_to_pass(history):
 
 
 def test_an_abort_is_no_fault(history):
-    """Neither in the row that it ends, nor at the Pi, nor when the scan has ended."""
+    """There is no such notice in the row that it ends, at the Pi, or when the scan has ended."""
     aborted = REJECTED | {"faults": [{"kind": "on_request"}]}
     add_fact(history, aborted)
     fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, problem="aborted"))

@@ -234,7 +234,7 @@ def test_another_file_in_its_place_is_read_from_the_beginning(finished, tmp_path
 
 
 def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path):
-    """Before anything else was appended to the one that was read."""
+    """The file was replaced before anything was appended to the one that was read."""
     path = tmp_path / MANIFEST
     raw = (finished / MANIFEST).read_bytes()
     other_items = [{"fact": "scan_ended", "reason": "another scan" * 50} for _ in raw.splitlines()]

@@ -65,7 +65,7 @@ def angles(number):
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    """materials/ with three sets, labels/ with two scans, and a stranger among the names."""
+    """materials/ with three sets, labels/ with two scans, and an unknown material."""
     folder = tmp_path_factory.mktemp("authors") / "dataset"
     seed = 0
     for k in range(3):
@@ -207,13 +207,13 @@ def test_images_made_here_are_turned_to_lie_as_the_authors_own(dataset, tmp_path
     v = np.load(dataset / "labels" / "scan0" / "sar_v.npy").conj()
     folder = tmp_path / "scan0"
     folder.mkdir()
-    ours = {"h": np.rot90(h, 1), "v": np.rot90(v, 1), "valid": np.ones(h.shape, bool)}
-    np.savez(folder / "image.npz", **ours)
+    our_images = {"h": np.rot90(h, 1), "v": np.rot90(v, 1), "valid": np.ones(h.shape, bool)}
+    np.savez(folder / "image.npz", **our_images)
     data = read_authors(dataset, RIG_FILE, images=tmp_path)
-    theirs = {(e.name, e.scan): e for e in data.sources[LABELS].entries}
+    authors_entries = {(e.name, e.scan): e for e in data.sources[LABELS].entries}
     for e in data.sources[IMAGES].entries:
         assert e.scan == "scan0"
-        np.testing.assert_allclose(e.p, theirs[e.name, e.scan].p, rtol=1e-4)
+        np.testing.assert_allclose(e.p, authors_entries[e.name, e.scan].p, rtol=1e-4)
     assert any("scan1: no image made here" in n for n in data.notices)
 
 
@@ -271,7 +271,7 @@ def test_leakage_is_taken_out_exactly_and_the_recipe_undoes_its_own_constants():
 
 @pytest.mark.parametrize("source", [MATERIALS, IMAGES])
 def test_the_recipe_takes_out_only_leakage_that_is_there(dataset, source):
-    """Images made here have none any more."""
+    """Images made here have no leakage any more."""
     acrylic = ROWS[3]
     p = complex(ratio_from_permittivity(acrylic.permittivity, np.radians(60.0))) / METAL_FACTOR
     if source != IMAGES:
@@ -306,7 +306,7 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
 
 
 def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, capsys, monkeypatch):
-    """Metal stands in both scans, and is what all is relative to: that it is recognised says nothing."""
+    """Metal is the reference of both scans, so that its recognition is no result."""
     monkeypatch.setattr(classify, "GRID", (1.0,))
     for k, material_index in enumerate((3, 12)):
         for number in (1, material_index):

@@ -1,4 +1,4 @@
-"""Pixels drawn patch by patch: what they obey, and that the noise is set on H alone."""
+"""Pixels drawn patch by patch: their laws, and that the noise is set by H only."""
 
 import inspect
 

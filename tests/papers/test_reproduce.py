@@ -87,7 +87,7 @@ def test_published_numbers_stand_in_the_data_file_alone():
 
 
 def test_contrast_under_each_angle_is_that_of_eq_2():
-    """The middle pixel at 0 degrees is |H|, at 55 and 60 |P|, of the published permittivity (fig. 16)."""
+    """The middle pixel is |H| at 0 degrees, |P| at 55 and 60 degrees, of the published permittivity (fig. 16)."""
     levels = report.MAKERS["fig16"](Run(quick=True)).data["level_db"]
     materials = {material.name: material.permittivity for material in table2()}
     for name in levels["0"]:

@@ -1,4 +1,4 @@
-"""Scenes, rig files and estimators behind the figures that come from images."""
+"""Scenes, rig files and estimators of those figures that are made from images."""
 
 from types import SimpleNamespace
 

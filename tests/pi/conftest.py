@@ -68,7 +68,7 @@ def config(instrument: Instrument, write_config: Callable[[Instrument], Path]) -
 
 @pytest.fixture
 def hub(tmp_path: Path) -> Iterator[Path]:
-    """A wire hub; gives its socket."""
+    """A wire hub; yields its socket."""
     path = tmp_path / "w"
     stop = threading.Event()
     with closing(WireHub(path, lambda _: None)) as hub:

@@ -1,4 +1,4 @@
-"""Laws of bursts, by the program and by the SPI controller, and of the trigger loop, on clocks that tests turn."""
+"""Laws of bursts, by the program and by the SPI controller, and of the trigger loop, with clocks set by tests."""
 
 import itertools
 import queue
@@ -34,7 +34,7 @@ SPEC = trigger.BurstSpec(16, PERIOD, 1000)
     late=st.lists(st.integers(0, 50_000), min_size=1),
 )
 def test_deadlines_do_not_drift(pulses, period, start, late):
-    """Each pulse is late by its own lateness alone, whatever happened to those before it."""
+    """The delay of a pulse does not depend on those of earlier pulses."""
     lines = FakeLines(late=lambda n: late[n // 2 % len(late)] if n % 2 == 0 else 0)
     spec = trigger.BurstSpec(pulses, period + 50_000, 1000)
     sent = trigger.send_burst(lines, spec, start + 1)
@@ -366,7 +366,7 @@ def instrument(instrument, request):
 
 @pytest.fixture
 def source(instrument):
-    """What the events say about the widths."""
+    """Widths of pulses in the events."""
     return "spi" if instrument.pi.wiring == "spi" else "one-shot"
 
 
@@ -406,7 +406,7 @@ def test_pulses_beyond_one_transfer_are_sent_in_several(pi, rises, source):
 
 @pytest.mark.parametrize("seen", [lambda n: n - 1, lambda n: n + 1, lambda _: 0])
 def test_pulses_that_are_not_seen_are_a_fault(seen):
-    """Each burst is compared with what came back: a dead buffer or cable is found at the first point."""
+    """Each burst is compared with the return wire: a defective buffer or cable is found at the first point."""
     lines = FakeLines()
     lines.seen = seen
     posted = []
@@ -419,7 +419,7 @@ def test_pulses_that_are_not_seen_are_a_fault(seen):
 
 
 def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch):
-    """On the simulated wires; a rig without the wire says so."""
+    """With simulated wires; a rig without a return wire reports that."""
     monkeypatch.setattr(pi_lines, "SIMULATED_LOOK_BACK_S", 0.2)
     with closing(WireClient(hub)) as cutter:
         pi.host.must_accept(pi.host.begin())
@@ -427,8 +427,8 @@ def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch
         assert pi.host.row(0).pulses_seen
         cutter._socket.sendall(f"X {instrument.pi.pulses_in} 1\n".encode())
         assert cutter._read_line(HANG_S) == "K"
-        done = pi.host.row(1)
-        assert (done.fault, done.pulses, done.pulses_seen) == (PiFault.PULSES_UNSEEN, 0, True)
+        row_finished = pi.host.row(1)
+        assert (row_finished.fault, row_finished.pulses, row_finished.pulses_seen) == (PiFault.PULSES_UNSEEN, 0, True)
         assert all(c.pulses_seen for c in pi.host.list_events(m.Capture))
 
 
@@ -440,5 +440,5 @@ def test_a_row_afterwards_is_complete_and_during_a_run_no_pulse_is_sent(pi, inst
     assert pi.host.ask(m.Hello()).in_run
     assert pi.host.must_refuse(pulse) == PiFault.NOT_READY
     pi.host.home()
-    done = pi.host.row(0)
-    assert (done.status, done.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)
+    row_finished = pi.host.row(0)
+    assert (row_finished.status, row_finished.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)

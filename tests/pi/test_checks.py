@@ -42,9 +42,9 @@ def on_chip(write_config, stage, tmp_path):
 
     def check(rig, *faults, port=None):
         arguments = ("--config", write_config(rig), "--stage-port", port or stage.port, "--json")
-        done = run("check", *arguments, **gpio.environment(tmp_path / "chip", faults=faults))
-        findings = {f["name"]: f for f in json.loads(done.stdout)}
-        assert (done.returncode == 0) == all(f["verdict"] != "fail" for f in findings.values())
+        process = run("check", *arguments, **gpio.environment(tmp_path / "chip", faults=faults))
+        findings = {f["name"]: f for f in json.loads(process.stdout)}
+        assert (process.returncode == 0) == all(f["verdict"] != "fail" for f in findings.values())
         assert all(f["remedy"] for f in findings.values() if f["verdict"] != "ok"), findings
         return findings
 
@@ -165,7 +165,7 @@ SET_VALUES = 3 << 30 | 16 << 16 | 0xB4 << 8 | 0x0F
 
 @pytest.mark.parametrize(("width_ns", "sent_ns"), [(25, 0), (1000, 0), (1001, 1001), (4000, 4000)])
 def test_a_short_pulse_is_two_calls_with_nothing_between_them(gpio_rig, monkeypatch, width_ns, sent_ns):
-    """The clock stands still between them; a longer pulse is waited for."""
+    """The clock does not advance between the calls; the test waits for a longer pulse."""
     clock = SimpleNamespace(t=0)
     log = []
 

@@ -94,16 +94,16 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
     assert host.ask(m.Hello()).backend == "gpiod"
     host.must_accept(host.begin())
     host.home()
-    done = host.row(0)
+    report = host.row(0)
     captures = [c for c in host.list_events(m.Capture) if c.pulses]
-    wires.until(lambda: len(wires.rises(SYNC)) == done.pulses)
-    assert sum(c.pulses for c in captures) == done.pulses
-    if wire_time or done.status == "done":
-        assert (done.points, done.edges, done.bursts, done.pulses) == (POINTS, POINTS, POINTS, 4 * POINTS)
+    wires.until(lambda: len(wires.rises(SYNC)) == report.pulses)
+    assert sum(c.pulses for c in captures) == report.pulses
+    if wire_time or report.status == "done":
+        assert (report.points, report.edges, report.bursts, report.pulses) == (POINTS, POINTS, POINTS, 4 * POINTS)
     else:
         # In real time a machine may be too busy for a row, and then it says so.
         busy = (PiFault.EDGE_DURING_BURST, PiFault.PERIOD_TOO_SHORT, PiFault.EDGE_TIME)
-        assert done.fault in busy, done.reason
+        assert report.fault in busy, report.reason
     memory = Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
     assert int(memory) < 60_000, f"more than 60 MB: {memory} KB"
     rises = wires.rises(SYNC)
@@ -122,8 +122,8 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
 def test_an_edge_during_a_burst_ends_the_row_alone(long_bursts, in_row, wires):
     _, host = in_row(long_bursts)
     wires.drive(*edge(1_001_000))
-    done = host.wait(m.RowFinished)
-    assert (done.status, done.fault, done.bursts) == ("fault", PiFault.EDGE_DURING_BURST, 1), done.reason
+    report = host.wait(m.RowFinished)
+    assert (report.status, report.fault, report.bursts) == ("fault", PiFault.EDGE_DURING_BURST, 1), report.reason
     assert host.list_events(m.Fault)[-1].number == PiFault.EDGE_DURING_BURST
     host.until_state("ready")
 
@@ -132,8 +132,8 @@ def test_a_chip_that_vanishes_is_fault_107(long_bursts, in_row, wires):
     program, host = in_row(long_bursts)
     host.wait(m.Capture)
     program.popen.send_signal(gpio.VANISH)
-    done = host.wait(m.RowFinished)
-    assert (done.status, done.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
+    report = host.wait(m.RowFinished)
+    assert (report.status, report.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
     assert "No such device" in host.until_state("fault").reason
     assert host.must_refuse(m.Home()) == PiFault.TRIGGER_LINE_LOST
     ended, _, err = program.end()
@@ -144,14 +144,14 @@ def test_a_chip_that_vanishes_is_fault_107(long_bursts, in_row, wires):
 def test_a_line_in_use_ends_the_program_with_fault_and_remedy(rig, write_config, stage, hub):
     """The other faults of a chip are those of `polysight-pi check` (test_checks.py): the same code opens the lines."""
     environment = gpio.environment(rig.pi.gpio_chip, hub, faults=("busy:22",))
-    done = run("run", "--config", write_config(rig), "--stage-port", stage.port, **environment)
-    assert done.returncode == 5
-    assert all(text in done.stderr for text in ("fault 107", "line 22", "'another-program'", "do: ")), done.stderr
+    process = run("run", "--config", write_config(rig), "--stage-port", stage.port, **environment)
+    assert process.returncode == 5
+    assert all(text in process.stderr for text in ("fault 107", "line 22", "'another-program'", "do: ")), process.stderr
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_outputs_are_low_after_a_signal_inside_a_pulse(rig, in_row, wires, number):
-    """The call that sets the line high does not return: the signal comes while it is high."""
+    """The call that sets the line high does not return, so that the signal comes while the line is high."""
     program, _ = in_row(rig, "stuck")
     wires.until(lambda: wires.level(SYNC) == 1)
     status, _, err = program.end(number)
@@ -189,7 +189,7 @@ lines.close()
 def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_path):
     """Bias, debouncing, clock, consumer: read back from the chip, which is found by its label.
 
-    Of edges that nobody reads the kernel keeps the newest 1024; the number of the next one says how many are lost.
+    Of unread edges the kernel keeps the newest 1024; the number of the next one shows how many were lost.
     """
     environment = {**os.environ, **gpio.environment(tmp_path / "gpiochip0", hub)}
     process = subprocess.Popen(
@@ -250,8 +250,8 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
     program, host = start_homed(hub, core_hz=f"250e6,{real_hz:g}")
     rate = 250e6 / real_hz
     assert host.ask(m.Hello()).backend == "spi"
-    done = host.row(0)
-    assert (done.status, done.timed_by) == ("done", "spi"), done.reason
+    report = host.row(0)
+    assert (report.status, report.timed_by) == ("done", "spi"), report.reason
     status, _, err = program.end()
     assert status == 0, err
     n = spi_rig.burst.pulses
@@ -328,7 +328,7 @@ def may_schedule():
 
 
 def priorities(pid):
-    """Of the threads of a process that are in real time."""
+    """Names of the threads of a process that have real-time priority."""
     tasks = [int(t.name) for t in Path(f"/proc/{pid}/task").iterdir()]
     return [os.sched_getparam(t).sched_priority for t in tasks if os.sched_getscheduler(t) == os.SCHED_FIFO]
 

@@ -1,4 +1,4 @@
-"""Rows are judged by place and time: those of the simulated stage (the arithmetic of the sketch), with drawn faults."""
+"""Edges of rows are checked by place and time: rows of the simulated stage (the sketch's arithmetic) with faults."""
 
 import random
 from typing import Any, NamedTuple
@@ -35,7 +35,7 @@ class Happening(NamedTuple):
 
 
 class Recorder:
-    """Runs a row on the simulated stage, with the Pi's machine, in virtual time; keeps all that happens."""
+    """Runs a row on the simulated stage, with the Pi's machine, in virtual time; records everything."""
 
     def __init__(self, speed_mm_s: float, accel_mm_s2: float, rng: random.Random) -> None:
         self.speed_mm_s = speed_mm_s
@@ -138,7 +138,7 @@ def give(bench: Bench, what: Any, t_ns: int) -> None:
 
 
 def replay(recorder: Recorder, edges_ns: list[int]) -> m.RowFinished:
-    """The row's end with these edges instead of its own."""
+    """End of the row with these edges instead of the true ones."""
     bench = make_bench(recorder)
     other_happenings = [h for h in recorder.happenings if h.what != "edge"]
     edges = [Happening(t_ns, "edge") for t_ns in edges_ns]
@@ -186,7 +186,7 @@ def are_equal(edges_ns: list[int], sound_ns: list[int], tolerance_ns: float) -> 
 
 
 def has_interval_beside_holds(recorder: Recorder) -> bool:
-    """True if no hold is in the first or last interval: a wait there hides how far the outermost edge was shifted."""
+    """True if no hold is in the first or last interval: a wait there hides the shift of the outermost edge."""
     replies = [h.what for h in recorder.happenings if isinstance(h.what, Reply)]
     held_after = [int(r.fields["points"]) for r in replies if r.fields.get("state") == "hold"]
     return all(2 <= points <= POINTS - 2 for points in held_after)
@@ -214,7 +214,7 @@ def record(speed_mm_s: float, accel_mm_s2: float, rng: random.Random, is_held: b
 @pytest.mark.parametrize("is_held", [False, True])
 @pytest.mark.parametrize(("speed_mm_s", "accel_mm_s2"), SPEEDS_AND_ACCELERATIONS)
 def test_drawn_edge_faults_are_found(speed_mm_s, accel_mm_s2, is_held, request):
-    """Lost, spurious, both, or shifted by 2 % of the interval or more: never `done`, and named; sound rows are."""
+    """Rows with lost, spurious or shifted edges (by 2 % of the interval or more) are faults; others are `done`."""
     rows = 25 if request.config.getoption("--long") else 1
     rng = random.Random(speed_mm_s)
     interval_ns = round(STEP_MM / speed_mm_s * 1e9)
@@ -240,7 +240,7 @@ def test_drawn_edge_faults_are_found(speed_mm_s, accel_mm_s2, is_held, request):
 
 @pytest.mark.parametrize("early_hold_s", [0.01, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
 def test_a_row_that_was_held_before_its_first_point_is_sound(early_hold_s):
-    """In the travel to it, where the stage may cross the row's own place, or in the run-up."""
+    """In the travel to the row, where the stage may cross the row's places, or in the run-up."""
     recorder = Recorder(20, 200, random.Random(1))
     recorder.run([], early_hold_s)
     assert any(h.what.fields.get("state") == "hold" for h in recorder.happenings if isinstance(h.what, Reply))

@@ -1,4 +1,4 @@
-"""Hostile messages, replies of the stage and connections: answered, within bounded memory, and a row is undisturbed.
+"""Hostile messages, replies of the stage and connections are answered in bounded memory, and rows are undisturbed.
 
 The clients that send without end speak ZMTP 3.0 (RFC 23) by hand, byte by byte.
 """
@@ -118,7 +118,7 @@ def stranger(pi):
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
 def test_an_impossible_value_is_no_command(commands, field, wrong):
-    """What cannot be decoded is refused; the fuzz test below shows that, through the socket."""
+    """Invalid messages are refused; the fuzz test below shows that through the socket."""
     for command in commands:
         for value in wrong:
             raw = msgpack.packb(msgspec.to_builtins(command) | {field: value})
@@ -202,7 +202,7 @@ HUGE = 9_999_999_999
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_impossible_position_is_ignored(pi, stage, sign):
-    """Status and events stay readable; the position is the last possible one."""
+    """Status and events can still be decoded; the position is the largest possible one."""
     stage.x = stage.y = sign * HUGE
     for alarm in (-HUGE, -1, 1000, HUGE):
         fields = {"state": "idle", "x": stage.x, "y": stage.y, "points": HUGE, "alarm": alarm}
@@ -224,13 +224,13 @@ def test_impossible_lost_steps_and_points_spoil_no_journal(pi, stage):
     pi.host.wait(m.Capture)
     row = stage.seen[-1]
     stage.say(Reply("done", row.sequence, fields={"points": str(HUGE), "pulses": "0", "x": str(HUGE), "y": "0"}))
-    done = pi.host.wait(m.RowFinished)
-    assert (done.status, done.points) == ("fault", HUGE)
-    assert pi.host.replay()[-1].seq >= done.seq
+    row_finished = pi.host.wait(m.RowFinished)
+    assert (row_finished.status, row_finished.points) == ("fault", HUGE)
+    assert pi.host.replay()[-1].seq >= row_finished.seq
 
 
 def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
-    """Far more than a serial line carries."""
+    """The replies are far more than a serial line carries."""
     lines = (
         Reply("status", fields={"state": "row", "x": "1", "y": "2", "points": "3", "alarm": "0"}),
         Reply("banner", fields={"fw": "x" * 60, "proto": "2"}), Reply("alarm", number=999), Reply("alarm", number=15),
@@ -304,7 +304,7 @@ ATTACKS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
-    """And the next one is served, by the same process with the same run."""
+    """The next client is served by the same process with the same run."""
     endpoint, kind, more_bytes = ATTACKS[attack]
     program, host = start(instrument, "--wires", hub)
     host.must_accept(host.begin())
@@ -324,7 +324,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     log = bytearray()
 
     def has_cut() -> bool:
-        """True once the program says so: ZeroMQ itself ends some of these connections."""
+        """True once the program's log says so: ZeroMQ itself ends some of these connections."""
         errors = program.popen.stderr.fileno()
         while select.select([errors], [], [], 0)[0]:
             log.extend(os.read(errors, 1 << 16))
@@ -367,21 +367,21 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
 
 
 def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
-    """The executor completes turns, however much waits: the watchdog and `Alive` go by them."""
+    """The executor completes turns however many items wait: the watchdog and `Alive` depend on turns."""
     monkeypatch.setattr(executors, "TURN_TIMEOUT_S", 0.05)
     turns = itertools.count()
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: next(turns))
-    done = threading.Event()
+    queue_is_empty = threading.Event()
     for _ in range(60):
         pi.service.executor.post(lambda: pi.clock.sleep(0.06))
-    pi.service.executor.post(done.set)
-    assert done.wait(HANG_S)
+    pi.service.executor.post(queue_is_empty.set)
+    assert queue_is_empty.wait(HANG_S)
     assert next(turns) >= 30, "a turn takes as long as it may, and the one under way"
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
 
 
 def test_replays_do_not_keep_other_commands_waiting(pi):
-    """Only few of them wait at a time; more are refused."""
+    """Only a few connections wait at a time; more are refused."""
     slow = threading.Event()
     pi.service.executor.post(lambda: slow.wait(HANG_S))
     replay = m.Replay(scan_id="scan", from_seq=1)

@@ -1,4 +1,4 @@
-"""What goes onto a Pi: the installation script, the systemd unit, the udev rules."""
+"""Installed files of a Pi: the installation script, the systemd unit, the udev rules."""
 
 import configparser
 import os
@@ -50,9 +50,9 @@ def analyze(tmp_path):
 
 
 def test_the_unit_is_what_systemd_accepts(analyze):
-    done = analyze("verify", "--man=no")
-    assert "polysight-pi.service" not in done.stderr, done.stderr
-    assert done.returncode == 0, done.stderr
+    process = analyze("verify", "--man=no")
+    assert "polysight-pi.service" not in process.stderr, process.stderr
+    assert process.returncode == 0, process.stderr
 
 
 # As systemd does for RestrictAddressFamilies=: socket() of another family fails with EAFNOSUPPORT (seccomp(2)).
@@ -79,8 +79,8 @@ def test_the_unit_leaves_the_address_families_that_zeromq_needs(unit):
     if os.uname().machine not in ("x86_64", "aarch64"):
         pytest.skip("the numbers of system calls are known for x86-64 and arm64 alone: run this test on one of these")
     families = unit["Service"]["RestrictAddressFamilies"].split()
-    done = subprocess.run([sys.executable, "-c", BIND, *families], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (0, "bound\n"), done.stderr
+    process = subprocess.run([sys.executable, "-c", BIND, *families], capture_output=True, text=True, check=False)
+    assert (process.returncode, process.stdout) == (0, "bound\n"), process.stderr
 
 
 def test_the_unit_gives_what_the_program_asks_for(unit):
@@ -97,12 +97,12 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
 
 
 def test_the_unit_exposes_little(analyze):
-    """systemd's own measure: 0 is a program that can do nothing, 10 one without any limit."""
-    done = analyze("security", "--offline=yes", "--no-pager")
-    exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
+    """systemd's exposure level: 0 is a program without any rights, 10 one without any limit."""
+    process = analyze("security", "--offline=yes", "--no-pager")
+    exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", process.stdout)
     if exposure is None:
-        pytest.skip(f"this systemd-analyze measures no file: {done.stderr.strip()}")
-    assert float(exposure[1]) <= 3.0, done.stdout
+        pytest.skip(f"this systemd-analyze measures no file: {process.stderr.strip()}")
+    assert float(exposure[1]) <= 3.0, process.stdout
 
 
 def test_pinned_versions_are_what_the_wheels_ask_for():
@@ -129,7 +129,7 @@ def test_udev_rules_are_well_formed():
 
 @pytest.fixture
 def install(bench, tmp_path):
-    """Runs install.sh as copied to the Pi; gives what it ended with."""
+    """Runs install.sh as copied to the Pi; returns the ended process."""
     copied = tmp_path / "copied"
     shutil.copytree(PI, copied)
     (copied / "a.whl").touch()
@@ -165,8 +165,8 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
         if rig_file:
             (root / "etc/polysight/instrument.toml").write_text(rig_file)
             log.unlink()
-        done = subprocess.run(make, cwd=REPO, env=bench, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
+        process = subprocess.run(make, cwd=REPO, env=bench, capture_output=True, text=True, check=False)
+        assert process.returncode == 0, process.stdout + process.stderr
         log_text = log.read_text()
         assert log_text.count("-m venv") == (rig_file is None), "made once, and kept with its libraries"
         order = [
@@ -185,7 +185,7 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
     )
     for words in ("useradd --system", "systemctl enable"):
         assert words in log_text
-    assert PROGRAM in done.stdout
+    assert PROGRAM in process.stdout
     opt = root / "opt/polysight"
     assert (opt / "venv").readlink() == Path("releases/2")
     back = [subprocess.run([PI / "install.sh", "--roll-back"], env=bench, check=False).returncode for _ in range(2)]
@@ -199,8 +199,8 @@ def test_a_machine_that_is_no_pi_is_not_changed(install, bench, tmp_path):
         pytest.skip("this machine has a device tree: it may be a Pi")
     del bench["ROOT"]
     for arguments in ((), ("--roll-back",)):
-        done = install(*arguments)
-        assert (done.returncode, "not a Raspberry Pi" in done.stderr) == (2, True)
+        process = install(*arguments)
+        assert (process.returncode, "not a Raspberry Pi" in process.stderr) == (2, True)
     assert not (tmp_path / "log").exists(), "no command was run"
 
 

@@ -49,7 +49,7 @@ def test_the_command_says_where_the_stage_rests_and_its_limits(rig, write_config
 
 
 def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):
-    """It lasts many times longer than a silent host is waited for; ended by another person's abort."""
+    """The jog lasts many times longer than the timeout of a silent host; another client's abort ends it."""
     stage.pace_s = 60.0
 
     def abort_later() -> None:

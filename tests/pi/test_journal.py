@@ -252,7 +252,7 @@ ROW_DONE: dict[str, Any] = {
 
 
 def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
-    """Neither the row whose end finds the disk full, nor one that ends before the full disk has stopped the run."""
+    """This holds for the row whose end fails on the full disk, and for one that ends before the run is stopped."""
     published = []
     folder = Journal(tmp_path, published.extend)
     folder.open("scan", RasterPlan(2, 2, 1.0, 1.0), 0)
@@ -278,14 +278,14 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     # The row would be done before a slow disk says that it is full.
     stage.stays_after = 4
     fault = host.wait(m.Fault)
-    done = host.wait(m.RowFinished)
+    row_finished = host.wait(m.RowFinished)
     stage.stays_after = None
     monkeypatch.undo()
-    assert fault.number == done.fault == PiFault.JOURNAL_FULL
-    assert done.status == "fault"
+    assert fault.number == row_finished.fault == PiFault.JOURNAL_FULL
+    assert row_finished.status == "fault"
     assert host.until_state("fault").fault == PiFault.JOURNAL_FULL
     last = host.ask(m.Hello()).last_seq
-    assert fault.seq == done.seq == last >= good
+    assert fault.seq == row_finished.seq == last >= good
     host.home()
     assert host.row(0, take=2).status == "done"
     replayed = host.replay()
@@ -293,7 +293,7 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
 
 
 def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch):
-    """`Accepted` says that the event is on the disk."""
+    """`Accepted` means that the event is on the disk."""
     host = pi.host
     stop = m.EndRun(scan_id="scan", exit_status="success")
 

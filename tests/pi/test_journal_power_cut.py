@@ -52,14 +52,14 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
             pass
         if not ended:
             os.close(journal._lock)  # as its end would
-        again = Journal(path)
-        again.open("s", PLAN, 0)
-        events_kept = [m.unpack_event(raw) for raw in again.read("s", 1, 1000)[0]]
+        reopened = Journal(path)
+        reopened.open("s", PLAN, 0)
+        events_kept = [m.unpack_event(raw) for raw in reopened.read("s", 1, 1000)[0]]
         assert [e.seq for e in events_kept] == list(range(1, len(events_kept) + 1))
         assert all(map(is_same_event, events_kept, added)), "a prefix of what was added"
         synced = max((e.seq for e in published if not isinstance(e, m.Capture)), default=0)
         assert len(events_kept) >= synced, "what was published as synced is on the disk"
-        again.write([NewEvent.now(added[-1][0], **added[-1][1])])
-        assert again.last_seq == len(events_kept) + 1
-        again.close()
+        reopened.write([NewEvent.now(added[-1][0], **added[-1][1])])
+        assert reopened.last_seq == len(events_kept) + 1
+        reopened.close()
     assert position > 20

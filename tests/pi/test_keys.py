@@ -71,7 +71,7 @@ def context():
 
 @pytest.fixture
 def make_client(context):
-    """Makes clients with these keys (own secret, Pi's public); gives the socket, and a function: True if refused."""
+    """Makes clients with these keys (own secret, Pi's public); returns the socket, and a function: True if refused."""
     sockets = []
 
     def make(kind, address, mine, pis):
@@ -115,7 +115,7 @@ def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, which):
 
 
 def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi, make_client):
-    """Its next command is refused though it is connected, and it cannot connect again."""
+    """The client's next command is refused although it is connected, and it cannot connect again."""
     keys = tmp_path / "keys"
     public, secret = allow(keys, "laptop")
     assert secret.stat().st_mode & 0o077 == 0
@@ -136,8 +136,8 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi
     assert isinstance(reply, m.Refused)
     assert reply.number == PiFault.NOT_OWNER
     assert isinstance(ask("host"), m.HelloReply)
-    again, refused = make_client(zmq.REQ, served_pi.command_address, secret, keys / "pi.key")
-    again.send(m.pack(m.Hello()))
+    old_client, refused = make_client(zmq.REQ, served_pi.command_address, secret, keys / "pi.key")
+    old_client.send(m.pack(m.Hello()))
     wait_for(refused, "the refusal")
     with expect_refused(ErrorCode.KEY_UNKNOWN, "laptop"):
         revoke(keys, "laptop")
@@ -192,7 +192,7 @@ def test_without_a_list_the_host_key_is_allowed(tmp_path):
 
 
 def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served_pi, context):
-    """And the Pi's secret is not among them."""
+    """The Pi's secret key is not among the files for the host."""
     copied_names = {p.name for p in (tmp_path / "keys").iterdir()}
     assert "pi.key_secret" in copied_names - set(HOST_KEYS)
     (tmp_path / "host").mkdir()
@@ -209,7 +209,7 @@ def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served_pi, context)
 
 
 def test_a_relative_key_dir_counts_from_the_rig_files_folder(tmp_path, monkeypatch):
-    """And not from the working folder, also when a scan is resumed with its manifest."""
+    """Keys are not read from the working folder, also when a scan is resumed with its manifest."""
     text = (RIG_FILE).read_text(encoding="utf-8")
     (tmp_path / "rig").mkdir()
     path = tmp_path / "rig" / "mine.toml"
@@ -233,9 +233,9 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
 
     monkeypatch.setattr(Path, "stat", refuse)
     assert main(["keys", "--config", str(config)]) == 5
-    said = capsys.readouterr().err
-    assert "Permission denied" in said
-    assert "sudo -u polysight" in said
+    messages = capsys.readouterr().err
+    assert "Permission denied" in messages
+    assert "sudo -u polysight" in messages
     finding = attempt("keys", checks._check_keys, config.parent / "keys", (ELSEWHERE,))
     assert (finding.level, "sudo -u polysight" in finding.do) == ("error", True)
     assert "pi.key_secret: Permission denied" in finding.what

@@ -1,4 +1,4 @@
-"""Laws of the state machine and of the checks before and during a row, on a clock that tests turn."""
+"""Laws of the state machine and of the checks before and during a row, with a clock set by tests."""
 
 import re
 from collections.abc import Callable
@@ -76,7 +76,7 @@ def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
 
 @pytest.mark.parametrize(("dx", "dy"), [(0, 1), (1, 0), (0, 20_000), (-4000, 0)])
 def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
-    """The Pi does not take the stage's word for it: the place is compared with the command."""
+    """The Pi does not rely on the stage's report: the position is compared with the command."""
     bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
@@ -92,7 +92,7 @@ def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
     [("Abort", "by hand"), ("row fault", PiFault.HOST_LOST, "silent"), ("lasting fault", PiFault.JOURNAL_FULL, "full")],
 )
 def test_stop_does_not_wait_for_the_burst_under_way(event, monkeypatch):
-    """A call that sets a line may hang, and with it whoever waits for the burst's end."""
+    """A call that sets a line may hang, and with it every thread that waits for the burst's end."""
     bench = Bench().begin_and_home()
     bench.start()
     bench.edge()
@@ -160,7 +160,7 @@ def test_a_host_that_falls_silent_ends_its_homing():
 
 
 def test_a_held_row_goes_on_once_it_rests():
-    """Then its place is known, and with it the times of the edges around it."""
+    """Then the place of the hold is known, and with it the times of the edges around it."""
     bench = Bench().begin_and_home()
     bench.start()
     bench.machine.command("Hold")
@@ -186,7 +186,7 @@ def test_a_host_without_a_heartbeat_is_not_watched():
     heartbeat_ms=st.integers(200, 500),
 )
 def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat_ms):
-    """The link's loop in virtual time: it looks every slice; from some moment on no answer comes."""
+    """The link's loop in virtual time: it polls every slice; from some moment on no answer comes."""
     heartbeat_s = heartbeat_ms / 1e3
     watch = StatusWatch(heartbeat_s, 0.0)
     watch.interval_s = heartbeat_s / STATUS_PER_HEARTBEAT
@@ -208,7 +208,7 @@ def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat
 
 
 def test_a_stage_at_rest_may_answer_late():
-    """A scan goes on if a busy machine delays the answer between two rows; a moving stage would be lost."""
+    """A scan continues if a busy machine delays the answer between two rows; a moving stage would count as lost."""
     watch = StatusWatch(1.0, 0.0)
     watch.ask_every(IDLE_STATUS_S, 0.0)
     t = 0.0
@@ -244,7 +244,7 @@ def test_a_lost_trigger_line_stops_everything_at_once(lasting):
 
 
 def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
-    """Points pass and no edge comes: a fault after two more statuses, a quarter of the heartbeat apart."""
+    """Points are passed without an edge: a fault after two more statuses, a quarter of the heartbeat apart."""
     assert 3 * 0.5 / STATUS_PER_HEARTBEAT <= SAFE_WITHIN_S
     bench = Bench().begin_and_home()
     bench.start()
@@ -409,7 +409,7 @@ def row_seconds(page: str, state: str) -> list[str]:
 
 
 def test_the_rules_are_whole():
-    """Every state can be reached and left, an event has one rule in a state, and rules name only states that are."""
+    """Every state can be reached and left, an event has one rule in a state, and rules name only existing states."""
     states = set(get_args(State))
     named = [(s, r.event) for r in RULES for s in r.states.split()]
     assert len(set(named)) == len(named)
@@ -432,7 +432,7 @@ replace = msgspec.structs.replace
 
 
 def find_broken_rule(make: Callable[[], object]) -> str:
-    """The rule of the rig file that is broken; "" when none is."""
+    """The violated rule of the rig file; "" if there is none."""
     try:
         make()
     except ValueError as e:
@@ -450,7 +450,7 @@ def find_broken_rule(make: Callable[[], object]) -> str:
 )
 @settings(max_examples=200, deadline=None)
 def test_the_pi_takes_a_raster_when_the_rig_file_is_taken(columns, rows, speed, accel, backlash, centre):
-    """So that what `config` and the doctor accept is not refused by BeginRun, and the other way round."""
+    """BeginRun accepts exactly the rig files that `config` and the doctor accept."""
     stage = replace(
         RIG.stage, speed_mm_s=float(speed), accel_mm_s2=float(accel), backlash_mm=float(backlash),
         centre_x_mm=float(centre), travel_speed_mm_s=100.0,

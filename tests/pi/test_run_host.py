@@ -1,4 +1,4 @@
-"""Who may command a run, and whose silence ends a row; the signs of a hanging program."""
+"""Clients that may command a run, those whose silence ends a row, and the signs of a hanging program."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class SlowDriver(FakeDriver):
 
 
 class Bench:
-    """An executor whose turns the test takes."""
+    """An executor whose turns the test runs."""
 
     def __init__(self, folder: Path) -> None:
         self.t = 100.0
@@ -111,7 +111,7 @@ def bench(tmp_path):
 
 
 def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
-    """A line to the stage is sent again: nothing else is taken meanwhile, so that no `Alive` can come."""
+    """A line to the stage is sent again: nothing else is executed meanwhile, so that no `Alive` can be sent."""
     bench.ready()
     bench.stage.row_takes_s = LIMIT_S + 0.15
     assert isinstance(bench.run_row(), m.Accepted)
@@ -237,7 +237,7 @@ def test_an_old_row_does_not_move_the_stage_again(host, stage):
 
 
 def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
-    """The journal has them."""
+    """The journal has these events."""
     rig = at_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:
@@ -295,7 +295,7 @@ def test_a_jog_outside_of_a_run_is_watched_and_aborted(pi, stage):
 
 
 def test_a_host_of_an_older_release_homes_in_its_own_run(pi):
-    """It sends no owner in `Home`."""
+    """A host of an older release sends no owner in `Home`."""
     pi.host.must_accept(pi.host.begin(owner="mine", heartbeat_ms=10_000, owns_home=False))
     pi.host.home()
 
@@ -374,7 +374,7 @@ def test_a_command_that_fails_in_the_program_is_a_refusal(pi, monkeypatch, capfd
 
 
 def test_the_watchdog_is_fed_by_the_executor_alone(pi, hang, monkeypatch, tmp_path):
-    """One datagram per turn, none while it hangs (sd_notify(3))."""
+    """One datagram per turn, none while the executor hangs (sd_notify(3))."""
     monkeypatch.setattr(executors, "TURN_S", 0.2)
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:

@@ -1,4 +1,4 @@
-"""The Pi half as the host sees it: real ZeroMQ, a pty, simulated wires."""
+"""The Pi half tested from the host's side: real ZeroMQ, a pty, simulated wires."""
 
 from contextlib import closing
 
@@ -20,18 +20,18 @@ RUN_0 = m.RunRow(scan_id="scan", row_index=0, take=1)
 
 
 def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
-    """Every pulse of the shipped rig file's wire is at its place, and the events say so."""
+    """Every pulse on the wire of the shipped rig file is at its place, and the events agree."""
     radar = WireClient(hub, listen=instrument.pi.sync_out)
     hello = host.ask(m.Hello())
     assert (hello.backend, hello.firmware, hello.state) == ("wires", "fake", "ready")
     assert hello.stage == instrument.stage.placement_settings
     assert hello.t_unix_ns > 1_600_000_000 * 10**9
-    done = host.row(1)
+    row_finished = host.row(1)
     burst = instrument.burst
     n = instrument.grid.columns
-    assert (done.status, done.points, done.edges, done.bursts) == ("done", n, n, n)
-    assert (done.pulses, done.fault, done.timed_by) == (n * burst.pulses, 0, "one-shot")
-    assert done.pulses_seen
+    assert (row_finished.status, row_finished.points, row_finished.edges, row_finished.bursts) == ("done", n, n, n)
+    assert (row_finished.pulses, row_finished.fault, row_finished.timed_by) == (n * burst.pulses, 0, "one-shot")
+    assert row_finished.pulses_seen
     events = host.journalled
     assert [e.seq for e in events] == list(range(1, len(events) + 1))
     assert [type(e) for e in events] == [m.RunStarted, m.RowStarted] + n * [m.Capture] + [m.RowFinished]
@@ -42,7 +42,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     for c in captures:
         assert c.last_pulse_ns - c.first_pulse_ns == (burst.pulses - 1) * round(burst.period_us * 1e3)
         assert (c.pulses, c.width_max_ns, c.jitter_ns) == (burst.pulses, round(burst.width_us * 1e3), 0)
-    edges = [radar.receive(HANG_S) for _ in range(2 * done.pulses)]
+    edges = [radar.receive(HANG_S) for _ in range(2 * row_finished.pulses)]
     rises = [e.t_ns for e in edges if isinstance(e, WireEdge) and e.value]
     falls = [e.t_ns for e in edges if isinstance(e, WireEdge) and not e.value]
     assert {b - a for a, b in zip(rises, falls, strict=True)} == {1000}
@@ -76,7 +76,7 @@ def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
 
 
 def test_homing_reports_lost_steps(host, stage):
-    """The check after a scan: home again, against the switches."""
+    """The check after a scan: home again, with the switches."""
     status = host.ask(m.Status())
     assert (status.lost_x_mm, status.lost_y_mm) == (0, 0)
     stage.lost = (-7, 12)
@@ -144,9 +144,9 @@ def test_hold_and_resume_lose_nothing(host_in_row, stage):
 def test_abort_ends_the_row_and_the_next_one_runs_without_homing(host_in_row, stage):
     host = host_in_row
     host.must_accept(m.Abort(reason="enough"))
-    done = host.wait(m.RowFinished)
-    assert (done.status, done.fault, done.reason) == ("aborted", PiFault.ABORTED, "enough")
-    assert done.bursts == len(host.list_events(m.Capture)) < 8
+    row_finished = host.wait(m.RowFinished)
+    assert (row_finished.status, row_finished.fault, row_finished.reason) == ("aborted", PiFault.ABORTED, "enough")
+    assert row_finished.bursts == len(host.list_events(m.Capture)) < 8
     host.until_state("ready")
     stage.stays_after = None
     assert host.row(0, take=2).status == "done"
@@ -166,10 +166,10 @@ def test_a_new_host_aborts_the_row_of_the_dead_one(host_in_row, stage):
 
 def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     stage.alarm_at = {3: StageError.LIMIT_SWITCH}
-    done = host.row(0)
-    assert (done.status, done.fault) == ("fault", PiFault.STAGE_ALARM)
+    row_finished = host.row(0)
+    assert (row_finished.status, row_finished.fault) == ("fault", PiFault.STAGE_ALARM)
     # Edges still under way at the alarm are not answered
-    assert done.bursts == len(host.list_events(m.Capture)) <= 3
+    assert row_finished.bursts == len(host.list_events(m.Capture)) <= 3
     assert not host.until_state("fault").homed
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
     host.home()
@@ -177,7 +177,7 @@ def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
 
 
 def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
-    """The heartbeat keeps the row for longer than silence would; without it the row ends with fault 108."""
+    """With heartbeats the row runs longer than the timeout; without them it ends with fault 108."""
     host = pi.host
     host.must_accept(host.begin(heartbeat_ms=100))
     host.home()
@@ -190,8 +190,8 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     pi.clock.sleep(1.2)
     assert host.ask(m.Status()).state == "running"
     beats.stop()
-    done = host.wait(m.RowFinished)
-    assert (done.status, done.fault) == ("fault", PiFault.HOST_LOST), done.reason
+    row_finished = host.wait(m.RowFinished)
+    assert (row_finished.status, row_finished.fault) == ("fault", PiFault.HOST_LOST), row_finished.reason
     assert Immediate.STOP in stage.bytes_seen
     assert host.until_state("ready").fault == PiFault.HOST_LOST
     stage.stays_after = None
@@ -216,8 +216,8 @@ def test_lost_and_damaged_lines_do_not_matter(pi, stage):
     stage.damage = 2
     host.home()
     stage.lose = stage.lose_end = 1
-    done = host.row(0)
-    assert done.status == "done", done.reason
+    row_finished = host.row(0)
+    assert row_finished.status == "done", row_finished.reason
     assert stage.rows_run == 1
 
 

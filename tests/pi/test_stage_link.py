@@ -31,7 +31,7 @@ def dry_stage():
 
 @pytest.fixture
 def connect(dry_stage):
-    """Opens the link; gives it and the queue of its unsolicited replies."""
+    """Opens the link; returns it and the queue of its unsolicited replies."""
     opened = []
 
     def connect(**options):
@@ -175,7 +175,7 @@ def test_jog_and_home_by_hand(dry_stage, instrument):
 
 @pytest.mark.slow
 def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys):
-    """Until another program lets DTR fall when it closes the port."""
+    """This holds until another program lowers DTR by closing the port."""
     port = tmp_path / "ttySTAGE"
     pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")  # no service
     arguments = ["--config", str(write_config(msgspec.structs.replace(instrument, pi=pi))), "--stage-port", str(port)]
@@ -190,7 +190,7 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
         assert place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
 
         def is_lost() -> bool:
-            """The stand-in learns how its port was closed only if it looks before the next program opens it."""
+            """The stand-in sees how its port was closed only if it polls before the next program opens it."""
             subprocess.run(["stty", "-F", port, "hupcl"], check=True)
             return main(["jog", *arguments, "--dx", "1"]) != 0
 

@@ -1,4 +1,4 @@
-"""Home and jog on the operator's page: what is pressed moves, within the limits, and can be stopped."""
+"""Home and jog on the operator's page: the stage moves within the limits, and can be stopped."""
 
 import threading
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Stops wait for nothing: neither for a disk that hangs, nor for sockets, nor for a thread that does.
+"""A stop does not wait for a hanging disk, for sockets, or for a hanging thread.
 
 The campaign (`--long`) measures the time to STOP at a hundred moments.
 """
@@ -100,7 +100,7 @@ def test_abort_stops_and_is_answered_while_the_disk_hangs(owned_run, stage, disk
 
 @pytest.mark.parametrize("beats", [True, False])
 def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, stage, monkeypatch, beats):
-    """A host that is lost: as always. One that lives: the row ends because of the disk, and the watchdog starves."""
+    """A lost host is handled as always. With a living host the disk ends the row, and the watchdog expires."""
     monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
     host = pi.host
     host.must_accept(host.begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
@@ -126,7 +126,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
 
 
 def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
-    """A Pi that has nothing to say is not late, however seldom it says so: the watchdog would end the service."""
+    """A Pi without events is not late, however rarely it reports: otherwise the watchdog would end the service."""
     settings = msgspec.structs.replace(instrument.pi, heartbeat_ms=3_600_000)
     rig = msgspec.structs.replace(instrument, pi=settings)
     with closing(Running(at_stage_port(rig, stage.port), hub)) as pi:
@@ -138,7 +138,7 @@ def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
 
 
 def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, monkeypatch):
-    """As when a busy machine gives it no processor: the executor, which judges, is as late as the others."""
+    """As on a busy machine without processor time: the executor, which judges, is as late as the others."""
     monkeypatch.setattr(executors, "LATE_S", LATE_S)
 
     def pause() -> None:
@@ -152,7 +152,7 @@ def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, m
 
 
 def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
-    """A run begins, a row starts and a run ends for the host when that is on the disk."""
+    """For the host a run begins, a row starts and a run ends only when that is on the disk."""
     host = pi.host
     commands: list[Any] = [host.begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
     commands.append(m.EndRun(scan_id="scan", exit_status="success"))
@@ -176,7 +176,7 @@ def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
 
 @pytest.mark.usefixtures("host")
 def test_a_full_queue_loses_no_reply(pi, stage):
-    """What waits for the journal is answered once there is room."""
+    """Requests that wait for the journal are answered once there is room."""
     go_on = threading.Event()
     pi.service._journal.call(lambda _: go_on.wait(HANG_S), lambda _: None)
     for _ in range(journals.JOBS_WAITING + 1):
@@ -190,7 +190,7 @@ def test_a_full_queue_loses_no_reply(pi, stage):
 
 
 def test_a_full_queue_keeps_its_bound(tmp_path):
-    """Events of a hanging disk are given up, with an error, before they fill the memory."""
+    """Events for a hanging disk are dropped, with an error, before they fill the memory."""
     journal = journals.JournalThread(journals.Journal(tmp_path))
     errors: list[Any] = []
     for _ in range(journals.JOBS_WAITING + journals.EVENTS_WAITING + 10):
@@ -203,7 +203,7 @@ def test_a_full_queue_keeps_its_bound(tmp_path):
 
 
 def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
-    """The thread that asks for the status does not speak for it."""
+    """Status requests of the polling thread are no sign of life of the executor."""
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
     host.must_accept(host.begin())
@@ -237,8 +237,8 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     monkeypatch.setattr(server, busy, lambda *a: (go_on.wait(HANG_S), real(*a))[1])
     wait_for(lambda: stop_is_sent(stage), "STOP")
     go_on.set()
-    done = host.wait(m.RowFinished)
-    assert (done.fault, which in done.reason) == (PiFault.PROGRAM_LATE, True)
+    row_finished = host.wait(m.RowFinished)
+    assert (row_finished.fault, which in row_finished.reason) == (PiFault.PROGRAM_LATE, True)
 
 
 LEAVE = """

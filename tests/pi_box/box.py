@@ -39,7 +39,7 @@ class Write(NamedTuple):
 
 
 def free_port() -> int:
-    """A TCP port of 127.0.0.1 that nobody uses."""
+    """An unused TCP port of 127.0.0.1."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
         return s.getsockname()[1]
@@ -56,7 +56,7 @@ class Monitor:
         self.do("qmp_capabilities")
 
     def do(self, command: str, **arguments: Any) -> Any:
-        """Carry out a command and return what it returns."""
+        """Execute a command and return its result."""
         self._socket.sendall(json.dumps({"execute": command, "arguments": arguments}).encode() + b"\n")
         while True:
             reply = json.loads(self._lines.readline())
@@ -70,7 +70,7 @@ class Monitor:
 
 
 class Box:
-    """A Pi that has been switched on; what is written to its card is gone with it.
+    """A Pi that has been switched on; data on its card is lost when it is deleted.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ class Box:
             raise
 
     def _boot(self) -> float:
-        """Until somebody can log in; how long that took."""
+        """Wait until a login is possible; return the duration."""
         begun = time.monotonic()
 
         def logged_in() -> bool:
@@ -151,21 +151,23 @@ class Box:
     ) -> subprocess.CompletedProcess[str]:
         """Run a shell command on the Pi as its user `pi`."""
         ssh = ["ssh", "-F", str(self.ssh_config), "box", command]
-        done = subprocess.run(ssh, input=stdin, capture_output=True, timeout=limit_s, check=False)
-        return subprocess.CompletedProcess(command, done.returncode, done.stdout.decode(), done.stderr.decode())
+        process = subprocess.run(ssh, input=stdin, capture_output=True, timeout=limit_s, check=False)
+        return subprocess.CompletedProcess(
+            command, process.returncode, process.stdout.decode(), process.stderr.decode()
+        )
 
     def run(self, command: str, stdin: bytes = b"", limit_s: float = COMMAND_LIMIT_S) -> str:
-        """The same for a command that must succeed; what it prints."""
-        done = self.try_run(command, stdin, limit_s)
-        assert done.returncode == 0, f"{command}: {done.returncode}\n{done.stdout}\n{done.stderr}"
-        return done.stdout
+        """Run a command that must succeed; return its output."""
+        process = self.try_run(command, stdin, limit_s)
+        assert process.returncode == 0, f"{command}: {process.returncode}\n{process.stdout}\n{process.stderr}"
+        return process.stdout
 
     def plug(self) -> None:
         """Plug in the stage's USB cable."""
         self._authorize_stage(1)
 
     def unplug(self) -> None:
-        """Pull it, for the Pi's kernel: the device goes. QEMU's own `device_del` crashes its USB controller."""
+        """Unplug it: the device disappears for the Pi's kernel. QEMU's own `device_del` crashes its USB controller."""
         self._authorize_stage(0)
 
     def _authorize_stage(self, value: int) -> None:
@@ -173,13 +175,13 @@ class Box:
         self.run(f"echo {value} | sudo tee $(dirname $({find}))/authorized >/dev/null")
 
     def register(self, offset: int) -> int:
-        """A register of the GPIO block, read past the Pi's processor."""
+        """A register of the GPIO block, read without the Pi's processor."""
         command = {"command-line": f"xp /1wx {GPIO_BASE + offset:#x}"}
         answer = self.monitor.do("human-monitor-command", **command)
         return int(answer.split(":")[1], 16)
 
     def function(self, line: int) -> int:
-        """What a line is: 0 an input, 1 an output."""
+        """Function of a line: 0 input, 1 output."""
         return self.register(SELECT + 4 * (line // 10)) >> 3 * (line % 10) & 7
 
     def level(self, line: int) -> int:
@@ -187,7 +189,7 @@ class Box:
         return self.register(LEVEL + 4 * (line // 32)) >> line % 32 & 1
 
     def writes_during(self, action: Callable[[], Any]) -> list[Write]:
-        """What is written to the registers that set and clear lines while something is done."""
+        """Record the writes to the registers that set and clear lines during the block."""
         size = self._trace.stat().st_size
         self.monitor.do("trace-event-set-state", name=MEMORY_WRITE, enable=True)
         try:
@@ -206,7 +208,7 @@ class Box:
         return writes
 
     def cut_power(self) -> None:
-        """Power off and on again: what was not on the card is gone. Returns when somebody can log in."""
+        """Switch the power off and on: data that was not on the card is lost. Returns when a login is possible."""
         self.monitor.do("system_reset")
         self._hang_up()
         self.boot_s = self._boot()

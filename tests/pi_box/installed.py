@@ -1,4 +1,4 @@
-"""An installed Pi: what a person does on it and from its host, as docs/how-to/install.md says."""
+"""An installed Pi: the steps of docs/how-to/install.md on it and from its host."""
 
 import json
 import subprocess
@@ -50,17 +50,17 @@ class InstalledPi:
         self.keys = work / "keys"
 
     def install(self) -> str:
-        """Run `make pi-install`, as on a host; return what it prints."""
+        """Run `make pi-install`, as on a host; return its output."""
         # For make: the environment of these tests is the one that it would make.
         (self.work / "installed").touch()
         make = ["make", "pi-install", f"HOST=-F {self.box.ssh_config} box", f"OUT={self.work / 'out'}"]
         make += [f"VENV={self.work}", f"BIN={BIN}"]
-        done = subprocess.run(make, cwd=REPO, capture_output=True, text=True, timeout=INSTALL_LIMIT_S, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        process = subprocess.run(make, cwd=REPO, capture_output=True, text=True, timeout=INSTALL_LIMIT_S, check=False)
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout
 
     def allow_for_a_slow_processor(self) -> None:
-        """Longer limits for the start and the watchdog: an emulated processor is 10 to 100 times slower than a Pi's."""
+        """Set longer limits for start and watchdog: an emulated processor is 10 to 100 times slower than a Pi's."""
         limits = b"[Service]\nTimeoutStartSec=3600\nWatchdogSec=120\n"
         folder = "/etc/systemd/system/polysight-pi.service.d"
         self.box.run(f"sudo mkdir -p {folder} && sudo tee {folder}/slow.conf >/dev/null", limits)
@@ -83,7 +83,7 @@ class InstalledPi:
             (folder / name_on_host).write_text(self.box.run(f"sudo cat /etc/polysight/keys/{name_on_box}"))
 
     def systemctl(self, words: str) -> str:
-        """Run `sudo systemctl` with these words; return what it prints."""
+        """Run `sudo systemctl` with these arguments; return its output."""
         return self.box.run(f"sudo systemctl {words}")
 
     def read_property(self, name: str) -> str:
@@ -103,8 +103,8 @@ class InstalledPi:
     def start(self) -> None:
         """Start the service and wait until it is ready."""
         self.systemctl("reset-failed polysight-pi")
-        done = self.box.try_run("sudo systemctl start polysight-pi")
-        assert done.returncode == 0, self.log()
+        process = self.box.try_run("sudo systemctl start polysight-pi")
+        assert process.returncode == 0, self.log()
 
     def addresses(self) -> tuple[str, str]:
         """Return the addresses of commands and events. 0.0.0.0 leads here too, and needs keys, unlike 127.0.0.1."""
@@ -119,9 +119,9 @@ class InstalledPi:
         config = self.work / "host.toml"
         config.write_bytes(tomli_w.dumps(to_builtins(msgspec.structs.replace(self.rig, pi=pi_settings))).encode())
         program = [BIN / "polysight-pi", *words, "--config", config]
-        done = subprocess.run(program, cwd=REPO, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        process = subprocess.run(program, cwd=REPO, capture_output=True, text=True, check=False)
+        assert process.returncode == 0, process.stdout + process.stderr
+        return process.stdout
 
     def host(self) -> HostSide:
         """A host with the keys, connected."""
@@ -134,8 +134,8 @@ class InstalledPi:
     def check(self) -> dict[str, dict[str, Any]]:
         """Return the findings of `polysight-pi check` by name, run as the service's user."""
         command = f"sudo -u polysight {PROGRAM} check --json --config /etc/polysight/instrument.toml"
-        done = self.box.try_run(command)
-        assert done.returncode in (0, 1), done.stderr
-        findings = {f["name"]: f for f in json.loads(done.stdout)}
-        assert done.returncode == any(f["verdict"] == "fail" for f in findings.values())
+        process = self.box.try_run(command)
+        assert process.returncode in (0, 1), process.stderr
+        findings = {f["name"]: f for f in json.loads(process.stdout)}
+        assert process.returncode == any(f["verdict"] == "fail" for f in findings.values())
         return findings

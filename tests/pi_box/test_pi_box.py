@@ -44,7 +44,7 @@ def homed_host(host: HostSide) -> HostSide:
 
 
 def home(host: HostSide) -> None:
-    """Home the stage. The Pi calls it lost when a busy computer keeps the two apart for a second: then once more."""
+    """Home the stage; once more if the Pi calls it lost, because a busy computer delays the connection for a second."""
     for _ in range(TRIES):
         host.must_accept(m.Home())
         if host.until_state("homed", "ready", "fault").state != "fault":
@@ -58,7 +58,7 @@ def service_pid(pi: InstalledPi) -> str:
 
 
 def seconds(begun: float) -> str:
-    """For a figure: since `begun`, on this computer's clock."""
+    """Duration since `begun`, by this computer's clock, for a figure."""
     return f"{time.monotonic() - begun:.1f} s"
 
 
@@ -77,7 +77,7 @@ def test_what_is_installed_belongs_to_whom_the_page_says(pi: InstalledPi):
 
 
 def test_the_service_has_the_rights_that_its_unit_promises(pi: InstalledPi):
-    """Real-time threads and locked memory; a right that is not given has a line in the log."""
+    """Real-time threads and locked memory; a missing right is reported in the log."""
     assert "no real-time scheduling" not in pi.log()
     assert "memory is not locked" not in pi.log()
     threads = pi.box.run(f"ps -L -o cls=,rtprio= -p {service_pid(pi)}").split("\n")
@@ -161,7 +161,7 @@ def test_check_finds_everything_that_is_there(bench: InstalledPi):
 
 
 def test_check_of_a_rig_with_spi_names_it_and_nothing_else(bench: InstalledPi):
-    """No SPI controller here, as on a Pi where it was not switched on."""
+    """There is no SPI controller, as on a Pi where it is not enabled."""
     bench.configure(at_stage_port(timed_by_spi(published_rig()), bench.rig.stage.port))
     findings = bench.check()
     assert {n for n, f in findings.items() if f["verdict"] == "fail"} == {"SYNC_IN line 10", "pulse width"}
@@ -180,7 +180,7 @@ def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
 
 
 def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
-    """What `check` cannot learn from Debian's driver: no pulse stays high when the program dies inside it."""
+    """No pulse stays high when the program dies within it, which `check` cannot see with Debian's driver."""
     holding_command = (
         f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 >/dev/null & echo $!"  # its end is not waited for
     )
@@ -217,7 +217,7 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_
 
 
 def test_a_service_that_hangs_is_started_anew(pi: InstalledPi):
-    """The executor feeds systemd's watchdog."""
+    """The executor notifies systemd's watchdog."""
     hung = service_pid(pi)
     begun = time.monotonic()
     pi.systemctl("kill --signal=STOP polysight-pi")
@@ -248,7 +248,7 @@ def test_a_stage_that_is_plugged_in_after_the_service_has_started_is_found(bench
 
 
 def test_update_and_roll_back(pi: InstalledPi):
-    """Rig file, keys and journals stay; a service that runs goes on with the release that is in use."""
+    """Rig file, keys and journals are kept; a running service continues with its release."""
     files = "/etc/polysight/instrument.toml /etc/polysight/keys/* /var/lib/polysight/journal/*.journal"
     checksum_command = f"sudo sh -c 'sha256sum {files}'"
     sums_before = pi.box.run(checksum_command)
@@ -274,7 +274,7 @@ def test_update_and_roll_back(pi: InstalledPi):
 
 
 def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, homed_host: HostSide):
-    """And the Pi comes back by itself, with its keys, ready to be homed."""
+    """After a power cut the Pi starts by itself, with its keys, ready to be homed."""
     homed_host.must_accept(homed_host.begin("cut"))
     homed_host.must_accept(m.RunRow(scan_id="cut", row_index=0, take=1))
     homed_host.wait(m.RowStarted)

@@ -1,4 +1,4 @@
-"""The emulated UNO with the real machine code, at a serial port, and where its motors really stand."""
+"""The emulated UNO with the real machine code, at a serial port, and the true position of its motors."""
 
 import socket
 import subprocess
@@ -53,23 +53,23 @@ class Uno:
 
     @property
     def moving(self) -> bool:
-        """Whether it moves along x, or anything of its motion has changed within the last second."""
+        """True if it moves along x, or if its motion has changed within the last second."""
         return bool(self.motion and self.motion.vx_um_s) or time.monotonic() - self._heard_s < REST_S
 
     @property
     def speed_mm_s(self) -> float:
-        """Along x."""
+        """Speed along x."""
         return self.motion.vx_um_s / 1e3 if self.motion else 0.0
 
     @property
     def x_mm(self) -> float:
-        """Where the stage is in x now."""
+        """Present position of the stage in x."""
         since_s = time.monotonic() - self._heard_s
         return self.stands_at_mm[0] + self.speed_mm_s * since_s
 
     @property
     def stands_at_mm(self) -> tuple[float, float]:
-        """Where the motors have brought the stage when it last rested or changed its speed, counted at the pins."""
+        """Position of the stage when it last rested or changed its speed, counted at the pins."""
         assert self.motion is not None
         return self.motion.x_um / 1e3, self.motion.y_um / 1e3
 

@@ -56,9 +56,9 @@ def test_a_duration_is_said_in_seconds_minutes_or_hours(capsys, options, unit, u
     assert main(["plan", *RIG, *options, "--json"]) == 0
     total_s = json.loads(capsys.readouterr().out)["time_s"]["total"]
     assert main(["plan", *RIG, *options]) == 0
-    said, unit_said = re.search(r"^time +([\d.]+) (\w+),", capsys.readouterr().out, re.MULTILINE).groups()
-    assert unit_said == unit
-    assert float(said) * unit_s == pytest.approx(total_s, rel=0.02)
+    shown_time, shown_unit = re.search(r"^time +([\d.]+) (\w+),", capsys.readouterr().out, re.MULTILINE).groups()
+    assert shown_unit == unit
+    assert float(shown_time) * unit_s == pytest.approx(total_s, rel=0.02)
 
 
 @pytest.mark.parametrize(("options", "aliases"), [(SMALL, False), (["--columns", "60", "--rows", "60"], True)])
@@ -108,7 +108,7 @@ def test_a_value_that_is_no_quantity_is_a_usage_error(option):
 
 
 def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
-    """Inserted into the rig file as printed, they give the plan's own figures without any option."""
+    """The printed values, inserted into the rig file, give the plan's figures without options."""
     arguments = [*SMALL, "--accel-mm-s2", "345", "--object-distance-mm", "480", "--width-mm", "120"]
     minutes = ["--minutes", "3", "--count", "1"]
     assert main(["plan", *RIG, *arguments, *minutes]) == 0
@@ -140,7 +140,7 @@ def scan(rig, tmp_path_factory):
 
 
 def taken_by_a_pi(scan, rig, gap_s: float) -> None:
-    """Give the scan events of a Pi with `gap_s` seconds from a row's last trigger to the next one's first."""
+    """Add events of a Pi to the scan, with `gap_s` seconds from a row's last trigger to the next one's first."""
     facts = facts_of(scan)
     facts[0]["pi"] = {"release": "test"}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))

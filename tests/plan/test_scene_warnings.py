@@ -57,7 +57,7 @@ def test_each_fault_of_a_scene_is_named(tmp_path, plates, expected):
 
 @pytest.mark.parametrize("axis", ["columns", "rows"])
 def test_one_row_or_column_is_too_small_an_aperture(tmp_path, axis):
-    """It resolves nothing across it: no size and no gap is large enough."""
+    """A single row resolves nothing across it: no size and no gap is large enough."""
     assert set(topics(tmp_path, plate(-30), plate(30), grid=GRID | {axis: 1})) == {"aperture"}
 
 
@@ -79,7 +79,7 @@ def test_plan_and_simulate_say_it(tmp_path, capsys):
 
 
 def test_proposals_are_of_the_scene_and_say_it_too(tmp_path, capsys):
-    """Its grid is the aperture that they keep; plates are checked in each."""
+    """Apertures of the plan have the same grid; plates are checked in each."""
     path = tmp_path / "scene.toml"
     grid = {"columns": 41, "rows": 21, "step_x_mm": 4.0, "step_y_mm": 4.0}
     path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": [plate(-30), plate(15)]}))

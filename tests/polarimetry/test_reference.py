@@ -33,18 +33,18 @@ def noisy(image, rng, noise):
 
 @given(st.integers(0, 2**32 - 1), st.floats(-3.1, 3.1), st.floats(-100, 100))
 def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
-    """For any distance and tilt of the plates: a common phase of both channels has no influence."""
+    """A common phase of both channels, by distance or tilt of the plates, has no influence."""
     light = gains(np.random.default_rng(seed), 0.1)
     common = np.exp(1j * (phase + tilt * X))[None, :]
     reference = plane_reference(make_images(-light[0] * common, -light[1] * common))
     r = fresnel(4 - 0.4j, THETA)
-    got = reference.apply(make_images(light[0] * r[0], light[1] * r[1]))
+    corrected = reference.apply(make_images(light[0] * r[0], light[1] * r[1]))
     is_valid = reference.valid
     assert is_valid.mean() > 0.9
-    np.testing.assert_allclose(got.p[is_valid], r[0] / r[1], rtol=0.08)
-    np.testing.assert_allclose(np.abs(got.h[is_valid]), abs(r[0]), rtol=0.08)
+    np.testing.assert_allclose(corrected.p[is_valid], r[0] / r[1], rtol=0.08)
+    np.testing.assert_allclose(np.abs(corrected.h[is_valid]), abs(r[0]), rtol=0.08)
     # The window is one-sided at the rim; in the middle the error is smaller.
-    np.testing.assert_allclose(got.p[15:-15, 15:-15], r[0] / r[1], rtol=0.012)
+    np.testing.assert_allclose(corrected.p[15:-15, 15:-15], r[0] / r[1], rtol=0.012)
 
 
 def test_speckle_of_the_plate_is_smoothed_and_measured():
@@ -64,9 +64,9 @@ def test_weak_parts_and_the_rim_are_masked():
     assert reference.valid[:, X < 0.06].all()
     assert not reference.valid[:, X > 0.068].any()
     assert np.isnan(reference.h[:, -1]).all()
-    got = reference.apply(make_images(h, h))
-    assert np.isnan(got.p[:, -1]).all()
-    np.testing.assert_allclose(got.p[reference.valid], 1, atol=0.02)
+    corrected = reference.apply(make_images(h, h))
+    assert np.isnan(corrected.p[:, -1]).all()
+    np.testing.assert_allclose(corrected.p[reference.valid], 1, atol=0.02)
     assert reference.facts().share_of_plane == pytest.approx(reference.valid.mean(), abs=1e-3)
 
 

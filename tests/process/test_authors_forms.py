@@ -48,7 +48,7 @@ def correlation(a, b, channel):
 
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory):
-    """A scan without disturbances, row by row: the image that all others are compared with."""
+    """A scan without disturbances, row by row: its image is the reference for the others."""
     scene = decode_scene(SCENE, "t").with_disturbances(ideal=True)
     return images(simulate(RIG, scene, tmp_path_factory.mktemp("rows"), layout="authors"))[0]
 

@@ -1,4 +1,4 @@
-"""An RX without a signal is left out of synchronisation and images, and the verdict says so and nothing false."""
+"""An RX without a signal is left out of synchronisation and images, and the verdict reports that and nothing wrong."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -69,7 +69,7 @@ def noise_of(row: int, words: np.ndarray, rms: float) -> np.ndarray:
 
 
 def kill(board: str, *rx: int, rms: float = 6.0, rows: range = range(1000), value: int | None = None) -> Mangle:
-    """Give RX, counted from 1, of a board noise or a constant `value` instead of their signal in some rows."""
+    """Replace the signal of a board's RX (from 1) in some rows by noise or a constant `value`."""
 
     def mangle(name: str, row: int, words: np.ndarray) -> None:
         if name == board and row in rows:
@@ -129,7 +129,7 @@ def about_rx(findings: Findings) -> list[str]:
 
 
 def other_reasons(findings: Findings) -> set[str]:
-    """Reasons but those about an RX, without their numbers."""
+    """All reasons except those about an RX, without their numbers."""
     return {"".join(c for c in r.what if not c.isdigit()) for r in findings.verdict.reasons if "RX" not in r.what}
 
 
@@ -232,11 +232,11 @@ def test_kept_samples_and_live_images_know_it(source, process):
     live = make_pipeline(Mangled(source, mangle), live=True)  # type: ignore[arg-type]
     current = live.form_images(from_sums=True)
     np.testing.assert_allclose(current.v, expected.v, atol=1e-5 * np.abs(expected.v).max())
-    again = make_pipeline(source)
+    next_pipeline = make_pipeline(source)
     for row in source.rows():
         for name, board in live.builder.boards.items():
-            again.builder.boards[name].put(row, board.read_reduced(row))
-    np.testing.assert_allclose(again.form_images().v, expected.v, atol=1e-6 * np.abs(expected.v).max())
+            next_pipeline.builder.boards[name].put(row, board.read_reduced(row))
+    np.testing.assert_allclose(next_pipeline.form_images().v, expected.v, atol=1e-6 * np.abs(expected.v).max())
 
 
 @pytest.mark.parametrize("rms", [0.0, 0.03])

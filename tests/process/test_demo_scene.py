@@ -12,7 +12,7 @@ from polysight_simulators.scene.simulated_scan import truth
 
 
 def test_each_plate_of_the_demo_has_a_permittivity_and_half_of_them_their_names():
-    """From samples as perfect synchronisation leaves them; what shines through from the table is not a layer."""
+    """The samples are perfectly synchronised; the table that shines through is not reported as a layer."""
     rig = published_rig()
     scene = load_scene(EXAMPLES / "demo.toml")
     pipeline = Pipeline(Cubes(rig, scene), Settings())

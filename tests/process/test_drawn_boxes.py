@@ -1,4 +1,4 @@
-"""Boxes drawn by hand instead of patches that are found."""
+"""Boxes drawn by hand instead of segmented patches."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Images of another program go through the same analysis as a recorded scan, and say what had to be assumed."""
+"""Images of another program are analysed like a recorded scan, and assumptions are reported."""
 
 import json
 import os
@@ -69,7 +69,7 @@ def permittivities(scan):
 
 
 def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, save_images, rig):
-    """The folder brings boxes and has its top row first; the file has neither."""
+    """The folder contains boxes and has its top row first; the file does not."""
     by_folder = analyse_file(labels_folder, rig)
     by_file = analyse_file(save_images(), rig)
     assert {s.box for s in by_folder.segments} == set(BOXES)
@@ -254,7 +254,7 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
 
 
 def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(save_images, pair, tmp_path):
-    """Its gains need not be even: they are divided out."""
+    """The gains of the images need not be uniform: they are divided out."""
     uneven = np.exp(np.add.outer(np.linspace(0, 0.5, 150), np.linspace(0, 0.3j, 150)))
     plate = save_images("plate", h=-uneven, v=-0.5 * uneven)
     scene = save_images(h=-pair["h"] * uneven, v=-0.5 * pair["v"] * uneven)

@@ -1,4 +1,4 @@
-"""Laws of the whole chain on raw data from an independent simulator: bytes in, images and materials out."""
+"""Laws of the whole chain on raw data from an independent simulator: from bytes to images and materials."""
 
 import numpy as np
 import pytest
@@ -58,12 +58,12 @@ def test_synchronisation_undoes_every_disturbance(image_scene):
 def test_metal_gives_one_at_every_pixel_within_noise(image_scene):
     """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
     scan = image_scene("metal-plate")
-    again = image_scene("metal-plate", seed=1003)
+    other_scene = image_scene("metal-plate", seed=1003)
     plate_pixels = plate_mask(scan, "copper", rim_mm=150.0)
     assert plate_pixels.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
     first = calibrate(scan.images, middle).p[plate_pixels]
-    second = calibrate(again.images, middle).p[plate_pixels]
+    second = calibrate(other_scene.images, middle).p[plate_pixels]
     noise = np.std(first - second) / np.sqrt(2)
     assert np.abs(first - 1).max() < 0.02 + 5 * noise
     assert np.abs(first.mean() - 1) < 0.01

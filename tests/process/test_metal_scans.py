@@ -69,7 +69,7 @@ def scan(rig: Instrument, tmp_path_factory):
 
 
 def remaining_at_same_plate(found: Leakage, truth: Leakage) -> tuple[float, float]:
-    """Crosstalk and imbalance left, both rigs brought to the same plate."""
+    """Remaining crosstalk and imbalance after both rigs measured the same plate."""
 
     def relative(x: Leakage) -> Leakage:
         return Leakage(x.h, x.v, (1 + x.v) / (1 + x.h), 0.0)
@@ -155,7 +155,7 @@ def test_the_change_over_the_sweep_is_that_of_the_plate_beside_metal_scanned_apa
 
 @pytest.fixture(scope="module")
 def products(scan, tmp_path_factory) -> Path:
-    """Of 3 mm of acrylic, with the metal plate as reference and three sub-bands, as typed."""
+    """Products of 3 mm of acrylic, with the metal plate as reference and three sub-bands, by the command."""
     out = tmp_path_factory.mktemp("products") / "out"
     arguments = ["process", str(scan("acrylic 3")), "--out", str(out), "--reference", str(scan("plate"))]
     assert main([*arguments, "--bands", str(BANDS), "--incidence", "pixel", "--model", "none"]) == 0
@@ -200,11 +200,11 @@ def test_incidence_and_reference_are_in_quality_json(products):
 
 def test_the_reference_is_valid_after_a_power_cycle(scan, reference):
     """Samples are referenced to the direct path: gains of the boards drop out of both scans."""
-    again = load_reference(scan("plate", hv_gain_db=-2.0))
-    valid_in_both = reference.valid & again.valid
+    other_reference = load_reference(scan("plate", hv_gain_db=-2.0))
+    valid_in_both = reference.valid & other_reference.valid
     assert valid_in_both.sum() > 200
     plate = Images(reference.h, reference.v, reference.x_m, reference.y_m, reference.valid)
-    p = again.apply(plate).p[valid_in_both]
+    p = other_reference.apply(plate).p[valid_in_both]
     assert np.abs(p - 1).max() < 0.06
     assert np.abs(p.mean() - 1) < 0.01
 
@@ -221,7 +221,7 @@ SIX_STACKS = {**STACKS, "acrylic 3": (["acrylic,?,3"], 4.00 - 0.40j), "pvc": (["
 
 
 def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytestconfig):
-    """The same with edges, neighbours and the scene's own metal: 72 x 78 mm plates, the whole instrument."""
+    """The same law with edges, neighbours and the scene's own metal: 72 x 78 mm plates, the whole instrument."""
     if not pytestconfig.getoption("--long"):
         pytest.skip("half a minute: --long")
     for i, plate in enumerate(SIX):

@@ -53,7 +53,7 @@ def test_the_image_is_written_before_anything_is_derived_from_it(
 
 
 def test_an_image_appears_with_its_whole_quality(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A later write would come without the folder's lock: it could fall into products of another program."""
+    """A later write would be without the folder's lock, and could change products of another program."""
     first: list[object] = []
 
     @contextmanager

@@ -89,7 +89,7 @@ def test_rows_on_several_threads_make_the_same_products(from_raw: Pipeline, expe
 
 
 def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The other rows that have begun go on only once the rest was cancelled, however slow the main thread is."""
+    """Other rows that have begun continue only after the rest was cancelled, even with a slow main thread."""
     begun: list[int] = []
     stopped = threading.Event()
     shutdown = ThreadPoolExecutor.shutdown
@@ -119,9 +119,9 @@ def test_samples_with_sub_bands_can_be_used_without_them(expected: Images, scan:
 
 
 def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> None:
-    again = process_scan(kept, bands=2)
-    assert len(again.sub_bands.finish()) == 2
-    assert process_scan(without_raw(kept), bands=2).sub_bands.bands == again.sub_bands.bands
+    processed_again = process_scan(kept, bands=2)
+    assert len(processed_again.sub_bands.finish()) == 2
+    assert process_scan(without_raw(kept), bands=2).sub_bands.bands == processed_again.sub_bands.bands
 
 
 @pytest.mark.parametrize(
@@ -298,9 +298,9 @@ def test_rows_of_dead_receivers_are_kept(
     damaged_raw(monkeypatch, one_rx)
     first = process_scan(scan)
     assert not caplog.text
-    again = process_scan(without_raw(scan))
-    assert same(again.form_images(), first.form_images())
-    assert again.quality.result().boards == first.quality.result().boards
+    processed_again = process_scan(without_raw(scan))
+    assert same(processed_again.form_images(), first.form_images())
+    assert processed_again.quality.result().boards == first.quality.result().boards
 
 
 @pytest.mark.parametrize("name", ["rows.jsonl", "RH.npy", "samples.json", ""])

@@ -70,7 +70,7 @@ def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
 
 @pytest.mark.parametrize("grid", [(25, 25), (33, 31)])
 def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
-    """A scan that reaches little beyond them sees more from one side of them."""
+    """A scan that ends close to the plates has more positions on one side of them."""
     columns, rows = grid
     images = _images(rig, [(0.0, 0.0)] * 6, {"columns": columns, "rows": rows})
     insides = _insides(images)

@@ -58,7 +58,7 @@ def examine(rig):
 
 @pytest.fixture(scope="module")
 def plain(examine):
-    """What is found of all plates with a rig whose leakage was measured."""
+    """Results for all plates with a rig whose leakage was measured."""
     return examine(world(disturbances={"leakage_measured": 0.003}))
 
 

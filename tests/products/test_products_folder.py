@@ -69,7 +69,7 @@ def test_an_error_leaves_the_old_products(out, error):
 
 
 class Killed(BaseException):
-    """The program ends here."""
+    """Raised in place of the program's end."""
 
 
 @pytest.mark.parametrize("step", range(20))

@@ -53,7 +53,7 @@ def test_from_off_to_done(radar, board, clock):
 
 
 def test_frames_of_a_software_trigger_without_number_run_until_they_are_stopped(radar, board, clock):
-    """None of them waits for SYNC_IN."""
+    """None of these steps waits for SYNC_IN."""
     radar.configure()
     for command in radar.program.frames(0, SOFTWARE_TRIGGER):
         radar.link.call(command)
@@ -148,7 +148,7 @@ def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, w
     radar.arm(FRAMES)
     if running:
         radar.pulses_begin()
-    board.say(number, data)
+    board.send_event(number, data)
     assert radar.poll() is State.FAULT
     assert words_of_it in radar.reason
 
@@ -164,7 +164,7 @@ def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, w
 )
 def test_other_events_are_no_faults(radar, board, number, data):
     radar.arm(FRAMES)
-    board.say(number, data)
+    board.send_event(number, data)
     assert radar.poll() is State.ARMED
 
 
@@ -234,7 +234,7 @@ def test_the_main_core_s_fault_is_ignored_only_until_the_board_is_configured(rig
     radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")))
     radar.configure()
     assert any("main core fault" in line for line in radar.report()["events"])
-    board.say(MAIN_CPU_FAULT, struct.pack("<BBH", 5, 0, 0) + bytes(32))
+    board.send_event(MAIN_CPU_FAULT, struct.pack("<BBH", 5, 0, 0) + bytes(32))
     assert radar.poll() is State.FAULT
 
 
@@ -254,7 +254,7 @@ IMAGE = check_image(make_image(), "image.bin")
 
 @pytest.mark.parametrize(("flash", "commands", "step"), [(make_image(), 25, 1), (b"", 60, 7)], ids=["flash", "RAM"])
 def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, commands, step):
-    """In place of each answer of a bring-up and an arming: the cause is the restart, not the rig file or the image."""
+    """The restart replaces each answer of a bring-up and an arming: it is the cause, not the rig file or the image."""
     for state_after in range(1, commands + 1, step):
         board = simulated.RadarBoard(lambda: clock.time, flash=flash)
         words = Restarts(board, clock, state_after)
@@ -324,7 +324,7 @@ def test_an_ignored_fault_is_named_after_the_cause_of_a_failure(radar, board, fa
 def test_events_without_end_delay_a_poll_only_briefly(radar, board, clock):
     radar.arm(FRAMES)
     for _ in range(5000):
-        board.say(0x1012, bytes(20))
+        board.send_event(0x1012, bytes(20))
     began = clock.time
     assert radar.poll() is State.ARMED
     assert clock.time - began < 0.5

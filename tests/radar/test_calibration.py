@@ -40,14 +40,14 @@ def test_a_calibration_is_saved_and_restored_at_the_next_start(make_board, board
     (file,) = (tmp_path / "kept").iterdir()
     assert json.loads(file.read_text())["die_id"] == first.facts.die_id
     board.executed.clear()
-    again = make_board(files)
-    again.configure()
-    assert again.facts.calibration_restored is True
+    restored_board = make_board(files)
+    restored_board.configure()
+    assert restored_board.facts.calibration_restored is True
     assert board.executed.count(RestoreCalibration.ID) == 3
     mask = struct.unpack_from("<I", board.settings[InitCalibrations.ID])[0]
     assert mask & RESTORED == 0
     assert mask | RESTORED == ALL
-    assert again.state is State.CONFIGURED
+    assert restored_board.state is State.CONFIGURED
 
 
 NEEDED = {1: "clock PLL", 2: "VCO1", 3: "VCO2", 4: "LO", 5: "ADC", 6: "high-pass", 7: "low-pass", 10: "gain", 12: "I/Q"}

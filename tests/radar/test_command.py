@@ -170,9 +170,9 @@ def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path,
     status = run(rig_file(), "check", "RH", "--trace", trace)
     result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
     assert run(rig_file(), "replay", trace) == status
-    again = capsys.readouterr().out.splitlines()
-    assert [line for line in again if line.startswith("RH")] == result
-    assert again[0].startswith("replayed from")
+    second_lines = capsys.readouterr().out.splitlines()
+    assert [line for line in second_lines if line.startswith("RH")] == result
+    assert second_lines[0].startswith("replayed from")
 
 
 @pytest.mark.parametrize("after_s", [0.0, 1e-4, 1.5e-3, 5e-3, 0.02, 0.5])
@@ -180,7 +180,7 @@ def test_a_replayed_trace_has_the_same_result(rig_file, board, capsys, tmp_path,
 def test_an_event_at_any_time_after_power_up_replays(
     rig_file, words, board, clock, capsys, tmp_path, opened_boards, look_s, after_s
 ):
-    """A trace counts looks, each of which takes its time over USB: the line rises in a replay where it was seen to."""
+    """A trace counts queries, because each takes time over USB: in a replay the line rises at the same query."""
     del opened_boards
     look = words.interrupt
     boot = board.cores.boot

@@ -213,7 +213,7 @@ def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
 )
 @pytest.mark.parametrize("image", [None, IMAGE])
 def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, rom, text, image):
-    """The same codes would be other frequencies on it."""
+    """The same codes would mean other frequencies on such a device."""
     board = Simulated(lambda: clock.time, flash=DATA)
     setattr(board.cores, core, rom)
     with refused(ErrorCode.MISMATCH, text):
@@ -245,7 +245,7 @@ def test_a_download_repairs_any_content_of_the_flash(clock, broken):
 
 @pytest.mark.parametrize("part", range(1, 37))
 def test_a_power_failure_at_any_part_is_recoverable(clock, part):
-    """Part 36 is the version question after the last part; the first two messages are questions too."""
+    """Part 36 is the version question after the last part; the first two messages are questions, too."""
     board = Simulated(lambda: clock.time, flash=make_image(4000))
     radar = make_board(board, clock, words=PowerCut(board, clock, part + 1))
     with pytest.raises(DeviceError):
@@ -297,7 +297,7 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
 
 @pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
 def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, reported, warned):
-    """Another patch than the file's is a warning; the old one, or none, is an error."""
+    """Another patch than that of the file is a warning; the old patch, or none, is an error."""
     effect = new.cores._apply_setting_or_query
 
     def answer(number, data):

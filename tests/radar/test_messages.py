@@ -50,13 +50,13 @@ def test_noise_is_refused(noise: bytes):
 
 
 def test_checksum_of_the_control_document():
-    """Its table 2.6."""
+    """Flags of the document's table 2.6."""
     words = struct.pack("<5H", 0x0281, 0x0800, 0x040C, 0x0000, 0x0001)
     assert m.checksum(words) == 0xF171
 
 
 def test_the_16_bit_crc_is_ccitt_false():
-    """Its check value; messages with it are in test_received.py."""
+    """The check value of the CRC; messages with it are in test_received.py."""
     assert m.crc(b"123456789", 2) == bytes.fromhex("b129")
 
 

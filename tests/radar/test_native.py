@@ -23,7 +23,7 @@ FRAMES = 24
 
 
 class Link(BoardWords):
-    """A link that can be lost for good."""
+    """A link that can be lost permanently."""
 
     lost = False
 
@@ -127,7 +127,7 @@ def test_two_names_for_one_board_are_refused(rig, usb, clock):
 
 @pytest.mark.parametrize("die", ["zero", "not told"])
 def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path, monkeypatch, die):
-    """They would share a file: gains and filters of one board are not another's."""
+    """Two boards would share a file, but gains and filters differ between boards."""
 
     def without_die(execute):
         return lambda number, *rest: (6, b"", 0.0) if number == GET_DIE_ID.ID else execute(number, *rest)
@@ -171,9 +171,9 @@ def test_the_report_fits_the_manifest_and_is_returned_once(radars):
     assert len(result["boards"]["RV"]["sent"]) > 40
     assert 0.9e6 < result["direct_if_hz"]["RH"] < 1.05e6
     assert any(c.startswith("IF budget of RV") for c in result["constraints"])
-    again = radars.report()
-    assert again["boards"]["RV"]["sent"] == []
-    assert "constraints" not in again
+    second_report = radars.report()
+    assert second_report["boards"]["RV"]["sent"] == []
+    assert "constraints" not in second_report
 
 
 def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock):

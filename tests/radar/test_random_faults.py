@@ -121,7 +121,7 @@ def _event(rng: random.Random) -> Case:
             (rng.randrange(0x1000, 0x6000), rng.randbytes(rng.randrange(40)), "."),
         )
     )
-    return Case(f"event 0x{number:04X}", cause, lambda words: words.board.say(number, data))
+    return Case(f"event 0x{number:04X}", cause, lambda words: words.board.send_event(number, data))
 
 
 def _flood(rng: random.Random) -> Case:
@@ -129,7 +129,7 @@ def _flood(rng: random.Random) -> Case:
 
     def act(words: FaultyWords) -> None:
         for _ in range(count):
-            words.board.say(0x1012, bytes(20))
+            words.board.send_event(0x1012, bytes(20))
 
     return Case("events without a pause", r"without a pause|did not report|no valid answer", act)
 

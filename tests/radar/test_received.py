@@ -44,7 +44,7 @@ RECEIVED = {
 
 
 class Sent:
-    """A device that says given messages: one after each command, or all together."""
+    """A device that sends given messages: one after each command, or all together."""
 
     def __init__(self, *messages: bytes) -> None:
         self.messages = list(messages)
@@ -120,7 +120,7 @@ def test_the_fault_during_loading_is_a_register_read_back_error():
 
 @pytest.mark.parametrize("sequence", range(16))
 def test_a_refusal_without_a_body_ends_a_command_with_any_sequence_number_at_once(sequence):
-    """The known one has number 0; it is not known if such a device repeats the command's number."""
+    """The known answer has number 0; it is not known if such a device repeats the command's number."""
     line, sent_words = connect(AWR1243_ERROR)
     line.sequence = sequence
     with refused(ErrorCode.REFUSED_BY_PEER, "LowPower"):

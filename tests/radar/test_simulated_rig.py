@@ -49,7 +49,7 @@ def served_board():
 
 
 class PatientClock(SystemClock):
-    """Its timeouts take a thousand times as long: the thread that serves the board may be held."""
+    """Its timeouts are a thousand times as long, because the thread that serves the board may be delayed."""
 
     def now(self) -> float:
         return super().now() / 1000

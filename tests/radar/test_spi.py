@@ -97,7 +97,7 @@ def test_an_event_between_command_and_answer_is_not_lost(link, board, sent):
 
 def test_events_come_in_order_and_once(link, board):
     for number in (0x100B, 0x100F, 0x1012):
-        board.say(number, bytes(20))
+        board.send_event(number, bytes(20))
     assert [e.id for e in link.poll()] == [0x100B, 0x100F, 0x1012]
 
 
@@ -132,7 +132,7 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
 
 
 def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(words, clock, sent, monkeypatch):
-    """The host looks, finds nothing, and is held for 100 s: after the RF power-up's request, and before its event."""
+    """The host polls without result and is delayed for 100 s: after the RF power-up's request, before its event."""
     link = Link("RH", words, clock, sent.append)
     words.reset(held=True)
     words.reset(held=False)

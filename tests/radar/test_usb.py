@@ -136,15 +136,15 @@ def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged_chip, clo
         words.close()
     assert UsbTools.Devices == {}
     bus.plug(plugged_chip)
-    again = open_usb("FT1234")
-    again.write([0x4321])
+    reopened = open_usb("FT1234")
+    reopened.write([0x4321])
     assert plugged_chip.chip.words_written == [0x4321]
-    again.close()
+    reopened.close()
     assert UsbTools.Devices == {}
 
 
 def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
-    """At each transfer of an opening, the error names the chip, nothing stays open, and a plugged chip opens again."""
+    """At each transfer of an opening, the error names the chip, no handle stays open, and a chip opens again."""
     words = open_usb("FT1234")
     transfers = plugged_chip.transfers
     words.close()

@@ -19,7 +19,7 @@ FRAMES = 5600
 
 
 def change_rig(rig: Instrument, table: str, **values) -> Instrument:
-    """A rig with values that its own declaration might refuse, too."""
+    """A rig with values that the rig file's types might refuse."""
     part = msgspec.structs.replace(getattr(rig, table))
     for key, value in values.items():
         msgspec.structs.force_setattr(part, key, value)
@@ -137,7 +137,7 @@ def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, fram
 
 @pytest.mark.parametrize(("frames", "holds"), [(0, False), (1, True), (65535, True), (65536, False)])
 def test_frame_counts(rig, frames, holds):
-    """0 would be frames without end."""
+    """The value 0 would mean endless frames."""
     assert ("frames" not in broken(rig, frames)) is holds
 
 

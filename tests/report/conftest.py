@@ -23,7 +23,7 @@ METAL = {**PATCH, "label": 5, "name": None, "confidence": None, "votes": {}, "me
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Products that somebody else sent: no raw data, no patches.npz."""
+    """Products from another person: no raw data, no patches.npz."""
     rng = np.random.default_rng(3)
     h, v = (rng.standard_normal((2, 6, 11)) + 1j * rng.standard_normal((2, 6, 11))).astype(np.complex64)
     products = tmp_path / "one"

@@ -1,4 +1,4 @@
-"""What is exported is what was saved: every format is read back by its own library."""
+"""Exports contain the saved values: every format is read back by its own library."""
 
 import json
 from pathlib import Path

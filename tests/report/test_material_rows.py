@@ -1,4 +1,4 @@
-"""The table of materials, number by number: what a patch of materials.json becomes in every format."""
+"""The table of materials in every format, number by number, compared with the patches of materials.json."""
 
 import csv
 
@@ -81,7 +81,7 @@ def test_csv_keeps_every_digit(exported_folder):
 
 
 def same(values, expected) -> bool:
-    """Whether a column holds these; nan and an empty word stand for what is not known."""
+    """True if a column has these values; NaN and empty texts mean unknown ones."""
     if any(isinstance(e, str) for e in expected):
         return ["" if np.size(v) == 0 else v for v in values] == ["" if e is None else e for e in expected]
     return np.array_equal(np.asarray(values, float), [np.nan if e is None else e for e in expected], equal_nan=True)

@@ -1,4 +1,4 @@
-"""Names in any script: figures draw them without warnings, and the page has every one of them in full."""
+"""Names in any script: figures draw them without warnings, and the page shows each in full."""
 
 import warnings
 from html import unescape
@@ -47,7 +47,7 @@ def strict():
 
 
 def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
-    """All in one report, which takes seconds, and all of them in its title."""
+    """All names in one report, because a report takes seconds; all of them in its title."""
     html = unescape(write_report(tmp_path, context(NAMES)).read_text(encoding="utf-8"))
     for number, name in enumerate(NAMES, 1):
         assert name in html

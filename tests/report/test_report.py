@@ -1,4 +1,4 @@
-"""The report is one file, loads nothing, and says what is simulated."""
+"""The report is one file, loads no other files, and marks simulated data."""
 
 import base64
 import re
@@ -142,7 +142,7 @@ def test_a_phone_shows_the_result_before_anything_is_opened(page, browser):
 
 
 def test_a_phone_shows_nine_patches_and_many_reasons_in_as_much(scan, browser, tmp_path):
-    """As wordy as reports of disturbed scenes are; figures are of the scan of two plates."""
+    """A report as long as those of disturbed scenes; its figures are of the scan of two plates."""
     texts = {
         "what": "plates are rough, wavy or bent: the phase of H scatters by 4 degrees, more than flat ones do",
         "why": "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
@@ -315,7 +315,7 @@ def with_every_number(content, value):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
-    """Just computed figures may be nan or inf; products have null in their place."""
+    """New results may contain NaN or infinity; products have null instead."""
     figures = with_every_number({"segments": MATERIALS, "quality": QUALITY}, value)
     strange = changed(
         scan,

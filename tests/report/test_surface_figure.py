@@ -1,4 +1,4 @@
-"""The picture of a surface: what is nearer to the eye hides what is behind it."""
+"""The picture of a surface: near points hide those behind them."""
 
 import io
 

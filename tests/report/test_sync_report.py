@@ -1,4 +1,4 @@
-"""The report on what synchronisation leaves of errors."""
+"""The report on the errors that remain after synchronisation."""
 
 import json
 
@@ -12,7 +12,7 @@ SCALES = {"received": (8e4, 1.8, 0.1), "aligned": (80.0, 0.013, 0.01), "averaged
 
 
 def row(snr_db=7.2, n=4000, seed=0):
-    """A row of errors of known size; nothing in it has an echo."""
+    """A row of errors of known size, without echoes."""
     rng = np.random.default_rng(seed)
     errors = {name: rng.standard_normal((3, n)) * np.array(scale)[:, None] for name, scale in SCALES.items()}
     errors["referenced"] = np.zeros((3, 0))
@@ -44,8 +44,8 @@ def test_spreads_are_those_of_the_errors():
     for name, scale in SCALES.items():
         stage = summary["stages"][name]
         assert stage["samples"] == 8000
-        got = [stage[f"{q}_std"] for q in ("frequency_hz", "phase_rad", "amplitude")]
-        assert got == pytest.approx(scale, rel=0.03)
+        stds = [stage[f"{q}_std"] for q in ("frequency_hz", "phase_rad", "amplitude")]
+        assert stds == pytest.approx(scale, rel=0.03)
     assert "referenced" not in summary["stages"]
 
 

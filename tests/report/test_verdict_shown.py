@@ -1,4 +1,4 @@
-"""The report with a verdict: what is withheld, ellipses that hold their share, labels that can be read."""
+"""The report with a verdict: withheld results, ellipses with the right share of points, readable labels."""
 
 import json
 from dataclasses import replace
@@ -39,7 +39,7 @@ RESULTS = (*NAMES, "2.90", "± 0.20", "ε′ ±")
 
 
 def write_products(folder, rows=None) -> ProcessedScan:
-    """What processing hands to the report: names in patches, pixels and truth, and quality.json."""
+    """Input of the report: names in patches, pixels and truth, and quality.json."""
     saved = read_products(folder)
     interior = np.zeros(saved.h.shape, bool)
     interior[5:9, 12:16] = True
@@ -55,7 +55,7 @@ def write_products(folder, rows=None) -> ProcessedScan:
 
 
 def drawn_text(make) -> str:
-    """All text that a figure is made with."""
+    """All texts of a figure."""
     collected: list[str] = []
     plain = Axes.text
     noted = Axes.annotate
@@ -88,7 +88,7 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
 
 
 def test_reasons_of_less_weight_are_folded(tmp_path):
-    """A phone shows three of a score of reasons before anything is opened."""
+    """A phone shows three of twenty reasons before a section is opened."""
     folder = judged_products(tmp_path, "care")
     verdict = {"level": "care", "reasons": [{**REASON, "what": f"reason {number}"} for number in range(1, 21)]}
     for name in ("quality.json", "materials.json"):

@@ -34,7 +34,7 @@ async def read_stream(port: int, scan: int) -> None:
 
 
 async def read_pages(port: int, views: int) -> None:
-    """Ask for one thing after another, as pages do."""
+    """Send one request after another, as pages do."""
     while True:
         try:
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -89,7 +89,7 @@ def open_connections(port: int, rate: int, opened: Synchronized[int]) -> None:
 
 
 async def report(opened: Synchronized[int]) -> None:
-    """Say each second what was counted."""
+    """Print the counts each second."""
     while True:
         await asyncio.sleep(1)
         counted["connections"] = opened.value
@@ -98,7 +98,7 @@ async def report(opened: Synchronized[int]) -> None:
 
 
 async def main() -> None:
-    """Run all of them until the process is ended."""
+    """Run all clients until the process is ended."""
     # The aborts of an attack are sent by the test, not from here.
     port, streams, readers, wrong_tokens, connections, _, views = map(int, sys.argv[1:])
     clients = [read_stream(port, k % views) for k in range(streams)]

@@ -1,4 +1,4 @@
-"""Small scans to look at, and watches."""
+"""Small scans, and watches of them."""
 
 from tests.support.page.fixtures import finished, growing, processed, samples, watching
 

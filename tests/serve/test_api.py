@@ -163,7 +163,7 @@ def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
 
 
 def test_open_live_views_keep_nobody_from_pausing_and_stopping(view, scans):
-    """Not those of the scan that is asked, nor of as many others as may be open."""
+    """A request does not close the view of its own scan, nor those of as many others as may be open."""
     for k in range(site.MAX_WATCHES):
         (scans / f"view{k}" / "program").mkdir(parents=True)
     with ExitStack() as pages, open_control(scans / "one") as stop:
@@ -218,7 +218,7 @@ def test_a_request_can_be_repeated_and_is_checked_again(view, scans):
 
 
 def test_a_page_gets_products_of_one_generation(view, scans):
-    """Of the one that it shows, or an answer that there is another."""
+    """The answer is for the products that the page shows, or says that they were replaced."""
     generation = get(view, "/api/result?scan=one")["generation"]
     assert get(view, "/api/scan?scan=one")["generation"] == generation
     assert ask(view, f"/api/map/h_amplitude?scan=one&generation={generation}")[0] == 200
@@ -232,7 +232,7 @@ def test_a_page_gets_products_of_one_generation(view, scans):
 
 
 def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(view, scans):
-    """Names and permittivities of one verdict under the reasons of another would be believed."""
+    """Otherwise results of one verdict would be shown with the reasons of another."""
     out = scans / "one" / "products"
     generations = itertools.count()
     ended = threading.Event()

@@ -1,6 +1,6 @@
-"""Abort while everybody asks at once: streams, live views, readers, wrong tokens, connections without a request.
+"""Abort during concurrent requests: streams, live views, readers, wrong tokens, connections without a request.
 
-The server runs as its command. How long each abort takes is said (`-s` shows it); only that it works is asserted.
+The server runs as its command. The duration of each abort is printed (`-s` shows it); only its success is asserted.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""The page of a scan goes from one generation of products to the next at once: no moment shows parts of two."""
+"""The page of a scan changes from one generation of products to the next as a whole: it never shows parts of two."""
 
 import json
 

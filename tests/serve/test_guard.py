@@ -1,4 +1,4 @@
-"""Who is let in, from where, how much and how slowly; what is refused changes nothing and locks nobody out."""
+"""Access by token and address, limits of size and time; refused requests change nothing and do not block others."""
 
 import http.client
 import json
@@ -132,7 +132,7 @@ def test_large_bodies_are_refused_and_nothing_is_kept(scans):
 
 
 def test_open_connections_and_unread_answers_lock_nobody_out(scans):
-    """300 clients send half a head, and 100 ask for pages and read none, while the operator's keeps its connection."""
+    """300 clients send half a head, and 100 ask for pages and read none; the operator keeps its connection."""
     pages = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
     with served_folder(scans, TOKEN) as view, ExitStack() as clients:
         operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
@@ -196,7 +196,7 @@ def test_a_connection_with_unread_bytes_is_not_closed():
 
 
 def test_a_download_that_is_aborted_leaves_no_file_open(scans):
-    """Also where the server ends while nobody reads the answer."""
+    """This holds even if the server ends before the answer is read."""
     large = scans / "one" / "products" / "report.html"
     large.write_bytes(b"x" * (16 << 20))
 
@@ -283,7 +283,7 @@ NO_HEADS = (b"", b"\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b
 
 
 def hostile(port: int) -> list[bytes]:
-    """Requests that nobody well-meaning sends, as bytes; some with the right token."""
+    """Malicious requests as bytes; some with the right token."""
     host_line = f"Host: 127.0.0.1:{port}"
     token = f"{TOKEN_HEADER}: {TOKEN}"
 

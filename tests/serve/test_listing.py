@@ -1,4 +1,4 @@
-"""Changes of the list: whoever applies them has the list of the server, whatever it had before."""
+"""Changes of the list: a client that applies them has the server's list, whatever it had before."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""Result, probe, label, library and comparison in a real browser, at a desk's width and at a phone's."""
+"""Result, probe, label, library and comparison in a real browser, at the widths of a desktop and of a phone."""
 
 import json
 import math
@@ -57,14 +57,14 @@ class Page:
         self.view = view
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK, token: str = TOKEN) -> None:
-        """Go there, and wait until it shows something; without a token, as who was never here."""
+        """Open the page, and wait until it has content; without a token, as on a first visit."""
         if not token:
             self.browser.forget(self.view.address)
         self.browser.visit(f"{self.view.address}{path}{f'#token={token}' if token else ''}", size)
         self.browser.wait(PAGES.get(path, "document.querySelector('.bar')"), path)
 
     def press(self, *keys: str) -> None:
-        """Keys, with the focus where it is."""
+        """Press keys, with the present focus."""
         for key in keys:
             if key == "Enter":
                 text = {"text": "\r"}
@@ -93,7 +93,7 @@ class Page:
             self.browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
     def check_whole(self) -> None:
-        """The page fits, and everything in it comes from its server."""
+        """Check that the page fits, and that everything in it comes from its server."""
         self.browser.check_whole(self.view.address)
 
 
@@ -167,18 +167,18 @@ CONTRAST = """(() => {
 NAMELESS = """[...document.querySelectorAll('button, a[href], input, select, textarea')]
   .filter((n) => n.checkVisibility() && !(n.getAttribute('aria-label') || n.textContent.trim() || n.labels?.length))
   .map((n) => n.outerHTML.slice(0, 80))"""
-"""What can be used and has no name for who cannot see it."""
+"""Controls without an accessible name."""
 
 
 def test_axe_is_here():
-    """Without it the rules of accessibility are not checked; everything else is."""
+    """Without axe-core the rules of accessibility are not checked; everything else is."""
     if find_axe() is None:
         pytest.skip("no axe-core here: npm install --no-save axe-core")
 
 
 @pytest.mark.parametrize("path", PAGES)
 def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page, scans, path, request):
-    """At both sizes and in both schemes, with all that a page unfolds; axe: https://github.com/dequelabs/axe-core."""
+    """Both sizes and both colour schemes, with all sections open; axe: https://github.com/dequelabs/axe-core."""
     axe = find_axe()
     browser = page.browser
     request.addfinalizer(lambda: browser.set_scheme("light"))
@@ -293,7 +293,7 @@ def test_the_new_page_lists_the_checks_as_the_doctor_prints_them(page, scans):
 
 
 def test_an_abort_goes_before_pictures_that_hang(page, scans, monkeypatch):
-    """A browser has six connections to a server, and pictures on a drive that is gone take all of them."""
+    """A browser has six connections to a server, and pictures on a disconnected drive occupy all of them."""
     released = threading.Event()
 
     def hang(*_: object) -> None:
@@ -369,9 +369,9 @@ def test_a_place_is_probed_by_keyboard_alone(page):
         page.press("ArrowDown")
     page.press("Enter")
     page.browser.wait("document.querySelectorAll('#probe-facts dt').length > 5", "the probe")
-    said = page.browser.text("probe-facts")
-    assert "± " in said
-    assert "PET" in said
+    shown_text = page.browser.text("probe-facts")
+    assert "± " in shown_text
+    assert "PET" in shown_text
     assert page.browser.value("document.querySelectorAll('#profile path').length") == 2
     page.press("+", "+")
     page.browser.wait("document.querySelector('tr.here')", "its row in the table")
@@ -416,33 +416,35 @@ def test_notes_are_kept_beside_the_scan(page, scans):
 def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
     monkeypatch.setattr(programs, "LOOK_S", 1e6)
     with served_folder(scans, TOKEN, config=RIG_FILE) as view:
-        again = Page(page.browser, view)
-        again.open("/new?from=one", PHONE)
-        again.browser.wait("document.querySelector('.time') && document.getElementById('rows').value == 17", "the plan")
+        reloaded_page = Page(page.browser, view)
+        reloaded_page.open("/new?from=one", PHONE)
+        reloaded_page.browser.wait(
+            "document.querySelector('.time') && document.getElementById('rows').value == 17", "the plan"
+        )
         # Start is on the first screen of a phone.
         start = "document.getElementById('start').getBoundingClientRect()"
-        assert again.browser.value(f"{start}.bottom <= innerHeight && {start}.top > 0")
-        again.browser.fill("#name", "over-night")
-        again.browser.click("#enqueue")
-        again.browser.wait("document.querySelectorAll('#waiting li').length == 1", "that it waits")
-        again.check_whole()
-        again.browser.click("#waiting button")
-        again.browser.wait("document.querySelectorAll('#waiting li').length == 0", "that it is out")
+        assert reloaded_page.browser.value(f"{start}.bottom <= innerHeight && {start}.top > 0")
+        reloaded_page.browser.fill("#name", "over-night")
+        reloaded_page.browser.click("#enqueue")
+        reloaded_page.browser.wait("document.querySelectorAll('#waiting li').length == 1", "that it waits")
+        reloaded_page.check_whole()
+        reloaded_page.browser.click("#waiting button")
+        reloaded_page.browser.wait("document.querySelectorAll('#waiting li').length == 0", "that it is out")
 
 
 def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
     page.open("/new")
     page.browser.fill("#columns", "0")
     page.browser.wait("document.getElementById('plan-wrong')?.innerText.length > 0", "the refusal")
-    said = page.browser.text("plan-wrong")
-    assert "Positions in a row" in said
-    assert "columns" not in said
+    shown_text = page.browser.text("plan-wrong")
+    assert "Positions in a row" in shown_text
+    assert "columns" not in shown_text
     assert page.browser.value("document.getElementById('start').disabled")
     page.browser.fill("#columns", "900")
     page.browser.wait("document.getElementById('plan-wrong')?.innerText.includes('900')", "the refusal")
-    said = page.browser.text("plan-wrong")
-    assert "does not fit the stage" in said
-    assert not re.search(r"\w_\w|stage\.|grid\.|changed|rule of its format", said), said
+    shown_text = page.browser.text("plan-wrong")
+    assert "does not fit the stage" in shown_text
+    assert not re.search(r"\w_\w|stage\.|grid\.|changed|rule of its format", shown_text), shown_text
     wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map((field) => field.id).join()"
     assert page.browser.value(wrong) == "columns,step_x_mm,speed_mm_s"
     # The refused requests
@@ -450,16 +452,19 @@ def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
 
 
 def test_a_scan_that_was_stopped_on_request_has_not_failed(page, scans):
-    """Its program leaves with the exit status of a scan that is not complete."""
+    """Its program ends with the exit status of an incomplete scan."""
     record = ProgramRecord(pid=1, ticks=0, words=["polysight", "scan"], started_utc="2026-01-01T00:00:00+00:00")
     folder = scans / "one" / PROGRAM
     folder.mkdir()
     (folder / "scan.json").write_bytes(msgspec.json.encode(record))
     (folder / "scan.status").write_text("6\n", encoding="utf-8")
-    for end, said in (("stopped on request, 2 of 3 rows are missing", "was stopped on request"), ("", "has failed")):
+    for end, shown_text in (
+        ("stopped on request, 2 of 3 rows are missing", "was stopped on request"),
+        ("", "has failed"),
+    ):
         (folder / "scan.log").write_text(f"1 of 3 rows, 0:40 left\nend: {end}\n", encoding="utf-8")
         page.open("/scan?scan=one")
-        page.browser.wait(f"document.getElementById('program-title').innerText.includes('{said}')", said)
+        page.browser.wait(f"document.getElementById('program-title').innerText.includes('{shown_text}')", shown_text)
 
 
 def test_metal_is_drawn_for_processing_again(page):
@@ -488,7 +493,7 @@ def test_the_page_follows_products_that_another_program_has_made(page, scans):
 
 
 def test_a_list_that_takes_long_is_shown_as_it_is_read(browser, tmp_path, monkeypatch):
-    """Each answer of this server has one scan more; the page asks again until it has all, and says so meanwhile."""
+    """Each answer of this server has one scan more; the page asks again until it has all, and shows that meanwhile."""
     monkeypatch.setattr(reading, "LIST_S", 0.0)
     for k in range(6):
         judged_products(tmp_path / "scans" / f"scan-{k}", "care")
@@ -531,7 +536,7 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
 
 
 def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, scans):
-    """Tests share one browser, and ports are given out again."""
+    """Tests share one browser, and ports are reused."""
     with served_folder(scans) as view:
         page = Page(browser, view)
         page.open("/", token="of another server")

@@ -1,4 +1,4 @@
-"""The processes of `polysight serve`: commands are answered whatever becomes of the others, and after a restart."""
+"""The processes of `polysight serve`: commands are answered even if the other processes fail, and after a restart."""
 
 import os
 import re
@@ -99,7 +99,7 @@ def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_starte
 
 
 def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_nothing(scans, tmp_path):
-    """More silent connections than are kept; a request that came with them is answered when the pages go on."""
+    """More silent connections than are kept; a request that came with them is answered when the pages continue."""
     with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
         assert ask(server, "/api/page")[2]["connection"] == "close"
         # Until it has its priority it looks like the door.
@@ -123,7 +123,7 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
 
 
 def test_the_live_view_of_one_scan_has_its_control_alone(scans, tmp_path):
-    """`polysight preview`; e2e/test_operator_page follows, pauses and resumes a scan, tests/page sees one killed."""
+    """`polysight preview`. Pause and resume are in e2e/test_operator_page, a killed scan is in tests/page."""
     (tmp_path / "scans" / "two").mkdir()
     with serving(scans / "one", tmp_path / "state", "--control", command="preview") as server:
         state = get(server, "/api/state")
@@ -172,34 +172,34 @@ def serve_interrupted(forks: str, where: str, folder: Path) -> tuple[int, str]:
     """Exit status and stderr of a server, interrupted at these forks, in itself or in the new processes."""
     words = [sys.executable, "-c", INTERRUPT_AT_FORKS, forks, where, "serve", str(folder), "--port", "0"]
     environment = os.environ | {"XDG_STATE_HOME": str(folder)}
-    said = ""
+    messages = ""
     with subprocess.Popen(words, cwd=folder, env=environment, stderr=subprocess.PIPE, text=True) as program:
         assert program.stderr is not None
         for line in program.stderr:
-            said += line
+            messages += line
             if line.startswith("Ctrl-C"):
                 program.send_signal(signal.SIGINT)
-    return program.returncode, said
+    return program.returncode, messages
 
 
 @pytest.mark.parametrize("fork", "12")
 def test_an_interrupt_at_a_fork_is_not_lost(tmp_path, fork):
-    """Python drops exceptions of what it calls at a fork: the server would go on."""
-    status, said = serve_interrupted(fork, "after_in_parent", tmp_path)
+    """Python ignores exceptions of functions that it calls at a fork: the server would continue."""
+    status, messages = serve_interrupted(fork, "after_in_parent", tmp_path)
     assert status == 128 + signal.SIGINT
-    assert said.splitlines() == ["polysight serve: starting", "polysight serve: stopped"]
+    assert messages.splitlines() == ["polysight serve: starting", "polysight serve: stopped"]
 
 
 def test_an_interrupt_of_new_processes_is_left_to_the_server(tmp_path):
     """Ctrl-C reaches all processes of a terminal, and those that begin are not a server yet."""
-    status, said = serve_interrupted("12", "after_in_child", tmp_path)
+    status, messages = serve_interrupted("12", "after_in_child", tmp_path)
     assert status == 128 + signal.SIGINT
-    assert "Traceback" not in said
-    assert "Exception ignored" not in said
+    assert "Traceback" not in messages
+    assert "Exception ignored" not in messages
 
 
 def test_an_interrupt_while_the_event_loop_is_made_ends_the_server_as_any_other(tmp_path):
-    """In the moment after the address is printed half a loop could be left, whose end is a traceback."""
+    """Just after the address is printed, an interrupt could leave an unfinished event loop, with a traceback."""
     words = [sys.executable, "-c", INTERRUPT_IN_LOOP, "serve", str(tmp_path), "--port", "0"]
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
     program = subprocess.run(words, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
@@ -242,7 +242,7 @@ def test_the_token_survives_a_restart_and_nobody_else_can_read_it(scans, tmp_pat
 
 
 def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
-    """Everybody comes from this machine then, under the proxy's name."""
+    """Then all clients have this machine's address and the proxy's name."""
     with serving(scans, tmp_path / "state", "--allow-host", "lab.example.org") as server:
         token = {TOKEN_HEADER: server.token}
         for host in ("lab.example.org", "127.0.0.1"):
@@ -254,7 +254,7 @@ def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
 
 
 def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
-    """A folder elsewhere may lie on a drive that is not mounted: scans would fill another one."""
+    """A folder elsewhere may be on an unmounted drive: scans would fill another one."""
     with serving(Path("scans"), tmp_path) as server:
         assert get(server, "/api/scans")["scans"] == []
     assert (tmp_path / "scans").is_dir()

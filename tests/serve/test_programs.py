@@ -55,7 +55,7 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
 
 @pytest.fixture
 def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
-    """A folder for which a program runs, which is killed in the end."""
+    """A folder for which a program runs; it is killed after the test."""
     pid = programs.launch(["/bin/sleep", "60"], tmp_path / PROGRAM / "scan")
     try:
         yield tmp_path
@@ -110,7 +110,7 @@ def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
 
 @pytest.fixture
 def refusing_pi(tmp_path: Path) -> Iterator[tuple[Path, Callable[[], None]]]:
-    """A rig file, and what makes its Pi refuse the next command; without that its programs wait for an answer."""
+    """A rig file, and a function that makes its Pi refuse the next command; until then programs wait for an answer."""
     rig = published_rig()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     pi = context.socket(zmq.REP)
@@ -179,7 +179,7 @@ def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
 
 @pytest.mark.parametrize("name", ["", "scan.log", "scan.json", "scan.status"])
 def test_nothing_is_written_through_a_link(programs, tmp_path, name):
-    """A scan folder from elsewhere may hold links where logs go."""
+    """A copied scan folder may have links in place of logs."""
     (tmp_path / "victim").mkdir()
     (tmp_path / "victim" / "file").write_text("as it was")
     if name:

@@ -1,4 +1,4 @@
-"""The documented reverse proxy in front of a server, in a real browser: what is read, what moves, what is asked for."""
+"""The documented reverse proxy in front of a server, in a real browser: pages, live updates, commands."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Scans that wait for the rig: one after another, in order, and never past one that did not finish."""
+"""Scans that wait for the rig: one after another, in order; the queue stops at a scan that did not finish."""
 
 import json
 from collections.abc import Iterator
@@ -90,14 +90,14 @@ def test_what_cannot_be_started_stays_and_says_why(queue, rig):
 
 def test_a_queue_survives_a_restart(queue, rig, tmp_path):
     queue.close()
-    again = Queue(tmp_path / "queue", rig.start, rig.list_states)
-    assert again.waiting().names == ["first", "second", "third"]
-    again.close()
+    next_queue = Queue(tmp_path / "queue", rig.start, rig.list_states)
+    assert next_queue.waiting().names == ["first", "second", "third"]
+    next_queue.close()
 
 
 @pytest.mark.parametrize("state", ["stopped", "failed", "lost"])
 def test_a_scan_that_somebody_else_started_holds_the_queue_too(queue, rig, state):
-    """Whoever aborts a scan may have his hands in the rig."""
+    """A person who aborts a scan may be touching the rig."""
     rig.states["by hand"] = "running"
     wait_for(lambda: rig.asked > 2, "that the queue has seen it")
     rig.states["by hand"] = state
@@ -122,7 +122,7 @@ def test_after_a_restart_a_newest_scan_that_did_not_finish_holds_the_queue(queue
     queue.close()
     rig.states["by hand"] = "stopped"
     rig.is_busy = False
-    again = Queue(tmp_path / "queue", rig.start, rig.list_states)
-    wait_for(lambda: again.waiting().held, "that it waits")
+    next_queue = Queue(tmp_path / "queue", rig.start, rig.list_states)
+    wait_for(lambda: next_queue.waiting().held, "that it waits")
     assert rig.started == []
-    again.close()
+    next_queue.close()

@@ -1,4 +1,4 @@
-"""What POST requests ask for, without a browser: limits just inside and outside, and the command line of each."""
+"""POST requests without a browser: values just inside and outside of limits, and the command line of each."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -65,7 +65,7 @@ def test_a_limit_holds_just_inside_and_not_just_outside(kind, inside, outside):
 
 
 def test_a_plan_of_the_page_has_at_most_so_many_positions_after_its_steps():
-    """A smaller step makes more positions of the same area of 698 mm."""
+    """A smaller step makes more positions in the same area of 698 mm."""
     within = PlanRequest(step_x_mm=0.35, speed_mm_s=5.0).apply(RIG_FILE)
     assert within.grid.columns == 1995
     with refused(ErrorCode.VALUE_INVALID, MAX_POSITIONS):

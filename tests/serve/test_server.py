@@ -1,4 +1,4 @@
-"""The server: who may ask, who may look, and that a page can be as slow as it likes."""
+"""The server: access to commands, access to pages, and slow pages."""
 
 import gc
 import hmac
@@ -28,7 +28,7 @@ from polysight_shared.error_codes import ErrorCode
 
 @pytest.fixture
 def desk(growing):
-    """A running scan of which nothing has come yet: its folder and what hears of commands."""
+    """A running scan without events so far: its folder, and the stop request that gets the commands."""
     growing.grow_until("scan_started")
     with open_control(growing.path) as stop:
         yield growing.path, stop
@@ -133,14 +133,14 @@ def test_connections_end_with_their_server(request_head):
 
 
 def read_queue_length(listener: socket.socket) -> int:
-    """Return how many connections the kernel queues for a listening socket: struct tcp_info, tcpi_sacked."""
+    """Return the number of connections that the kernel queues for a listening socket: struct tcp_info, tcpi_sacked."""
     return int.from_bytes(listener.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 32)[28:32], sys.byteorder)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="struct tcp_info is Linux's")
 def test_connections_wait_in_a_long_queue():
     async def ignore(_scope, _receive, _send):
-        """Requests do not come."""
+        """No requests come."""
 
     with socket.create_server(("127.0.0.1", 0), backlog=BACKLOG) as listener:
         # At most what the kernel allows, net.core.somaxconn.
@@ -156,7 +156,7 @@ def test_connections_wait_in_a_long_queue():
 
 
 def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
-    """Rows of modules, True for dark, as a terminal shows them that has black text on white, or white on black."""
+    """Rows of modules, True for dark, as a terminal with black text on white shows them, or one with white on black."""
     colours = {"0": (black_text, not black_text), "38;5;16;48;5;231": (True, False)}
     blocks = {" ": (1, 1), "\u2580": (0, 1), "\u2584": (1, 0), "\u2588": (0, 0)}
     rows: list[list[bool]] = []
@@ -197,7 +197,7 @@ def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_tex
     ids=str,
 )
 def test_whoever_other_machines_may_be_needs_the_token(place, is_private, control, tmp_path, monkeypatch):
-    """Behind a reverse proxy they all are this machine, also where there is nothing but to look."""
+    """Behind a reverse proxy all clients have this machine's address, also on a server without commands."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with socket.create_server(("127.0.0.1", 0)) as listener:
         access = make_access(place, listener, control)

@@ -1,4 +1,4 @@
-"""A folder that does not answer, such as a network drive that is gone, stops the reads of no other."""
+"""A folder that does not answer, such as a disconnected network drive, does not block reads of others."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -138,7 +138,7 @@ def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):
 
 
 def test_only_threads_that_may_hang_ask_a_folder_of_the_list_for_its_time(root, monkeypatch):
-    """A drive that is gone hangs already then."""
+    """A disconnected drive hangs already then."""
     real = scans._read_modified_s
     asking: set[threading.Thread] = set()
 

@@ -1,4 +1,4 @@
-"""Every state of the table in a real browser: its words, its colour, its buttons, and nothing that it must not say."""
+"""Every state of the table in a real browser: its text, colour and buttons, and no text of other states."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -46,7 +46,7 @@ class StillWatch:
         self._history = history
 
     def show(self, key: str, **words: str) -> None:
-        """Publish a state of the table, with other words than `WORDS`."""
+        """Publish a state of the table, with other texts than `WORDS`."""
         signs = LifeSigns(
             life=Life(), alive=True, killed=False, alive_s=0.0, pi_silent_s=0.1, pi_limit_s=6.0, now_s=1.8e9
         )
@@ -59,7 +59,7 @@ class StillWatch:
         self.state = self.state.publish(replace(snapshot, status=status, verdict=verdict))
 
     def close(self) -> None:
-        """Nothing runs."""
+        """No program runs."""
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def still(finished: Path, tmp_path: Path) -> Iterator[tuple[StillWatch, Served]]
 
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (PHONE, "dark")], ids=["desk", "phone"])
 def test_every_state_says_what_the_table_says(browser: Browser, still, size, scheme, request):
-    """And axe finds nothing in it."""
+    """axe-core finds no faults in any state."""
     axe = find_axe()
     watch, view = still
     request.addfinalizer(lambda: browser.set_scheme("light"))

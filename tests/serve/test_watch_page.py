@@ -1,4 +1,4 @@
-"""The page in a real browser, at a desk's width and at a phone's."""
+"""The page in a real browser, at the widths of a desktop and of a phone."""
 
 import time
 
@@ -82,7 +82,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 
 
 def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
-    """At an address of its own: a port of 127.0.0.1 that was free for a while may be somebody else's by then."""
+    """At an address of its own: a free port of 127.0.0.1 may be used by another program by then."""
     rig = move_to_free_subnet(published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished)

@@ -1,4 +1,4 @@
-"""The rig file: complete and checked; an error names file, key, value and rule."""
+"""The rig file: complete and checked; errors name file, key, value and rule."""
 
 import math
 from pathlib import Path

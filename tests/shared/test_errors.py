@@ -1,4 +1,4 @@
-"""What an error advises can be pasted into a shell."""
+"""Commands in errors can be pasted into a shell."""
 
 import re
 import shlex

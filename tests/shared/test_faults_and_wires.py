@@ -1,4 +1,4 @@
-"""The fault table is complete and is that of the firmware; simulated wires keep edges and their times."""
+"""The fault table is complete and agrees with the firmware; simulated wires preserve edges and their times."""
 
 import socket
 import threading

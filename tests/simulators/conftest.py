@@ -1,4 +1,4 @@
-"""Sockets that are closed after the test, and a rig on addresses of its own."""
+"""Sockets that are closed after the test, and a rig on its own addresses."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack

@@ -74,7 +74,7 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
 
 
 def at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
-    """The stage raises its trigger at a point of the plan; the pulses of its burst, with numbers of no meaning."""
+    """The stage raises its trigger at a point of the plan; the pulses of its burst, with arbitrary numbers."""
     plan = plan_raster(RIG.grid)
     centre = (RIG.stage.centre_x_mm, RIG.stage.centre_y_mm)
     x = (column - (plan.columns - 1) / 2) * plan.step_x_mm + centre[0]
@@ -89,6 +89,6 @@ def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column:
     point = column if row % 2 == 0 else RIG.grid.columns - 1 - column
     first = (row * RIG.grid.columns + point) * RIG.burst.pulses
     track = StageTrack(RIG)
-    for again in (0, 10**11):
-        numbered = track.places(at_point(track, row, column, t_ns + again))
+    for base_ns in (0, 10**11):
+        numbered = track.places(at_point(track, row, column, t_ns + base_ns))
         assert [p.number for p in numbered] == list(range(first, first + RIG.burst.pulses))

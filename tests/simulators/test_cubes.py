@@ -116,9 +116,9 @@ def test_an_ideal_rig_gives_the_reference_cube_and_a_constant_direct_path() -> N
 
 def test_the_same_seed_gives_the_same_bytes_and_a_power_cycle_keeps_the_specimens() -> None:
     first = synced_cube(RIG, SCENE, "RH", seed=5)
-    again = synced_cube(RIG, SCENE, "RH", seed=5)
+    second_cube = synced_cube(RIG, SCENE, "RH", seed=5)
     cycle = synced_cube(RIG, SCENE, "RH", seed=6)
-    assert first.tobytes() == again.tobytes()
+    assert first.tobytes() == second_cube.tobytes()
     assert first.tobytes() != cycle.tobytes()
     ideal = SCENE.with_disturbances(ideal=True)
     assert np.array_equal(synced_cube(RIG, ideal, "RH", seed=5), synced_cube(RIG, ideal, "RH", seed=6))

@@ -30,7 +30,7 @@ def arrivals(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH")
     first = 0
     out = []
     for size in sizes:
-        out += [r.tobytes() for part in network.carry(data[first : first + size]) for r in part]
+        out += [r.tobytes() for part in network.transmit(data[first : first + size]) for r in part]
         first += size
     assert (data == rows(sum(sizes))).all(), "what was sent stays as it was"
     return out + [r.tobytes() for part in network.drain() for r in part]
@@ -59,9 +59,9 @@ def test_each_fault_alone(faults: Faults, numbers: list[int]) -> None:
 
 
 def test_reordered_packets_all_arrive() -> None:
-    got = arrivals(Faults(reorder=0.2), [200])
-    assert got != [r.tobytes() for r in rows(200)]
-    assert sorted(got) == sorted(r.tobytes() for r in rows(200))
+    received = arrivals(Faults(reorder=0.2), [200])
+    assert received != [r.tobytes() for r in rows(200)]
+    assert sorted(received) == sorted(r.tobytes() for r in rows(200))
 
 
 def test_truncated_packets_are_half() -> None:

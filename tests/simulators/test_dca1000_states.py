@@ -40,7 +40,7 @@ class AnyUse(RuleBasedStateMachine):
         self.sizes: list[int] = []
 
     def compare(self, outputs: list[Output], ends: bool) -> None:
-        """Compare what came out with the model; `ends`: the record ends with it."""
+        """Compare what came out with the model; `ends`: True if the record ends with it."""
         packets = [row.tobytes() for o in outputs if isinstance(o, Packets) for row in o.rows]
         assert self.recording or not packets, "data outside a record"
         for packet in packets:

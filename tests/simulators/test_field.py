@@ -60,13 +60,13 @@ def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
     samples = sample_frequencies_hz(rig)
     f = samples[[128]]
     field = build_field(rig, scene, board, samples)
-    got = read(field, offsets, f, 0, samples)[:, 0]
+    field_values = read(field, offsets, f, 0, samples)[:, 0]
     image = ant.rx_m[0] * [1, 1, -1] + [0, 0, 2 * ant.plane_z_m]
     path = float(np.linalg.norm(image - ant.tx_m))
     expected = -ant.direct_m[0] / path * np.exp(2j * np.pi * f[0] * path / SPEED_OF_LIGHT_M_S)
     # The plate's edges still ring by some percent at each offset; their mean does not.
-    assert abs(np.mean(got) / expected - 1) < 0.03
-    assert np.abs(np.abs(got) / abs(expected) - 1).max() < 0.25
+    assert abs(np.mean(field_values) / expected - 1) < 0.03
+    assert np.abs(np.abs(field_values) / abs(expected) - 1).max() < 0.25
 
 
 def test_echoes_add_up() -> None:
@@ -101,8 +101,8 @@ def test_leakage_mixes_the_two_polarisations() -> None:
 def test_a_point_at_the_specular_midpoint_equals_its_amplitude() -> None:
     rig, scene = setup(points=[{"position_mm": [0.0, 0.0], "amplitude": [0.6, 0.0]}])
     ideal = scene.with_disturbances(ideal=True)
-    got = optics.field_exact(rig, ideal, rig.receivers[0], np.zeros((1, 2)), np.array([78e9]))
-    assert np.isclose(abs(got[0, 0]), 0.6)
+    field_values = optics.field_exact(rig, ideal, rig.receivers[0], np.zeros((1, 2)), np.array([78e9]))
+    assert np.isclose(abs(field_values[0, 0]), 0.6)
 
 
 def test_an_empty_scene_has_no_echo_and_offsets_outside_are_refused() -> None:

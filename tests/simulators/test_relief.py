@@ -94,9 +94,9 @@ def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_
     board = rig.receivers[0]
     offsets = np.array([[0.01, -0.02], [0.04, 0.03]])
     f = np.array([77e9, 80e9])
-    got = field_exact(rig, shifted, board, offsets, f)
+    field = field_exact(rig, shifted, board, offsets, f)
     # The image centre does not depend on the distance: both boards' antennas lie at z = 0.
-    assert np.abs(got - field_exact(nearer, distant, board, offsets, f)).max() < 1e-3 * np.abs(got).max()
+    assert np.abs(field - field_exact(nearer, distant, board, offsets, f)).max() < 1e-3 * np.abs(field).max()
 
 
 def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:

@@ -72,12 +72,12 @@ def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
 @pytest.mark.parametrize("key", sorted(OFF))
 @pytest.mark.parametrize("word", ["off", False])
 def test_each_disturbance_can_be_switched_off_alone(key: str, word: object) -> None:
-    got = msgspec.to_builtins(scene(disturbances={key: word}).disturbances)
+    disturbances = msgspec.to_builtins(scene(disturbances={key: word}).disturbances)
     expected = {
         **msgspec.to_builtins(Disturbances()),
         key: msgspec.to_builtins(msgspec.convert(OFF, Disturbances))[key],
     }
-    assert got == expected
+    assert disturbances == expected
 
 
 def test_overrides_merge_with_the_rig_and_twice_is_once(rig: Instrument) -> None:

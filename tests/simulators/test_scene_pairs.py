@@ -85,7 +85,7 @@ def look_up(table: Any, path: tuple[str | int, ...]) -> Any:
 
 
 def draw_value(kind: msgspec.inspect.Type, draw: random.Random) -> Any:
-    """A value of a type: at a limit of it, beyond, or of another type."""
+    """A value of a type: at a limit, beyond it, or of another type."""
     if draw.random() < 0.15:
         return draw.choice((*WRONG_NUMBERS, *WRONG_TYPES))
     if isinstance(kind, msgspec.inspect.UnionType):
@@ -106,7 +106,7 @@ def draw_value(kind: msgspec.inspect.Type, draw: random.Random) -> Any:
 
 
 def change(scene: dict[str, Any], path: tuple[str | int, ...], value: Any) -> None:
-    """Set a key of a scene; a table that another change took away stays away."""
+    """Set a key of a scene, unless another change has removed its table."""
     table: Any = scene
     for key, following in itertools.pairwise(path):
         if isinstance(key, str) and isinstance(table, dict):
@@ -120,7 +120,7 @@ def change(scene: dict[str, Any], path: tuple[str | int, ...], value: Any) -> No
 
 
 def is_small(scene: Path) -> bool:
-    """Whether the simulation of a scene ends soon; refused scenes do."""
+    """True if the simulation of a scene takes little time; that of refused scenes does."""
     try:
         checked = load_scene(scene)
         grid = {**BASE["grid"], **checked.grid}
@@ -133,7 +133,7 @@ def is_small(scene: Path) -> bool:
 
 
 def check_scene(scene: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[str]) -> bool:
-    """Simulate a scene: return whether it was taken; a whole scan, or a message and no scan."""
+    """Simulate a scene: True if it was accepted. Check that the result is a complete scan, or a message and no scan."""
     file = folder / "scene.toml"
     file.write_text(tomli_w.dumps(scene), encoding="utf-8")
     scan = folder / "scan"

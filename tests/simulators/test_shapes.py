@@ -1,4 +1,4 @@
-"""Shapes of scene files: through an entry point, in the simulator's own convention, up to recorded rows."""
+"""Shapes of scene files: through an entry point, in the simulator's sign convention, up to recorded rows."""
 
 import json
 
@@ -24,7 +24,7 @@ def scene(**content: object) -> Scene:
 
 @pytest.fixture
 def worlds_entry_point(tmp_path, monkeypatch):
-    """The worlds' entry point as an installation writes it, whatever this environment was installed from."""
+    """The worlds' entry point as an installation writes it, for any kind of installation of this environment."""
     package = tmp_path / "offers_shapes-1.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Name: offers-shapes\nVersion: 1\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Laws of the wires hub: per-sender order, nothing lost, nothing sent back, nothing unasked for."""
+"""Laws of the wires hub: order per sender, no loss, no echo to the sender, no unrequested messages."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -48,10 +48,10 @@ def serve(tmp_path: Path, reports: list[str]) -> Iterator[Serve]:
 
 def take(client: WireClient, n: int) -> list[WireMessage]:
     """Return the next n messages; fewer if 5 s pass without one."""
-    got: list[WireMessage] = []
-    while len(got) < n and (message := client.receive(5.0)) is not None:
-        got.append(message)
-    return got
+    received: list[WireMessage] = []
+    while len(received) < n and (message := client.receive(5.0)) is not None:
+        received.append(message)
+    return received
 
 
 def test_edges_arrive_in_the_order_of_each_sender(serve: Serve, join: Join) -> None:
@@ -70,11 +70,11 @@ def test_edges_arrive_in_the_order_of_each_sender(serve: Serve, join: Join) -> N
     senders = [threading.Thread(target=send, args=job) for job in ((stage, triggers), (pi, pulses))]
     for thread in senders:
         thread.start()
-    got = take(listener, 2 * n)
+    received = take(listener, 2 * n)
     for thread in senders:
         thread.join()
-    assert [m for m in got if isinstance(m, WireEdge) and m.line == 26] == triggers
-    assert [m for m in got if isinstance(m, WireEdge) and m.line == 22] == pulses
+    assert [m for m in received if isinstance(m, WireEdge) and m.line == 26] == triggers
+    assert [m for m in received if isinstance(m, WireEdge) and m.line == 22] == pulses
     assert listener.receive(0.05) is None
 
 

@@ -1,4 +1,4 @@
-"""Fixtures: stages to talk to. `stage` is one in virtual time with simulated wires, `talker` any of them."""
+"""Fixtures: `stage` is a stage in virtual time with simulated wires, `talker` any kind of stage."""
 
 import os
 import subprocess

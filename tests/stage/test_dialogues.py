@@ -8,12 +8,12 @@
 `-> sealed "body"`   this body with its checksum and line end
 `<- REPLY`           the next reply; # is the number of the last command, #ROW that of the last ROW, ? any value
 `<- silence`         nothing has come
-`.. 100 ms`          let time go on; also `rest`, `press X|Y|E|nothing`, `slip DX DY`, `reset`
+`.. 100 ms`          let time pass; also `rest`, `press X|Y|E|nothing`, `slip DX DY`, `reset`
 
-Lines `->` that follow each other are sent in one go. A real stage does not wait while this machine is busy: so what
-must be sent before something happens there goes in one go, or it has seconds to spare.
+Consecutive lines `->` are sent in one piece. A real stage does not wait while this machine is busy: so bytes that
+must be sent before an event of the stage go in one piece, or have seconds to spare.
 
-Behind them: no flipped bit, lost byte or random bytes make any of these stages move.
+Further tests: no flipped bit, lost byte or random bytes make any of these stages move.
 """
 
 import random

@@ -1,6 +1,6 @@
 """Laws of a row: one trigger at each exact step count, evenly spaced in time, in both directions, and no step lost.
 
-Firmware and Python stand-in obey them, and send the same bytes and edges at the same ticks.
+They hold for firmware and Python stand-in, which send the same bytes and edges at the same ticks.
 """
 
 import itertools

@@ -33,7 +33,7 @@ def pins(text: str) -> dict[str, int]:
 
 
 def test_pinout():
-    """Pins are the published rig's and further ones; the emulated board has the same."""
+    """Pins are those of the published rig and additional ones; the emulated board has the same."""
     published = {"TRIGGER": 2, "LEFT_PUL": 3, "LEFT_DIR": 8, "RIGHT_PUL": 4, "RIGHT_DIR": 9, "X_PUL": 5, "X_DIR": 10}
     board = pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
     assert published.items() <= board.items()
@@ -145,8 +145,8 @@ def test_the_arduino_ide_makes_the_same_image(built: tuple[Path, str], tmp_path:
     command += ["-prefs", "compiler.cpp.extra_flags=-DDECIMAL_DIG=__DECIMAL_DIG__", str(SKETCH / "arduino_stage.ino")]
     compilation = subprocess.run(command, capture_output=True, text=True, check=False)
     assert compilation.returncode == 0, compilation.stderr
-    ours = (built[0] / "arduino_stage.hex").read_bytes()
-    assert (tmp_path / "arduino_stage.ino.hex").read_bytes() == ours
+    our_image = (built[0] / "arduino_stage.hex").read_bytes()
+    assert (tmp_path / "arduino_stage.ino.hex").read_bytes() == our_image
 
 
 def test_sketch_folder_is_what_the_arduino_ide_wants():
@@ -241,16 +241,16 @@ def test_flash(built: tuple[Path, str]):
         pytest.skip("no avrdude: `sudo apt-get install avrdude` runs this too")
     board = BootLoader()
     try:
-        done = flash(built[0], board.port)
+        process = flash(built[0], board.port)
     finally:
         board.close()
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr
     image = read_hex(built[0] / "arduino_stage.hex")
     assert board.flash.startswith(image)
-    assert "verified" in done.stderr
+    assert "verified" in process.stderr
 
 
 def test_flash_asks_for_a_port(built: tuple[Path, str]):
-    done = flash(built[0], "")
-    assert done.returncode != 0
-    assert "make flash PORT=/dev/ttyACM0" in done.stdout
+    process = flash(built[0], "")
+    assert process.returncode != 0
+    assert "make flash PORT=/dev/ttyACM0" in process.stdout

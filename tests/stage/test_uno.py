@@ -29,7 +29,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 def test_random_rows(host, batch: int):
     """Pulses = points, each at its exact step count, both ways, held or not; evenly in time unless held; no step lost.
 
-    A quarter of the rows is held and resumed once or twice at any moment: in travel, in a ramp, between the triggers.
+    A quarter of the rows is held and resumed once or twice at random moments: in travel, in a ramp, between triggers.
     """
     rng = random.Random(batch)
     host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
@@ -112,7 +112,7 @@ def test_backlash_comes_from_below_and_runs_up(host):
 
 
 def test_a_short_hold_is_told_and_costs_no_step(host):
-    """HOLD and RESUME at once: the row is reported as held even if the main program did not see the hold."""
+    """RESUME directly after HOLD: the row is reported as held even if the main program did not see the hold."""
     host.uno.edges.clear()
     host.must_obey("ROW", 3000, 100, 60, 0, 4000)
     while not host.uno.edges:

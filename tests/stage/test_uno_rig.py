@@ -58,6 +58,6 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
 def test_a_time_scale_its_heartbeat_cannot_follow_is_refused(tmp_path: Path):
     with closing(Bench(tmp_path)) as bench:
         options = ("--config", RIG_FILE, "--dir", "rig", "--pattern", "--uno", "--time-scale", "5")
-        done = bench.run(*SIMULATED_RIG, *options)
-    assert done.status == 2
-    assert "--time-scale 5" in done.err
+        process = bench.run(*SIMULATED_RIG, *options)
+    assert process.status == 2
+    assert "--time-scale 5" in process.err

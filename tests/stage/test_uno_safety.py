@@ -1,6 +1,6 @@
-"""Noise on the line and the switches of an emulated UNO with the compiled sketch must move nothing.
+"""Noise on the line and the switches of an emulated UNO with the compiled sketch must not move the stage.
 
-The test turns the emulator's clock (`run_ms`); times are cycles of its processor.
+The test advances the emulator's clock (`run_ms`); times are cycles of its processor.
 """
 
 import random
@@ -107,7 +107,7 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
 
 
 def test_a_program_that_works_is_never_reset(host):
-    """Rows for four seconds, with the longest lines and status requests between: the watchdog's 250 ms never pass."""
+    """Rows for four seconds, with the longest lines and status requests between: the watchdog's 250 ms do not pass."""
     for turn in range(4):
         host.must_obey("ROW", 6000, 40, 150, 400 * (turn % 2), TOP_RATE)
         for _ in range(40):
@@ -137,8 +137,8 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
             host.uno.press(0)
         glitches += 250
         host.uno.rest()
-        (done,) = host.replies()
-        assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
+        (answer,) = host.replies()
+        assert (answer.kind, answer.integer("points"), answer.integer("pulses")) == ("done", points, points)
     rising = [e for e in host.uno.edges if e.value]
     assert [host.at(e) for e in rising[-points:]] == [(4000 + 400 * i, 500) for i in range(points)]
 
@@ -203,6 +203,6 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
 def test_homing_tells_the_steps_that_were_lost(host):
     host.motion("MOVE", 9000, 700, TOP_RATE)
     host.uno.slip(-7, 12)
-    done = host.motion("HOME")
-    assert (done.integer("lostx"), done.integer("losty")) == (-7, 12)
-    assert (host.motion("HOME").integer("lostx"), done.integer("x"), done.integer("y")) == (0, 0, 0)
+    answer = host.motion("HOME")
+    assert (answer.integer("lostx"), answer.integer("losty")) == (-7, 12)
+    assert (host.motion("HOME").integer("lostx"), answer.integer("x"), answer.integer("y")) == (0, 0, 0)

@@ -50,7 +50,7 @@ def may_change(path: tuple[str | int, ...]) -> bool:
 
 
 def does_not_matter(path: tuple[str | int, ...]) -> bool:
-    """The scan goes on with its own, which nobody uses (the stage's port is the Pi's) or a copy of it."""
+    """The scan continues with its own settings that the host does not use (the stage's port), or with a copy."""
     return path[0] == "calibration" or path in (("stage", "port"), ("stage", "baud"))
 
 
@@ -95,7 +95,7 @@ def move_rig(rig: Instrument) -> Instrument:
 
 
 def test_new_connection_settings_hold_from_then_on(undisturbed_scan, tmp_path):
-    """For every reader, and for a later resume that says nothing; what the scan was begun with is still there."""
+    """They hold for readers and for later resumes without options; the first settings are still in the manifest."""
     small = undisturbed_scan.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
     begun = scan.instrument
@@ -125,8 +125,8 @@ def test_another_rig_is_refused_before_anything_is_written(undisturbed_scan, tmp
     table["chirp"] |= {"samples": table["chirp"]["samples"] - 1}
     (tmp_path / "rig.toml").write_text(tomli_w.dumps(table))
     assert main(["resume", str(small.path), "--config", str(tmp_path / "rig.toml")]) == 2
-    said = capsys.readouterr().err
-    assert "grid.columns is 3 in the scan and 5 there" in said
-    assert "chirp.samples" in said
-    assert "pi." not in said.partition("why:")[0]
+    messages = capsys.readouterr().err
+    assert "grid.columns is 3 in the scan and 5 there" in messages
+    assert "chirp.samples" in messages
+    assert "pi." not in messages.partition("why:")[0]
     assert (small.path / "manifest.jsonl").read_bytes() == state_before

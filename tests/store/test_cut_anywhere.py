@@ -1,6 +1,6 @@
-"""Manifest, event log, journal and rows are cut at every byte of their last record, or a bit of it is turned.
+"""Manifest, event log, journal and rows are cut at every byte of their last record, or one bit of it is flipped.
 
-Each time `validate` names what is wrong, or nothing is, and after `resume`, with at most one row taken again, every row
+Each time `validate` names the damage, if there is any; after `resume`, with at most one row retaken, every row
 and the image are those of the undisturbed scan.
 """
 
@@ -39,7 +39,7 @@ def faults(scan: SmallScan, severity: str = "error") -> list[str]:
 
 
 def resume(scan: SmallScan, undisturbed_scan, image: bool = False, damaged_lines: int = 0) -> set[int]:
-    """Resume; everything is as if nothing had been. Returns the rows that were taken again."""
+    """Resume; check that the scan is like an undisturbed one. Returns the rows that were retaken."""
     assert scan.run().exit_status == "success"
     notes = faults(scan, "note")
     assert faults(scan) == []
@@ -49,11 +49,11 @@ def resume(scan: SmallScan, undisturbed_scan, image: bool = False, damaged_lines
         assert scan.image() == undisturbed_scan.final_image
     facts = facts_of(scan.path)
     since = max(i for i, f in enumerate(facts) if f["fact"] == "scan_resumed")
-    again = [f["row"] for f in facts[since:] if f["fact"] == "row_committed"]
-    assert len(again) == len(set(again))
+    resumed = [f["row"] for f in facts[since:] if f["fact"] == "row_committed"]
+    assert len(resumed) == len(set(resumed))
     started = [(e.row.index, e.take) for e in read_events(scan.path / "events.msgpack").events if is_row(e)]
     assert len(set(started)) == len(started), "a take was used twice"
-    return set(again)
+    return set(resumed)
 
 
 def is_row(event: object) -> bool:
@@ -88,8 +88,8 @@ def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
         assert len(named) == 1
         # The last line is cut off, others stay where they are
         is_kept = record == -1 or (record == -2 and end)
-        again = resume(scan, undisturbed_scan, damaged_lines=0 if is_kept else 1)
-        assert again == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
+        resumed = resume(scan, undisturbed_scan, damaged_lines=0 if is_kept else 1)
+        assert resumed == {1: {0, 1} if end else {0}, -2: {2}, -1: set()}[record]
 
 
 def turn(path: Path, bit: int) -> None:
@@ -107,7 +107,7 @@ def ends_of_events(raw: bytes) -> list[int]:
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
 def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
-    """What the host has lost, the Pi's journal has; no row is taken again."""
+    """Events that the host has lost come from the Pi's journal; no row is retaken."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     start = ends_of_events(raw)[-1 - record]
     stop = ends_of_events(raw)[-record]
@@ -196,7 +196,7 @@ def check_resumed_journal(scan: SmallScan, undisturbed_scan, lost: int, rows: se
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
 def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
-    """Never imaged in silence: validate names the file, reading it is refused, resume takes that row again."""
+    """Damaged rows are never imaged: validate names the file, reading it is refused, resume retakes that row."""
     name = f"raw/RV/0001{suffix}"
     raw = (undisturbed_scan.path / name).read_bytes()
     for cut in sample([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):

@@ -1,6 +1,6 @@
 """The host and the Pi are killed, or lose power, at every disk operation; the scan resumes.
 
-In one process, with the code that writes in the instrument; tests/e2e kills real ones.
+In one process, with the code that writes files in the instrument; tests/e2e kills real processes.
 """
 
 import shutil
@@ -24,7 +24,7 @@ pytestmark = [
 
 
 def list_retaken_rows(path: Path) -> set[int]:
-    """Rows that were taken again since the last resume, by the manifest."""
+    """Rows that were retaken since the last resume, by the manifest."""
     facts = facts_of(path)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     return {f["row"] for f in facts[since:] if f["fact"] == "row_committed" and f["take"] > 1}
@@ -44,7 +44,7 @@ def run_until_fault(scan: SmallScan, disk: FaultyDisk) -> bool:
 
 
 def assert_that_it_resumes(scan: SmallScan, undisturbed_scan, where: str) -> None:
-    """Resume the scan: it must end like an undisturbed one, with at most one row taken again."""
+    """Resume the scan: it must end like an undisturbed one, with at most one row retaken."""
     state_before = scan.rows() if scan.begun else {}
     assert scan.run().exit_status == "success", where
     assert validate(scan.path) == [], where
@@ -64,44 +64,44 @@ def list_disk_operations(samples: Samples, folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
 def test_scan_is_killed_at_every_operation(samples, undisturbed_scan, tmp_path, fault, sample):
-    done = list_disk_operations(samples, tmp_path / "count")
-    assert len(done) > 100
+    operations = list_disk_operations(samples, tmp_path / "count")
+    assert len(operations) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
-    for step, seed in sample([(step, seed) for step in range(1, len(done) + 1) for seed in range(draws)], 12):
+    for step, seed in sample([(step, seed) for step in range(1, len(operations) + 1) for seed in range(draws)], 12):
         folder = tmp_path / f"{step}-{seed}"
         scan = SmallScan(samples, folder)
         folder.mkdir()
         assert run_until_fault(scan, FaultyDisk(folder, fault, step, seed))
-        assert_that_it_resumes(scan, undisturbed_scan, f"{fault} at {step} ({done[step - 1]}), seed {seed}")
+        assert_that_it_resumes(scan, undisturbed_scan, f"{fault} at {step} ({operations[step - 1]}), seed {seed}")
         shutil.rmtree(folder)
 
 
 def test_nothing_unsynced_is_relied_on(samples, undisturbed_scan, tmp_path):
-    """Power is cut at and after every sync of a folder and operation on the manifest; all unsynced is lost."""
+    """Power is cut at and after every sync of a folder and operation on the manifest; all unsynced data is lost."""
     folder = tmp_path / "count"
-    done = list_disk_operations(samples, folder)
+    operations = list_disk_operations(samples, folder)
     folders = {f"fsync {path.name}" for path in (folder, *folder.rglob("*")) if path.is_dir()}
     steps = [
         position
-        for position, description in enumerate(done, 1)
+        for position, description in enumerate(operations, 1)
         if description in folders or description.endswith(" manifest.jsonl")
     ]
     assert len(steps) > 16
-    for position in sorted({*steps, *(position + 1 for position in steps if position < len(done))}):
+    for position in sorted({*steps, *(position + 1 for position in steps if position < len(operations))}):
         folder = tmp_path / str(position)
         scan = SmallScan(samples, folder)
         folder.mkdir()
         assert run_until_fault(scan, FaultyDisk(folder, "worst power cut", position))
-        assert_that_it_resumes(scan, undisturbed_scan, f"power cut at {position} ({done[position - 1]})")
+        assert_that_it_resumes(scan, undisturbed_scan, f"power cut at {position} ({operations[position - 1]})")
         shutil.rmtree(folder)
 
 
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
 def test_resume_is_killed_at_every_operation_too(samples, undisturbed_scan, tmp_path, fault, sample):
-    done = list_disk_operations(samples, tmp_path / "count")
-    first = next(i for i, description in enumerate(done, 1) if description == "write 0001.idx")  # within row 1
+    operations = list_disk_operations(samples, tmp_path / "count")
+    first = next(i for i, description in enumerate(operations, 1) if description == "write 0001.idx")  # within row 1
     killed = 0
-    for position in sample(range(1, len(done)), 12):
+    for position in sample(range(1, len(operations)), 12):
         folder = tmp_path / str(position)
         folder.mkdir()
         scan = SmallScan(samples, folder)

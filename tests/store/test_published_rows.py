@@ -37,7 +37,7 @@ def make_plan(by_columns):
 
 
 def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False):
-    """Write random rows; returns the folder and what was sent, {(board, row): bytes of the whole row}."""
+    """Write random rows; return the folder and the sent data, {(board, row): bytes of the whole row}."""
     layout = AuthorsLayout(
         path=folder,
         rig=RIG,
@@ -65,7 +65,7 @@ def packets(*numbers):
 
 
 def check(data, sent):
-    """Nothing is invented; returns what is masked, bool [byte]."""
+    """Check that unmasked bytes are those that were sent; return the mask, bool [byte]."""
     mask = np.zeros(sent.size, bool) if data.mask is None else data.mask
     np.testing.assert_array_equal(data.payload[~mask], sent[~mask])
     assert not data.payload[mask].any()

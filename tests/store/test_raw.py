@@ -57,7 +57,7 @@ def processed_scan(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def scan(processed_scan, tmp_path) -> Path:
-    """A copy of it, to be dropped from."""
+    """A copy of it, whose raw data may be dropped."""
     return Path(shutil.copytree(processed_scan, tmp_path / "scan"))
 
 
@@ -75,8 +75,8 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     products = contents(scan / "products")
     digests = find_processed_digests(scan / "products")
     assert len(payloads(scan)) == ROWS * BOARDS
-    done = polysight("drop-raw", scan, typed="drop\n")
-    assert done.returncode == 0, done.stderr
+    process = polysight("drop-raw", scan, typed="drop\n")
+    assert process.returncode == 0, process.stderr
     assert not payloads(scan)
     said = json.loads(products.pop("quality.json"))
     products_before = contents(scan / "products")
@@ -90,18 +90,18 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert [f["row"] for f in facts] == list(range(ROWS))
     said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
     assert said == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
-    done = polysight("validate", scan)
-    assert (done.returncode, done.stdout.count("note: raw: ")) == (0, 1)
-    assert f"the raw data of {ROWS} rows was dropped after processing into products" in done.stdout
+    process = polysight("validate", scan)
+    assert (process.returncode, process.stdout.count("note: raw: ")) == (0, 1)
+    assert f"the raw data of {ROWS} rows was dropped after processing into products" in process.stdout
     with refused(ErrorCode.NO_DATA, ROWS):
         resume(scan, DEFAULT, keep_incomplete=False, process=True)
     assert contents(scan / "products") == products
     assert drop_raw(scan, None, yes=True) == 0
     assert "dropped already" in capsys.readouterr().out
     assert main(["process", str(scan), "--out", str(scan / "products")]) in (0, NoResult.exit_status)
-    again = json.loads((scan / "products" / "quality.json").read_text())
-    assert again["raw_dropped"] == json.loads(products["quality.json"])["raw_dropped"]
-    assert again["boards"] == dropped["boards"]
+    quality_again = json.loads((scan / "products" / "quality.json").read_text())
+    assert quality_again["raw_dropped"] == json.loads(products["quality.json"])["raw_dropped"]
+    assert quality_again["boards"] == dropped["boards"]
 
 
 def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
@@ -228,12 +228,12 @@ def test_a_scan_in_use_keeps_its_rows(scan):
 
 
 class PowerCut(BaseException):
-    """The program ends here."""
+    """Raised in place of the program's end."""
 
 
 @pytest.mark.parametrize("cut_after", range(ROWS * (BOARDS + 1)))
 def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, monkeypatch, cut_after):
-    """The steps are a line in the manifest and a removal for each board, row after row; it ends before each of them."""
+    """The steps: a line in the manifest and a removal for each board, row after row. The program ends before each."""
     digests = find_processed_digests(scan / "products")
     steps = iter(range(ROWS * (BOARDS + 1)))
     unlink = Path.unlink
@@ -266,7 +266,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
 
 
 def test_what_remains_is_on_the_disk_before_raw_data_is_deleted(scan):
-    """Samples are written without waiting for the disk: a power cut must not take them and the raw data."""
+    """Samples are written without waiting for the disk: a power cut must not destroy both them and the raw data."""
     disk = FaultyDisk(scan)
     with disk():
         drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")

@@ -41,14 +41,14 @@ def test_a_simulated_scan_folder_is_whole(tmp_path: Path, loss: float) -> None:
 def test_both_layouts_read_alike(tmp_path: Path, loss: float, zero_filling: bool) -> None:
     scene = decode_scene(RAW, "t").with_disturbances(packet_loss=loss)
     own_source = open_source(simulate(RIG, scene, tmp_path / "own"))
-    theirs = open_source(simulate(RIG, scene, tmp_path / "a", layout="authors", zero_filling=zero_filling), RIG)
+    authors_source = open_source(simulate(RIG, scene, tmp_path / "a", layout="authors", zero_filling=zero_filling), RIG)
     assert isinstance(own_source, ScanFolder)
-    assert theirs.simulated
-    assert theirs.plan == own_source.plan
-    assert theirs.instrument.chirp == own_source.instrument.chirp
+    assert authors_source.simulated
+    assert authors_source.plan == own_source.plan
+    assert authors_source.instrument.chirp == own_source.instrument.chirp
     for row in own_source.rows():
         for board in ("RH", "RV"):
             a = own_source.read_row(board, row)
-            b = theirs.read_row(board, row)
+            b = authors_source.read_row(board, row)
             assert np.array_equal(a.payload, b.payload)
             assert a.missing == b.missing

@@ -1,4 +1,4 @@
-"""Rows placed again from their packets: different results are committed, equal ones not touched."""
+"""Rows placed again from their packets: different results are committed, equal ones are not written."""
 
 import gc
 import json
@@ -23,7 +23,7 @@ from polysight_shared.raster import plan_raster
 
 
 def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder, bytes]:
-    """One row of each board, with a packet lost and a leftover; `wrong`: as a worse placement masked all of it."""
+    """One row of each board, with a packet lost and a leftover; `wrong`: all masked, as by an earlier release."""
     rig = rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
     size = rig.row_bytes
@@ -90,8 +90,8 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     names = {p.name for p in scan.path.rglob("raw/RH/*")}
     assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS}"}
     assert inspect_placement(scan.path / "raw/RH/0000-1.idx", as_json=True) == 0
-    said = json.loads(capsys.readouterr().out)
-    assert (said["leftover"], said["duplicates"], said["missing"]) == (1, 1, [[9 * 1456, 10 * 1456]])
+    report = json.loads(capsys.readouterr().out)
+    assert (report["leftover"], report["duplicates"], report["missing"]) == (1, 1, [[9 * 1456, 10 * 1456]])
     assert [r.changed for r in replace_rows(scan)] == [False, False]
 
 
@@ -119,7 +119,7 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
 @pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS])
 @pytest.mark.parametrize("other", [False, True])
 def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
-    """One bit of it is turned, or it is another board's."""
+    """One bit of the packet file is flipped, or it is another board's."""
     scan, _ = scan_with(tmp_path / "scan", lost=9)
     path = scan.path / f"raw/RH/0000{suffix}"
     raw = bytearray(path.read_bytes())

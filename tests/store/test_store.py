@@ -42,7 +42,7 @@ def test_manifest_round_trip(some):
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
 def test_flipped_bit_is_never_a_fact(some, data):
-    """One flipped bit in a line: that line is refused, all others stand."""
+    """One flipped bit in a line: only that line is refused."""
     lines = [encode_line(f) for f in some]
     line_number = data.draw(st.integers(0, len(lines) - 1))
     bad = bytearray(lines[line_number])
@@ -149,7 +149,7 @@ def test_validate_names_each_damage(whole_scan, kind):
 
 
 def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed_scan, tmp_path):
-    """They were not synced, and the Pi's journal has them; what was committed may not be damaged."""
+    """Such events were not synced, and the Pi's journal has them; committed data may not be damaged."""
     scan = undisturbed_scan.copy(tmp_path / "scan")
     log = scan.path / "events.msgpack"
     committed = ScanFolder.load(scan.path).facts(RowCommitted)[-1].events.bytes
@@ -190,7 +190,7 @@ def test_notes_damage_nothing(whole_scan):
 
 
 def test_a_scan_that_is_being_recorded_has_not_ended(whole_scan):
-    """Rows to come, the row that is recorded now and a line half written are not faults; a damaged row is one."""
+    """Future rows, the row that is recorded now and a half-written line are not faults; a damaged row is one."""
     lines = (whole_scan / "manifest.jsonl").read_bytes().splitlines(keepends=True)
     (whole_scan / "manifest.jsonl").write_bytes(b"".join(lines[:3]))
     (whole_scan / "raw/RH/0002.part").write_bytes(b"half")

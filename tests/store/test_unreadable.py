@@ -24,29 +24,31 @@ def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
     path = tmp_path / "manifest.jsonl"
     ManifestWriter(path, create=True).close()
 
-    def no_locks(*_: object) -> None:
+    def refuse_lock(*_: object) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(manifest.fcntl, "flock", no_locks)
+    monkeypatch.setattr(manifest.fcntl, "flock", refuse_lock)
     with refused(ErrorCode.FILE_UNWRITABLE, os.strerror(errno.ENOLCK)):
         ManifestWriter(path, create=False)
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE])
-def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypatch, suffix, number):
+@pytest.mark.parametrize("error_number", [errno.EIO, errno.ESTALE])
+def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypatch, suffix, error_number):
     scan = ScanFolder.load(undisturbed_scan.path)
     bad = (undisturbed_scan.path / next(iter(scan.committed_rows()[0].boards.values())).file).with_suffix(suffix)
 
-    def fails(path: Path) -> None:
+    def raise_for_bad(path: Path) -> None:
         if path == bad:
-            raise OSError(number, os.strerror(number))
+            raise OSError(error_number, os.strerror(error_number))
 
-    opened = Path.open
-    read = Path.read_bytes
-    monkeypatch.setattr(Path, "open", lambda path, *how, **more: fails(path) or opened(path, *how, **more))
-    monkeypatch.setattr(Path, "read_bytes", lambda path: fails(path) or read(path))
-    with refused(ErrorCode.FILE_UNREADABLE, os.strerror(number)) as e:
+    path_open = Path.open
+    path_read = Path.read_bytes
+    monkeypatch.setattr(
+        Path, "open", lambda path, *arguments, **options: raise_for_bad(path) or path_open(path, *arguments, **options)
+    )
+    monkeypatch.setattr(Path, "read_bytes", lambda path: raise_for_bad(path) or path_read(path))
+    with refused(ErrorCode.FILE_UNREADABLE, os.strerror(error_number)) as e:
         validation.damaged_rows(scan)
     assert f"polysight resume {undisturbed_scan.path}" in e.value.remedy
     assert [f.where for f in validation.validate(undisturbed_scan.path)] == [
@@ -57,28 +59,28 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypa
 def test_row_whose_file_is_gone_is_taken_again(undisturbed_scan, monkeypatch):
     scan = ScanFolder.load(undisturbed_scan.path)
     missing_file = undisturbed_scan.path / next(iter(scan.committed_rows()[1].boards.values())).file
-    opened = Path.open
+    path_open = Path.open
 
-    def absent(path: Path, *how, **more):
+    def open_unless_missing(path: Path, *arguments, **options):
         if path == missing_file:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
-        return opened(path, *how, **more)
+        return path_open(path, *arguments, **options)
 
-    monkeypatch.setattr(Path, "open", absent)
+    monkeypatch.setattr(Path, "open", open_unless_missing)
     assert list(validation.damaged_rows(scan)) == [1]
 
 
-def needs_space(samples: Samples, folder: Path, whose: str) -> list[int]:
+def list_operations_that_need_space(samples: Samples, folder: Path, disk_of: str) -> list[int]:
     """Numbers of the operations of a scan that need space."""
     folder.mkdir()
-    disk = FaultyDisk(folder / whose)
+    disk = FaultyDisk(folder / disk_of)
     with disk():
         SmallScan(samples, folder).run()
     return [i for i, description in enumerate(disk.done, 1) if description.split()[0] in GROWS]
 
 
-def failure(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
-    """How the scan fails on that disk; None when it does not."""
+def run_on_disk(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
+    """Run the scan on a faulty disk; return its error, None if it has none."""
     try:
         with disk():
             scan.run()
@@ -88,16 +90,16 @@ def failure(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
 
 
 @pytest.mark.parametrize("fault", ["full", "short"])
-@pytest.mark.parametrize("whose", ["scan", "journal"])
-def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_path, sample, fault, whose):
-    writes = 0
-    for position in sample(needs_space(samples, tmp_path / "count", whose), 10):
+@pytest.mark.parametrize("disk_of", ["scan", "journal"])
+def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_path, sample, fault, disk_of):
+    failures = 0
+    for position in sample(list_operations_that_need_space(samples, tmp_path / "count", disk_of), 10):
         folder = tmp_path / str(position)
         folder.mkdir()
         scan = SmallScan(samples, folder)
-        error = failure(scan, FaultyDisk(folder / whose, fault, position))
+        error = run_on_disk(scan, FaultyDisk(folder / disk_of, fault, position))
         if error is not None:
-            writes += 1
+            failures += 1
             assert os.strerror(errno.ENOSPC) in error.what
             assert error.remedy
         committed = set(ScanFolder.load(scan.path).committed_rows()) if scan.begun else set()
@@ -111,11 +113,11 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_
         assert scan.rows() == undisturbed_scan.digests
         assert state_before.items() <= undisturbed_scan.digests.items()
         shutil.rmtree(folder)
-    assert writes > 5
+    assert failures > 5
 
 
 def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_path):
-    """What one call has failed to write, no later call writes by surprise."""
+    """Bytes that one call could not write are not written by a later call."""
     disk = FaultyDisk(tmp_path, "short", at=10**6)
     scan = SmallScan(samples, tmp_path)
     scan.run()

@@ -1,4 +1,4 @@
-"""Untrusted scan folders and files: no path leads out of the folder, and no small file takes much memory."""
+"""Untrusted scan folders and files: no path leads out of the folder, and no small file needs much memory."""
 
 import io
 import json
@@ -100,7 +100,7 @@ def test_only_bytes_that_were_committed_are_dropped(scan):
 
 
 def bomb(path: Path, size: int = 6 << 30) -> Path:
-    """An archive of 64 KB with an array of 6 GB, by what its directory and its header say."""
+    """An archive of 64 KB with an array of 6 GB, by its directory and its header."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as z:
@@ -209,7 +209,7 @@ def test_nothing_is_written_through_a_link(write, tmp_path):
 
 
 def begun_with(scan: ScanFolder, **answer: object) -> Path:
-    """The scan's folder, whose first line says something else."""
+    """The scan's folder, with a changed first line of its manifest."""
     first, *rest = (scan.path / "manifest.jsonl").read_bytes().splitlines(keepends=True)
     fact = {**manifest.decode_line(first.rstrip()), **answer}
     (scan.path / "manifest.jsonl").write_bytes(manifest.encode_line(fact) + b"".join(rest))

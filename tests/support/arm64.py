@@ -20,7 +20,7 @@ PACKAGES = "gcc-aarch64-linux-gnu qemu-user-static"
 
 
 def is_installed() -> bool:
-    """Return True if the cross-compiler and the emulator are here."""
+    """Return True if the cross-compiler and the emulator are installed."""
     return all(shutil.which(name) for name in (COMPILER, EMULATOR))
 
 
@@ -46,10 +46,10 @@ class EmulatedLibrary(Library):
                 message += struct.pack("<qq", -1, argument)
             else:
                 message += struct.pack("<q", argument.nbytes) + argument.tobytes()
-        done = subprocess.run([EMULATOR, self._program, name], input=message, stdout=subprocess.PIPE, check=True)
+        process = subprocess.run([EMULATOR, self._program, name], input=message, stdout=subprocess.PIPE, check=True)
         first = 0
         for argument in given:
             if isinstance(argument, np.ndarray):
-                values = np.frombuffer(done.stdout[first : first + argument.nbytes], argument.dtype)
+                values = np.frombuffer(process.stdout[first : first + argument.nbytes], argument.dtype)
                 first += argument.nbytes
                 argument[...] = values.reshape(argument.shape)

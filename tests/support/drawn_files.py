@@ -1,6 +1,6 @@
 """Write `labels/` and `materials/` files of the published data set with known truth.
 
-Their images and pixels are not imaged but drawn: Fresnel reflection of each box with speckle and phase errors.
+Their images and pixels are random, not simulated scans: Fresnel reflection of each box with speckle and phase errors.
 """
 
 import json

@@ -2,9 +2,9 @@
 
     python killed_at.py HITS OPERATION:SUFFIX:NTH,... polysight scan --out DIR
 
-At the NTH `OPERATION` (pwrite, fsync, rename, ftruncate) on a file whose name ends in SUFFIX the process is gone:
-before it, but a write is half done. This finds the instants that chance hardly ever meets. Every such operation adds
-its line OPERATION:SUFFIX to the file HITS; with NTH 0 that is all.
+At the NTH `OPERATION` (pwrite, fsync, rename, ftruncate) on a file whose name ends in SUFFIX the process is killed:
+before the operation, but within a write. Random kills would hardly ever hit these moments. Every such operation adds
+its line OPERATION:SUFFIX to the file HITS; with NTH 0 nothing else happens.
 """
 
 import os
@@ -39,7 +39,7 @@ def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
 
 
 def main(words: list[str]) -> int:
-    """Run `polysight` or `polysight-pi` with the rest of the words."""
+    """Run `polysight` or `polysight-pi` with the remaining arguments."""
     hits, places, program, *arguments = words
     for place in places.split(","):
         operation, suffix, nth = place.split(":")

@@ -1,4 +1,4 @@
-"""Where things are."""
+"""Paths of the repository and of its parts."""
 
 import sys
 from pathlib import Path

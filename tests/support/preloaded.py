@@ -1,9 +1,9 @@
 """Start our programs as forks of a process that has imported them: an import takes longer than most programs.
 
-`install` replaces `subprocess.Popen` in the process that runs the tests. A command of ours goes to the server, a child
-process with all our modules loaded, no thread and no socket. The program is a fork of it: a real process with its own
-arguments, environment, folder, files, and signals. Every other command, and one whose environment changes how Python
-starts, is started as always.
+`install` replaces `subprocess.Popen` in the process that runs the tests. Commands of ours are sent to the server, a
+child process with all our modules loaded, no thread and no socket. The program is a fork of it: a real process with its
+own arguments, environment, folder, files, and signals. Every other command, and one whose environment changes how
+Python starts, is started as always.
 
 The program is the child of the process that asked, as if that had started it: the server forks twice, the middle one
 ends, and the asking process adopts its orphans meanwhile. Exit status, `getppid` and signals at a parent's end work. So
@@ -188,7 +188,7 @@ def close() -> None:
 
 
 def adopt_orphans(enabled: bool) -> None:
-    """Become the parent of descendants whose parent ends, or no longer."""
+    """Become the parent of descendants whose parent ends, or stop being it."""
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(enabled), 0, 0, 0)
 
 
@@ -219,7 +219,7 @@ def preload() -> None:
 
 
 def serve(connection: socket.socket) -> list[str]:
-    """Fork a program for each request. Return in each program, which is prepared, with its words."""
+    """Fork a program for each request. Return in each program, which is prepared, with its arguments."""
     while True:
         try:
             message, files, _, _ = socket.recv_fds(connection, 1 << 20, 64)
@@ -296,7 +296,7 @@ def become(request: Request, files: list[int], starter: int) -> None:
 
 
 def show_in_process_list(words: list[str]) -> None:
-    """Write the words over this process's own arguments, see proc(5), `arg_start`."""
+    """Write the arguments over this process's own ones, see proc(5), `arg_start`."""
     fields = Path("/proc/self/stat").read_bytes().rpartition(b")")[2].split()
     start = int(fields[45])
     end = int(fields[46])
@@ -335,7 +335,7 @@ def run(words: list[str]) -> int:
 
 
 def end(status: int) -> None:
-    """End as Python does, but for its taking all modules apart, which takes longer than most programs."""
+    """End as Python does, but without deleting all modules, which takes longer than most programs."""
     threading._shutdown()  # type: ignore[attr-defined]
     atexit._run_exitfuncs()
     try:

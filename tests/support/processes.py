@@ -25,7 +25,7 @@ HANG_S = 900.0
 def idle_s() -> float:
     """Seconds that a core of this machine was idle so far, the mean of all.
 
-    Waits are limited by these seconds, not by the clock: what is slow because the machine is busy does not hang.
+    Waits are limited by these seconds, not by the clock: slowness of a busy machine does not count as a hang.
     """
     ticks = Path("/proc/stat").read_text(encoding="ascii").split(maxsplit=5)[4]
     return int(ticks) / os.sysconf("SC_CLK_TCK") / (os.cpu_count() or 1)
@@ -50,7 +50,7 @@ class Ended:
 
 
 def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
-    """Return when the condition holds; fail when the machine has idled for `limit_s` since."""
+    """Return when the condition holds; fail when the machine has idled for `limit_s` meanwhile."""
     deadline = idle_s() + limit_s
     while not condition():
         assert idle_s() < deadline, f"not within {limit_s} s: {what}"
@@ -96,12 +96,12 @@ class Program:
 
     @property
     def out(self) -> str:
-        """What it has written to stdout so far."""
+        """Its stdout so far."""
         return self._out.read_text(encoding="utf-8")
 
     @property
     def err(self) -> str:
-        """What it has written to stderr so far."""
+        """Its stderr so far."""
         return self._err.read_text(encoding="utf-8")
 
     def interrupt(self) -> None:

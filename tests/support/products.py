@@ -64,7 +64,7 @@ def segments(level: str | None) -> list[dict[str, Any]]:
 def judged_products(folder: Path, level: str | None, careless: bool = False, seed: int = 2) -> Path:
     """Write the files; the images are noise of this seed.
 
-    With `careless`, names and permittivities are kept although the verdict allows none.
+    With `careless`, names and permittivities are kept although the verdict withholds them.
     """
     rng = np.random.default_rng(seed)
     h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)

@@ -1,4 +1,4 @@
-"""Scene files small enough for a test: few positions, and a metal plate in the middle or nothing at all."""
+"""Scene files small enough for a test: few positions, and a metal plate in the middle or an empty scene."""
 
 from typing import Any
 

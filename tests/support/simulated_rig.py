@@ -79,7 +79,7 @@ class Rig(Bench):
         wait_for(is_received, f"row {rows} being received")
 
     def committed(self) -> int:
-        """How many rows of the scan are committed."""
+        """Number of committed rows of the scan."""
         with suppress(PolysightError):  # not begun yet
             return len(ScanFolder.load(self.folder / "scan").committed_rows())
         return 0

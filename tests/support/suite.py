@@ -1,11 +1,11 @@
-"""The suite on several cores: who runs what and when, what is made once for all workers, and what tests cost.
+"""The suite on several cores: order of tests, their workers, folders that are made once for all workers, and costs.
 
 A file's tests run in one worker, so that its fixtures are made once. pytest-xdist's own `--dist loadgroup` would do for
-most of it, but it writes its groups into the names of tests, and since pytest 9.2 nothing reads them there: every test
-is a group of its own, without a word (https://github.com/pytest-dev/pytest-xdist/issues/1386).
+most of it, but it writes its groups into the names of tests, and since pytest 9.2 no scheduler reads them there: every
+test is a group of its own, without a warning (https://github.com/pytest-dev/pytest-xdist/issues/1386).
 
-Costs (`--costs`) are processor times of a test's own process and of all programs that it started, also of those that
-still run or that nobody awaited, such as a browser's. On a busy machine they change less than the clock.
+Costs (`--costs`) are processor times of a test's own process and of all programs that it started, including those that
+still run or were not awaited, such as a browser's. On a busy machine they change less than the clock.
 """
 
 import fcntl
@@ -72,7 +72,7 @@ FIRST = (
     "tests/jobs/test_batch.py",
     "tests/serve/test_attack.py",
 )
-"""Files and folders that take longest: begun first, so that no worker ends long after the others."""
+"""Files and folders that take longest. They are begun first, so that no worker ends long after the others."""
 
 
 def worker_group(node_id: str) -> str:
@@ -89,7 +89,7 @@ def longest_first(items: list[pytest.Item]) -> None:
 
 
 class ByFile(LoadScopeScheduling):
-    """Hands out whole files, in the order of collection."""
+    """Distributes whole files to workers, in the order of collection."""
 
     def _split_scope(self, nodeid: str) -> str:
         return worker_group(nodeid)
@@ -101,7 +101,7 @@ class ByFile(LoadScopeScheduling):
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """Folder `name` of this run. The first worker that asks for it has `make` fill it; nobody may change it."""
+    """Folder `name` of this run. The first worker that needs it fills it by `make`; tests must not change it."""
     base = factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
     shared.mkdir(exist_ok=True)
@@ -124,8 +124,8 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 class ProcessTimes:
     """Processor time of this process and of all programs that it started, directly or not.
 
-    A program that was seen once is followed after its parent has ended, too: most processes of a browser are such
-    orphans. What one used until the last call counts when it has ended and nobody of ours can have awaited it.
+    A program that was seen once is followed even after its parent has ended: most processes of a browser are such
+    orphans. An ended one counts with its time at the last call, unless a process of ours may have awaited it.
     """
 
     def __init__(self) -> None:
@@ -203,7 +203,7 @@ class Costs:
     def pytest_runtest_makereport(
         self, call: pytest.CallInfo[None]
     ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-        """Add what a test used to the report of its last phase."""
+        """Add a test's times to the report of its last phase."""
         report = yield
         if call.when != "teardown":
             return report
@@ -214,7 +214,7 @@ class Costs:
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Note what a test used."""
+        """Add a test's times to the sums."""
         for name, spent_s in report.user_properties:
             if name == _NAME:
                 self._add(report.nodeid, spent_s)

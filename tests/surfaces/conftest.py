@@ -1,4 +1,4 @@
-"""Scenes of the worlds as the surfaces take them; simulated, no code shared with the estimator."""
+"""Scenes of the worlds in the form that the surface estimator takes; simulated, no code shared with the estimator."""
 
 from collections.abc import Callable, Sequence
 
@@ -21,7 +21,7 @@ See = Callable[..., Seen]
 
 
 def nominal_optics() -> Optics:
-    """Return the places and polarisations of the published rig's antennas, as the estimator takes them."""
+    """Return the places and polarisations of the published rig's antennas in the estimator's form."""
     boards = published_boards()
     middle = {name: np.mean([rx.position for rx in rxs], axis=0) for name, rxs in boards.receivers().items()}
     tx_m = boards.tx.position

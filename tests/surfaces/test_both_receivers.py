@@ -1,4 +1,4 @@
-"""H / V of a point: both receivers see it from places and under angles of their own. Judge: the series of a sphere."""
+"""H / V of a point, which both receivers see under different angles, compared with the series of a sphere."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ OFFSETS_M = np.array([[0.0, 0, 0], [0.1, 0.05, 0], [-0.1, 0.05, 0], [0.05, -0.1,
 
 
 def see_exactly(solid: WorldShape, optics: Optics) -> tuple[Seen, Shape]:
-    """What both receivers would measure of the specular points without noise, by the exact series at one frequency."""
+    """Noiseless measurements of the specular points by both receivers, by the exact series at one frequency."""
     published = published_boards()
     boards = Boards(
         published.tx,
@@ -97,7 +97,7 @@ def find_pattern(antenna: Antenna, points: np.ndarray, at_m: np.ndarray) -> np.n
 @pytest.mark.parametrize("medium", [2.8 - 0.1j, 4.5 - 0.3j, 8 - 1j], ids=["2.8", "4.5", "8"])
 @pytest.mark.parametrize("axis", [None, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)], ids=["sphere", "upright", "level"])
 def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
-    """Beyond the first order, gains known. It was stated twice as large, and in any direction."""
+    """Beyond the first order, with known gains. The error was once stated twice as large, and in any direction."""
     x, y, z = CENTRE_M[0], CENTRE_M[1], 0.5
     solid: WorldShape = sphere("solid", Stack(below=medium), (x, y, z + 0.1), 0.1)
     if axis is not None:
@@ -120,7 +120,7 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
 
 @pytest.mark.parametrize(("behind_m", "most_std"), [(0.0, 0.03), (0.18, 0.1)], ids=["same distance", "180 mm behind"])
 def test_the_level_of_metal_is_known_as_well_as_both_its_directions_are(behind_m, most_std, gains, optics):
-    """Away from the distance of the reference an arrival goes with another departure: 15 degrees at 180 mm, 7 %."""
+    """At another distance, an arrival angle has another departure angle than in the reference: 15 degrees at 180 mm."""
     learnt = gains(optics)
     x, y, z = CENTRE_M
     seen, shape = see_exactly(sphere("ball", METAL, (x, y, z + behind_m), RADIUS_M), optics)
@@ -133,7 +133,7 @@ def test_the_level_of_metal_is_known_as_well_as_both_its_directions_are(behind_m
 
 
 def test_echoes_have_their_phases_at_the_wave_number_of_the_rig():
-    """At that of the whole sweep, 12 / m beside, H / V turned by 0.009 rad for paths of H and V 0.7 mm apart."""
+    """With that of the whole sweep, off by 12 / m, H / V changed by 0.009 rad for paths of H and V 0.7 mm apart."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     optics = make_optics(rig)
     reduced = reduction(rig.chirp, (0.1, 0.6))

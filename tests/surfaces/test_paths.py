@@ -1,4 +1,4 @@
-"""The path of an echo over a window: what was put in comes out."""
+"""The path of an echo over a window is recovered."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Errors of single points: their regions hold where the segment is quiet and where edges or other echoes ripple."""
+"""Errors of single points: their regions are right in quiet segments and where edges or other echoes ripple."""
 
 from dataclasses import replace
 
@@ -79,7 +79,7 @@ def test_regions_of_points_hold_where_it_is_quiet_and_where_it_ripples(stated_no
 
 
 def test_scatter_that_noise_does_not_explain_may_be_common_to_a_block():
-    """Few blocks of a small plate do not show how far edges move their mean: noise does not move it at all."""
+    """Few blocks of a small plate do not show the shift of their mean by edges; noise does not shift it."""
     x, y = np.meshgrid(np.arange(8) * 0.008, np.arange(20) * 0.008)
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)
     ripple = np.full(len(at_m), 0.05)
@@ -92,9 +92,9 @@ def test_scatter_that_noise_does_not_explain_may_be_common_to_a_block():
     ("ripple", "columns", "rows"), [(0.002, 40, 24), (0.02, 40, 24), (0.02, 12, 20)], ids=["quiet", "wide", "small"]
 )
 def test_a_region_is_as_wide_as_the_points_ripple(ripple, columns, rows):
-    """Ripple as long as a Fresnel zone, 40 mm. While 2 % was expected of all, regions were ten times too wide.
+    """Ripple as long as a Fresnel zone, 40 mm. When 2 % was assumed for all, regions were ten times too wide.
 
-    While ripple was expected to be common to 68 mm, those of small plates were twice too wide.
+    When ripple was assumed to be common to 68 mm, regions of small plates were twice as wide as right.
     """
     x, y = np.meshgrid(np.arange(columns) * 0.008, np.arange(rows) * 0.008)
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -172,7 +172,7 @@ def test_a_wide_object_averages_over_what_a_reference_leaves_and_a_flat_one_does
     ("wave", "least", "most"), [(0.0, 0.0, 0.0012), (0.006, 0.0028, 0.005)], ids=["noise", "gains"]
 )
 def test_noise_of_the_points_of_a_reference_is_no_property_of_its_gains(wave, least, most):
-    """The polynomials average over noise; what they do not follow of the gains is there at every object."""
+    """The polynomials average over noise; gains that they do not follow are the same for every object."""
     x, y = np.meshgrid(np.arange(16) * 0.028, np.arange(14) * 0.028)
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)
     metal = make_voltages(np.zeros(len(at_m)), at_m, 0.0)

@@ -1,4 +1,4 @@
-"""Drawn shapes: place, normal and permittivity come out within what is asked, or no figure is given."""
+"""Drawn shapes: place, normal and permittivity are within the required errors, or no value is given."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -108,7 +108,7 @@ def test_the_error_grows_with_what_is_not_known(glass_ball, gains, optics):
 
 
 def test_scans_of_a_turntable_are_joined_where_the_object_stood(glass_ball):
-    """The same ball, as a table that has turned by 40 degrees shows it, comes back to its place."""
+    """The same ball, scanned on a table that was turned by 40 degrees, is moved back to its place."""
     _, _, surface = glass_ball
     axis = (0.03, 0.55)
     angle = np.radians(40.0)

@@ -1,4 +1,4 @@
-"""A surface that twists in the plane of incidence mixes s and p; the exact series of a cylinder is the judge."""
+"""A surface that twists in the plane of incidence mixes s and p; compared with the exact series of a cylinder."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ DISTANCE_M = 5.0
 
 
 def mix_by_series(eps: complex | None, theta: float, radius_m: float) -> complex:
-    """What p receives of s over the ray's spreading, of a cylinder at 45 degrees to the plane of incidence, y = 0."""
+    """Echo of s in p relative to the ray's spreading, of a cylinder at 45 degrees to the plane of incidence, y = 0."""
     stack = Stack(below=4.0) if eps is None else Stack(below=eps)
     solid = cylinder("solid", stack, (0.0, 0.0, radius_m), radius_m, 10.0, axis=(1.0, 1.0, 0.0))
     ray = np.array([np.sin(theta), 0.0, np.cos(theta)])

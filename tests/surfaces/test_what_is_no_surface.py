@@ -1,4 +1,4 @@
-"""Edges and thin walls: no figure comes from them, and normals are those of the surface."""
+"""Edges and thin walls: they give no permittivity, and normals are those of the surface."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ MEDIUM = 4.2 - 0.4j
 
 
 def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
-    """The plate is seen from two thirds of the grid; from the rest its edges alone are."""
+    """The plate is seen from two thirds of the grid, and only its edges from the rest."""
     board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(2.0, -2.0))
     surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
     _, a, b = board.project(surface.points_m)
@@ -50,7 +50,7 @@ def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
 
 
 def test_edges_alone_give_no_permittivity(see, gains, optics):
-    """So far tilted that no position of the grid sees the plate's mirror point."""
+    """The plate is tilted so far that no position of the grid sees its mirror point."""
     board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(12.0, 0.0))
     surface = analyse_surface(see([board], 64, 44), optics, gains, uncertainty=EXACT)
     assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
@@ -58,7 +58,7 @@ def test_edges_alone_give_no_permittivity(see, gains, optics):
 
 
 def test_an_edge_has_no_level_of_its_own(metal, gains, optics):
-    """What an edge diffracts falls off as 1 / angle from the border of the zone that its surface reflects to."""
+    """The diffraction of an edge falls as 1 / angle from the border of the zone that its surface reflects to."""
     voltages = find_voltages(metal, optics)
     amplitude = np.abs(metal.h.amplitude)
     number = np.zeros(len(metal), int)
@@ -98,7 +98,7 @@ def check_a_thin_wall(see, gains, optics, wall_mm):
 
 
 def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
-    """Below 40 mm nothing has a permittivity; the points of a wall lie off all the same, and its reason says so."""
+    """Below 40 mm no segment has a permittivity; the points of a wall are still displaced, and its reason says so."""
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
     gain = np.exp(learnt.level(voltages))[:, None]
@@ -139,7 +139,7 @@ def receive_wall(voltages, wave_numbers, medium, wall_m):
 
 
 def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, optics):
-    """Walls whose back face hardly shows: with limits of 10 and 2 % some had one, 7 to 15 % off."""
+    """Walls with a weak back face: with limits of 10 and 2 % some had a permittivity, wrong by 7 to 15 %."""
     learnt = gains(optics)
     voltages = find_voltages(metal[np.arange(0, len(metal), 4)], optics)
     flat = 0 * voltages.bend_inside
@@ -262,7 +262,7 @@ def test_ripples_of_edges_do_not_make_a_plate_a_wall(rippled_plane, metal, gains
 def test_points_of_a_wall_say_how_far_they_may_lie_off(least, most):
     """Drawn walls: the path by the matched filter over the band, by the sum of both faces' echoes at 53 degrees.
 
-    Thick ones are among them, whose faces one window just does not resolve.
+    Among them are thick walls, whose faces one window just does not resolve.
     """
     rng = np.random.default_rng(1)
     wave_numbers = 2 * np.pi * np.linspace(76.282e9, 79.749e9, 24) / 299792458

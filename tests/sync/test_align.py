@@ -148,11 +148,11 @@ def test_one_spoiled_chirp_of_16_changes_nothing(burst, how, bad):
         spoiled[:, bad] = np.rint(3000 * np.cos(2 * np.pi * (0.0004 * n + 0.3) * n))[:, None, None]
     without = np.ones(df.shape, bool)
     without[:, bad] = False
-    got = align_row(spoiled, np.ones(df.shape, bool), LINEAR)
+    aligned = align_row(spoiled, np.ones(df.shape, bool), LINEAR)
     expected = align_row(frames, without, LINEAR)
-    np.testing.assert_array_equal(got.good, without)
+    np.testing.assert_array_equal(aligned.good, without)
     # Magnitudes do not depend on the reference chirp.
-    np.testing.assert_allclose(np.abs(average_halves(got)), np.abs(average_halves(expected)), atol=30)
+    np.testing.assert_allclose(np.abs(average_halves(aligned)), np.abs(average_halves(expected)), atol=30)
 
 
 def test_missing_chirps_and_missing_positions(burst):

@@ -64,11 +64,11 @@ def _relative_error(row, ideal, inside=slice(None)):
 
 def test_a_disturbed_row_is_restored_to_the_ideal(row, setup):
     frames, valid, ideal = row()
-    done = synchronise_row(frames, valid, setup)
-    assert done.valid.all()
-    assert (done.chirps == PULSES).all()
+    synchronised = synchronise_row(frames, valid, setup)
+    assert synchronised.valid.all()
+    assert (synchronised.chirps == PULSES).all()
     noise_floor = 10 ** (-12 / 20) / np.sqrt(PULSES) / np.sqrt(2)
-    assert _relative_error(done, ideal) < 1.3 * noise_floor
+    assert _relative_error(synchronised, ideal) < 1.3 * noise_floor
 
 
 def test_offsets_have_no_effect_beyond_noise(row, setup):
@@ -87,15 +87,15 @@ def test_the_high_pass_filter_is_compensated(row, small, setup):
 
 
 def test_errors_shrink_from_received_to_averaged(row, setup):
-    done = synchronise_row(*row()[:2], setup)
-    assert list(done.stages) == ["received", "aligned", "averaged", "referenced"]
-    f, phase, amplitude = zip(*done.stages.values(), strict=True)
+    synchronised = synchronise_row(*row()[:2], setup)
+    assert list(synchronised.stages) == ["received", "aligned", "averaged", "referenced"]
+    f, phase, amplitude = zip(*synchronised.stages.values(), strict=True)
     assert f[0] > 20 * f[1]
     assert f[1] > 1.5 * f[2]
     assert phase[0] > 1 > 20 * phase[1]
     assert phase[1] > phase[2]
     assert amplitude[1] > 1.5 * amplitude[2]
-    np.testing.assert_allclose(done.direct_amplitude, 800, rtol=0.05)
+    np.testing.assert_allclose(synchronised.direct_amplitude, 800, rtol=0.05)
 
 
 def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
@@ -109,15 +109,15 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
     frames = 800 * (frames + noise(frames.shape, -snr_db, rng))
     full_setup = replace(setup, examined=positions)
-    done = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), full_setup)
+    synchronised = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), full_setup)
 
-    echo = (done.samples / 800 - 1).astype(complex)
+    echo = (synchronised.samples / 800 - 1).astype(complex)
     mean = echo.mean(axis=1, keepdims=True)
     tone = estimate_tone((echo * mean.conj()).sum(axis=0).astype(np.complex64))
-    f_hz, rad, _ = done.stages["referenced"]
+    f_hz, rad, _ = synchronised.stages["referenced"]
     assert f_hz == pytest.approx(tone.frequency.std() * rig.chirp.sample_rate_hz / 4, rel=0.15)
     assert rad == pytest.approx(np.angle(tone.amplitude).std(), rel=0.15)
-    assert done.stages["averaged"][2] == pytest.approx(done.direct_amplitude.std() / 800, rel=0.15)
+    assert synchronised.stages["averaged"][2] == pytest.approx(synchronised.direct_amplitude.std() / 800, rel=0.15)
 
 
 def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, noise, setup):
@@ -143,30 +143,30 @@ def test_clipped_and_missing_chirps_are_left_out(row, setup):
     valid[5 * PULSES : 5 * PULSES + 2] = False
     valid[7 * PULSES : 8 * PULSES] = False
     frames[:, ~valid] = 0
-    done = synchronise_row(frames, valid, setup)
-    assert done.chirps.tolist() == [6, 6, 6, 5, 6, 4, 6, 0, 6]
-    assert done.valid.tolist() == [True] * 7 + [False, True]
-    assert not done.samples[:, 7].any()
-    is_valid = done.valid
-    assert np.abs(done.samples[:, is_valid] / 800 - ideal[:, is_valid]).mean() < 0.2
+    synchronised = synchronise_row(frames, valid, setup)
+    assert synchronised.chirps.tolist() == [6, 6, 6, 5, 6, 4, 6, 0, 6]
+    assert synchronised.valid.tolist() == [True] * 7 + [False, True]
+    assert not synchronised.samples[:, 7].any()
+    is_valid = synchronised.valid
+    assert np.abs(synchronised.samples[:, is_valid] / 800 - ideal[:, is_valid]).mean() < 0.2
 
 
 def test_bursts_of_one_chirp(row, setup):
-    """Only the direct path synchronises them; residuals that need two chirps are missing."""
+    """They are synchronised only by the direct path; residuals that need two chirps are missing."""
     frames, valid, ideal = row(snr_db=20)
     single_chirp = replace(setup, pulses=1)
-    done = synchronise_row(frames[:, ::PULSES], valid[::PULSES], single_chirp)
-    assert done.valid.all()
-    assert (done.chirps == 1).all()
-    assert "referenced" not in done.stages
-    assert done.stages["received"][2] < 0.2  # amplitude: noise, and no more
-    assert _relative_error(done, ideal) < 1.3 * 10 ** (-20 / 20)
+    synchronised = synchronise_row(frames[:, ::PULSES], valid[::PULSES], single_chirp)
+    assert synchronised.valid.all()
+    assert (synchronised.chirps == 1).all()
+    assert "referenced" not in synchronised.stages
+    assert synchronised.stages["received"][2] < 0.2  # amplitude: noise, and no more
+    assert _relative_error(synchronised, ideal) < 1.3 * 10 ** (-20 / 20)
 
 
 def test_a_row_without_frames_is_invalid(setup):
-    done = synchronise_row(np.zeros((4, 2 * PULSES, 256), np.complex64), np.zeros(2 * PULSES, bool), setup)
-    assert not done.valid.any()
-    assert done.stages == {}
+    synchronised = synchronise_row(np.zeros((4, 2 * PULSES, 256), np.complex64), np.zeros(2 * PULSES, bool), setup)
+    assert not synchronised.valid.any()
+    assert synchronised.stages == {}
 
 
 @pytest.mark.parametrize("shape", [(3, PULSES, 256), (4, PULSES + 1, 256), (4, PULSES, 128)])

@@ -23,7 +23,7 @@ WIDTHS = (128, 256, 512)
 
 @pytest.fixture(scope="module")
 def library_file(tmp_path_factory):
-    """The library beside the sources if it is up to date; otherwise compiled for this test."""
+    """The library in the folder of the sources if it is up to date; otherwise one that is compiled for this test."""
     with suppress(sync_loops.LoadError):
         sync_loops.Library()
         return build.HERE / build.LIBRARY
@@ -87,10 +87,10 @@ def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, othe
         for k in range(6):
             words = np.full((3, 6, *burst.shape[2:]), 32767 if other == "clipped" else 0, np.int16)
             words[:, k] = burst[:, 0]
-            got = align(by, words, np.ones((3, 6), bool), (0, 192))
-            np.testing.assert_array_equal(got.good, np.arange(6) == np.full((3, 1), k))
-            np.testing.assert_allclose(got.centre, expected.centre, rtol=0, atol=1e-6)
-            np.testing.assert_allclose(got.halves, expected.halves, rtol=0, atol=1e-2)
+            result = align(by, words, np.ones((3, 6), bool), (0, 192))
+            np.testing.assert_array_equal(result.good, np.arange(6) == np.full((3, 1), k))
+            np.testing.assert_allclose(result.centre, expected.centre, rtol=0, atol=1e-6)
+            np.testing.assert_allclose(result.halves, expected.halves, rtol=0, atol=1e-2)
 
 
 def test_a_row_in_pieces_is_the_same_row(loops):
@@ -129,7 +129,7 @@ def test_any_linear_part(loops, rig, linear, filtered):
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
 def test_any_number_of_samples(loops, rig, samples, linear):
-    """Also if samples do not fill whole vectors or blocks."""
+    """The law holds also if samples do not fill whole vectors or blocks."""
     words, valid = bursts(samples=samples), np.ones((5, 6), bool)
     equaliser = make_equaliser(rig)
     assert_equal_rows(
@@ -139,7 +139,7 @@ def test_any_number_of_samples(loops, rig, samples, linear):
 
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
 def test_any_number_of_chirps(loops, rig, chirps):
-    """Sixteen are transformed at once; a single one has no reference."""
+    """Sixteen are transformed together; a single one has no reference."""
     words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
     equaliser = make_equaliser(rig)
     assert_equal_rows(
@@ -158,13 +158,13 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
     words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other chirp, so another reference is tried
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
-    done = align(loops.align, words, valid, (0, 192), make_equaliser(rig))
-    assert_equal_rows(done, align(align_in_numpy, words, valid, (0, 192), make_equaliser(rig)))
-    assert not done.good[1].any()
-    assert not done.good[6].any()
-    assert not done.good[3, [2, 5]].any()
-    assert not done.good[4, 0]
-    for values in done:
+    aligned = align(loops.align, words, valid, (0, 192), make_equaliser(rig))
+    assert_equal_rows(aligned, align(align_in_numpy, words, valid, (0, 192), make_equaliser(rig)))
+    assert not aligned.good[1].any()
+    assert not aligned.good[6].any()
+    assert not aligned.good[3, [2, 5]].any()
+    assert not aligned.good[4, 0]
+    for values in aligned:
         assert np.isfinite(values).all()
 
 
@@ -188,10 +188,10 @@ def test_words_in_another_order_in_memory(loops):
 def test_any_number_of_positions_and_none(loops):
     for positions in (0, 1, 17):
         words, valid = bursts(positions=positions), np.ones((positions, 6), bool)
-        got = align(loops.align, words, valid, (0, 192))
-        assert got.halves.shape == (positions, 2, 4, 48)
+        result = align(loops.align, words, valid, (0, 192))
+        assert result.halves.shape == (positions, 2, 4, 48)
         if positions:
-            assert_equal_rows(got, align(align_in_numpy, words, valid, (0, 192)))
+            assert_equal_rows(result, align(align_in_numpy, words, valid, (0, 192)))
 
 
 def test_the_direct_path(loops, rig, paths, noise, counts):
@@ -205,16 +205,16 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
     aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, make_equaliser(rig))
     path = prepare(rig, board)
     expected = offsets.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
-    got = offsets.reference(aligned, path, rig.chirp, loops)
-    np.testing.assert_array_equal(got.found, expected.found)
-    assert 30 < got.found.sum() < 37
-    is_found = got.found
+    result = offsets.reference(aligned, path, rig.chirp, loops)
+    np.testing.assert_array_equal(result.found, expected.found)
+    assert 30 < result.found.sum() < 37
+    is_found = result.found
     largest = np.abs(expected.samples).max()
-    np.testing.assert_allclose(got.samples, expected.samples, rtol=0, atol=1e-5 * largest)
-    np.testing.assert_allclose(got.noise, expected.noise, rtol=1e-5)
-    np.testing.assert_allclose(got.frequency[is_found], expected.frequency[is_found], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(got.amplitude[is_found], expected.amplitude[is_found], rtol=1e-5)
-    assert got.drift == pytest.approx(expected.drift, rel=1e-3, abs=1e-10)
+    np.testing.assert_allclose(result.samples, expected.samples, rtol=0, atol=1e-5 * largest)
+    np.testing.assert_allclose(result.noise, expected.noise, rtol=1e-5)
+    np.testing.assert_allclose(result.frequency[is_found], expected.frequency[is_found], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(result.amplitude[is_found], expected.amplitude[is_found], rtol=1e-5)
+    assert result.drift == pytest.approx(expected.drift, rel=1e-3, abs=1e-10)
 
 
 @pytest.mark.parametrize("size", [64, 256, 512])
@@ -232,12 +232,12 @@ def test_peaks_and_medians_of_any_spectrum(loops, size):
         "estimator": estimator,
         "steps": 0,
     }
-    got = loops.find(halves, weights, **arguments)
+    result = loops.find(halves, weights, **arguments)
     expected = sync_loops.NumpyLoops.find(halves, weights, **arguments)
-    np.testing.assert_array_equal(got.peaks, expected.peaks)
-    np.testing.assert_array_equal(got.frequency, expected.peaks[0])
-    np.testing.assert_allclose(got.median, expected.median, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(got.estimate, expected.estimate, rtol=1e-4, atol=1e-3)
+    np.testing.assert_array_equal(result.peaks, expected.peaks)
+    np.testing.assert_array_equal(result.frequency, expected.peaks[0])
+    np.testing.assert_allclose(result.median, expected.median, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(result.estimate, expected.estimate, rtol=1e-4, atol=1e-3)
 
 
 def test_three_receivers_are_aligned_in_numpy():

@@ -1,4 +1,4 @@
-"""Decimation passes the scene unchanged and stops what would fall onto it."""
+"""Decimation passes the scene unchanged and suppresses echoes that would alias onto it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The direct path is found beside an equally strong object, with its phase at the Cramer-Rao bound."""
+"""The direct path is found in the presence of an equally strong object, with its phase at the Cramer-Rao bound."""
 
 import msgspec
 import numpy as np
@@ -41,19 +41,19 @@ def run(rig, paths, noise, direct_paths, align_single):
         signal *= np.exp(1j * (2 * np.pi * cycles + phase[:, None]))[:, None]
         if snr_db is not None:
             signal += noise(signal.shape, -snr_db, rng)
-        done = reference(align_single(signal, np.ones(positions, bool)), direct_paths[board.name], rig.chirp)
+        referenced = reference(align_single(signal, np.ones(positions, bool)), direct_paths[board.name], rig.chirp)
         delay = length[0] / SPEED_OF_LIGHT_M_S
-        f_error = (done.frequency - df - rig.chirp.hz_per_sample * delay + 0.5) % 1 - 0.5
+        f_error = (referenced.frequency - df - rig.chirp.hz_per_sample * delay + 0.5) % 1 - 0.5
         middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * CENTRE
-        turn = np.exp(1j * (np.angle(done.amplitude) - phase - 2 * np.pi * middle_hz * delay))
-        return done, f_error * rate, np.angle(turn / turn.mean())
+        turn = np.exp(1j * (np.angle(referenced.amplitude) - phase - 2 * np.pi * middle_hz * delay))
+        return referenced, f_error * rate, np.angle(turn / turn.mean())
 
     return go
 
 
 def test_without_an_object_it_is_exact(run, board):
-    done, f, phase = run(board, echo=0.0)
-    assert done.found.all()
+    referenced, f, phase = run(board, echo=0.0)
+    assert referenced.found.all()
     assert np.abs(f).max() < 0.5
     assert np.abs(phase).max() < 1e-3
 
@@ -71,9 +71,9 @@ def test_a_tone_whose_frequency_still_steps_by_a_fiftieth_of_a_bin_is_not_found(
             removed = loops.NumpyLoops.remove(*arguments)
             return removed._replace(step=np.full_like(removed.step, step_bins / (last - first)))
 
-    done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp, by=Unsettled)
-    assert (done.found == is_found).all()
-    assert (np.abs(done.samples).max() > 0) == is_found
+    referenced = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp, by=Unsettled)
+    assert (referenced.found == is_found).all()
+    assert (np.abs(referenced.samples).max() > 0) == is_found
 
 
 @pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
@@ -91,8 +91,8 @@ def test_a_cube_that_is_mixed_down_may_have_any_if_near_zero(rig, paths, direct_
 @pytest.mark.parametrize("echo", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("echoes", [1, 9])
 def test_the_object_3_to_4_bins_away_does_not_bias_it(run, board, echo, echoes):
-    done, f, phase = run(board, echo=echo, echoes=echoes)
-    assert done.found.all()
+    referenced, f, phase = run(board, echo=echo, echoes=echoes)
+    assert referenced.found.all()
     assert np.abs(f).max() < 12  # Hz: a thousandth of a bin of the linear samples
     assert phase.std() < 1e-3
 
@@ -111,15 +111,15 @@ def test_the_bias_is_small_for_every_object_distance(rig, align_single, board, z
         2j * np.pi * (f * d[..., None] + rng.uniform(size=(n, 1, 1)))
     )
     received *= np.exp(2j * np.pi * 0.3 * np.arange(256))
-    done = reference(align_single(received, np.ones(n, bool)), prepare(rig, board), rig.chirp)
+    referenced = reference(align_single(received, np.ones(n, bool)), prepare(rig, board), rig.chirp)
     true = 0.3 + rig.chirp.hz_per_sample * direct[0] / SPEED_OF_LIGHT_M_S
-    assert done.found.all()
-    assert np.abs(done.frequency - true).max() * rig.chirp.sample_rate_hz < 10
-    assert np.angle(done.amplitude / done.amplitude.mean()).std() < 6e-4
+    assert referenced.found.all()
+    assert np.abs(referenced.frequency - true).max() * rig.chirp.sample_rate_hz < 10
+    assert np.angle(referenced.amplitude / referenced.amplitude.mean()).std() < 6e-4
 
 
 def test_clutter_behind_the_object_hardly_moves_it_and_costs_little_noise(board, direct_paths):
-    """Clutter of any direction: its power in the estimate, against that of a plain mean; noise against one tone's."""
+    """Clutter of any direction: its power in the estimate over that of a plain mean; noise over that of one tone."""
     path = direct_paths[board.name]
     rx, blocks = path.folded_steering.shape
     time = (np.arange(blocks) - (blocks - 1) / 2) * FOLD
@@ -144,25 +144,25 @@ def test_clutter_half_as_strong_0_9_m_behind_it_leaves_its_phase(rig, align_sing
         2j * np.pi * (f * clutter[..., None] + rng.uniform(size=(n, 4, 1)))
     )
     received *= np.exp(2j * np.pi * 0.3 * np.arange(256))
-    done = reference(align_single(received, np.ones(n, bool)), direct_paths[board.name], rig.chirp)
+    referenced = reference(align_single(received, np.ones(n, bool)), direct_paths[board.name], rig.chirp)
     true = 0.3 + rig.chirp.hz_per_sample * direct[0] / SPEED_OF_LIGHT_M_S
-    assert done.found.all()
-    assert np.angle(done.amplitude / done.amplitude.mean()).std() < 2.5e-3
-    assert (done.frequency - true).std() * rig.chirp.sample_rate_hz < 50
+    assert referenced.found.all()
+    assert np.angle(referenced.amplitude / referenced.amplitude.mean()).std() < 2.5e-3
+    assert (referenced.frequency - true).std() * rig.chirp.sample_rate_hz < 50
 
 
 def test_unequal_receivers_do_not_bias_it_much(run, board):
-    done, f, phase = run(board, gain=0.2, echoes=5)
-    assert done.found.all()
+    referenced, f, phase = run(board, gain=0.2, echoes=5)
+    assert referenced.found.all()
     assert f.std() < 25
     assert phase.std() < 2e-3
 
 
 def test_noise_is_near_the_cramer_rao_bound(run, board):
-    done, f, phase = run(board, snr_db=16, positions=600)
+    referenced, f, phase = run(board, snr_db=16, positions=600)
     power, n = 10**-1.6, 192
     f_bound = np.sqrt(power / 2 / (4 * n * (n**2 - 1) / 12)) / 2 / np.pi * 2.15e6
-    assert done.found.all()
+    assert referenced.found.all()
     assert f.std() < 1.2 * f_bound
     assert phase.std() < 1.15 * np.sqrt(power / 2 / (4 * n))
 
@@ -181,10 +181,10 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
     signal = np.exp(2j * np.pi * f * direct[:, None]) + np.exp(2j * np.pi * (f * echo[:, None] + between))
     signal *= np.exp(2j * np.pi * (0.3 * (np.arange(256) - CENTRE) + phase))
     signal += noise(signal.shape, -16, rng)
-    done = reference(align_single(signal, np.ones(trials, bool)), prepare(near, board), near.chirp)
-    error = np.angle(done.amplitude) - 2 * np.pi * phase[:, 0, 0]
+    referenced = reference(align_single(signal, np.ones(trials, bool)), prepare(near, board), near.chirp)
+    error = np.angle(referenced.amplitude) - 2 * np.pi * phase[:, 0, 0]
     error = np.angle(np.exp(1j * error) / np.exp(1j * error).mean())
-    assert done.found.all()
+    assert referenced.found.all()
     assert error.std() < 1.2 * np.sqrt(10**-1.6 / 2 / (4 * 192))
 
 
@@ -195,22 +195,22 @@ def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(rig, paths, d
     strong = np.arange(40) % 8 == 3
     signal = np.where(strong[:, None, None], pure + 8 * (signal - pure), signal)
     signal *= np.exp(2j * np.pi * 0.25 * np.arange(256))
-    done = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
+    referenced = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
     true = 0.25 + rig.chirp.hz_per_sample * length[0] / SPEED_OF_LIGHT_M_S
-    assert done.found.all()
-    assert np.abs(done.frequency - true).max() * 192 < 0.1  # IF bins; the object is 3.5 away
+    assert referenced.found.all()
+    assert np.abs(referenced.frequency - true).max() * 192 < 0.1  # IF bins; the object is 3.5 away
 
 
 def test_the_lower_of_two_peaks_is_used_if_the_object_is_stronger(run, board):
-    done, f, _ = run(board, echo=1.0, direct=0.5, spread_m=0.05)
-    assert done.found.all()
+    referenced, f, _ = run(board, echo=1.0, direct=0.5, spread_m=0.05)
+    assert referenced.found.all()
     assert np.abs(f).max() < 100
 
 
 def test_a_slope_difference_of_the_crystals_is_removed(run, board):
-    done, _, phase = run(board, drift_hz=5.5e3, snr_db=20)
-    assert done.found.all()
-    inside = done.samples / 1000
+    referenced, _, phase = run(board, drift_hz=5.5e3, snr_db=20)
+    assert referenced.found.all()
+    inside = referenced.samples / 1000
     flat = run(board, drift_hz=0.0, snr_db=20)[0].samples / 1000
     assert np.sqrt((np.abs(inside - flat) ** 2).mean()) < 0.05
     assert phase.std() < 0.01
@@ -226,32 +226,32 @@ def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths,
     echo = 0.8 * np.exp(2j * np.pi * f * (excess + length)[:, None] / SPEED_OF_LIGHT_M_S)
     turn = np.exp(1j * (2 * np.pi * 0.3 * np.arange(256) + 2.0))
     received = ((only_direct[0] + echo) * turn)[None].astype(np.complex64)
-    done = reference(align_single(received, np.ones(1, bool)), direct_paths[board.name], rig.chirp)
+    referenced = reference(align_single(received, np.ones(1, bool)), direct_paths[board.name], rig.chirp)
     f = direct_paths[board.name].sweep_hz
     expected = 1 + 0.8 * np.exp(2j * np.pi * f * excess[:, None] / SPEED_OF_LIGHT_M_S)
-    np.testing.assert_allclose(done.samples[:, 0] / 1000, expected, atol=3e-3)
+    np.testing.assert_allclose(referenced.samples[:, 0] / 1000, expected, atol=3e-3)
 
 
-def check_what_is_left(done, path):
-    """The rest has a direct path of the amplitude found and no phase."""
-    samples = done.samples[:, done.found].swapaxes(0, 1)
+def check_what_is_left(referenced, path):
+    """The other positions have a direct path of that amplitude, but no phase."""
+    samples = referenced.samples[:, referenced.found].swapaxes(0, 1)
     left = samples.reshape(len(samples), -1) @ path.estimator[0]
-    size = np.abs(done.amplitude[done.found])
+    size = np.abs(referenced.amplitude[referenced.found])
     np.testing.assert_allclose(left, size, rtol=0, atol=1e-5 * size.max())
 
 
 @pytest.mark.parametrize("echo", [0.0, 1.0, 2.0])
 def test_what_is_left_has_the_direct_path_s_amplitude_and_no_phase(run, direct_paths, board, echo):
-    done, _, _ = run(board, echo=echo, echoes=9, snr_db=10)
-    assert done.found.mean() > 0.95
-    check_what_is_left(done, direct_paths[board.name])
+    referenced, _, _ = run(board, echo=echo, echoes=9, snr_db=10)
+    assert referenced.found.mean() > 0.95
+    check_what_is_left(referenced, direct_paths[board.name])
 
 
 @pytest.mark.parametrize("loop", [None, loops.NumpyLoops])
 def test_of_two_tones_that_look_like_direct_path_and_object_the_one_with_the_row_s_amplitude_is_taken(
     rig, paths, noise, direct_paths, align_single, board, loop
 ):
-    """A tone as far below the direct path as the object lies above it: in most positions the second try finds it."""
+    """A tone as far below the direct path as the object lies above it: in most positions the second search finds it."""
     rng, path = np.random.default_rng(4), direct_paths[board.name]
     signal, _ = paths(board, 60, 0.0, rng)
     signal += noise(signal.shape, -20, rng)
@@ -259,12 +259,12 @@ def test_of_two_tones_that_look_like_direct_path_and_object_the_one_with_the_row
     disturbed = np.arange(5, 60, 7)
     signal[disturbed] += 0.4 * signal[disturbed] * np.exp(-2j * np.pi * below * np.arange(256))
     signal *= np.exp(2j * np.pi * 0.3 * np.arange(256))
-    done = reference(align_single(signal, np.ones(60, bool)), path, rig.chirp, loop)
-    size = np.abs(done.amplitude)
+    referenced = reference(align_single(signal, np.ones(60, bool)), path, rig.chirp, loop)
+    size = np.abs(referenced.amplitude)
     is_usual = np.abs(size / np.median(size) - 1) < 0.1
     assert is_usual[disturbed].sum() > len(disturbed) / 2
-    assert np.ptp(done.frequency[is_usual]) < below / 10
-    check_what_is_left(done, path)
+    assert np.ptp(referenced.frequency[is_usual]) < below / 10
+    check_what_is_left(referenced, path)
 
 
 def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, direct_paths, align_single, board):
@@ -275,9 +275,9 @@ def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, direct_
     signal[9] *= 0.05
     usable = np.ones(40, bool)
     usable[20] = False
-    done = reference(align_single(signal, usable), direct_paths[board.name], rig.chirp)
-    assert np.flatnonzero(~done.found).tolist() == [5, 9, 20]
-    assert not done.samples[:, [5, 9, 20]].any()
+    referenced = reference(align_single(signal, usable), direct_paths[board.name], rig.chirp)
+    assert np.flatnonzero(~referenced.found).tolist() == [5, 9, 20]
+    assert not referenced.samples[:, [5, 9, 20]].any()
 
 
 @pytest.mark.parametrize(("relative", "found"), [(0.35, True), (0.25, False)])
@@ -287,9 +287,9 @@ def test_a_direct_path_below_three_tenths_of_the_rows_is_lost(
     signal, _ = paths(board, 40, 0.0, np.random.default_rng(2))
     signal[9] *= relative
     signal *= np.exp(2j * np.pi * 0.2 * np.arange(256))
-    done = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
-    assert done.found[9] == found
-    assert done.found.sum() == 39 + found
+    referenced = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
+    assert referenced.found[9] == found
+    assert referenced.found.sum() == 39 + found
 
 
 def test_a_row_of_noise_has_no_direct_path(rig, noise, direct_paths, align_single, board):
@@ -300,23 +300,23 @@ def test_a_row_of_noise_has_no_direct_path(rig, noise, direct_paths, align_singl
 @pytest.mark.parametrize(("snr_db", "least", "most"), [(-17, 0.0, 0.05), (-13.5, 0.1, 0.9), (-10.5, 0.95, 1.0)])
 def test_a_direct_path_is_found_from_15_db_over_the_noise_of_its_estimate(run, board, snr_db, least, most):
     """-13.5 dB in a sample of one RX: averaged over 4 RX and 192 samples in a window, 15 dB."""
-    done, _, _ = run(board, echo=0.0, snr_db=snr_db, positions=300)
-    assert least <= done.found.mean() <= most
+    referenced, _, _ = run(board, echo=0.0, snr_db=snr_db, positions=300)
+    assert least <= referenced.found.mean() <= most
 
 
 def test_an_if_outside_the_band_is_masked(rig, paths, direct_paths, align_single, board):
     signal, _ = paths(board, 4, 1.0, np.random.default_rng(2))
     base = rig.chirp.hz_per_sample * 1.39 / SPEED_OF_LIGHT_M_S
     signal *= np.exp(2j * np.pi * (np.array([0.2, 0.5, 0.95, 0.7])[:, None] - base) * np.arange(256))[:, None]
-    done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp)
-    assert done.found.tolist() == [True, True, False, True]
+    referenced = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp)
+    assert referenced.found.tolist() == [True, True, False, True]
     two = msgspec.structs.replace(rig.chirp, if_mode="complex2x")
-    done = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], two)
-    assert done.found.tolist() == [True, False, True, True]
+    referenced = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], two)
+    assert referenced.found.tolist() == [True, False, True, True]
 
 
 def test_the_compiled_search_is_never_given_more_blocks_than_it_has_room_for(rig, align_single, noise, monkeypatch):
-    """It would write beyond its arrays."""
+    """Otherwise the loop would write beyond its arrays."""
     compiled = loops.library()
     if compiled is None:
         pytest.skip("nothing is compiled here")
@@ -338,6 +338,6 @@ def test_the_compiled_search_is_never_given_more_blocks_than_it_has_room_for(rig
         )
         path = prepare(msgspec.structs.replace(rig, chirp=chirp), rig.receivers[0])
         received = noise((3, 4, linear[1]), 0.0, rng) + np.exp(0.5j * np.arange(linear[1]))
-        done = reference(align_single(received, np.ones(3, bool), linear), path, chirp)
-        assert np.isfinite(done.samples).all()
+        referenced = reference(align_single(received, np.ones(3, bool), linear), path, chirp)
+        assert np.isfinite(referenced.samples).all()
     assert blocks_searched == [48, 256]

@@ -69,10 +69,10 @@ def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, rece
     rng = np.random.default_rng(count)
     chosen = choose(count, rng)
     words = make_words(counts, cross(receive_bursts(), chosen, level, rng))
-    got, expected = align(words), align(words, ~chosen)
-    np.testing.assert_array_equal(got.good, ~chosen)
-    np.testing.assert_array_equal(got.halves, expected.halves)
-    assert not got.clipped.any()
+    aligned, expected = align(words), align(words, ~chosen)
+    np.testing.assert_array_equal(aligned.good, ~chosen)
+    np.testing.assert_array_equal(aligned.halves, expected.halves)
+    assert not aligned.clipped.any()
 
 
 @pytest.mark.parametrize("level", [0.2, 0.5, 1.0])
@@ -80,9 +80,9 @@ def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, rec
     rng = np.random.default_rng(9)
     chosen = choose(3, rng)
     quiet = receive_bursts()
-    got = align(make_words(counts, cross(quiet, chosen, level, rng)))
+    aligned = align(make_words(counts, cross(quiet, chosen, level, rng)))
     clean = align(make_words(counts, quiet))
-    deviation = np.abs(got.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
+    deviation = np.abs(aligned.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
     noise = COUNTS * 10 ** (-8 / 20) / np.sqrt(2 * CHIRPS * 4)
     assert np.sqrt((deviation**2).mean()) < noise
 
@@ -110,10 +110,10 @@ def clip(words, limit):
 def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, receive_bursts, counts, limit):
     words = make_words(counts, 8 * receive_bursts(20.0, echo=0.3))
     low = clip(words, int(limit * np.abs(words).max()))
-    got = align(low)
-    assert got.clipped.all()
-    assert not got.good.any()
-    assert not got.halves.any()
+    aligned = align(low)
+    assert aligned.clipped.all()
+    assert not aligned.good.any()
+    assert not aligned.halves.any()
     full = clip(np.rint(words * (32767 / (limit * np.abs(words).max()))), 32767).astype(np.int16)
     assert not align(full).good.any()
 
@@ -123,10 +123,10 @@ def test_clipped_chirps_among_others_are_left_out(align, receive_bursts, counts)
     words = make_words(counts, 2.5 * receive_bursts(20.0))
     loud = clip(4 * words, 7000)
     words = np.where(chosen[..., None, None, None], loud, words)
-    got, expected = align(words), align(words, ~chosen)
-    np.testing.assert_array_equal(got.clipped, chosen)
-    np.testing.assert_array_equal(got.good, ~chosen)
-    np.testing.assert_array_equal(got.halves, expected.halves)
+    aligned, expected = align(words), align(words, ~chosen)
+    np.testing.assert_array_equal(aligned.clipped, chosen)
+    np.testing.assert_array_equal(aligned.good, ~chosen)
+    np.testing.assert_array_equal(aligned.halves, expected.halves)
 
 
 def test_both_forms_leave_out_the_same(receive_bursts, counts):

@@ -58,7 +58,7 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
         ]
         root = ["root=/dev/root", "rootfstype=hostfs", "rootflags=/", "ro", "mem=256M", f"init={HERE / 'init.sh'}"]
         console = ["con=null", "con0=null,fd:1", "quiet"]
-        done = subprocess.run(
+        process = subprocess.run(
             [str(kernel), *root, *console, *options, *program],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -68,8 +68,8 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
             check=False,
             preexec_fn=partial(_prepare_guest, real_time),
         )
-        results = [line.removeprefix("RESULT ") for line in done.stdout.splitlines() if line.startswith("RESULT ")]
-        assert results, f"the guest says:\n{done.stdout[-3000:]}"
+        results = [line.removeprefix("RESULT ") for line in process.stdout.splitlines() if line.startswith("RESULT ")]
+        assert results, f"the guest says:\n{process.stdout[-3000:]}"
         return json.loads(results[0])
 
     return run

@@ -38,9 +38,9 @@ def test_without_reasons_all_is_good():
 def test_json_gives_back_what_was_written():
     verdict = join_reasons(ALL)
     content = {"verdict": verdict.to_dict(), "other": 1}
-    again = read_verdict(content)
-    assert again is not None
-    assert again.to_dict() == verdict.to_dict()
+    reread = read_verdict(content)
+    assert reread is not None
+    assert reread.to_dict() == verdict.to_dict()
     assert all(set(r) == {"what", "why", "do"} for r in content["verdict"]["reasons"])
 
 

@@ -57,8 +57,8 @@ def test_each_disturbance_changes_the_samples_and_repeats(change):
     disturbed = scan(nuisances)
     largest = max(np.abs(disturbed[channel] - quiet[channel]).max() / np.abs(quiet[channel]).max() for channel in quiet)
     assert 0.01 < largest < 2.5
-    again = scan(nuisances)
-    assert all(np.array_equal(disturbed[channel], again[channel]) for channel in quiet)
+    second_scan = scan(nuisances)
+    assert all(np.array_equal(disturbed[channel], second_scan[channel]) for channel in quiet)
 
 
 def test_the_back_of_a_body_is_no_surface_that_is_seen():

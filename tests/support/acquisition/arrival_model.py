@@ -1,4 +1,4 @@
-"""Model of a row's way from SYNC_IN edges to arrival times: frames, a card that queues, stalls, lost packets."""
+"""Model of a row from SYNC_IN edges to arrival times: frames, a card that queues, stalls, lost packets."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ def receive(
     """Return the arrivals, int64 [n, 2] of time (ns) and bytes by then, and when the host reads each burst's event.
 
     `edges_ns` [frame] are the edges that the radar takes for pulses, `pulses_ns` [burst, pulse] those that were sent.
-    `lost` are the numbers of packets that never come. The clocks' offset is drawn; `drift` is their relative rate.
+    `lost` are the numbers of packets that do not arrive. The clocks' offset is drawn; `drift` is their relative rate.
     """
     offset = int(rng.integers(10**10, 10**14))
     sent = edges_ns * (1 + drift) + offset

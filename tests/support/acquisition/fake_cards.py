@@ -19,7 +19,7 @@ def make_payload(board: str, row: int, size: int) -> bytes:
 
 
 class FakeCard:
-    """Answers commands from source port 1024 and sends a row on demand; its counters go on from record to record."""
+    """Answers commands from source port 1024 and sends a row on demand; its counters continue from record to record."""
 
     def __init__(self, board: Board, row_bytes: int) -> None:
         self.board = board
@@ -116,7 +116,7 @@ class FakeCard:
             self.arrivals_ns[self._record_bytes] = self._arrival_ns
 
     def send_row(self, row: int, take: int) -> None:
-        """Send a row at once with the faults of this take, then that the record is completed."""
+        """Send all of a row with the faults of this take, then the status that the record is completed."""
         if not self.recording or self.silent_data:
             return
         data = make_payload(self.board.name, row, self.row_bytes)

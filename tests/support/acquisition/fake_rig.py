@@ -213,7 +213,7 @@ class FakePi:
             )  # fmt: skip
 
     def _send_frames(self, row: Row, take: int) -> None:
-        """Send all frames at once, with the times of a row that has run until now.
+        """Send all frames together, with the times of a row that has run until now.
 
         Bursts are 60 ms apart and pulses 1.5 ms, on the Pi's own clock; a frame arrives 0.1 ms after its pulse.
         """
@@ -279,7 +279,7 @@ class FakeRig:
 def small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
     """The published rig with a small grid and few pulses, on a loopback subnet that is free.
 
-    Each of the three attempts at a command waits for its reply until a test hangs.
+    Each of the three attempts of a command waits for its reply as long as `HANG_S`.
     """
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 3 * HANG_S, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}

@@ -37,7 +37,7 @@ setup_of = functools.cache(lambda board: BoardSetup.from_rig(RIG, RIG.by_name(bo
 
 
 def direct_signal(board, rig=RIG, **disturbances):
-    """What the doctor finds of the direct path in simulated frames of a board."""
+    """The doctor's finding on the direct path in simulated frames of a board."""
     words = simulate_frames(board, rig, **disturbances)
     return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))
 

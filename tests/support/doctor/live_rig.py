@@ -124,7 +124,7 @@ class LiveRig:
 
 @contextmanager
 def answering(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSION) -> Iterator[None]:
-    """Run a fake Pi that answers `hello`, and to every other request that it is at rest."""
+    """Run a fake Pi that answers `hello`, and reports to every other request that it is at rest."""
     rest = m.StatusReply(
         state=hello.state, homed=True, x_mm=0, y_mm=0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
         last_seq=0, fault=0, reason="",

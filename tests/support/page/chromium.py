@@ -1,4 +1,4 @@
-"""Headless Chromium, driven over its DevTools protocol: as much of it as these tests need.
+"""Headless Chromium, driven over its DevTools protocol, with the methods that these tests need.
 
 Protocol: https://chromedevtools.github.io/devtools-protocol/ (Page, Runtime, Emulation).
 """
@@ -27,12 +27,12 @@ PHONE = (390, 844, True)
 
 
 def find_chromium() -> str | None:
-    """The browser's program; None where there is none."""
+    """The browser's program; None if there is none."""
     return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 def find_axe() -> Path | None:
-    """The accessibility checker axe-core, as npm installs it in the checkout; None where it is not."""
+    """The accessibility checker axe-core, as npm installs it in the checkout; None if it is not installed."""
     path = REPO / "node_modules" / "axe-core" / "axe.min.js"
     if not path.is_file():
         return None
@@ -44,7 +44,7 @@ class NavigatedError(Exception):
 
 
 class Browser:
-    """One window of a browser with a profile of its own.
+    """One window of a browser with its own profile.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class Browser:
         self.call("Page.navigate", url=url)
 
     def visit(self, url: str, size: tuple[int, int, bool] = DESK) -> None:
-        """Go to a page, without the errors and requests of the one before."""
+        """Go to a page, and forget errors and requests of the previous one."""
         self.size(*size)
         # A page that differs by its fragment only is not loaded again
         self.open("about:blank")

@@ -1,4 +1,4 @@
-"""Small scans to look at, and watches: fixtures of the rooms `page` and `serve`."""
+"""Small scans, and watches of them: fixtures of the rooms `page` and `serve`."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -40,7 +40,7 @@ def growing(finished: Path, tmp_path: Path) -> GrowingScan:
 
 
 class Watched(Watch):
-    """A watch whose snapshots are waited for."""
+    """A watch with a method that waits for a snapshot."""
 
     def wait_for(self, condition: Callable[[dict[str, Any]], bool]) -> None:
         """Wait until a snapshot meets a condition."""

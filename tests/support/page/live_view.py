@@ -23,14 +23,14 @@ from tests.support.store.facts import facts_of
 
 
 def begin_history(started: dict[str, Any]) -> ScanHistory:
-    """A history of which only the first fact is there."""
+    """A history with only the first fact."""
     content = manifest.parse(manifest.encode_line(started))
     assert content.started is not None
     return ScanHistory(content, content.started)
 
 
 def add_fact(history: ScanHistory, fact: dict[str, Any]) -> None:
-    """Write a further fact, as the history reads it."""
+    """Write a further fact, for the history to read."""
     for new in history.content.feed(manifest.encode_line(fact)):
         history.add_fact(new)
 

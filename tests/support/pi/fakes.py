@@ -1,4 +1,4 @@
-"""Stand-ins around the Pi's program: a stage, its driver, and trigger lines on a clock that tests turn."""
+"""Stand-ins around the Pi's program: a stage, its driver, and trigger lines with a clock set by tests."""
 
 import contextlib
 import math
@@ -57,7 +57,7 @@ class FakeDriver:
 
 
 class FakeLines:
-    """Trigger lines on a clock of their own, `t`, which only sleeps, edges and changes of the output move on.
+    """Trigger lines with their own clock `t`, which is advanced only by sleeps, edges and changes of the output.
 
     `late(n)`: how late the n-th sleep ends; `long(n)`: how long the n-th change of the output takes; nanoseconds.
     """
@@ -137,7 +137,7 @@ ACCEL = 40000
 
 
 def _rest_after(row: Command) -> tuple[int, int]:
-    """Where the stage rests after ROW (docs/spec/stage-line.md), without backlash."""
+    """Position of the stage after ROW (docs/spec/stage-line.md), without backlash."""
     x0, dx, points, y, feed = row.args
     run_up = math.ceil(feed**2 / (2 * ACCEL)) + abs(dx)
     return x0 + (points - 1) * dx + (run_up if dx > 0 else -run_up), y
@@ -245,7 +245,7 @@ class FakeStage:
                     buffer += bytes([c])
 
     def _immediate(self, c: int) -> None:
-        """Obey an immediate byte."""
+        """Execute an immediate byte."""
         self.bytes_seen.append(c)
         if c == Immediate.STATUS:
             if self.held:
@@ -304,7 +304,7 @@ class FakeStage:
         return 0
 
     def _carry_out(self, c: Command) -> None:
-        """Clear an alarm, or start a motion once the one before has ended."""
+        """Clear an alarm, or start a motion after the previous one has ended."""
         if c.verb == "CLEAR":
             self.alarm = 0
         elif c.verb in ("HOME", "MOVE", "ROW", "BUZZ"):

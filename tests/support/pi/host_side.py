@@ -25,9 +25,9 @@ TICK_S = 0.01
 
 
 class TickingClock:
-    """The Pi's clock in this process: each turn of a thread moves it on by `TICK_S`, however long the turn takes.
+    """The Pi's clock in this process: each turn of a thread advances it by `TICK_S`, however long the turn takes.
 
-    So nothing is late because a busy machine holds the process, or gives it little processor time. It stands still
+    So nothing is late because a busy machine gives the process little processor time. It stands still
     while `stands`.
     """
 
@@ -51,7 +51,7 @@ class TickingClock:
                 self._now_s += TICK_S
 
     def sleep(self, seconds: float) -> None:
-        """Return when the clock has moved on by this much."""
+        """Return when the clock has advanced by this much."""
         end_s = self._now_s + seconds
         wait_for(lambda: self._now_s >= end_s, f"{seconds} s of the Pi's clock")
 

@@ -1,4 +1,4 @@
-"""The state machine with a stage, a trigger loop and a journal that tests control, on a clock that they turn."""
+"""The state machine with a stage, a trigger loop and a journal that tests control, with a clock that they set."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Bench:
         self.row = ROW
 
     def run_posted(self) -> None:
-        """Do what machine and trigger loop have posted, as the executor does."""
+        """Execute the items that machine and trigger loop have posted, as the executor does."""
         while self.posted:
             item = self.posted.pop(0)
             if isinstance(item, BurstSent):
@@ -57,7 +57,7 @@ class Bench:
                 item()
 
     def later(self, seconds: float) -> None:
-        """Time goes on, in the executor's turns: until something is due, or the time is over."""
+        """Advance the time in the executor's turns, until something is due or the time is over."""
         end = self.t + seconds
         while self.t < end:
             seconds_left = self.machine.seconds_left()
@@ -89,18 +89,18 @@ class Bench:
         self.stage_says(Reply("status", fields=fields, **times_ns))
 
     def row_done(self, dx: int = 0, dy: int = 0, held: int = 0, extra_pulses: int = 0, **times_ns: int) -> None:
-        """The stage ends the row, this many steps away from where it should, with so many trigger pulses more."""
+        """The stage ends the row, this many steps from its end position, with so many additional trigger pulses."""
         x, y = RowMotion.plan(self.row, self.stage.config, 20.0).end
         fields = {"points": str(self.row.points), "pulses": str(self.row.points + extra_pulses)}
         fields |= {"x": str(x + dx), "y": str(y + dy), "held": str(held)}
         self.stage_says(Reply("done", self.stage.number, fields=fields, **times_ns))
 
     def edge(self) -> None:
-        """Give the next edge at its right time."""
+        """Send the next edge at its right time."""
         self.give_edge(self.edge_ns + INTERVAL_NS)
 
     def give_edge(self, t_ns: int) -> None:
-        """Give an edge to the trigger loop, and its results to the machine."""
+        """Send an edge to the trigger loop, and its results to the machine."""
         self.seqno += 1
         self.edge_ns = t_ns
         self.lines.t = max(self.lines.t, t_ns)

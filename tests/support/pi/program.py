@@ -41,7 +41,7 @@ class Process:
         self.events = self.popen.stdout.readline().split()
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Its exit status and what else it said."""
+        """Wait for the end; return exit status, stdout and stderr."""
         self.popen.send_signal(number)
         out = self.popen.communicate(timeout=HANG_S)
         return self.popen.returncode, *out
@@ -69,15 +69,15 @@ def resident_bytes(pid: int | str = "self") -> int:
 
 def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
     """Any command, to its end."""
-    done = subprocess.run(
+    process = subprocess.run(
         [*PROGRAM, *map(str, args)],
         capture_output=True,
         text=True,
         cwd=REPO,
         env={**os.environ, **environment},
     )
-    assert "Traceback" not in done.stderr
-    return done
+    assert "Traceback" not in process.stderr
+    return process
 
 
 class WiresLog:

@@ -1,4 +1,4 @@
-"""A rig under native control, virtual time, and simulated boards behind words."""
+"""A rig under native control, virtual time, and simulated boards that are reached by words."""
 
 from collections.abc import Sequence
 

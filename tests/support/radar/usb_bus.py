@@ -53,7 +53,7 @@ class Bus(IBackend):
     packet
         Bytes of data a read returns at most, to cut answers anywhere.
     refuses
-        Error number with which interfaces are not given; 0: they are.
+        Error number with which claims of interfaces are refused; 0: they are accepted.
     """
 
     def __init__(self) -> None:
@@ -73,7 +73,7 @@ class Bus(IBackend):
             self.chips.append(chip)
 
     def pull(self, chip: Chip) -> None:
-        """Pull it out."""
+        """Unplug it."""
         chip.plugged = False
 
     # what pyusb calls

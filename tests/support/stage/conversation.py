@@ -14,7 +14,7 @@ PRESSED = {"X": 1, "Y": 2, "E": 4, "nothing": 0}
 
 
 class Conversation:
-    """One conversation with a stage, whose steps are called one after another."""
+    """One conversation with a stage; its steps are played one after another."""
 
     def __init__(self, stage) -> None:
         self.stage = stage

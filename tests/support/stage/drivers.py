@@ -47,7 +47,7 @@ class Driver:
         return
 
     def until(self, there: Callable[[], bool]) -> None:
-        """Wait until this holds for the received bytes. In virtual time it holds now or never."""
+        """Wait until a condition holds for the received bytes. In virtual time no further bytes can come."""
         assert there(), f"received {self.received!r}"
 
     def linger(self) -> None:
@@ -81,7 +81,7 @@ class Driver:
         return reply
 
     def motion(self, verb: str, *args: int) -> tuple[Reply, list[WireMessage]]:
-        """Send a motion command that is accepted, wait for its end; the last reply and what was on the wires."""
+        """Send a valid motion command, wait for its end; return the last reply and the changes of the wires."""
         self.wires.clear()
         reply = self.command(verb, *args)
         assert reply.kind == "ok", reply
@@ -275,9 +275,9 @@ class UnoDriver(Driver):
 class PortDriver(Driver):
     """A stage behind a real serial port, in its own time.
 
-    `speed`: how many times the wall clock the stage's time runs; 1 for a real one. What needs hands on switches is
-    skipped. What has to come is waited for, however long this machine takes; only what must not come has a time. The
-    heartbeat is kept up only as far as the conversation does it.
+    `speed`: rate of the stage's time relative to the wall clock; 1 for a real one. Steps that need hands on switches
+    are skipped. Expected replies are awaited without limit; only the check that none comes has a time. The
+    heartbeat is sent only if the conversation sends it.
     """
 
     def __init__(self, port: str, speed: float = 1.0) -> None:

@@ -20,7 +20,7 @@ COMMANDS = {"pc": ("stage",), "python": ("stage", "--python"), "uno": ("uno",)}
 class StageProcess:
     """`python -m polysight_simulators.stage` or `.uno` at the port `link`.
 
-    Without a `hub` the wires end here: `messages` has what came over them.
+    Without a `hub` the wires end here: `messages` has the messages on them.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class StageProcess:
         return [m for m in self.messages if isinstance(m, WireMotion)]
 
     def end(self, number: int = signal.SIGTERM) -> list[WireMessage]:
-        """End it with a signal; everything that came over the wires."""
+        """End it with a signal; return all messages of the wires."""
         self.process.send_signal(number)
         assert self.process.wait(HANG_S) == 0
         self._listener.join(HANG_S)
@@ -85,7 +85,7 @@ time.sleep(600)
 
 
 def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "") -> bool:
-    """Start a command in another process, kill that process, and return True if the command goes on."""
+    """Start a command in another process, kill that process, and return True if the command continues."""
     arguments = [sys.executable, "-c", PARENT, standard_input, *map(str, command)]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True, cwd=REPO) as parent:
         assert parent.stdout is not None

@@ -1,4 +1,4 @@
-"""The facts of a scan as its file has them."""
+"""The facts of a scan as they are in its file."""
 
 from pathlib import Path
 from typing import Any

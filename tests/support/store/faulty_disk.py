@@ -1,7 +1,7 @@
 """A disk that fails, or a program that is killed, at the n-th operation on one folder.
 
-Only what Python does in this process is seen: every write, fsync, reservation, truncation, and every name made, moved
-or removed below the folder. So a test can count them once and then fail each of them.
+Only Python's operations in this process are counted: every write, fsync, reservation, truncation, and every name made,
+moved or removed below the folder. So a test can count them once and then fail each of them.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ class Killed(BaseException):
 
 
 class FaultyDisk:
-    """Counts what is done below `folder`; with a fault, the `at`-th is hit (from 1).
+    """Counts operations below `folder`; a fault hits the `at`-th of them (from 1).
 
     full
-        It and all that need space after it fail with ENOSPC, until :meth:`free_space`.
+        This and all later operations that need space fail with ENOSPC, until :meth:`free_space`.
     short
-        As full, but a write that is hit writes half of its bytes first, as a disk does whose last block is taken.
+        As full, but the failing write writes half of its bytes first, as on a disk whose last block is used.
     killed, killed within
-        The program ends before it, or in the middle of it.
+        The program ends before the operation, or in the middle of it.
     power cut
-        The same, and what was not synced may be lost: a file may have its old size or its new one, and each of its
+        The same, and unsynced data may be lost: a file may have its old size or its new one, and each of its
         sectors may be old, new or, beyond the old end, zero; names made, moved or removed may be as before. Bytes that
         were synced and not written again are always there.
     worst power cut
@@ -66,11 +66,11 @@ class FaultyDisk:
         self._undo: list[tuple[Path, Callable[[], object]]] = []
 
     def free_space(self) -> None:
-        """The disk takes writes again."""
+        """The disk accepts writes again."""
         self._space = True
 
     def _hit(self, what: str, path: Path, half: Callable[[], object] = lambda: None) -> None:
-        """Count one operation, and fail it when it is its turn."""
+        """Count one operation, and fail it if its number is `at`."""
         if not str(path).startswith(self._folder):
             return
         if self._dead:
@@ -102,7 +102,7 @@ class FaultyDisk:
             del self._durable[path]
 
     def lose_power(self) -> None:
-        """Draw which unsynced changes are left. Names are lost from the newest on: file systems keep their order."""
+        """Draw which unsynced changes remain. Names are lost from the newest on: file systems keep their order."""
         worst = self._fault == "worst power cut"
         for path, durable in self._durable.items():
             if path.exists():
@@ -113,7 +113,7 @@ class FaultyDisk:
             back()
 
     def _draw_content(self, durable: bytes, now: bytes) -> bytes:
-        """Draw what is left of a file: old, new, written in order up to some byte, or each sector old or new."""
+        """Draw the remaining content of a file: old, new, new up to some byte, or each sector old or new."""
         written = self._random.randint(0, len(now))
         content_before = durable + bytes(max(0, len(now) - len(durable)))
         sectors = (slice(k, k + SECTOR_BYTES) for k in range(0, len(now), SECTOR_BYTES))
@@ -142,7 +142,7 @@ class FaultyDisk:
                 self.lose_power()
 
     def _opened(self, file: Any, mode: str = "r", buffering: int = -1, *more: Any, **named: Any) -> Any:
-        """Replace `io.open`: a file below the folder that is opened for writing is one that the disk sees."""
+        """Replace `io.open`: a file below the folder that is opened for writing is counted."""
         path = Path(str(file))
         if isinstance(file, int) or not str(path).startswith(self._folder) or not set(mode) & set("wxa+"):
             return REAL_OPEN(file, mode, buffering, *more, **named)
@@ -239,5 +239,5 @@ class _SeenFile(io.FileIO):
 
 
 def _descriptor_path(fd: int) -> Path:
-    """The path that a descriptor is open at."""
+    """The path of an open descriptor."""
     return Path(f"/proc/self/fd/{fd}").readlink()

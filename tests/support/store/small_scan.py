@@ -1,6 +1,6 @@
 """A scan without processes: the host's own run and resume, the Pi's own journal, and simulated samples.
 
-Everything that is written to a disk is written by the code that writes it in the instrument; only wires, sockets and
+All files are written by the code that writes them in the instrument; only wires, sockets and
 time are left out. A whole scan takes some milliseconds.
 """
 
@@ -59,7 +59,7 @@ class Samples:
 
 
 class SmallPi:
-    """Replaces PiClient: writes the Pi's journal; rows end at once."""
+    """Replaces PiClient: writes the Pi's journal; rows end immediately."""
 
     def __init__(self, instrument: Instrument, folder: Path) -> None:
         self._instrument = instrument
@@ -102,7 +102,7 @@ class SmallPi:
         )  # fmt: skip
 
     def run_row(self, scan_id: str, row_index: int, take: int) -> None:
-        """Journal a whole row at once."""
+        """Journal a whole row."""
         assert scan_id == self._scan_id
         row = self._plan.row(row_index)
         n = self._instrument.burst.pulses
@@ -145,7 +145,7 @@ class SmallPi:
         self._journal.broken = False
 
     def come_to_rest(self, reason: str) -> None:
-        """Do nothing: nothing moves."""
+        """Do nothing: there is no stage."""
 
     def abort(self, reason: str) -> None:
         raise AssertionError(f"nothing asks for an abort here: {reason}")

@@ -22,27 +22,16 @@ if TYPE_CHECKING:
     from polysight.materials import Library, PaperKNeighborsClassifier
     from polysight.polarimetry.xarray_labels import fresnel, multilayer, permittivity_from_ratio
 
-# Public name to the module that it is imported from.
-_HOME = {
-    "Classifier": "polysight.api.classifier",
-    "Library": "polysight.materials",
-    "PaperKNeighborsClassifier": "polysight.materials",
-    "Plan": "polysight.api.functions",
-    "Scan": "polysight.api",
-    "backproject": "polysight.imaging",
-    "check": "polysight.api.functions",
-    "compare": "polysight.api.functions",
-    "fresnel": "polysight.polarimetry.xarray_labels",
-    "multilayer": "polysight.polarimetry.xarray_labels",
-    "open_scan": "polysight.api",
-    "permittivity_from_ratio": "polysight.polarimetry.xarray_labels",
-    "plan": "polysight.api.functions",
-    "plot_check": "polysight.api.functions",
-    "read_netcdf": "polysight.api",
-    "simulate": "polysight.api.functions",
-    "train": "polysight.api.classifier",
-    "write_netcdf": "polysight.api",
+# Module to the public names that are imported from it.
+_NAMES = {
+    "polysight.api": ("Scan", "open_scan", "read_netcdf", "write_netcdf"),
+    "polysight.api.classifier": ("Classifier", "train"),
+    "polysight.api.functions": ("Plan", "check", "compare", "plan", "plot_check", "simulate"),
+    "polysight.imaging": ("backproject",),
+    "polysight.materials": ("Library", "PaperKNeighborsClassifier"),
+    "polysight.polarimetry.xarray_labels": ("fresnel", "multilayer", "permittivity_from_ratio"),
 }
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "Classifier",

@@ -23,6 +23,7 @@ from polysight.capture import (
     receiver_cores,
 )
 from polysight.store import PART
+from polysight_shared.closing import Closing
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.errors import PolysightError
 
@@ -48,7 +49,7 @@ def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int,
     return progress.complete or silent_ns >= silence_ns
 
 
-class CaptureRig:
+class CaptureRig(Closing):
     """Cards and receivers of the recorded boards, by board name; a record is what a card sends from start to stop.
 
     `warnings` lists what differs from the request but suffices to scan. Raises DeviceError if a port is in use, or the
@@ -178,9 +179,3 @@ class CaptureRig:
                 with suppress(PolysightError):
                     card.record_stop()
         self._stack.close()
-
-    def __enter__(self) -> CaptureRig:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -24,6 +24,7 @@ from typing import Literal
 
 import msgspec
 
+from polysight_shared.closing import Closing
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ScanError, quote
 
@@ -180,7 +181,7 @@ def read_start_ticks(pid: int) -> int | None:
     return int(fields[19])
 
 
-class ControlFolder:
+class ControlFolder(Closing):
     """Serve `<folder>/control` for a scan of this program and pass commands to `stop`.
 
     Runs in a thread of its own, so that a slow disk does not stop the scan.
@@ -275,12 +276,6 @@ class ControlFolder:
         self._closed.set()
         if self._thread is not None:
             self._thread.join(_TIMEOUT_S)
-
-    def __enter__(self) -> ControlFolder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _accepted_path(path: Path) -> Path:

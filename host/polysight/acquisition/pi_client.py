@@ -21,6 +21,7 @@ import zmq
 
 from polysight.capture import take_priority
 from polysight_shared import messages as m
+from polysight_shared.closing import Closing
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError, ProtocolError, ScanError
@@ -99,7 +100,7 @@ class RefusedError(ScanError):
         self.number = refusal.number
 
 
-class PiClient:
+class PiClient(Closing):
     """Client of one Pi, for one thread; `instrument` has addresses, keys and limits.
 
     `owner` identifies the runs and jogs that it begins; clients with the same one stop each other's.
@@ -404,12 +405,6 @@ class PiClient:
         if self._heartbeat is not None:
             self._heartbeat.stop()
             self._heartbeat = None
-
-    def __enter__(self) -> PiClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _find_place_mm(status: m.StatusReply, axis: m.Axis) -> float:

@@ -33,6 +33,7 @@ from polysight.capture.network import (
     silent_radar,
 )
 from polysight.capture.receiver import PRIORITY_REMEDY, Core, ReceiverProcess, RowCapture, receiver_cores
+from polysight_shared.closing import Closing
 from polysight_shared.config import Board, Card, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
@@ -53,7 +54,7 @@ DEFAULT_MAC = "12:34:56:78:90:12"
 _MAC_REMEDY = "give six bytes in hexadecimal, the first of them even, e.g. 12:34:56:78:90:13"
 
 
-class CardClient:
+class CardClient(Closing):
     """Client of one capture card.
 
     Parameters
@@ -211,12 +212,6 @@ class CardClient:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-    def __enter__(self) -> CardClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _send_command(self, code: Code, data: bytes = b"") -> None:
         """Send a command, repeated if there is no reply. Raises DeviceError if the card refuses or is silent."""

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight_shared.closing import Closing
 from polysight_shared.config import Board
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DeviceError
@@ -296,7 +297,7 @@ def next_request(connection: Connection) -> Request:
     return _requests.decode(connection.recv_bytes())
 
 
-class ReceiverProcess:
+class ReceiverProcess(Closing):
     """The receiver process of one card: `begin_row`, then `poll` until complete or timeout, then `end_row`.
 
     Attributes `granted_bytes`, `scheduling` and `warnings` as in :class:`Opened`.
@@ -401,12 +402,6 @@ class ReceiverProcess:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-
-    def __enter__(self) -> ReceiverProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _note_answer(self, answer: Answer) -> None:
         """Remember progress; raise a failure as DeviceError."""

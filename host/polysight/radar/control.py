@@ -25,7 +25,6 @@ from contextlib import ExitStack, suppress
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 
 from polysight.radar.board import RadarBoard, State
@@ -35,6 +34,7 @@ from polysight.radar.diagnosis import TracedWords, new_trace, trace_words
 from polysight.radar.firmware import Image, read_image
 from polysight.radar.messages import command, encode
 from polysight.radar.usb import SCHEME, Clock, SystemClock, WordLink, open_tcp, open_usb
+from polysight_shared.closing import Closing
 from polysight_shared.config import Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import ConfigError, DeviceError
@@ -56,7 +56,7 @@ class BoardState(NamedTuple):
     detail: str = ""
 
 
-class RadarControl(ABC):
+class RadarControl(Closing, ABC):
     """The radars of a rig; a context manager that closes the connections."""
 
     @abstractmethod
@@ -71,7 +71,7 @@ class RadarControl(ABC):
     def states(self) -> dict[str, BoardState]:
         """Return the states by board name, without waiting; boards without any information may be missing."""
 
-    def row_begins(self) -> None:  # noqa: B027 - optional
+    def row_begins(self) -> None:
         """Note that pulses may come from now on."""
 
     def wait_done(self, timeout_s: float) -> list[str]:
@@ -83,16 +83,8 @@ class RadarControl(ABC):
         """Return the radars' report for the manifest since the last call; empty if there is none."""
         return {}
 
-    def close(self) -> None:  # noqa: B027 - optional
+    def close(self) -> None:
         """Close the connections; may be called twice."""
-
-    def __enter__(self) -> RadarControl:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 # Time between two queries of the boards (chosen).

@@ -23,6 +23,7 @@ from typing import IO, Any, Literal, TypeVar
 import msgspec
 
 from polysight.store.logs import AppendFile, LogDigest
+from polysight_shared.closing import Closing
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such, quote
 from polysight_shared.files import MAX_JSON_BYTES, open_regular, read_bounded
@@ -566,7 +567,7 @@ def is_being_written(path: Path) -> bool:
     return False
 
 
-class ManifestWriter:
+class ManifestWriter(Closing):
     """Appends facts durably and locks the scan against other programs. A torn last line is cut off.
 
     `create`: make the file, which must not exist; otherwise it must.
@@ -629,9 +630,3 @@ class ManifestWriter:
     def close(self) -> None:
         """Close the file and release the lock. Safe to repeat."""
         self._file.close()
-
-    def __enter__(self) -> ManifestWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -1,13 +1,16 @@
 """Classifiers judged on data that was left out: a split by pixel is optimistic, a split by scan is not."""
 
+from collections import Counter
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, PaperKnn, Weights, fit_weights
-from polysight.materials.library import CHANNELS, Model, Samples, feature_matrix
+from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, PaperKnn, Weights, _LeftOut, fit_weights
+from polysight.materials.library import CHANNELS, Model, Samples, feature_matrix, median_by_patch
 from polysight.materials.train import score, splits
 from polysight_shared.error_codes import ErrorCode
 
@@ -224,3 +227,44 @@ def test_one_strange_specimen_does_not_open_a_material_to_everything():
     moved[strange] += 5 * np.ptp(data.x, axis=0)
     reach = fit_weights(Samples(moved, data.names, data.groups, data.patches)).thresholds
     assert reach["m2"] <= 3 * np.median(list(reach.values())) * (1 + 1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.sampled_from([0.0, np.inf, np.nan]))
+def test_the_median_of_each_patch_is_that_of_its_values_alone(seed, patches, odd_one):
+    rng = np.random.default_rng(seed)
+    patch = rng.permutation(np.concatenate([np.arange(patches), rng.integers(0, patches, 12)]))
+    # Of few values, so that many are alike
+    values = rng.integers(0, 4, patch.size) / 4
+    values[rng.integers(patch.size)] = odd_one
+    expected = [np.median(values[patch == i]) for i in range(patches)]
+    assert np.array_equal(median_by_patch(values, patch), expected, equal_nan=True)
+
+
+@pytest.mark.parametrize("steps", [None, 5])
+def test_pixels_left_out_are_named_by_most_of_the_nearest_of_other_scans(steps):
+    """Written out pixel by pixel; with `steps` many pixels are equally far, and those that vote are any of them."""
+    rng = np.random.default_rng(4)
+    names = np.repeat(np.array(["acrylic", "copper", "rubber"]), 8)
+    scans = np.tile(np.array(["a", "b", "c", "d"]), 6)
+    pixels = Samples(np.ones((24, 4)), names, scans, np.arange(24))
+    distance = rng.random((24, 24))
+    if steps is not None:
+        distance = np.floor(distance * steps)
+    same_scan = scans[:, None] == scans[None, :]
+    surely_right = []
+    possibly_right = []
+    for pixel in range(24):
+        others = np.flatnonzero(~same_scan[pixel])
+        limit = np.sort(distance[pixel, others])[4]
+        nearer = names[others[distance[pixel, others] < limit]]
+        as_far = names[others[distance[pixel, others] == limit]]
+        free = 5 - nearer.size
+        right = set()
+        for chosen in combinations(as_far.tolist(), free):
+            counted = Counter([*nearer.tolist(), *chosen])
+            right.add(min(counted, key=lambda name: (-counted[name], name)) == names[pixel])
+        surely_right.append(right == {True})
+        possibly_right.append(True in right)
+    accuracy = _LeftOut.prepare(pixels, same_scan, 5).accuracy(distance)
+    assert np.mean(surely_right) - 1e-9 <= accuracy <= np.mean(possibly_right) + 1e-9
+    assert steps is not None or np.mean(surely_right) == np.mean(possibly_right)

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.library import Model, NamedScan, Real, Samples, split_by_angle
+from polysight.materials.library import Model, NamedScan, Real, Samples, median_by_patch, split_by_angle
 from polysight.materials.specimens import (
     METAL_SPECIMENS,
     METAL_WITHOUT_ERROR,
@@ -320,8 +320,7 @@ class ErrorDiscriminant(Model):
     def _find_metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
         """Return true for patches 0, 1, ... whose median V / H is nearly 1 under all angles, bool [patch]."""
         q = split_by_angle(x)[2]
-        parts = [q[patch == i] for i in range(patch.max() + 1)]
-        middle = np.stack([np.median(p.real, axis=0) + 1j * np.median(p.imag, axis=0) for p in parts])
+        middle = np.stack([median_by_patch(t.real, patch) + 1j * median_by_patch(t.imag, patch) for t in q.T], axis=1)
         return np.asarray((np.abs(middle - 1) < METAL_WITHOUT_ERROR).all(axis=1), np.bool_)
 
     def _decorrelate_angles(self, covariance: Real) -> Real:

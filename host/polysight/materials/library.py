@@ -565,11 +565,21 @@ def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> 
 
     Its confidence is their share, its distance the median over all of its pixels.
     """
-    ids = np.unique(patches)
-    rows = []
-    for i in ids:
-        pixels = patches == i
-        names, count = np.unique(pixel_names[pixels], return_counts=True)
-        rows.append((names[count.argmax()], count.max() / pixels.sum(), float(np.median(distance[pixels]))))
-    names, share, far = zip(*rows, strict=True)
-    return NamedScan(pixel_names, distance, ids, np.array(names), np.array(share), np.array(far))
+    ids, patch, count = np.unique(patches, return_inverse=True, return_counts=True)
+    names, name_of_pixel = np.unique(pixel_names, return_inverse=True)
+    votes = np.bincount(patch * names.size + name_of_pixel, minlength=ids.size * names.size).reshape(ids.size, -1)
+    share = votes.max(axis=1) / count
+    return NamedScan(pixel_names, distance, ids, names[votes.argmax(axis=1)], share, median_by_patch(distance, patch))
+
+
+def median_by_patch(values: Real, patch: npt.NDArray[np.intp]) -> Real:
+    """Return the median of the values [n] of each patch, [patches]; `patch` [n] are numbers from 0, all of them in use.
+
+    All patches at once: `numpy.median` takes 30 us a call, and scores need it for thousands of patches.
+    """
+    count = np.bincount(patch)
+    in_order = values[np.lexsort((values, patch))]
+    first = np.cumsum(count) - count
+    middle = (in_order[first + (count - 1) // 2] + in_order[first + count // 2]) / 2
+    # Values that are not numbers are sorted to the end.
+    return np.where(np.isnan(in_order[first + count - 1]), np.nan, middle)

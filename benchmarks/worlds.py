@@ -25,6 +25,7 @@ import polysight_worlds as generator
 from polysight.data import find_packaged
 from polysight.imaging import Antennas, Dispersion, Illumination, Images, illumination_geometry
 from polysight.materials import (
+    DISCRIMINANT,
     UNKNOWN,
     Classifier,
     Entry,
@@ -40,7 +41,6 @@ from polysight.materials.kinds import inverse_ratio
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.result import PatchResult
 from polysight.materials.segment import Segmentation
-from polysight.materials.train import fit_library
 from polysight.polarimetry import fresnel
 from polysight.process.quality import scene_reasons
 from polysight.results import join_reasons
@@ -199,7 +199,8 @@ def table_2_classifier(theta_rad: float) -> Classifier:
                 specimen=f"{name} {piece}",
             )
             entries.append(entry)
-    return Classifier(fit_library(Library(tuple(entries))))
+    # The library is not judged: that takes longer than a scene, and no name depends on it.
+    return Classifier(Library(tuple(entries)), model=DISCRIMINANT)
 
 
 def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illumination:

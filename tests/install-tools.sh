@@ -3,7 +3,15 @@
 set -u
 missing=()
 lean=()  # installed without what Debian recommends beside them: a browser would bring half a desktop
-command -v chromium >/dev/null || lean+=(chromium fonts-dejavu-core)
+# A browser: in Debian the one without windows, which takes half the processor time.
+if ! command -v chromium-headless-shell >/dev/null; then
+  whole=$(command -v chromium)
+  if apt-cache show chromium-headless-shell >/dev/null 2>&1 && { [ -z "$whole" ] || [ "$(id -u)" -eq 0 ]; }; then
+    lean+=(chromium-headless-shell fonts-dejavu-core)
+  elif [ -z "$whole" ]; then
+    lean+=(chromium fonts-dejavu-core)
+  fi
+fi
 command -v g++ >/dev/null || missing+=(g++)
 command -v make >/dev/null || missing+=(make)
 command -v gcc >/dev/null || missing+=(gcc libc6-dev)

@@ -51,6 +51,7 @@ CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_co
 LAWS := tests/house/test_rooms.py tests/shared tests/polarimetry tests/sync/test_tone.py tests/imaging/test_direct.py
 
 mutants: $(VENV)/installed  ## change the code at 100 random places: do the tests notice? (hours; COUNT=100 SEED=1)
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --group mutants
 	$(BIN)/python -m tests.mutants --count $(or $(COUNT),100) --seed $(or $(SEED),1)
 
@@ -68,6 +69,7 @@ check: $(VENV)/installed  ## lint, format, types, import contracts
 	$(BIN)/lint-imports
 
 bench: $(VENV)/installed  ## speed as ratios, measured side by side in one run
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --group bench
 	$(BIN)/python -m benchmarks --out $(OUT)/bench
 

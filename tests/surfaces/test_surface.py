@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.kept import assert_kept, summarise_array
 from tests.support.refusals import refused
 
 from polysight.data import find_packaged
@@ -50,6 +51,13 @@ def test_points_and_normals_of_a_sphere_are_found(glass_ball):
     angle = np.degrees(np.arccos(np.clip((normals * surface.normals).sum(axis=1), -1, 1)))
     assert np.median(np.abs(distance)) < 0.5e-3
     assert np.median(angle) < 0.5
+
+
+def test_the_surface_of_a_sphere_changes_only_on_purpose(glass_ball):
+    _, _, surface = glass_ball
+    arrays = {name: value for name, value in vars(surface).items() if isinstance(value, np.ndarray)}
+    figures = {name: summarise_array(value) for name, value in arrays.items() if value.dtype.kind in "bfc"}
+    assert_kept(Path(__file__).parent / "kept" / "glass-ball.json", figures)
 
 
 def test_the_permittivity_of_a_sphere_is_found_within_its_error(glass_ball):

@@ -1,19 +1,22 @@
 """The serial link against a pty, and a port whose opening resets an UNO (DTR)."""
 
+import itertools
 import json
 import os
 import queue
 import subprocess
 from contextlib import closing
+from types import SimpleNamespace
 
 import msgspec
 import pytest
 from tests.support.pi.fakes import FakeStage
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.rigs import at_stage_port
+from tests.support.rigs import at_stage_port, published_rig
 from tests.support.stage.processes import StageProcess
 
+from polysight_pi import stage
 from polysight_pi.cli import main
 from polysight_pi.stage import BenchStage, StageLink, StageLost, StageLostError, StageRefusedError
 from polysight_shared.error_codes import ErrorCode
@@ -196,3 +199,24 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
 
         wait_for(is_lost, "the stage's reset")
         assert "polysight-pi home" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "tries"), [(StageError.BUSY, 7), (StageError.LIMIT_SWITCH, 1)])
+def test_a_moving_stage_is_asked_again_to_clear_its_alarm_for_three_seconds(number, tries, monkeypatch):
+    """Another refusal is final. The clock stands half a second later at each look."""
+    asked = []
+    stops = []
+
+    def refuse(verb):
+        asked.append(verb)
+        raise StageRefusedError(verb, number)
+
+    clock = itertools.count(0, 0.5)
+    monkeypatch.setattr(stage.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(stage.time, "sleep", lambda _: None)
+    driver = stage.StageDriver(published_rig().stage, print)
+    driver._open_link = SimpleNamespace(request=refuse, send_byte=stops.append)
+    with pytest.raises(StageRefusedError):
+        driver.clear(stop=True)
+    assert asked == ["CLEAR"] * tries
+    assert stops == [Immediate.STOP] * (tries - 1)

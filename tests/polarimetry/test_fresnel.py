@@ -26,6 +26,13 @@ def test_permittivity_is_the_same_for_p_and_its_reciprocal(modulus, phase, theta
     assert permittivity_from_ratio(1 / p, theta) == pytest.approx(permittivity_from_ratio(p, theta), rel=1e-9)
 
 
+@given(st.floats(0.01, 60.0), angle)
+def test_a_medium_without_loss_is_the_limit_of_little_loss(re, theta):
+    """Also where it reflects totally: the root whose wave decays is taken."""
+    for exact, little in zip(fresnel(re + 0j, theta), fresnel(re - 1e-12j, theta), strict=True):
+        assert exact == pytest.approx(little, abs=1e-4)
+
+
 @given(real_part, loss, angle)
 def test_passive_media_reflect_at_most_all_power(re, im, theta):
     r_s, r_p = fresnel(re - 1j * im, theta)

@@ -224,3 +224,13 @@ def test_every_constraint_is_tested(rig):
     tested |= {"frames", "pulse gap", "LDO bypass of RH", "IF budget of RH"}
     general = {c.name for c in constraints(rig, FRAMES) if not c.name.endswith((" of LS", " of RV"))}
     assert general == tested
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("size", "is_usable"), [(1e29, True), (1.1e30, False), (math.inf, False), (math.nan, False)])
+def test_a_number_that_no_radar_has_is_named_alone(rig, sign, size, is_usable):
+    receiver = rig.receivers[0]
+    strange = msgspec.structs.replace(receiver, start_offset_hz=sign * size)
+    boards = tuple(strange if b is receiver else b for b in rig.boards)
+    names = [c.name for c in constraints(msgspec.structs.replace(rig, boards=boards), 4) if not c.holds]
+    assert (names == [f"boards.{receiver.name}.start_offset_hz"]) == (not is_usable)

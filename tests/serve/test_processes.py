@@ -20,7 +20,7 @@ from tests.support.refusals import refused
 
 from polysight.serve.door import MOST_SILENT, is_command
 from polysight.serve.guard import TOKEN_HEADER
-from polysight.serve.server import Place, load_token, serve
+from polysight.serve.server import TOKEN_BYTES, Place, load_token, serve
 from polysight_shared.error_codes import ErrorCode
 
 
@@ -239,6 +239,12 @@ def test_the_token_survives_a_restart_and_nobody_else_can_read_it(scans, tmp_pat
     path.chmod(0o644)
     with refused(ErrorCode.VALUE_INVALID, path):
         load_token()
+    path.chmod(0o600)
+    path.write_text(token[: TOKEN_BYTES - 1])
+    with refused(ErrorCode.VALUE_INVALID, path):
+        load_token()
+    path.write_text(token[:TOKEN_BYTES])
+    assert load_token() == token[:TOKEN_BYTES]
 
 
 def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):

@@ -35,8 +35,7 @@ from ophyd_async.core import (
 from polysight.acquisition import ControlFolder, ScanProgress, ScanResult, StopRequest, run_scan
 from polysight.store import MANIFEST, ScanFolder
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, ScanError
+from polysight_shared.errors import ConfigError, ErrorCode, ScanError
 
 ROWS = "rows"
 _KEYS = ("row", "take", "pulses", "missing_bytes")

@@ -24,8 +24,7 @@ from polysight_pi.lines import (
 from polysight_pi.stage import BenchStage
 from polysight_pi.trigger import MIN_PART, BurstSpec, spi_burst
 from polysight_shared.config import Instrument, Pi
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError, os_error
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, os_error
 from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight_shared.sockets import is_loopback, make_server_context, publisher, replier

@@ -20,8 +20,7 @@ from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.stage import MOTION_TIMEOUT_S
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, os_error
+from polysight_shared.errors import DeviceError, ErrorCode, os_error
 from polysight_shared.sockets import Socket, requester, subscriber
 
 # A program that does not accept a connection in this time counts as not running (chosen).

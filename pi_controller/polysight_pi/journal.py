@@ -30,8 +30,7 @@ from typing import Any, BinaryIO, NamedTuple
 import msgspec
 
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, ProtocolError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError, ProtocolError
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.raster import RasterPlan
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.sockets import HOST_KEYS
 
 # Names of the two pairs of keys that `make_keys` makes.

@@ -21,8 +21,7 @@ from typing import Any
 
 from polysight_pi.trigger import DEFAULT_BUFSIZ, Edge, Lines, Seen, SpiBurst
 from polysight_shared.config import Instrument, Pi
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.messages import GPIOD, SPI, WIRES
 from polysight_shared.wires import WireClient, WireEdge

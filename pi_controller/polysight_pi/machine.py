@@ -23,8 +23,7 @@ from polysight_pi.rules import END_TIMEOUT_S, MOVING, RULES, TIMEOUTS_S, WIRE_ST
 from polysight_pi.stage import MAX_MM, StageDriver, StageLostError, StageRefusedError
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop, TriggerWatch
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError, ProtocolError
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply

@@ -30,8 +30,7 @@ from polysight_pi.stage import StageDriver
 from polysight_pi.trigger import TriggerLoop
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ProtocolError, VersionError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, PolysightError, ProtocolError, VersionError
 from polysight_shared.faults import PiFault
 from polysight_shared.program import die_with_parent
 from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier

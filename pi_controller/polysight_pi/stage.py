@@ -21,8 +21,7 @@ import msgspec
 import serial
 
 from polysight_pi.edges import RowMotion
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, ProtocolError
+from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError
 from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import INVERTIBLE, Stage
 from polysight_shared.stage_line import (

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.error_codes import ErrorCode as ErrorCode
 
 
 class PolysightError(Exception):

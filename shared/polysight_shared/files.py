@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError
+from polysight_shared.errors import DataError, DeviceError, ErrorCode
 
 # A hundred times the manifest of a scan of ten thousand rows.
 MAX_JSON_BYTES = 256 << 20

@@ -6,8 +6,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError
+from polysight_shared.errors import ErrorCode, PolysightError
 
 Level = Literal["ok", "note", "warning", "error"]
 """`ok`: checked and right. `note`: worth knowing. `warning`: usable with care. `error`: does not work, or no result."""

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal
 import msgpack
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ProtocolError, VersionError
+from polysight_shared.errors import ErrorCode, ProtocolError, VersionError
 from polysight_shared.raster import RasterPlan, Row
 
 # "major.minor": a new major number whenever older programs could not read a message.

@@ -11,8 +11,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.tables import Count, NonNegative, Positive, Section, require
 from polysight_shared.units import us_to_ns
 

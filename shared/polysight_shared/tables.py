@@ -12,8 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, did_you_mean
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, did_you_mean
 from polysight_shared.files import read_bounded
 
 # Chosen: far above any table written by hand.

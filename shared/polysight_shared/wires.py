@@ -22,8 +22,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, ProtocolError
+from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError
 
 
 class WireEdge(NamedTuple):

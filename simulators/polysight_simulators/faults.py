@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.tables import decode, read_toml
 
 Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]

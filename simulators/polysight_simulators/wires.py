@@ -20,8 +20,7 @@ from contextlib import closing
 from pathlib import Path
 from threading import Event
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, ProtocolError
 from polysight_shared.wires import WireMotion, parse
 from polysight_simulators.process import announce_ready, command_line, run_until_stopped
 

@@ -28,7 +28,7 @@ from polysight.acquisition.control import (
 )
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.fixture

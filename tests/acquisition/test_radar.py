@@ -16,8 +16,7 @@ from polysight.acquisition.scan import run_scan
 from polysight.radar.control import LINE, BoardState, Endless, LineServers, RadarControl, RadarState, radar_control
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.config import Instrument, Radar
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.tables import decode, to_builtins
 
 

@@ -17,7 +17,7 @@ from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.doctor.rig_checks import check_time
 from polysight.planning.forecast import forecast
 from polysight.store.scan_folder import ScanFolder
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 

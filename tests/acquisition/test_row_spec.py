@@ -12,7 +12,7 @@ from polysight.capture.dca1000 import Code
 from polysight.radar.control import RadarControl, RadarState
 from polysight_shared import messages
 from polysight_shared.config import Radar
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 SPEC = (REPO / "docs/spec/row.md").read_text(encoding="utf-8")
 

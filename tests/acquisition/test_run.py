@@ -27,8 +27,7 @@ from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.config import Board
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError
+from polysight_shared.errors import ErrorCode, ScanError
 from polysight_shared.messages import Capture, RunStarted, RunStopped
 
 

@@ -25,8 +25,7 @@ from polysight.settings import DEFAULT
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError, ScanError, os_error
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, ScanError, os_error
 from polysight_shared.faults import explain
 
 

@@ -21,7 +21,7 @@ from polysight.acquisition.progress import NICE
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.store.validation import validate
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def limit_rows(instrument, **limits):

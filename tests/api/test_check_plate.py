@@ -13,7 +13,7 @@ import polysight
 from polysight.cli.main import main
 from polysight.results import WARNING_SIGMAS, PatchFigures, PermittivityFigures, check_plate, check_reasons
 from polysight_shared.config import CheckPlate
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 from .conftest import PET
 

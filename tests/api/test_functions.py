@@ -14,8 +14,7 @@ import polysight
 from polysight import compare, fresnel, multilayer, open_scan, permittivity_from_ratio
 from polysight.planning import Changes
 from polysight.products.processed import read_image
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 
 from .conftest import COPPER, PET, simulate_plates
 

@@ -15,7 +15,7 @@ from polysight.polarimetry import correct_leakage, specular_incidence_rad
 from polysight.products import ProcessedScan, permittivity_dataset
 from polysight.results import ErrorBudget, IncidenceError, LeakageError, ScanFacts, ScanMaterials, ScanQuality, to_plain
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 LEAKAGE_H = 0.05 - 0.02j
 LEAKAGE_V = -0.03 + 0.06j

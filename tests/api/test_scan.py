@@ -18,8 +18,7 @@ from polysight.jobs import surface as jobs_surface
 from polysight.products.processed import read_image
 from polysight.store import MANIFEST, ScanFolder, manifest
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 from .conftest import COPPER, PET, REPO, command, simulate_plates
 

@@ -26,8 +26,7 @@ from polysight.calibration.files import (
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.raster import plan_raster
 from polysight_shared.tables import to_builtins
 

@@ -16,7 +16,7 @@ from polysight.materials import KnownScene
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings
 from polysight.store import ScanFolder
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def board(name, **more):

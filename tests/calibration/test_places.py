@@ -10,7 +10,7 @@ from polysight.calibration.files import Calibration, PlacesFile, load_calibratio
 from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
 from polysight.imaging.geometry import Antennas
 from polysight.jobs.calibrate import take_antenna_places
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
 SHIFTS = {"RH": (1.5, -1.0, 0.8), "RV": (-1.2, 0.7, -1.4)}

@@ -9,7 +9,7 @@ from polysight.calibration.direct_signal import choose_start_offset, fit_start, 
 from polysight.calibration.files import StartFile, open_raw, read_calibration
 from polysight.cli.main import main
 from polysight.radar.commands import direct_if_hz
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.tables import to_builtins
 
 TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}

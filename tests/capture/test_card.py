@@ -16,7 +16,7 @@ from polysight.capture.card import CardClient, EepromSettings, program_eeprom, s
 from polysight.capture.dca1000 import Code, Status
 from polysight.capture.network import neighbour_mac
 from polysight_shared.config import Card
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.cards import Network
 from polysight_simulators.faults import Faults
 

@@ -7,8 +7,7 @@ from tests.support.refusals import refused
 
 from polysight.capture import dca1000 as d
 from polysight.capture.dca1000 import decode_row, decode_two_lane
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ProtocolError
+from polysight_shared.errors import ErrorCode, ProtocolError
 
 
 def test_vectors_seen():

@@ -21,8 +21,7 @@ from polysight.capture import recognise_format
 from polysight.capture.dca1000 import Status
 from polysight.capture.inspect import Layout, inspect_bin, inspect_pcap, is_pcap, read_pcap
 from polysight.jobs.recordings import format_report, inspect_file, plot_profile
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 needs_real = pytest.mark.skipif(
     not REAL_CAPTURES.is_dir(),

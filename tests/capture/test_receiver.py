@@ -25,8 +25,7 @@ from polysight.capture.network import BatchReceiver, bind_udp, usable_packets
 from polysight.capture.receiver import BeginRow, EndRow, Open, Progress, ReceiverProcess, RowCapture
 from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 
 
 @pytest.fixture

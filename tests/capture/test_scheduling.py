@@ -9,8 +9,7 @@ from tests.support.refusals import refused
 
 from polysight.capture.network import check_receive_buffer, usable_packets
 from polysight.capture.receiver import Core, ReceiverProcess, receiver_cores, take_core, take_priority
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 
 # Payload bytes of a full packet.
 FULL = 1456

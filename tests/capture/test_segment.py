@@ -8,8 +8,7 @@ from tests.support.refusals import refused
 
 from polysight.capture.dca1000 import PacketLog
 from polysight.capture.row_files import Segment, read_index
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError
+from polysight_shared.errors import DataError, DeviceError, ErrorCode
 
 
 def test_memory_is_taken_again_and_clean():

@@ -13,8 +13,7 @@ from polysight.catalogue import Pixels, compare, draw_comparison, draw_products,
 from polysight.catalogue.pictures import MAPS
 from polysight.catalogue.results import SIGNIFICANT, measure_scatter
 from polysight.products import map_permittivity, read_products
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 CENTRE = tuple(PET["centre_mm"])
 

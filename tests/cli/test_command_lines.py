@@ -18,7 +18,7 @@ from polysight.cli.options import join_negative_values
 from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.products import write_json
 from polysight_pi.cli import main as polysight_pi
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.program import expand_home
 
 E = {"real": 4.5, "imag": -0.4, "real_std": 0.07, "imag_std": 0.08}

@@ -24,7 +24,7 @@ from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import __version__
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.messages import WIRE_VERSION, BeginRun, HelloReply
 from polysight_shared.raster import plan_raster
 from polysight_simulators.builds import sketch_compiler

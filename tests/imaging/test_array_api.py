@@ -10,7 +10,7 @@ from polysight.imaging import backproject, project
 from polysight.imaging.direct import DirectImager
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m
 from polysight.imaging.spectral import IncrementalImager, SpectralImager
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def _strict():

@@ -25,7 +25,7 @@ from polysight.imaging.samples import mirror_samples, reduction
 from polysight.materials.layers import Spectrum
 from polysight.polarimetry import multilayer
 from polysight.sync import BoardSetup, synchronise_row
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

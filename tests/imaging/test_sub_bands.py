@@ -8,7 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight.imaging.images import MIN_SAMPLES, sub_bands
 from polysight.materials.layers import Spectrum
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 CHIRP = published_rig().chirp
 

@@ -19,7 +19,7 @@ from polysight.process import cores
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder, drop
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
 WORKER = """

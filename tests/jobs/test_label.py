@@ -12,7 +12,7 @@ from polysight.cli.main import build_parser, main
 from polysight.jobs.label import Edits, label
 from polysight.materials import read_labels
 from polysight.products import find_labels, find_products, making_products, write_image, write_json
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
 

@@ -13,7 +13,7 @@ from tests.support.scenes import COPPER, scene_of
 
 from polysight.catalogue import Notes, read_notes
 from polysight.cli.main import build_parser, main
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
 

@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 
 from polysight.materials import train
 from polysight.polarimetry import ratio_from_permittivity
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 MATERIALS = {
     "Copper plate": Material("copper", None),

@@ -8,8 +8,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.materials.train import read_material, read_materials, read_pickle
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 RNG = np.random.default_rng(1)
 

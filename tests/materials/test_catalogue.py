@@ -8,7 +8,7 @@ from tests.support.refusals import refused
 
 from polysight import materials
 from polysight.cli.main import main
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.tables import read_toml
 
 VACUUM = 8.8541878128e-12

@@ -15,7 +15,7 @@ from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, classifier
 from polysight.materials.result import PATCHES, match_patches, pack_patches, read_patches
 from polysight.materials.train import make_entries
 from polysight_papers.sensys2026.patches import Errors, draw, groups
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 ANGLES = (55.0, 60.0)
 

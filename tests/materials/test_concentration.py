@@ -12,7 +12,7 @@ from tests.support.refusals import refused
 from polysight.cli.main import main
 from polysight.materials import Entry, Library
 from polysight.materials.sub_bands import Line, concentrations, fit_concentration, polarisation_angle_rad
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 SUGAR = {"water": 0.0, "sugar (1.3%)": 1.3, "sugar (3.8%)": 3.8, "sugar (5.1%)": 5.1, "sugar (7.4%)": 7.4}
 

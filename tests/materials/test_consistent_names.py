@@ -6,7 +6,7 @@ from tests.support.refusals import refused
 
 from polysight.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
 from polysight.materials.result import pixel_features
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 ANGLE_DEG = 54.9
 

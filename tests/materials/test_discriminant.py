@@ -8,7 +8,7 @@ from polysight.materials.classify import DISCRIMINANT, PAPER, fit_weights
 from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.train import fit_samples, score, score_unseen_materials
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.4, -1.5, -3.1], [-0.3, -1.2, 0.5]])
 """ln|H|, ln|V| and arg P of five materials; two of them lie on either side of 180 degrees."""

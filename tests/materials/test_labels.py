@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 from polysight import materials
 from polysight.process import Inputs, boxes_as_patches
 from polysight.settings import DEFAULT
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 # 50 pixels of 2 mm: -50 to 50 mm
 X_M = Y_M = np.linspace(-0.049, 0.049, 50)

@@ -10,7 +10,7 @@ from tests.support.rigs import published_rig
 
 from polysight.materials.layers import Bands, Layer, LayerFit, Spectrum, check_range, check_stack, fit_layer, predict
 from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j

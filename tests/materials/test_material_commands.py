@@ -8,7 +8,7 @@ from tests.support.refusals import refused
 from polysight.cli.main import main
 from polysight.jobs.materials import report
 from polysight.materials import Entry, Library
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def test_a_report_of_images_alone_says_what_is_missing(tmp_path):

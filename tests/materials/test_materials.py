@@ -16,8 +16,7 @@ from polysight.materials.result import pixel_features
 from polysight.polarimetry import fresnel
 from polysight.results import to_plain
 from polysight_papers.sensys2026.item import table2
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 THETA = np.radians(55.0)
 

@@ -12,7 +12,7 @@ from tests.support.refusals import refused
 from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, PaperKnn, Weights, _LeftOut, fit_weights
 from polysight.materials.library import CHANNELS, Model, Samples, feature_matrix, median_by_patch
 from polysight.materials.train import score, splits
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, angle=0.0):

@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 
 from polysight.imaging import Images
 from polysight.materials import UNKNOWN, Classifier, match_patches, pack_patches, read_patches
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def named_again(found, scene, classifier, path):

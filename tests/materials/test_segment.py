@@ -10,7 +10,7 @@ from polysight.materials import Labels, SegmentSettings, pack_labels, read_label
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.metal import find_metals, metal_by_label, metal_in_box
 from polysight.materials.segment import box_mask, match_truth, segment
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.mark.parametrize("seed", range(6))

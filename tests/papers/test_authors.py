@@ -44,8 +44,7 @@ from polysight_papers.sensys2026.dataset_items import (
 from polysight_papers.sensys2026.dataset_sugar import authors_fig21
 from polysight_papers.sensys2026.item import table2
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 CHOSEN = (1, 3, 12, 15, 27, 28, 30, 32, 34, 36)
 ERRORS = Errors(0.004, 0.01, leakage=0.05)

@@ -16,7 +16,7 @@ from polysight_papers.sensys2026.item import Run, table2
 from polysight_papers.sensys2026.permittivities import APART_MM, REACH_MM, places
 from polysight_papers.sensys2026.synchronisation import _draw_skirts, tones
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.mark.parametrize("seed", range(20))

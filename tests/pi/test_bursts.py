@@ -18,7 +18,7 @@ from tests.support.rigs import published_rig, timed_by_spi
 from polysight_pi import lines as pi_lines, trigger
 from polysight_pi.lines import SpiWireLines
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
 from polysight_shared.wires import WireClient, WireEdge

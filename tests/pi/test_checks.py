@@ -18,7 +18,7 @@ from polysight_pi.keys import make_keys
 from polysight_pi.lines import GpiodLines, find_chip, open_lines
 from polysight_pi.trigger import BurstSpec, send_burst
 from polysight_shared.config import Instrument, Pi
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.findings import Finding
 from polysight_shared.sockets import publisher, replier
 from polysight_shared.tables import decode, to_builtins

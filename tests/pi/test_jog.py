@@ -14,7 +14,7 @@ from tests.support.refusals import refused
 from polysight.acquisition import PiClient
 from polysight.cli.main import main
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from polysight_pi.journal import (
     NewEvent,
 )
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.messages import RunStopped, unpack_event
 from polysight_shared.raster import RasterPlan

@@ -21,8 +21,7 @@ from polysight_pi.keys import allow, make_keys, read_allowed, revoke
 from polysight_pi.service import Server
 from polysight_shared import messages as m
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.sockets import HOST_KEYS, HandshakeMonitor, requester
 from polysight_shared.tables import decode, to_builtins

@@ -28,7 +28,7 @@ from polysight_pi.journal import Journal, JournalThread
 from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.trigger import TriggerLoop
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.raster import RasterPlan
 from polysight_shared.stage_line import Reply

@@ -19,7 +19,7 @@ from tests.support.stage.processes import StageProcess
 from polysight_pi import stage
 from polysight_pi.cli import main
 from polysight_pi.stage import BenchStage, StageLink, StageLost, StageLostError, StageRefusedError
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import StageError, explain
 from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
 from polysight_simulators.builds import sketch_compiler

@@ -19,7 +19,7 @@ from polysight.planning.plan_command import measure_noise
 from polysight.store import manifest
 from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.messages import Capture
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import decode_scene, simulate

@@ -18,7 +18,7 @@ from polysight.planning.forecast import (
     predict_burst,
     predict_noise,
 )
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
 

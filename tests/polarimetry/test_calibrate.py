@@ -8,7 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight import polarimetry
 from polysight.imaging import Images
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import incidence_deg, specular_midpoint_m
 
 THETA = np.radians(55.0)

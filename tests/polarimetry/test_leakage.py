@@ -15,7 +15,7 @@ from polysight.polarimetry.calibrate import (
     estimate_leakage,
     strips_wave,
 )
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.scene import strips
 
 THETA = np.radians(55.0)

@@ -7,7 +7,7 @@ from tests.support.refusals import refused
 
 from polysight.imaging import Images
 from polysight.polarimetry import fresnel, plane_reference
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 THETA = np.radians(55.0)
 X = np.arange(60) * 2e-3

@@ -15,7 +15,7 @@ from polysight.store.open import open_source
 from polysight.store.published import PublishedCubes
 from polysight.sync.cubes import detect_form
 from polysight_shared.config import Image
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate, write_cube
 

@@ -18,8 +18,7 @@ from polysight.materials import Labels
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan
 from polysight.settings import Settings
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError
+from polysight_shared.errors import ErrorCode, PolysightError
 
 ANGLE = 55.0
 MATERIALS = {

@@ -23,8 +23,7 @@ from polysight.products import QUALITY, making_products, read_products
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_json
 
 

@@ -22,8 +22,7 @@ from polysight.process import Use, map_rows
 from polysight.store import RowData, ScanFolder
 from polysight.store.manifest import encode_line
 from polysight.store.source import split_pieces
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
 

@@ -12,8 +12,7 @@ from polysight.products import write_image, write_json
 from polysight.products.exports import export_folder
 from polysight.products.processed import read_image
 from polysight.results import to_plain
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import write_atomically
 
 

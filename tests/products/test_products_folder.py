@@ -11,8 +11,7 @@ from tests.support.refusals import refused
 
 from polysight.products import folder as products_folder, write_json
 from polysight.products.folder import check_products_folder, making_products
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError
+from polysight_shared.errors import DataError, DeviceError, ErrorCode
 
 OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}
 NEW = {"image.npz": b"new", "quality.json": b"{}", "figures/h.png": b"new h"}

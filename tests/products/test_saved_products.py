@@ -19,8 +19,7 @@ from polysight.imaging import Images, sub_bands
 from polysight.materials import parse_layer
 from polysight.materials.layers import Layer, Spectrum, predict
 from polysight.products import MATERIALS, ProcessedScan, read_products, rx_gains, write_json
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, os_error
+from polysight_shared.errors import DataError, ErrorCode, os_error
 from polysight_shared.files import write_atomically
 from polysight_shared.tables import to_builtins
 

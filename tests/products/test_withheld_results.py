@@ -17,7 +17,7 @@ from polysight.imaging import Images
 from polysight.products import read_products, write_image, write_json
 from polysight.products.processed import read_image
 from polysight.results import PermittivityFigures, ScanMaterials, Verdict
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.mark.parametrize("level", ["good", "care", "none"])

@@ -20,7 +20,7 @@ from polysight.radar.commands import (
 from polysight.radar.firmware import check_image
 from polysight.radar.link import NotReportedError
 from polysight.radar.messages import ANALOG_FAULT, FRAME_END, MAIN_CPU_FAULT, RF_CPU_FAULT, RF_ERROR, RF_ESM_FAULT
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars import Fault, board as simulated, cores, make_image
 
 FRAMES = 32

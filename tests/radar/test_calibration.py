@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.calibration_data import ALL, RESTORED, CalibrationFiles, InitCalibrations, RestoreCalibration
 from polysight.radar.commands import program
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 FRAMES = 4
 

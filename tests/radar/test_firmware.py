@@ -10,8 +10,7 @@ from tests.support.refusals import refused
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import program
 from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, read_image, split_into_chunks
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 RIG = native_rig()

@@ -5,7 +5,7 @@ from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
 from polysight.radar.usb import UsbWords, read_words, set_up_spi, write_words
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars import UsbChip, board as simulated
 
 

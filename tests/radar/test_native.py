@@ -13,8 +13,7 @@ from polysight.radar.control import NativeRadars, RadarState, radar_board
 from polysight.radar.diagnosis import ReplayedWords, read_trace
 from polysight.store.manifest import decode_line, encode_line
 from polysight_shared.config import Instrument, NativeRadar, Radar
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.radars import RadarBoard, make_image
 

@@ -14,7 +14,7 @@ from tests.support.refusals import refused
 from polysight.radar import messages as m
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
 from polysight.radar.link import Link
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars.cores import frame, ones_sum
 
 # AWR2243, refused 0x0105 (advanced frame) with error 62; the commands had a 32-bit CRC. E2E 1096533.

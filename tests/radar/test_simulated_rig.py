@@ -13,7 +13,7 @@ from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import constraints, program
 from polysight.radar.control import open_board
 from polysight.radar.usb import SystemClock
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars import RadarBoard as Simulated, RadarSocket, make_image
 from polysight_simulators.rig import derive
 from polysight_simulators.scene import decode_scene

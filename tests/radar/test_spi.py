@@ -17,7 +17,7 @@ from polysight.radar.commands import (
 )
 from polysight.radar.link import ATTEMPTS, Link
 from polysight.radar.messages import CALIBRATION_REPORT, MAIN_POWER_UP, READY_TO_READ, RF_POWER_UP_DONE, decode
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 

@@ -11,8 +11,7 @@ from tests.support.refusals import refused
 
 from polysight.radar.control import NativeRadars, RadarState
 from polysight.radar.usb import open_usb
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_simulators.radars import RadarBoard, UsbChip, make_image
 
 FRAMES = 4

@@ -11,8 +11,7 @@ from tests.support.refusals import refused
 
 from polysight.radar.commands import constraints, direct_if_hz, program, require
 from polysight_shared.config import Instrument, NativeRadar
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import direct_path_m
 
 FRAMES = 5600

@@ -29,7 +29,7 @@ from polysight.results import ScanFacts, to_plain
 from polysight.serve import commands as control, site
 from polysight.serve.guard import TOKEN_HEADER
 from polysight_shared.config import CheckPlate, load_instrument
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.fixture

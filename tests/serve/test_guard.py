@@ -23,7 +23,7 @@ from tests.support.refusals import refused
 from polysight.serve import Place, guard, server
 from polysight.serve.front import ConnectionLimit
 from polysight.serve.guard import TOKEN_HEADER, Access
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 SECRET = "nobody may read this"
 FOREIGN_HOSTS = ("evil.example", "127.0.0.1.evil.example", "localhost.evil.example:80", "192.168.1.7", "", "[", "a:b:c")

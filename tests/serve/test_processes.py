@@ -21,7 +21,7 @@ from tests.support.refusals import refused
 from polysight.serve.door import MOST_SILENT, is_command
 from polysight.serve.guard import TOKEN_HEADER
 from polysight.serve.server import TOKEN_BYTES, Place, load_token, serve
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @dataclass

@@ -22,8 +22,7 @@ from polysight.jobs.live_scan import _check_new
 from polysight.serve.programs import Programs
 from polysight.store import validate
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_shared.faults import PiFault
 from polysight_shared.tables import to_builtins
 

@@ -10,8 +10,7 @@ from tests.support.refusals import refused
 
 from polysight.serve import programs
 from polysight.serve.programs import Queue
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, ScanError
+from polysight_shared.errors import DeviceError, ErrorCode, ScanError
 
 
 class Rig:

@@ -24,7 +24,7 @@ from polysight.serve.commands import (
     TrainRequest,
 )
 from polysight.serve.programs import Programs
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.tables import decode
 
 BOX = (0.0, 0.0, 10.0, 10.0)

@@ -23,7 +23,7 @@ from polysight.serve.commands import Format
 from polysight.serve.front import BACKLOG, STATIC, EndingServer
 from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight.serve.server import ELSEWHERE, Place, describe_server, draw_code, find_addresses, make_access
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 @pytest.fixture

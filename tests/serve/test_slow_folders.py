@@ -14,7 +14,7 @@ from tests.support.products import judged_products
 
 from polysight.catalogue import Scans, scans
 from polysight.serve import reading, site
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 LIMIT_S = 0.4
 

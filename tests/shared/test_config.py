@@ -10,8 +10,7 @@ from tests.support.refusals import refused
 
 from polysight_shared import geometry
 from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Section, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, no_such
+from polysight_shared.errors import ConfigError, ErrorCode, no_such
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 

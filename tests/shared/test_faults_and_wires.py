@@ -10,8 +10,7 @@ from tests.support.paths import REPO
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, ProtocolError
+from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError
 from polysight_shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
 from polysight_shared.wires import WireClient, WireEdge, WireMotion, encode, parse
 

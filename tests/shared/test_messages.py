@@ -10,8 +10,7 @@ from msgspec import inspect
 from tests.support.refusals import refused
 
 from polysight_shared import messages as m
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ProtocolError
+from polysight_shared.errors import ErrorCode, ProtocolError
 from polysight_shared.raster import RasterPlan
 
 

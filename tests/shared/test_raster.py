@@ -5,7 +5,7 @@ from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
 from polysight_shared.config import Burst, Grid, Stage
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
 
 grids = st.builds(

@@ -7,8 +7,7 @@ from unittest.mock import Mock
 import pytest
 import zmq
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.sockets import replier
 
 

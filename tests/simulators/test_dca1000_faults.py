@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
 from polysight_simulators.cards.sync_in import Pulse
 from polysight_simulators.faults import Faults, read_faults

@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import Plate, Scene, apply_scene, decode_scene, optics
 from polysight_simulators.scene.field import ObjectField, build_field, node_matrix

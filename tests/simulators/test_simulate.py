@@ -11,8 +11,7 @@ from msgspec import convert
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.messages import Capture, RowFinished, RunStarted, RunStopped, ScanId, unpack_event
 from polysight_shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm, simulate

@@ -16,7 +16,7 @@ from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import to_text, validate
 from polysight_pi.journal import records
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.messages import RowStarted
 
 # With --long each byte and bit is tried.

@@ -10,7 +10,7 @@ from polysight.store.open import open_source
 from polysight.store.published import RowLosses
 from polysight.store.published_rig import mirror_rig
 from polysight_shared.config import Burst, Grid
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions_m, tx_position_m
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import AuthorsLayout

@@ -9,7 +9,7 @@ from tests.support.rigs import published_rig
 
 from polysight.store.open import open_source
 from polysight.store.published import PublishedCubes
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import rx_positions_m, tx_position_m
 
 COLUMNS = 7

@@ -29,8 +29,7 @@ from polysight.store.logs import AppendFile
 from polysight.store.raw import drop, find_droppable, require_raw
 from polysight.store.scan_folder import MANIFEST, ScanFolder, dropped_files
 from polysight.store.validation import damaged_rows
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, ScanError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 
 ROWS = 4
 BOARDS = 2

@@ -18,7 +18,7 @@ from polysight.capture.placement import Past
 from polysight.jobs.recordings import inspect_placement, replace_folder
 from polysight.store import ManifestWriter, ScanFolder, describe_damage, replace_rows
 from polysight.store.logs import crc32
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.raster import plan_raster
 
 

@@ -17,8 +17,7 @@ from polysight.store.manifest import ManifestWriter, RowCommitted, ScanResumed, 
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import RawSource, allocate_pages, split_pieces
 from polysight.store.validation import to_json, validate
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.messages import Fault
 from polysight_shared.raster import plan_raster
 

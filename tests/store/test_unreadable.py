@@ -16,8 +16,7 @@ from polysight.store import manifest, validation
 from polysight.store.manifest import ManifestWriter
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError
+from polysight_shared.errors import ErrorCode, PolysightError
 
 
 def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):

@@ -33,8 +33,7 @@ from polysight.store.raw import drop, find_droppable
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError
 from polysight_shared.files import write_atomically
 
 OUTSIDE = ["../victim.bin", "/etc/passwd", "raw/../../victim.bin", "raw/a\0b.bin", "", ".", "manifest.jsonl"]

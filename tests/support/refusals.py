@@ -5,8 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError
+from polysight_shared.errors import ErrorCode, PolysightError
 
 
 @contextmanager

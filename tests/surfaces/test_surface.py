@@ -23,7 +23,7 @@ from polysight.surfaces import (
 )
 from polysight.surfaces.result import point_cloud
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_worlds.media import Stack
 from polysight_worlds.shape_scenes import ShapeScene
 from polysight_worlds.shapes import cylinder, sphere

@@ -11,7 +11,7 @@ from polysight.sync import BoardSetup, synchronise_row
 from polysight.sync.cubes import CubeForm
 from polysight.sync.high_pass_filter import high_pass
 from polysight.sync.loops import estimate_tone
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 POSITIONS, PULSES = 9, 6

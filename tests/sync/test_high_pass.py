@@ -6,7 +6,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.sync.high_pass_filter import Equaliser, HighPass, apply_filter, fit_high_pass, high_pass
-from polysight_shared.error_codes import ErrorCode
+from polysight_shared.errors import ErrorCode
 
 
 def test_each_section_is_3_db_down_and_45_degrees_ahead_at_its_corner():

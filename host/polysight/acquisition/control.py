@@ -25,8 +25,7 @@ from typing import Literal
 import msgspec
 
 from polysight_shared.closing import Closing
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError, quote
+from polysight_shared.errors import ErrorCode, ScanError, quote
 
 # Names of the folder in a scan folder, and of the file with the sign of life.
 CONTROL = "control"

@@ -23,8 +23,7 @@ from polysight.capture import take_priority
 from polysight_shared import messages as m
 from polysight_shared.closing import Closing
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, ProtocolError, ScanError
+from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError, ScanError
 from polysight_shared.faults import PiFault
 from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
 

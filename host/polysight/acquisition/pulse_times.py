@@ -42,8 +42,7 @@ from polysight.capture import (
     write_packets,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.messages import Capture
 from polysight_shared.raster import Row
 from polysight_shared.units import us_to_ns

@@ -16,8 +16,7 @@ from polysight.acquisition.pi_client import MOVING, PiClient
 from polysight.acquisition.row import ON_REQUEST
 from polysight.store import PiDescription
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError, quote
+from polysight_shared.errors import ErrorCode, ScanError, quote
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.messages import HelloReply, StatusReply
 from polysight_shared.raster import Stage

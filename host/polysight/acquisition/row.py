@@ -36,8 +36,7 @@ from polysight.store import (
     utc_now,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError, advice, quote
+from polysight_shared.errors import ErrorCode, ScanError, advice, quote
 from polysight_shared.faults import explain
 from polysight_shared.files import sync_folder
 from polysight_shared.messages import Capture, RowFinished

@@ -69,8 +69,7 @@ from polysight.store import (
     utc_now,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError, ScanError, advice, quote
+from polysight_shared.errors import ErrorCode, PolysightError, ScanError, advice, quote
 from polysight_shared.messages import AnyEvent, BeginRun, HelloReply, RowStarted, RunStarted, is_simulated
 from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster

@@ -26,8 +26,7 @@ from polysight.planning import Changes, Forecast, describe, find_scene_warnings,
 from polysight.products import PLANE, ProcessedScan, image_dataset
 from polysight.results import CheckResult
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, expand_paths
+from polysight_shared.errors import ConfigError, ErrorCode, expand_paths
 
 if TYPE_CHECKING:
     import xarray

@@ -10,8 +10,7 @@ import numpy as np
 from polysight.materials import LAYER_FORMS, Layer, fit_row, incidence_std_rad, parse_layer
 from polysight.products import ProcessedScan, patch_coordinates
 from polysight_shared.config import Chirp
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 
 if TYPE_CHECKING:
     import xarray

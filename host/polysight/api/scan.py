@@ -42,8 +42,7 @@ from polysight.results import PatchFigures, Verdict, declared_figures
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 
 if TYPE_CHECKING:
     import xarray

@@ -26,8 +26,7 @@ from polysight.calibration.files import BoardFilter, BoardStart, board_rows, pla
 from polysight.radar import direct_if_hz
 from polysight.store import RawSource
 from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 Real = NDArray[np.float64]
 

@@ -40,8 +40,7 @@ from polysight.store import (
 )
 from polysight.sync import HighPass
 from polysight_shared.config import Board, Instrument, MountStep
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, quote
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, quote
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 FORMAT = 1

@@ -29,8 +29,7 @@ from polysight.imaging import Antennas, image_grid, reduction, row_offsets_m, sc
 from polysight.store import RawSource
 from polysight.sync import BoardSetup, HighPass, synchronise_row
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.raster import plan_raster
 from polysight_shared.tables import decode, read_toml

@@ -35,8 +35,7 @@ from polysight.capture.network import (
 from polysight.capture.receiver import PRIORITY_REMEDY, Core, ReceiverProcess, RowCapture, receiver_cores
 from polysight_shared.closing import Closing
 from polysight_shared.config import Board, Card, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, ProtocolError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, ProtocolError
 from polysight_shared.findings import Finding
 
 # Times that a command is sent before the card counts as silent (chosen); they share the timeout.

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, ProtocolError
+from polysight_shared.errors import DataError, ErrorCode, ProtocolError
 
 # First and last word of a request and a reply.
 REQUEST_MAGIC = 0xA55A

@@ -30,8 +30,7 @@ from polysight.capture.dca1000 import (
     decode_two_lane,
 )
 from polysight.capture.placement import Past, Placed, counter_differences, place_record
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, ProtocolError
+from polysight_shared.errors import DataError, ErrorCode, ProtocolError
 from polysight_shared.files import read_bounded
 
 MAX_BYTES = 256 << 20

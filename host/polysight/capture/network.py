@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from polysight.capture.dca1000 import MAX_PAYLOAD_BYTES, Status
 from polysight.capture.receiver import RowCapture
 from polysight_shared.config import Board
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.units import NS_PER_S
 
 # Socket options of Linux (asm-generic/socket.h), which Python does not name.

@@ -21,8 +21,7 @@ import msgspec
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
 from polysight_shared.closing import Closing
 from polysight_shared.config import Board
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 
 # Real-time priority: below the kernel's threads, and below the Pi's pulses if both run on one machine.
 REAL_TIME = 5

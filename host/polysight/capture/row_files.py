@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from polysight.capture.dca1000 import PacketLog
 from polysight.capture.placement import Evidence, Placed
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError, quote
+from polysight_shared.errors import DataError, DeviceError, ErrorCode, quote
 from polysight_shared.files import open_to_write, read_bounded
 
 Bytes = NDArray[np.uint8]

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, ScanError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 from polysight_shared.files import write_atomically
 
 NOTES = "operator.json"

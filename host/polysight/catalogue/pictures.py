@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from polysight import products
 from polysight.imaging import Images
 from polysight.polarimetry import specular_incidence_rad
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 Real = NDArray[np.float64]
 # Colour maps of matplotlib: one that colour-blind people read, and a cyclic one.

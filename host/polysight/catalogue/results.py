@@ -33,8 +33,7 @@ from polysight.products import (
 from polysight.results import ComplexNumber, PatchFigures, PermittivityFigures, Verdict
 from polysight.store import MANIFEST, ScanFolder
 from polysight.surfaces import POINTS, SURFACE
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 Real = NDArray[np.float64]
 EXPORT = "export"

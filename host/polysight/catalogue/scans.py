@@ -26,8 +26,7 @@ from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_no
 from polysight.products import IMAGE, LABELS, MATERIALS, QUALITY, SCAN, ProcessedScan, find_labels
 from polysight.results import NoResult
 from polysight.store import MANIFEST, Manifest, manifest
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError, no_such
+from polysight_shared.errors import DataError, ErrorCode, PolysightError, no_such
 from polysight_shared.files import write_atomically
 from polysight_shared.findings import Finding
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from polysight.cli.options import Add, add_config_option, add_json_option, add_model_option, count, number
 from polysight.data import find_packaged
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 
 if TYPE_CHECKING:
     from polysight.materials import Layer

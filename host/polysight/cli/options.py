@@ -14,8 +14,7 @@ from typing import Any, Protocol, TypeVar
 
 from polysight.data import find_packaged
 from polysight.settings import Settings, path_text
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 
 # Name of the rig file, the settings of the whole instrument, in a folder.
 RIG = Path("instrument.toml")

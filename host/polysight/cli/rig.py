@@ -26,8 +26,7 @@ from polysight.cli.options import (
 )
 from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 
 # Limits of options are chosen, far beyond what a rig has, where nothing else is said.
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)

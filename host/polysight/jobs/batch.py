@@ -41,8 +41,7 @@ from polysight.store import (
     open_source,
     versions,
 )
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.errors import ConfigError, ErrorCode, PolysightError
 from polysight_shared.files import read_json
 
 SUMMARY = "processed.json"

@@ -30,8 +30,7 @@ from polysight.jobs.process import form_scan_images, load_reference, make_plane_
 from polysight.polarimetry import Leakage, leakage_from_images, specular_incidence_rad
 from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 from polysight_shared.tables import to_builtins
 
 # Least number of pixels that show metal in all scans of `leakage`; chosen: 25 remain in each quarter for the error.

@@ -18,8 +18,7 @@ from pathlib import Path
 
 from polysight.results import NoResult
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError
 
 # An empty file that marks a folder as a demo, which another demo may overwrite.
 _MARK = ".polysight-demo"

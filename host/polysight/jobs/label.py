@@ -34,8 +34,7 @@ from polysight.materials import (
 )
 from polysight.products import IMAGE, LABELS, LABELS_PICTURE, ProcessedScan, find_labels, find_products, label_folder
 from polysight.store import MANIFEST
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, quote
 from polysight_shared.files import write_together
 
 METAL = "metal"

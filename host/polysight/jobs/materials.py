@@ -46,8 +46,7 @@ from polysight.products import MATERIALS, REPORT, SCAN, ProcessedScan, find_prod
 from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_line, to_plain
 from polysight.store import is_source
 from polysight_shared.config import Chirp, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, quote
 from polysight_shared.findings import Finding
 
 # Relative difference of two frequencies that are the same: far above rounding, far below any other chirp.

@@ -43,8 +43,7 @@ from polysight.results import one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, advice, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, advice, quote
 
 _log = logging.getLogger(__name__)
 

@@ -29,8 +29,7 @@ from polysight.store import (
     validate,
 )
 from polysight_shared.config import load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError, os_error
+from polysight_shared.errors import DataError, ErrorCode, PolysightError, os_error
 
 # Missing ranges that are printed: they fill about one line of a terminal.
 _MAX_RANGES = 8

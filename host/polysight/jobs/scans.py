@@ -29,8 +29,7 @@ from polysight.jobs.output import confirm, print_json, print_lines
 from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, REPORT, ProcessedScan, find_products, products_locked, read_products, write_json
 from polysight.results import WARNING_SIGMAS, CheckResult, ComplexNumber, RawDropped, check_plate, read_object, to_plain
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, no_such, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such, quote
 from polysight_shared.files import write_atomically
 
 if TYPE_CHECKING:

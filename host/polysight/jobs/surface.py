@@ -32,8 +32,7 @@ from polysight.surfaces import (
     summary_lines,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 
 # Fronts of objects lie up to this before or behind the object plane; chosen.
 DEPTH_M = 0.12

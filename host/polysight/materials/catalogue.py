@@ -15,8 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.tables import decode, read_toml
 
 CATALOGUE = Path(__file__).with_name("catalogue.toml")

@@ -48,8 +48,7 @@ from polysight.materials.names import (
     make_patch_without_pixels,
     name_patch,
 )
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread; chosen."""

@@ -24,8 +24,7 @@ import numpy.typing as npt
 from polysight.imaging import Mask
 from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm, box_mask, make_patch
 from polysight.store import TRUTH
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_json
 
 

@@ -29,8 +29,7 @@ from polysight.imaging import window_weights
 from polysight.materials.names import format_permittivity
 from polysight.polarimetry import multilayer
 from polysight_shared.config import Chirp
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]

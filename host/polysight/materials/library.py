@@ -22,8 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.store import open_npz
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import write_atomically
 
 FORMAT = "polysight-library-1"

@@ -35,8 +35,7 @@ from polysight.materials.measure import median_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
 from polysight.polarimetry import PlaneReference, divide_by_metal, metal_gains
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]

@@ -32,8 +32,7 @@ from polysight.materials.names import UNKNOWN, NamedPatch, PatchName
 from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
 from polysight.store import open_npz
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.findings import Finding
 
 MAX_BEND = 3.5

@@ -23,8 +23,7 @@ import scipy
 import skimage
 
 from polysight.imaging import Image, Images, Mask
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 Real = npt.NDArray[np.float64]
 # Corners x0, y0, x1, y1.

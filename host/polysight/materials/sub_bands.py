@@ -36,8 +36,7 @@ from polysight.materials.result import MaterialsResult, ratio_slopes
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
 from polysight_shared.config import Chirp
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 AMPLITUDE_ERROR = 0.1
 """Relative standard deviation of |H| of a patch by its size, edges and tilt, which do not affect ratios."""

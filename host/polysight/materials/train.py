@@ -42,8 +42,7 @@ from polysight.materials.result import MaterialsResult
 from polysight.materials.segment import Box
 from polysight.materials.training_advice import alike_pairs, specimen_freedom
 from polysight.polarimetry import metal_gains
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_bounded, read_json
 
 Image = npt.NDArray[np.complexfloating]

@@ -44,8 +44,7 @@ from polysight.store import EVENTS, RawSource, ScanFolder, read_events
 from polysight.surfaces import VisibleNormals, visible_normals
 from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Capture
 from polysight_shared.raster import burst_duration_s

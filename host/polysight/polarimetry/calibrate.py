@@ -45,8 +45,7 @@ from msgspec import UNSET
 
 from polysight.imaging import Dispersion, Image, ImagedWith, Images, Mask
 from polysight.results import MetalPlate
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 
 def ratio(h: Image, v: Image) -> Image:

@@ -24,8 +24,7 @@ import scipy
 
 from polysight.results import IncidenceAngles
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import PolysightError
+from polysight_shared.errors import ErrorCode, PolysightError
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

@@ -20,8 +20,7 @@ from polysight.polarimetry.fresnel import (
     multilayer as plain_multilayer,
     permittivity_from_ratio as plain_permittivity,
 )
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 
 if TYPE_CHECKING:
     from xarray import DataArray

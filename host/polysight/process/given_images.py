@@ -37,8 +37,7 @@ from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuali
 from polysight.settings import Settings
 from polysight.store import open_npz, versions
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, no_such
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such
 from polysight_shared.findings import Finding
 
 NPZ = ".npz"

@@ -58,8 +58,7 @@ from polysight.store import (
 )
 from polysight.sync import HighPass
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, quote
+from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import read_json
 
 HEAD = "samples.json"

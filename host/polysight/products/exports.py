@@ -32,8 +32,7 @@ from polysight.products.processed import ProcessedScan, read_products
 from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
 from polysight.store import MAX_BYTES
 from polysight.surfaces import Surface
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 from polysight_shared.files import write_atomically, write_together
 
 if TYPE_CHECKING:

@@ -32,8 +32,7 @@ from polysight.products.processed import (
 )
 from polysight.store import is_source, lock_file
 from polysight.surfaces import POINTS, SURFACE
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode
 from polysight_shared.files import sync_folder, write_atomically
 
 # Picture of the boxes, and the products of surfaces.

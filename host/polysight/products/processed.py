@@ -46,8 +46,7 @@ from polysight.results import (
 )
 from polysight.store import open_npz
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, no_such
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such
 from polysight_shared.files import write_atomically
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode

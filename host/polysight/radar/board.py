@@ -24,8 +24,7 @@ from polysight.radar.commands import Program
 from polysight.radar.firmware import TO_FLASH, TO_RAM, Image, describe_patch, require_family, require_rom, send_image
 from polysight.radar.link import Link, NotReportedError, UnexpectedRestartError
 from polysight.radar.usb import Clock, WordLink
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError
 
 # Timeouts are chosen: a healthy board reports its power-up within a second.
 POWER_UP_TIMEOUT_S = 5.0

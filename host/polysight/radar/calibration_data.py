@@ -17,8 +17,7 @@ from pathlib import Path
 from polysight.radar import messages
 from polysight.radar.commands import Command
 from polysight.radar.link import Link
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_shared.files import read_bounded
 
 # The calibration data is read and written in parts (ICD 70).

@@ -16,8 +16,7 @@ from typing import ClassVar, Literal, NamedTuple
 
 from polysight.radar.messages import SubBlock
 from polysight_shared.config import HPF_FIRST_KHZ, HPF_SECOND_KHZ, Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import direct_path_m
 from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

@@ -36,8 +36,7 @@ from polysight.radar.messages import command, encode
 from polysight.radar.usb import SCHEME, Clock, SystemClock, WordLink, open_tcp, open_usb
 from polysight_shared.closing import Closing
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 
 
 class RadarState(Enum):

@@ -23,8 +23,7 @@ from polysight.radar.board import RadarBoard, Step
 from polysight.radar.usb import Clock, WordLink
 from polysight_shared import __version__
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, PolysightError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, PolysightError
 from polysight_shared.files import read_bounded
 
 # Jumpers as they must be, printed if the reset fails.

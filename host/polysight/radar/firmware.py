@@ -16,8 +16,7 @@ from pathlib import Path
 from polysight.radar.commands import FileChunk
 from polysight.radar.link import Link
 from polysight.radar.messages import BODY_LIMIT
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_shared.files import read_bounded
 
 # File types of a download (ICD 302): the RAM, which the next reset clears, and the first of four flash areas.

@@ -17,8 +17,7 @@ from dataclasses import replace
 from polysight.radar import messages
 from polysight.radar.commands import RF_POWER_UP, Command
 from polysight.radar.usb import Clock, WordLink
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, ProtocolError
+from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError
 from polysight_shared.findings import Finding
 
 # Timeout of one attempt, and the number of attempts (chosen).

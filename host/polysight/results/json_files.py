@@ -10,8 +10,7 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_json
 from polysight_shared.findings import Finding
 

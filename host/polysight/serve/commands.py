@@ -30,8 +30,7 @@ from polysight.serve.reading import json_answer
 from polysight.serve.site import LIBRARIES, Site
 from polysight.store import ScanFolder
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, ScanError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 from polysight_shared.tables import decode, to_builtins
 
 RIG = "instrument.toml"

@@ -37,8 +37,7 @@ from polysight.catalogue import Scans
 from polysight.serve.commands import decode_body
 from polysight.serve.guard import HANDLERS, Access, Guard, cookie_name, refuse, tell_no_page
 from polysight.serve.stage import JogRequest, StageControl, StagePlace
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 STATIC = Path(__file__).parent / "static"
 # Connections in the kernel's queue. A client that finds the queue full tries again after 1 s, and after 2 s more.

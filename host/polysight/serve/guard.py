@@ -24,8 +24,7 @@ from starlette.requests import ClientDisconnect, Request, cookie_parser
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, PolysightError, os_error
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError, os_error
 
 TOKEN_HEADER = "X-Polysight-Token"
 # Largest head (address and headers) and largest body of a request; chosen, far above what the page sends.

@@ -27,8 +27,7 @@ import msgspec
 
 from polysight.acquisition import read_start_ticks
 from polysight.catalogue import PROGRAM, ProgramRecord, find_program, is_plain
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, PolysightError, ScanError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, PolysightError, ScanError
 from polysight_shared.files import write_atomically
 
 OOM_SCORE = Path("/proc/self/oom_score_adj")

@@ -27,8 +27,7 @@ from polysight.results import ACTION_SIGMAS, WARNING_SIGMAS, CheckResult
 from polysight.serve.guard import refuse
 from polysight.serve.programs import Waiting
 from polysight.serve.site import THUMBNAIL, ListChanges, ListedScan, Site, check_products, compare_products, draw_map
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, PolysightError, ScanError
+from polysight_shared.errors import DataError, ErrorCode, PolysightError, ScanError
 
 # A report may come from anywhere, so browsers run no script in it and load nothing for it.
 REPORT_POLICY = "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'"

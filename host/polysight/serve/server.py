@@ -51,8 +51,7 @@ from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Site, Watches
 from polysight.serve.stage import StageControl
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError, quote
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, quote
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Nice value of the reading process, chosen: it gives way to capture and scan.

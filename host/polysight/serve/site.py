@@ -27,8 +27,7 @@ from polysight.page import Watch
 from polysight.products import read_products
 from polysight.results import CheckResult, check_plate
 from polysight.serve.programs import Programs, Queue
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DeviceError
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 
 READ_S = 30.0
 """Time limit of one read. Longer ones are refused, and so is their folder until they have returned."""

@@ -18,8 +18,7 @@ import zmq
 from polysight.acquisition import PiClient
 from polysight.serve.commands import Body
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError
+from polysight_shared.errors import ErrorCode, ScanError
 from polysight_shared.messages import MAX_JOG_MM, Axis
 
 

@@ -19,8 +19,7 @@ import msgpack
 import msgspec
 
 from polysight.capture import write_error
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError, ProtocolError
+from polysight_shared.errors import DataError, DeviceError, ErrorCode, ProtocolError
 from polysight_shared.files import open_to_write, sync_folder
 from polysight_shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
 

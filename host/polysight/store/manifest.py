@@ -24,8 +24,7 @@ import msgspec
 
 from polysight.store.logs import AppendFile, LogDigest
 from polysight_shared.closing import Closing
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError, PolysightError, no_such, quote
+from polysight_shared.errors import DataError, DeviceError, ErrorCode, PolysightError, no_such, quote
 from polysight_shared.files import MAX_JSON_BYTES, open_regular, read_bounded
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan

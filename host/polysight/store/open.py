@@ -11,8 +11,7 @@ from polysight.store.raw import require_raw
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import Source
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, no_such
+from polysight_shared.errors import DataError, ErrorCode, no_such
 
 
 def is_source(path: Path) -> bool:

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from polysight.store.published_rig import build_rig, mirror_rig, read_settings
 from polysight.store.source import HEADER_LOCK, CubeRow, RowData, split_pieces
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan, plan_raster
 

@@ -13,8 +13,7 @@ import msgspec
 
 from polysight_shared import files
 from polysight_shared.config import Board, Instrument, MountStep
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.tables import decode
 
 # The two files with a scan's settings.

@@ -22,8 +22,7 @@ from polysight.store.logs import crc32
 from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, Reception, RowCommitted
 from polysight.store.scan_folder import SAMPLES, ScanFolder, dropped_files, utc_now
 from polysight.store.validation import board_faults, to_text
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError, DeviceError, ScanError, quote
+from polysight_shared.errors import DataError, DeviceError, ErrorCode, ScanError, quote
 from polysight_shared.files import sync_folder
 
 Digests = dict[str, dict[int, str]]

@@ -53,8 +53,7 @@ from polysight.store.manifest import (
 from polysight.store.source import HEADER_LOCK, RowData, allocate_pages
 from polysight_shared import __version__
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError, DeviceError, quote
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, quote
 from polysight_shared.files import open_regular, sync_folder
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
 

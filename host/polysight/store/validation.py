@@ -12,8 +12,7 @@ from polysight.capture import PACKETS, read_index
 from polysight.store import manifest, scan_folder
 from polysight.store.logs import LogDigest, crc32, read_events
 from polysight.store.manifest import MANIFEST, BoardRow, RowCommitted, ScanEnded
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError, quote
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
 

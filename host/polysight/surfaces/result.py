@@ -42,8 +42,7 @@ from polysight.surfaces.permittivity import (
 )
 from polysight.surfaces.points import tangents
 from polysight.surfaces.window import Echoes
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import write_atomically
 
 # Fields of a surface that are not arrays of points.

@@ -20,8 +20,7 @@ from polysight.polarimetry import correct_leakage
 from polysight.store import COLLECTION, build_rig, open_npz, read_settings
 from polysight_papers.sensys2026.item import Published, table2
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_json
 from polysight_shared.geometry import incidence_deg
 

@@ -49,8 +49,7 @@ from polysight_papers.sensys2026.item import (
 )
 from polysight_papers.sensys2026.patches import groups
 from polysight_papers.sensys2026.run import Origin, make_folder, make_items
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 
 JUDGED_PIXELS = 1500
 PATCH_PIXELS = 6

@@ -11,8 +11,7 @@ from polysight.report import INK, PALETTE
 from polysight_papers.sensys2026.dataset import AuthorsData
 from polysight_papers.sensys2026.item import Item, Picture, Table, new_figure, published_values, style_axes
 from polysight_papers.sensys2026.permittivities import WATER_IN_GLASS
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 FIG21_NOTE = (
     "A straight line from the polarisation angle to the concentration, each concentration estimated by a line"

@@ -29,8 +29,7 @@ from polysight.report import INK, draw_channel
 from polysight.results import ScanFacts, ScanMaterials, ScanQuality
 from polysight.store import TRUTH, RawSource, ScanFolder
 from polysight_papers.sensys2026.item import Item, Picture, Run, Table, new_figure, style_axes, table2
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ScanError
+from polysight_shared.errors import ErrorCode, ScanError
 
 # Sides of the plates, as in `examples/nine-materials.toml`.
 PLATE_MM = 45.0

@@ -20,8 +20,7 @@ from polysight_papers.sensys2026.images import fig4, fig13, fig14, fig19
 from polysight_papers.sensys2026.item import Item, Run, Table
 from polysight_papers.sensys2026.permittivities import fig3, fig16, fig17, fig21, table2_item
 from polysight_papers.sensys2026.synchronisation import fig9, fig12, fig15
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, PolysightError
+from polysight_shared.errors import ConfigError, ErrorCode, PolysightError
 from polysight_shared.files import write_atomically
 
 TITLES: dict[str, str] = {

@@ -14,8 +14,7 @@ from pathlib import Path
 from threading import Event
 
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.wires import WireClient
 from polysight_simulators.cards.card import SimulatedCard
 from polysight_simulators.cards.server import CardServer

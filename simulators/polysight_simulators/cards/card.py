@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError, PolysightError
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError
 from polysight_simulators.cards import dca1000
 from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults, fault_generator
 from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, SyncInput

@@ -11,8 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_simulators.radars.cores import (
     ERASE_S,
     EVENT,

@@ -21,8 +21,7 @@ import socket
 import struct
 from collections.abc import Callable
 
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DeviceError
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_simulators.faults import Faults
 from polysight_simulators.radars.board import RadarBoard
 

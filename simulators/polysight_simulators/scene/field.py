@@ -38,8 +38,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.tables import to_builtins
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import optics

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from polysight_shared import __version__
 from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import name_in_errors
 from polysight_shared.messages import AnyEvent, Capture, RowFinished, RowStarted, RunStarted, RunStopped, pack_with_crc
 from polysight_shared.raster import FIRST_PULSE_DELAY_S, RasterPlan, Row, burst_duration_s

@@ -20,8 +20,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight_shared.config import Image, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.raster import Burst, Grid, Stage
 from polysight_shared.tables import decode, read_toml, to_builtins
 

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene.scene_file import Scene
 

@@ -13,8 +13,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import Vector, incidence_deg, specular_midpoint_m
 from polysight_shared.raster import Grid, RasterPlan, Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 from polysight_shared.tables import to_builtins

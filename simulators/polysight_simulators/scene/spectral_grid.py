@@ -11,8 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight_shared.config import Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.raster import mean_burst_travel_mm
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene.optics import Antennas, Real

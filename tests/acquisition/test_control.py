@@ -14,7 +14,7 @@ from tests.support.refusals import refused
 from tests.support.store.facts import facts_of
 from tests.support.store.small_scan import SmallScan
 
-from polysight.acquisition import scan as host_run
+from polysight.acquisition import control as control_module, scan as host_run
 from polysight.acquisition.control import (
     ALIVE,
     CONTROL,
@@ -116,6 +116,19 @@ def test_after_the_rows_no_command_is_obeyed(tmp_path):
         wait_for(lambda: (life := read_life(tmp_path)) is not None and life.asked != "", "a sign of life after it")
         assert not stop.paused
         assert (tmp_path / CONTROL / "pause").exists()
+
+
+def test_a_sign_of_life_is_written_once_an_interval(tmp_path, monkeypatch):
+    """Commands are looked for more often; each look touches no disk."""
+    monkeypatch.setattr(control_module, "_ALIVE_INTERVAL_S", 3600.0)
+    looks = []
+    written = []
+    monkeypatch.setattr(ControlFolder, "_obey_command", lambda _, command: looks.append(command))
+    monkeypatch.setattr(ControlFolder, "_write", lambda _, life: written.append(life))
+    with ControlFolder(tmp_path, StopRequest()) as control:
+        control.open()
+        wait_for(lambda: len(looks) > 5 * len(ScanCommand), "five looks")
+        assert len(written) == 1
 
 
 def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):

@@ -160,6 +160,8 @@ def _waiting(board: Board) -> int:
 def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 4096, 4096, tmp_path / "a.part")
+        # Before the process has said anything of the row
+        assert not receiver._progress.complete
         receiver.begin_row(0, 2, 4096, 4096, tmp_path / "b.part")
         assert not (tmp_path / "a.part").exists()
         row = receiver.end_row()

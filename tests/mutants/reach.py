@@ -23,6 +23,7 @@ from xml.etree import ElementTree
 from tests.mutants.draw import Mutant, list_files
 from tests.support.paths import REPO
 
+TESTS_OF_ROOM = {"pi_controller": "pi", "planning": "plan", "results": "verdict"}
 FLAGS = "tests/house/test_flags.py"
 PROJECTS = ("shared", "pi_controller", "simulators", "host", "papers", "worlds")
 MARKS_MODULE = "marks_of_mutants"
@@ -62,8 +63,10 @@ class Reach:
         tests |= {test for test in self.seconds if _file_of(test) in files}
         tests -= set(self.failed)
 
+        folder = TESTS_OF_ROOM.get(mutant.room, mutant.room)
+
         def order(test: str) -> tuple[bool, float]:
-            return f"tests/{mutant.room}/" not in test, self.seconds.get(test, 0.0)
+            return not test.startswith(f"tests/{folder}/"), self.seconds.get(test, 0.0)
 
         # Flags are judged by laws that read the code; without a place in a function that is all.
         selected = [FLAGS] if "True" in mutant.operator else []

@@ -1,10 +1,13 @@
 """Errors that a scene shows: displaced images, a drift, a halo of an overdriven receiver."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from polysight.imaging import Images
+from polysight.materials import common_change
 from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.common_change import _Explained, estimate_common_change
 from polysight.materials.measure import Scatter, median_ratio
@@ -147,6 +150,20 @@ def test_any_drift_is_within_its_error():
         standardised.append(deviation.real / change.std.real[in_other_rows])
         standardised.append(deviation.imag / change.std.imag[in_other_rows])
     assert np.sqrt(np.mean(np.square(standardised))) < 1.3
+
+
+def test_drifts_taken_together_or_one_by_one_give_the_same_change(monkeypatch):
+    """Many plates would need much memory for all drifts at once."""
+    scatters = make_scatter(lambda x, y: (20 * x * y + 0.1j, 0.8 * np.cos(30 * y)))
+    together = estimate_common_change(scatters, ORIGIN_M)
+    monkeypatch.setattr(common_change, "MOST_NUMBERS", 1)
+    one_by_one = estimate_common_change(scatters, ORIGIN_M)
+    for field in fields(together):
+        assert getattr(together, field.name) == pytest.approx(getattr(one_by_one, field.name), rel=1e-9, abs=1e-12)
+
+
+def test_no_plates_have_no_change():
+    assert estimate_common_change([], ORIGIN_M).largest_drift() == (0.0, 0.0)
 
 
 def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_ways():

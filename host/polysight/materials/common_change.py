@@ -17,6 +17,7 @@ slopes leave becomes part of the error of each plate.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -81,6 +82,8 @@ within the interval is smaller for the phase: 0.73 of the amplitude's in scenes 
 the independent generator."""
 TWO_SIDED_95 = 1.96
 """Standard deviations on both sides of a normal distribution's mean that hold 95 %."""
+# Numbers of the largest array, 16 MB: up to this drifts are computed together. Few plates then take half the time.
+MOST_NUMBERS = 2_000_000
 # Halvings of the range in which the width of an interval is searched: to 1e-7 of it.
 _BISECTIONS = 24
 WEIGHT_OF_USUAL = 2.0
@@ -290,7 +293,14 @@ class _Fields:
 
         `noise` [2, plate] is the standard deviation of the slopes.
         """
-        parts = [_list_arrays(self._explain(slopes, noise, *shared)) for shared in self.shared]
+        explained: dict[tuple[float, float, float, bool], tuple[Real, ...]] = {}
+        parts = []
+        for fringe, fringe_m, common, stable in self.shared:
+            # Where there are no fringes their length makes no difference.
+            case = (fringe, fringe_m if fringe > 0 else FRINGE_LENGTHS_M[0], common, stable)
+            if case not in explained:
+                explained[case] = _list_arrays(self._explain(slopes, noise, *case))
+            parts.append(explained[case])
         return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _explain(
@@ -308,32 +318,43 @@ class _Fields:
         shared_slope = np.kron(np.eye(2), np.ones((count, count)))
         of_common_causes = common**2 * shared_slope + fringe**2 * fringes.of_slopes
         own_slopes, own_slopes_prior = _list_own_variances(count)
-        cases = []
-        for field, drift in itertools.product(self.drifts, DRIFTS[stable]):
-            explained = of_common_causes + drift**2 * field.of_slopes
-            total = explained + (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
+        own_variances = (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
+        drifts = list(itertools.product(self.drifts, DRIFTS[stable]))
+        drifts_at_once = max(1, MOST_NUMBERS // max(1, own_variances.size))
+        parts = []
+        for first in range(0, len(drifts), drifts_at_once):
+            fields_of_drift = drifts[first : first + drifts_at_once]
+            explained = of_common_causes + np.stack([drift**2 * field.of_slopes for field, drift in fields_of_drift])
             # Gaussian process: the expected value of any quantity is its covariance with the slopes times `answer`,
-            # [case of own slopes, 2 plate].
-            inverse = np.asarray(np.linalg.inv(total), np.float64)
+            # [drift, own, 2 plate].
+            inverse = np.asarray(np.linalg.inv(explained[:, None] + own_variances), np.float64)
             answer = inverse @ measured
-            of_drift = drift**2 * field.with_slopes
+            of_drift = np.stack([drift**2 * field.with_slopes for field, drift in fields_of_drift])
             of_all = of_drift + fringe**2 * fringes.with_slopes
-            variance_of_drift = drift**2 * field.of_itself
-            case = _Explained(
-                # Prior of the case, and the normal distribution of the slopes with the covariance `total`.
-                log_evidence=np.log(own_slopes_prior / len(DRIFTS[stable]))
-                - 0.5 * answer @ measured
-                + 0.5 * np.linalg.slogdet(inverse)[1],
-                mean=answer @ of_all.T,
-                square=_compute_mean_square(answer, inverse, of_all, variance_of_drift + fringe**2 * fringes.of_itself),
-                drift=answer @ of_drift.T,
-                drift_square=_compute_mean_square(answer, inverse, of_drift, variance_of_drift),
-                remaining=slopes - (answer @ explained).reshape(-1, 2, count),
+            variance_of_drift = np.stack([drift**2 * field.of_itself for field, drift in fields_of_drift])
+            variance_of_all = variance_of_drift + fringe**2 * fringes.of_itself
+            square = _compute_mean_square(answer, inverse, of_all, variance_of_all)
+            # Without fringes the drift is all there is.
+            drift_square = square
+            if fringe > 0:
+                drift_square = _compute_mean_square(answer, inverse, of_drift, variance_of_drift)
+            # Prior of the case, and the normal distribution of the slopes with the covariance inverted above.
+            log_prior = np.log(own_slopes_prior / len(DRIFTS[stable]))
+            log_evidence = log_prior - 0.5 * answer @ measured + 0.5 * np.linalg.slogdet(inverse)[1]
+            cases_at_once = log_evidence.size
+            cases = _Explained(
+                log_evidence=log_evidence.ravel(),
+                mean=(answer @ of_all.mT).reshape(cases_at_once, count),
+                square=square.reshape(cases_at_once, count),
+                drift=(answer @ of_drift.mT).reshape(cases_at_once, count),
+                drift_square=drift_square.reshape(cases_at_once, count),
+                remaining=slopes - (answer @ explained).reshape(cases_at_once, 2, count),
             )
-            cases.append(case)
-        return _Explained.average_over(cases)
+            parts.append(cases)
+        return _Explained.average_over(parts)
 
 
+@functools.cache
 def _list_own_variances(count: int) -> tuple[Real, Real]:
     """Return variances of the plates' own slopes, [case, 2 plate] (x before y), and the prior probability of each case.
 
@@ -351,13 +372,15 @@ def _list_own_variances(count: int) -> tuple[Real, Real]:
 
 
 def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itself: Real) -> Real:
-    """Return the expected square of a field at each plate given the slopes, [case, plate].
+    """Return the expected square of a field at each plate given the slopes, [drift, own, plate].
 
-    `answer` is as in `_Fields._explain`, `inverse` that of the slopes' covariance, `with_slopes` and `of_itself` as in
-    `_Field`.
+    `answer` is as in `_Fields._explain`, `inverse` that of the slopes' covariance, [drift, own, 2 plate, 2 plate];
+    `with_slopes` [drift, plate, 2 plate] and `of_itself` [drift, plate] are as in `_Field`.
     """
+    with_slopes = with_slopes[:, None]
     explained_variance = np.sum(with_slopes @ inverse * with_slopes, axis=-1)
-    return np.maximum(of_itself - explained_variance, 0.0) + (answer @ with_slopes.T) ** 2
+    expected = (with_slopes @ answer[..., None])[..., 0]
+    return np.maximum(of_itself[:, None] - explained_variance, 0.0) + expected**2
 
 
 @dataclass(frozen=True)

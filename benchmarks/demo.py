@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.data import ROOT, temporary
-from benchmarks.measure import Line, add_arguments, count_repeats, cpu_s, show, write
+from benchmarks.measure import add_arguments, count_repeats, cpu_s, line_at_most, show, write
 from benchmarks.waits import command
 from polysight.store import MANIFEST
 
@@ -46,9 +46,13 @@ def run(args: argparse.Namespace) -> int:
     total = sum(by_kind.values()) / rows
     process_s = statistics.median(processed)
     lines = [
-        _make_seconds_line("a row of the demo's scan, all processes, CPU s", total, 0.75, f"{rows} rows: {each}"),
-        _make_seconds_line(
-            "process of that scan, CPU s", process_s, 6.0, ", ".join(f"{seconds:.1f}" for seconds in processed)
+        line_at_most("a row of the demo's scan, all processes, CPU s", total, "s", 0.75, note=f"{rows} rows: {each}"),
+        line_at_most(
+            "process of that scan, CPU s",
+            process_s,
+            "s",
+            6.0,
+            note=", ".join(f"{seconds:.1f}" for seconds in processed),
         ),
     ]
     show("the demo's scan, simulated cards, radars, Pi and stage", lines, args.quick)
@@ -115,13 +119,3 @@ def _list_parents() -> Iterator[tuple[int, int]]:
                 continue
             # After the name, which is in brackets: state, then the parent (proc(5)).
             yield int(process.name), int(status.rsplit(")", 1)[1].split()[1])
-
-
-def _make_seconds_line(name: str, value: float, limit: float, note: str) -> Line:
-    """Return a line of the table for seconds that must not exceed the limit (`at_least` is the worst accepted value).
-
-    There is no other program to compare with.
-    """
-    return Line(
-        name, f"{value:.2f} s", theirs="", value=value, at_least=limit, aim=limit, higher_is_better=False, note=note
-    )

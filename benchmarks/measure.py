@@ -236,6 +236,18 @@ class Line:
         return [self.quantity, self.ours, self.theirs, value, number(self.at_least), number(self.aim), self.verdict]
 
 
+def line_at_most(
+    quantity: str, value: float, unit: str, limit: float, aim: float | None = None, note: str = ""
+) -> Line:
+    """Return the line of an amount that must not exceed the limit, and should not exceed the aim (default: the limit).
+
+    There is no other program to compare with.
+    """
+    if aim is None:
+        aim = limit
+    return Line(quantity, f"{value:.3g} {unit}", "", value, limit, aim, higher_is_better=False, note=note)
+
+
 HEAD = ["quantity (simulated data)", "ours", "beside it", "value", "at least", "aim", ""]
 
 

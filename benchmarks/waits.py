@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from benchmarks.data import ROOT, SCENE, published_scene, recorded_rows, temporary, write_scan
-from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, show, write
+from benchmarks.measure import Seconds, add_arguments, count_repeats, line_at_most, show, write
 from benchmarks.whole import rows_that_fit
 from polysight.catalogue import Scans
 from polysight.jobs.process import make_products, publish_images
@@ -128,24 +128,24 @@ def run(args: argparse.Namespace) -> int:
         waited = [seconds_by_stage[stage] for seconds_by_stage in after_last_row]
         note = ", ".join(f"{seconds:.2f}" for seconds in waited)
         lines.append(
-            _report_seconds(f"last committed row to {stage}, wall s", statistics.median(waited), limit, limit, note)
+            line_at_most(f"last committed row to {stage}, wall s", statistics.median(waited), "s", limit, note=note)
         )
     for name, took in (("its own plane", same), ("another plane", other_seconds)):
         lines.append(
-            _report_seconds(f"image from kept samples, {name}, a board, CPU s", took.median / boards, 0.15, 0.1)
+            line_at_most(f"image from kept samples, {name}, a board, CPU s", took.median / boards, "s", 0.15, 0.1)
         )
     for name, took in (("first look", first), ("later", next_seconds)):
         note = f"{took.median_wall:.2f} s wall"
         lines.append(
-            _report_seconds(
-                f"list of {scans_in_list} scans of the operator's page, {name}, CPU s", took.median, 1.0, 0.5, note
+            line_at_most(
+                f"list of {scans_in_list} scans of the operator's page, {name}, CPU s", took.median, "s", 1.0, 0.5, note
             )
         )
     for name, times in command_times.items():
         cpu = statistics.median(t[0] for t in times)
         wall = statistics.median(t[1] for t in times)
         note = f"{wall:.2f} s wall"
-        lines.append(_report_seconds(f"polysight {name.split()[0]}, CPU s", cpu, COMMANDS[name], COMMANDS[name], note))
+        lines.append(line_at_most(f"polysight {name.split()[0]}, CPU s", cpu, "s", COMMANDS[name], note=note))
     show("waiting times, simulated rows", lines, args.quick)
     write(args.json, "waits", lines, behind=after_last_row, commands=command_times)
     return 0
@@ -170,11 +170,3 @@ def small_products(folder: Path) -> Path:
     command(["process", str(scan), "--out", str(products)])
     shutil.rmtree(scan)
     return products
-
-
-def _report_seconds(name: str, value: float, limit: float, aim: float, note: str = "") -> Line:
-    """Return a line for seconds that must not exceed the limit, and should not exceed the aim."""
-    # `at_least` holds the most that is allowed where lower is better.
-    return Line(
-        name, f"{value:.3f} s", theirs="", value=value, at_least=limit, aim=aim, higher_is_better=False, note=note
-    )

@@ -14,7 +14,16 @@ import numpy as np
 from benchmarks import sync
 from benchmarks.chain import Chain
 from benchmarks.data import published_scene, recorded_rows, temporary, write_scan
-from benchmarks.measure import Line, Seconds, add_arguments as add_common, count_repeats, one_core, show, write
+from benchmarks.measure import (
+    Line,
+    Seconds,
+    add_arguments as add_common,
+    count_repeats,
+    line_at_most,
+    one_core,
+    show,
+    write,
+)
 from benchmarks.published import form_image
 from polysight.imaging import image_grid
 from polysight_shared.config import Instrument
@@ -107,7 +116,13 @@ def run(args: argparse.Namespace) -> int:
     lines = [
         _make_time_line(quantity, seconds, statistics.median(theirs), statistics.median(theirs_tuned), part),
         _make_last_row_line(beside_scan),
-        _make_memory_line(memory, part),
+        line_at_most(
+            "anonymous memory of a full scan, GB",
+            memory / 1e9,
+            "GB",
+            0.4,
+            note=f"highest RssAnon of the processing process, at once and row by row; {part}",
+        ),
     ]
     show("a whole scan, one core, simulated rows repeated", lines, args.quick)
     write(args.json, "whole", lines, ours=ours, live=beside_scan, published_s=theirs, published_tuned_s=theirs_tuned)
@@ -133,31 +148,13 @@ def _make_time_line(quantity: str, seconds: float, published_s: float, tuned_s: 
 
 def _make_last_row_line(live: dict[str, list[float]]) -> Line:
     """Return the line about the wait after the last row, from figures of `Chain.run`."""
-    # `at_least` holds the most that is allowed where lower is better.
     last = statistics.median(live["last_row_wall_s"])
     last_cpu = statistics.median(live["last_row_cpu_s"])
-    return Line(
+    return line_at_most(
         "last committed row to final image, s",
-        f"{last:.2f} s",
-        "",
         last,
-        at_least=0.1,
-        aim=0.1,
-        higher_is_better=False,
+        "s",
+        0.1,
         note=f"median of {len(live['last_row_wall_s'])}, wall seconds ({last_cpu:.2f} s of CPU): reading,"
         " synchronising and imaging the last row of both boards, then both images",
-    )
-
-
-def _make_memory_line(memory: int, part: str) -> Line:
-    """Return the line about `memory`, which is in bytes."""
-    return Line(
-        "anonymous memory of a full scan, GB",
-        f"{memory / 1e9:.2f} GB",
-        "",
-        memory / 1e9,
-        at_least=0.4,
-        aim=0.4,
-        higher_is_better=False,
-        note=f"highest RssAnon of the processing process, at once and row by row; {part}",
     )

@@ -49,7 +49,10 @@ LIBRARIES = (
 )  # fmt: skip
 # Of pytest-xdist, which has execnet start it by `python -u -c CODE`.
 WORKER = "worker"
-STARTING_OTHERS = ("polysight", "polysight_simulators.rig", "polysight_simulators", WORKER)
+# Runs a program of ours: `python killed_at.py HITS PLACES polysight scan ...`.
+KILLED_AT = str(Path(__file__).with_name("killed_at.py"))
+STARTING_OTHERS = ("polysight_simulators.rig", "polysight_simulators", WORKER)
+COMMANDS_STARTING_OTHERS = frozenset({"demo", "doctor", "process", "resume", "scan", "serve"})
 # Variables that only a new process takes notice of.
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
 # Descriptors below are the program's; above are those on their way to it.
@@ -80,10 +83,19 @@ def program_name(words: list[str]) -> str:
         return program.name
     if words[1:] == ["-u", "-c", popen_bootstrapline]:
         return WORKER
+    if words[1:2] == [KILLED_AT]:
+        return KILLED_AT
     is_module = program.name.startswith("python") and len(words) > 2 and words[1] == "-m"
     if is_module and words[2].partition(".")[0] in PACKAGES:
         return words[2]
     return ""
+
+
+def starts_others(words: list[str]) -> bool:
+    """True for a program that may start others of ours, and gets a server; a fork takes as long as a short command."""
+    name = program_name(words)
+    is_command = name == KILLED_AT or name == "polysight"
+    return name in STARTING_OTHERS or (is_command and not COMMANDS_STARTING_OTHERS.isdisjoint(words))
 
 
 def is_ours(function: Callable[[], object] | None) -> bool:
@@ -248,7 +260,7 @@ def serve(connection: socket.socket) -> list[str]:
         spare = [moved_up(file) for file in files]
         for end in (connection, near):
             end.close()
-        if program_name(request.words) in STARTING_OTHERS:
+        if starts_others(request.words):
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             server = os.fork()
             if not server:
@@ -318,6 +330,9 @@ def run(words: list[str]) -> int:
             if not hasattr(sys.modules.get(words[2]), "__path__"):
                 sys.modules.pop(words[2], None)
             runpy.run_module(words[2], run_name="__main__", alter_sys=True)
+        elif words[1:2] == [KILLED_AT]:
+            sys.argv = words[1:]
+            runpy.run_path(KILLED_AT, run_name="__main__")
         else:
             sys.path[0] = str(BIN)
             sys.argv = words

@@ -14,7 +14,7 @@ from tests.support.kept import assert_kept, collect_figures, describe_figures, f
 
 from polysight.cli.main import main
 from polysight.products import read_products
-from polysight.report import write_report
+from polysight.report import label_figure, write_report
 
 HERE = Path(__file__).parent
 # Edges of patches are those of pixels, versions and times are of the run, texts have other tests.
@@ -58,7 +58,9 @@ def test_arrays_change_only_on_purpose(products):
 
 def test_numbers_and_pictures_of_the_report_change_only_on_purpose(products, tmp_path):
     with collect_figures() as saved:
-        report = write_report(tmp_path, read_products(products))
+        scan = read_products(products)
+        report = write_report(tmp_path, scan)
+        label_figure(scan, {"copper": (-70, -20, -20, 25), "PET": (20, -25, 72, 26)}, "copper")
     html = report.read_text(encoding="utf-8")
     text = re.sub(r"<(style|script|svg)\b.*?</\1>|<[^>]+>", " ", html, flags=re.DOTALL)
     # Without how long the run took, when it was and with which versions.

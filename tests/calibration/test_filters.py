@@ -1,7 +1,11 @@
 """High-pass corners that differ from the rig file are recovered from scans at several start frequencies."""
 
+from pathlib import Path
+
+import msgspec
 import numpy as np
 import pytest
+from tests.support.kept import assert_kept
 
 from polysight.calibration.direct_signal import BIN_HZ, MIN_CHIRPS, average_in_bins
 from polysight.calibration.files import FilterFile, load_calibration, read_calibration
@@ -40,6 +44,11 @@ def filter_run(scans, tmp_path_factory):
     out = tmp_path_factory.mktemp("found")
     assert main(["calibrate", "hpf", *map(str, scans), "--out", str(out)]) == 0
     return next(out.iterdir())
+
+
+def test_the_filters_found_change_only_on_purpose(filter_run):
+    figures = msgspec.to_builtins(read_calibration(filter_run, FilterFile, "hpf"))
+    assert_kept(Path(__file__).parent / "kept" / "filters.json", figures["boards"], 0.01)
 
 
 def test_unknown_corners_are_recovered(scans, filter_run):

@@ -1,8 +1,12 @@
 """Positions of boards and plane: a displaced rig is recovered from a scan of points, and processing uses the result."""
 
+from pathlib import Path
+
+import msgspec
 import numpy as np
 import pytest
 import tomli_w
+from tests.support.kept import assert_kept
 from tests.support.processes import read_output
 from tests.support.refusals import refused
 
@@ -66,6 +70,13 @@ def places_run(case, tmp_path_factory):
 @pytest.fixture(scope="module")
 def file(places_run):
     return read_calibration(places_run[1], PlacesFile, "direct_path")
+
+
+def test_the_places_found_change_only_on_purpose(file):
+    figures = msgspec.to_builtins(file)
+    of_the_run = ("made_utc", "sources", "versions")
+    kept = {name: value for name, value in figures.items() if name not in of_the_run}
+    assert_kept(Path(__file__).parent / "kept" / "places.json", kept, 0.01)
 
 
 def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):

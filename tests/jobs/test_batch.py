@@ -360,3 +360,14 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     (broken / "data_collection_cfg.json").unlink()
     assert main(command) == 0
     assert "1 skipped" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("content", "positions"),
+    [('{"total_x": 5, "total_y": 7}', 35), ('{"total_x": 5}', 70_000), ("[", 70_000), (None, 70_000)],
+)
+def test_positions_are_those_of_the_settings_or_of_the_published_grid(content, positions, tmp_path):
+    """They decide how many scans are processed at a time; what is wrong with a scan its own program says."""
+    if content is not None:
+        (tmp_path / "data_collection_cfg.json").write_text(content)
+    assert batch._count_positions(tmp_path) == positions

@@ -79,6 +79,15 @@ def test_an_unknown_item_is_refused_by_name(tmp_path, capsys):
     assert not (tmp_path / "r").exists()
 
 
+def test_a_wrong_rig_file_is_refused_before_any_item(tmp_path, capsys):
+    rig = tmp_path / "rig.toml"
+    rig.write_text("[chirp]\n")
+    assert main(["reproduce", "--config", str(rig), "--out", str(tmp_path / "r"), "fig99"]) != 0
+    said = capsys.readouterr().err
+    assert str(rig) in said
+    assert "fig99" not in said
+
+
 def test_published_numbers_stand_in_the_data_file_alone():
     folder = report.Path(report.__file__).parent
     numbers = [str(g["all_percent"]) for g in published_values()["classification"].values() if g["all_percent"] < 100]

@@ -71,3 +71,24 @@ def test_the_16_bit_crc_is_ccitt_false():
 def test_a_message_that_exceeds_its_limits_is_refused(blocks, sequence, value):
     with pytest.raises(ValueError, match=value):
         m.encode(m.command(blocks, sequence=sequence))
+
+
+@pytest.mark.parametrize(
+    ("message_id", "sequence", "fits"),
+    [
+        (0, 0, True),
+        (1023, 15, True),
+        (1024, 0, False),
+        (1025, 0, False),
+        (-1, 0, False),
+        (1, 16, False),
+        (1, 17, False),
+    ],
+)
+def test_numbers_beyond_their_bits_are_refused(message_id, sequence, fits):
+    message = m.Message(m.Direction.HOST_TO_MAIN, m.Kind.COMMAND, message_id, (m.SubBlock(1),), sequence)
+    if fits:
+        assert m.encode(message)
+        return
+    with pytest.raises(ValueError, match=f"sequence {sequence} .* id {message_id} "):
+        m.encode(message)

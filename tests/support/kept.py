@@ -24,6 +24,7 @@ Kept = float | int | str | bool | None
 NUMBER = re.compile(r"(?<![\w.#])[-+\N{MINUS SIGN}]?\d+(?:\.\d+)?(?![\w]*[-:/]\d)")
 # Without compiled loops and vector units, votes of single pixels changed by 2 %, all else by less than 1 %.
 RELATIVE = 0.03
+MANY_LINES = 40
 
 
 def assert_kept(file: Path, figures: object, absolute: float = 1e-5) -> None:
@@ -125,11 +126,18 @@ def _describe_axes(ax: Any) -> dict[str, Any]:
         "place": list(ax.get_position().bounds),
         "limits": [*ax.get_xlim(), *ax.get_ylim()],
         "texts": [[*_place(text), text.get_fontsize(), find_numbers(text.get_text())] for text in ax.texts],
-        "lines": [[len(line.get_xdata()), *_spread(np.column_stack(line.get_data()))] for line in ax.lines],
+        "lines": _describe_lines([np.column_stack(line.get_data()) for line in ax.lines]),
         "patches": [_spread(patch.get_path().vertices @ _data_matrix(patch)) for patch in ax.patches],
         "points": [[c.get_alpha(), *c.get_clim(), *_spread(np.asarray(c.get_offsets()))] for c in ax.collections],
         "images": [[*image.get_extent(), *image.get_clim(), *image.get_size()] for image in ax.images],
     }
+
+
+def _describe_lines(lines: list[np.ndarray]) -> list[list[float]]:
+    """Points of each line and where they lie; of very many lines, such as normals, of all together."""
+    if len(lines) > MANY_LINES:
+        lines = [np.concatenate(lines)]
+    return [[len(points), *_spread(points)] for points in lines]
 
 
 def _place(text: Any) -> list[float]:

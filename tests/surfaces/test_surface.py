@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.kept import assert_kept, summarise_array
+from tests.support.kept import assert_kept, collect_figures, describe_figures, summarise_array
 from tests.support.refusals import refused
 
 from polysight.data import find_packaged
+from polysight.report import surface_figure
 from polysight.surfaces import (
     SURFACE,
     Uncertainty,
@@ -56,7 +57,10 @@ def test_points_and_normals_of_a_sphere_are_found(glass_ball):
 def test_the_surface_of_a_sphere_changes_only_on_purpose(glass_ball):
     _, _, surface = glass_ball
     arrays = {name: value for name, value in vars(surface).items() if isinstance(value, np.ndarray)}
-    figures = {name: summarise_array(value) for name, value in arrays.items() if value.dtype.kind in "bfc"}
+    figures: dict[str, Any] = {name: summarise_array(v) for name, v in arrays.items() if v.dtype.kind in "bfc"}
+    with collect_figures() as saved:
+        surface_figure(surface)
+    figures["picture"] = describe_figures(saved)
     assert_kept(Path(__file__).parent / "kept" / "glass-ball.json", figures)
 
 

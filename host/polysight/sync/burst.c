@@ -275,13 +275,14 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
 static void lay_out(Work *w, Memory *memory)
 {
     const size_t chirps = LANES * (size_t)w->groups, values = (size_t)RX * w->blocks, words = (size_t)WORDS * w->n;
-    const size_t size = LANES * (size_t)w->table.size, row = LANES * (values + 2 * RX);
-    take_table(memory, &w->table, w->table.size);
+    const size_t points = w->table.size, size = LANES * points, row = LANES * (values + 2 * RX);
+    w->table.bin = take(memory, points, sizeof *w->table.bin);
+    w->table.place = take(memory, points, sizeof *w->table.place);
     w->words = take(memory, chirps * words, sizeof *w->words);
-    float **arrays[] = {&w->chosen, &w->re, &w->im, &w->phase_c, &w->phase_s, &w->row_re, &w->row_im, &w->folded_re,
-                        &w->folded_im, &w->all_re, &w->all_im};
-    const size_t counts[] = {words, size, size, LANES * (size_t)w->blocks, LANES * (size_t)w->blocks, row, row,
-                             chirps * values, chirps * values, values, values};
+    float **arrays[] = {&w->table.c, &w->table.s, &w->chosen, &w->re, &w->im, &w->phase_c, &w->phase_s, &w->row_re,
+                        &w->row_im, &w->folded_re, &w->folded_im, &w->all_re, &w->all_im};
+    const size_t counts[] = {points, points, words, size, size, LANES * (size_t)w->blocks, LANES * (size_t)w->blocks, row,
+                             row, chirps * values, chirps * values, values, values};
     for (size_t i = 0; i < sizeof counts / sizeof *counts; i++)
         *arrays[i] = floats(memory, counts[i]);
 }

@@ -57,8 +57,8 @@ class Decimator(NamedTuple):
     taps
         float32 [3, TAPS]: of the first block, of inner ones, of the last block; 0 for samples beyond the ends.
     flat
-        float32 [5, FLAT]: of the first four blocks, over blocks 0 to 8, and of inner ones, over their neighbours. The
-        last four blocks have those of the first in reverse.
+        float32 [FLAT, FLAT]: of the first four blocks, over blocks 0 to 8; of inner ones, over their neighbours; of the
+        last four blocks, over the last nine.
     noise
         Noise power of a sample after both filters, relative to a sample before.
     """
@@ -98,6 +98,8 @@ def decimator() -> Decimator:
     for block, weight_of_block in enumerate(flat[-1]):
         combined_taps[FOLD * block : FOLD * block + TAPS] += weight_of_block * inner
     taps = np.stack([first, inner, first]).astype(np.float32)
+    # The end of a chirp is its beginning in reverse.
+    flat += [part[::-1] for part in flat[-2::-1]]
     return Decimator(taps, np.stack(flat).astype(np.float32), float((combined_taps**2).sum()))
 
 
@@ -146,11 +148,10 @@ def _make_flat_matrix(blocks: int) -> NDArray[np.float32]:
     """Return `flatten` as a matrix [block in, block out]."""
     flat = decimator().flat
     matrix = np.zeros((blocks, blocks), np.float32)
-    for block in range(_EDGE):
-        matrix[:FLAT, block] = flat[block]
-        matrix[-FLAT:, -1 - block] = flat[block][::-1]
-    for block in range(_EDGE, blocks - _EDGE):
-        matrix[block - _EDGE : block + _EDGE + 1, block] = flat[_EDGE]
+    for block in range(blocks):
+        # The nine blocks about this one, or those nearest to the end.
+        first = min(max(block - _EDGE, 0), blocks - FLAT)
+        matrix[first : first + FLAT, block] = flat[block - first]
     return matrix
 
 

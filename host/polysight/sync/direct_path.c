@@ -2,6 +2,8 @@
    parts interleaved. */
 #include "signal.h"
 
+#define SEARCH 256 /* most blocks, and points of the transform, `decimate.SEARCH_FFT` */
+
 /* exp(-j 2 pi frequency FOLD (m - middle)) for m < blocks: conjugate before and behind the middle. */
 static inline void ramp(double frequency, int blocks, float *restrict c, float *restrict s)
 {
@@ -18,7 +20,7 @@ static inline void ramp(double frequency, int blocks, float *restrict c, float *
 static inline void weighted(const float *restrict halves, const float *restrict weights, int count, float *restrict x,
                             float *restrict y)
 {
-    float sum[2 * RX * MOST]; /* first, so that only one array is taken apart into real and imaginary parts */
+    float sum[2 * RX * SEARCH]; /* first, so that only one array is taken apart into real and imaginary parts */
     VECTOR
     for (int i = 0; i < 2 * count; i++)
         sum[i] = halves[i] + halves[2 * count + i];
@@ -53,32 +55,29 @@ static inline void medians(const float *powers, int size, float *median)
 static inline void choose_peaks(const Table *t, const float *re, const float *im, int top, int nearest, int farthest,
                                 double comparable, int bins[2])
 {
-    const int last = t->size - 1;
     int lower = top;
-    double best = 0, above = squared(value_at(re, im, t->place[(top - nearest + 1) & last]));
-    double here = squared(value_at(re, im, t->place[(top - nearest) & last]));
-    for (int d = nearest; d <= farthest; d++) {
-        double below = squared(value_at(re, im, t->place[(top - d - 1) & last]));
-        if (here >= below && here >= above && here > best) {
+    double best = 0;
+    for (int bin = top - nearest; bin >= top - farthest; bin--) {
+        double here = power_at(t, re, im, bin);
+        if (here > best && here >= power_at(t, re, im, bin - 1) && here >= power_at(t, re, im, bin + 1)) {
             best = here;
-            lower = (top - d) & last;
+            lower = bin & (t->size - 1);
         }
-        above = here;
-        here = below;
     }
-    int is_object = best > comparable * comparable * squared(value_at(re, im, t->place[top & last]));
+    int is_object = best > comparable * comparable * power_at(t, re, im, top);
     bins[0] = is_object ? lower : top;
     bins[1] = is_object ? top : lower;
 }
 
 /* `NumpyLoops.refine` for a position's weighted sum x, y: estimator [row][2][rx][block], real and imaginary part; changes
-   frequency, returns the last step. c, s: ramp of the last estimate [block]; work [2][row][block]. */
+   frequency, returns the last step. c, s: ramp of the last estimate [block]. */
 static double refine(const float *x, const float *y, const float *estimator, int blocks, int rows, int count_steps,
-                     float *c, float *s, float *work, double *frequency, Complex *estimate)
+                     float *c, float *s, double *frequency, Complex *estimate)
 {
     double step = 0, reach = 1.0 / (blocks * FOLD);
-    float *re = work, *im = re + rows * blocks;
-    memset(re, 0, sizeof *re * 2 * rows * blocks);
+    float re[3 * SEARCH], im[3 * SEARCH]; /* [row][block] */
+    memset(re, 0, sizeof *re * rows * blocks);
+    memset(im, 0, sizeof *im * rows * blocks);
     for (int i = 0; i < rows * RX; i++) { /* the same demodulation for all RX: sum over them first */
         const float *e = estimator + (i / RX * 2 * RX + i % RX) * blocks, *f = e + RX * blocks;
         const float *u = x + i % RX * blocks, *v = y + i % RX * blocks;
@@ -112,21 +111,16 @@ static double refine(const float *x, const float *y, const float *estimator, int
 
 /* `NumpyLoops.find`: halves [position][2][rx][block]; weights and steering [2][rx][block], real and imaginary part;
    preference [bin], `loops._weigh_bins`; the object is nearest..farthest bins above the direct path; estimator [3][2][rx][block]. Results:
-   peaks [2][position], median and frequency [position], estimates [position][3]. Returns 0, or 1 without memory. */
+   peaks [2][position], median and frequency [position], estimates [position][3]. Returns 0. */
 int NAME(find)(const float *halves, const float *weights, const float *preference, int positions, int blocks, int size,
                int nearest, int farthest, const double *comparable, const float *steering, const float *estimator,
                int count_steps, double *peaks, double *median, double *frequency, double *estimates)
 {
     const int count = RX * blocks;
-    Memory memory = {NULL, sizeof(float) * (size_t)(2 * count + 3 * LANES * size + 8 * blocks)};
-    Table table;
-    take_table(&memory, &table, size);
-    if (!reserve(&memory))
-        return 1;
-    take_table(&memory, &table, size);
-    float *re = floats(&memory, LANES * (size_t)size), *im = floats(&memory, LANES * (size_t)size);
-    float *power = floats(&memory, LANES * (size_t)size), *c = floats(&memory, 8 * (size_t)blocks);
-    float *x = floats(&memory, 2 * (size_t)count), *y = x + count, *s = c + blocks;
+    int bin[SEARCH], place[SEARCH];
+    float c[SEARCH], s[SEARCH], root_re[SEARCH], root_im[SEARCH], x[RX * SEARCH], y[RX * SEARCH];
+    float re[LANES * SEARCH] = {0}, im[LANES * SEARCH] = {0}, power[LANES * SEARCH];
+    Table table = {size, bin, place, root_re, root_im};
     fill_table(&table);
     for (int first = 0; first < positions; first += LANES) {
         int lanes = positions - first < LANES ? positions - first : LANES;
@@ -159,10 +153,9 @@ int NAME(find)(const float *halves, const float *weights, const float *preferenc
             median[p] = sqrt(middle[k]);
             frequency[p] = peaks[p];
             weighted(halves + 4 * (size_t)p * count, steering, count, x, y);
-            refine(x, y, estimator, blocks, 3, count_steps, c, s, s + blocks, frequency + p, (Complex *)estimates + 3 * p);
+            refine(x, y, estimator, blocks, 3, count_steps, c, s, frequency + p, (Complex *)estimates + 3 * p);
         }
     }
-    free(memory.block);
     return 0;
 }
 
@@ -174,15 +167,12 @@ int NAME(remove)(const float *halves, const float *steering, const float *estima
                  float *apart)
 {
     const int count = RX * blocks;
-    Memory memory = {NULL, 2 * sizeof(float) * ((size_t)count + 3 * blocks)};
-    if (!reserve(&memory))
-        return 1;
-    float *x = (float *)memory.block, *y = x + count, *c = y + count, *s = c + blocks;
+    float x[RX * SEARCH], y[RX * SEARCH], c[SEARCH], s[SEARCH];
     for (int p = 0; p < positions; p++) {
         const float *first = halves + 4 * (size_t)p * count, *second = first + 2 * count;
         Complex *estimate = (Complex *)estimates + 2 * p;
         weighted(first, steering, count, x, y);
-        steps[p] = refine(x, y, estimator, blocks, 2, count_steps, c, s, s + blocks, frequency + p, estimate);
+        steps[p] = refine(x, y, estimator, blocks, 2, count_steps, c, s, frequency + p, estimate);
         const double size = magnitude(*estimate);
         const float u = size > 0 ? (float)(estimate->re / size) : 0, v = size > 0 ? (float)(-estimate->im / size) : 0;
         float energy = 0;
@@ -202,6 +192,5 @@ int NAME(remove)(const float *halves, const float *steering, const float *estima
             }
         }
     }
-    free(memory.block);
     return 0;
 }

@@ -141,8 +141,8 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
 
 
 def search_size(n: int) -> int:
-    """Return the FFT size to find a tone of n samples: a power of two, with at least a quarter of padding."""
-    return 1 << int(np.ceil(np.log2(1.25 * n)))
+    """Return the FFT size to find a tone of n samples: a power of four, with at least a quarter of padding."""
+    return 4 ** int(np.ceil(np.log2(1.25 * n) / 2))
 
 
 def strongest(z: NDArray[np.complex64], samples: int) -> Tone:

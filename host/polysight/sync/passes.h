@@ -18,7 +18,7 @@ typedef struct {
     int chirps, samples, a, n, blocks, groups; /* n linear samples from a; groups of chirps */
     int parts, edges[PARTS + 1];
     double part_times[PARTS];
-    const float *taps, *flat;     /* `decimate.Decimator`: [3][TAPS], [5][FLAT] */
+    const float *taps, *flat;     /* `decimate.Decimator`: [3][TAPS], [FLAT][FLAT] */
     Table table;                  /* of the transform */
     int16_t *words;               /* [group][word][LANES] of the linear samples; a chirp stands in for missing ones */
     float *chosen;                /* words of the reference chirp */
@@ -84,10 +84,9 @@ static inline double peak_between(double below, double middle, double above)
 /* `loops.strongest`: the tone at an index of a spectrum; frequency in cycles per sample. */
 static inline Complex interpolated(const Work *w, const float *re, const float *im, int at, double *frequency)
 {
-    const int size = w->table.size, top = w->table.bin[at], *place = w->table.place;
+    const int size = w->table.size, top = w->table.bin[at];
     Complex peak = value_at(re, im, at);
-    double below = magnitude(value_at(re, im, place[(top + size - 1) % size]));
-    double above = magnitude(value_at(re, im, place[(top + 1) % size]));
+    double below = sqrt(power_at(&w->table, re, im, top - 1)), above = sqrt(power_at(&w->table, re, im, top + 1));
     double whole = (double)(top < size / 2 ? top : top - size) / size;
     *frequency = whole + peak_between(below, magnitude(peak), above) / size;
     return times(peak, cis(whole * (w->n - 1) / 2));
@@ -336,6 +335,15 @@ static inline void flatten(const float *flat, const float *restrict in, int bloc
     memcpy(out, in, sizeof *in * 2 * blocks);
     if (blocks < FLAT)
         return;
+    for (int row = 0; row < FLAT; row++) { /* blocks near the ends */
+        const int first = row < edge ? 0 : blocks - FLAT;
+        for (int part = 0; part < 2; part++) {
+            float sum = 0;
+            for (int t = 0; t < FLAT; t++)
+                sum += flat[FLAT * row + t] * in[2 * (first + t) + part];
+            out[2 * (first + row) + part] = sum;
+        }
+    }
     for (int i = 2 * edge; i < 2 * (blocks - edge); i++) {
         const float *x = in + i - 2 * edge;
         float sum = inner[edge] * x[2 * edge];
@@ -343,16 +351,6 @@ static inline void flatten(const float *flat, const float *restrict in, int bloc
             sum += inner[t] * (x[2 * t] + x[2 * (FLAT - 1 - t)]);
         out[i] = sum;
     }
-    for (int m = 0; m < edge; m++)
-        for (int part = 0; part < 2; part++) {
-            float first = 0, last = 0;
-            for (int t = 0; t < FLAT; t++) {
-                first += flat[FLAT * m + t] * in[2 * t + part];
-                last += flat[FLAT * m + t] * in[2 * (blocks - 1 - t) + part];
-            }
-            out[2 * m + part] = first;
-            out[2 * (blocks - 1 - m) + part] = last;
-        }
 }
 
 /* Third pass: the sum of the reduced chirps, turned by frequency and turns, in two halves with the weights first and

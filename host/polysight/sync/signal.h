@@ -128,18 +128,8 @@ static inline float total(Vector x)
     return sum;
 }
 
-/* Size of a transform, roots of unity exp(-j 2 pi k / size), the bin at each index of its output, the index of each bin. */
+/* Size of a transform, a power of four; roots of unity exp(-j 2 pi k / size), the bin at each index of its output, the index of each bin. */
 typedef struct { int size, *bin, *place; float *c, *s; } Table;
-
-/* Take memory for a table, or count it. */
-static inline void take_table(Memory *memory, Table *t, int size)
-{
-    t->size = size;
-    t->bin = take(memory, size, sizeof(int));
-    t->place = take(memory, size, sizeof(int));
-    t->c = floats(memory, size);
-    t->s = floats(memory, size);
-}
 
 /* Fill a table: the output of the transform is in the order of reversed digits, to base four. */
 static inline void fill_table(Table *t)
@@ -148,13 +138,11 @@ static inline void fill_table(Table *t)
         Complex root = cis(-(double)i / t->size);
         t->c[i] = (float)root.re;
         t->s[i] = (float)root.im;
-        int size = t->size, place = i, scale = 1, bin = 0;
-        for (; size >= 4; size /= 4, scale *= 4) {
-            bin += scale * (place / (size / 4));
-            place %= size / 4;
-        }
-        t->bin[i] = bin + scale * place;
-        t->place[t->bin[i]] = i;
+        int bin = 0;
+        for (int scale = 1, rest = i; scale < t->size; scale *= 4, rest /= 4)
+            bin = 4 * bin + rest % 4;
+        t->bin[i] = bin;
+        t->place[bin] = i;
     }
 }
 
@@ -185,8 +173,7 @@ static inline void transform(float *restrict re, float *restrict im, int samples
     memset(re + LANES * samples, 0, sizeof *re * LANES * (size - samples));
     memset(im + LANES * samples, 0, sizeof *im * LANES * (size - samples));
     const float *c = table->c, *s = table->s;
-    int n = size;
-    for (; n >= 4; n /= 4) {
+    for (int n = size; n > 1; n /= 4) {
         int q = n / 4, turn = table->size / n;
         for (int first = 0; first < size; first += n)
             for (int j = 0; j < q; j++) {
@@ -195,15 +182,6 @@ static inline void transform(float *restrict re, float *restrict im, int samples
                 butterfly(re + i, im + i, q * LANES, w);
             }
     }
-    if (n == 2)
-        for (int i = 0; i < size * LANES; i += 2 * LANES)
-            for (int k = 0; k < LANES; k++) {
-                float a = re[i + k], b = im[i + k], d = re[i + LANES + k], e = im[i + LANES + k];
-                re[i + k] = a + d;
-                im[i + k] = b + e;
-                re[i + LANES + k] = a - d;
-                im[i + LANES + k] = b - e;
-            }
 }
 
 /* Index of the strongest bin of each of sixteen spectra. */
@@ -224,6 +202,12 @@ static inline void strongest(const float *re, const float *im, int size, int32_t
 
 /* The value of a record at index i; re and im begin at the record's lane. */
 static inline Complex value_at(const float *re, const float *im, int i) { return (Complex){re[LANES * i], im[LANES * i]}; }
+
+/* The power of a bin of a record's spectrum, counted round the circle. */
+static inline double power_at(const Table *t, const float *re, const float *im, int bin)
+{
+    return squared(value_at(re, im, t->place[bin & (t->size - 1)]));
+}
 
 /* A step of Newton's method on the periodograms of `count` records [part][record], `loops.refine`: from frequencies `start`
    to f, in cycles per sample (both may be one array); t: times of the parts in samples. tone: sums at f. */

@@ -159,9 +159,9 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     offsets = np.zeros((plan.rows, plan.columns, 3))
     # Rows run to and fro: the first two give x of either direction.
     along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
-    for row in plan:
-        offsets[row.index, :, 0] = along[row.direction]
-        offsets[row.index, :, 1] = row.y_mm / 1e3
+    rows = list(plan)
+    offsets[..., 0] = [along[row.direction] for row in rows]
+    offsets[..., 1] = [[row.y_mm / 1e3] for row in rows]
     return offsets
 
 

@@ -387,9 +387,11 @@ class BoardSamples:
     ) -> None:
         """Replace a row in the samples and the live image; `forward` brings `offsets_m` into the order of columns."""
         self._add_to_live_image(index, -1)
-        mask = row.valid.astype(np.complex64)
-        np.multiply(row.samples, mask, out=self._cube[:, :, index])
-        np.multiply(row.direct, mask, out=self._direct[:, index])
+        self._cube[:, :, index] = row.samples
+        self._direct[:, index] = row.direct
+        if not row.valid.all():
+            self._cube[:, :, index, ~row.valid] = 0
+            self._direct[:, index, ~row.valid] = 0
         self.valid[index] = row.valid
         if offsets_m is not None:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
@@ -398,7 +400,7 @@ class BoardSamples:
             deviation = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
             if deviation > SLACK_M or geometry.find_irregularity(self.aperture) is not None:
                 self._live = None
-        self.has_rx[:, index] = row.samples.any(axis=(1, 2))
+        self.has_rx[:, index] = self._cube[:, :, index].any(axis=(1, 2))
         if not self.has_rx[:, index].all() and row.valid.any():
             # Running sums hold the constant echo of all RX.
             self._live = None

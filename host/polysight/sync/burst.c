@@ -271,20 +271,33 @@ static void align_position(Work *w, Chirps *c, const Equaliser *e, const int16_t
         ; /* again without the disturbed chirps */
 }
 
-/* Assign the arrays to memory, or count their size. */
-static void lay_out(Work *w, Memory *memory)
+/* Allocate the arrays as one block of zeros, each on its own cache lines. Returns the block, to be freed; NULL if there is
+   not enough memory. */
+static void *allocate(Work *w)
 {
+    float *bins, *places, *grouped; /* these hold integers */
+    void *block;
     const size_t chirps = LANES * (size_t)w->groups, values = (size_t)RX * w->blocks, words = (size_t)WORDS * w->n;
     const size_t points = w->table.size, size = LANES * points, row = LANES * (values + 2 * RX);
-    w->table.bin = take(memory, points, sizeof *w->table.bin);
-    w->table.place = take(memory, points, sizeof *w->table.place);
-    w->words = take(memory, chirps * words, sizeof *w->words);
-    float **arrays[] = {&w->table.c, &w->table.s, &w->chosen, &w->re, &w->im, &w->phase_c, &w->phase_s, &w->row_re,
-                        &w->row_im, &w->folded_re, &w->folded_im, &w->all_re, &w->all_im};
-    const size_t counts[] = {points, points, words, size, size, LANES * (size_t)w->blocks, LANES * (size_t)w->blocks, row,
-                             row, chirps * values, chirps * values, values, values};
-    for (size_t i = 0; i < sizeof counts / sizeof *counts; i++)
-        *arrays[i] = floats(memory, counts[i]);
+    float **arrays[] = {&bins, &places, &grouped, &w->table.c, &w->table.s, &w->chosen, &w->re, &w->im, &w->phase_c,
+                        &w->phase_s, &w->row_re, &w->row_im, &w->folded_re, &w->folded_im, &w->all_re, &w->all_im};
+    const size_t counts[] = {points, points, chirps * words / 2, points, points, words, size, size, LANES * (size_t)w->blocks,
+                             LANES * (size_t)w->blocks, row, row, chirps * values, chirps * values, values, values};
+    const size_t count = sizeof counts / sizeof *counts, line = 64 / sizeof(float);
+    size_t used = 0;
+    for (size_t i = 0; i < count; i++)
+        used += (counts[i] + line - 1) / line * line;
+    if (posix_memalign(&block, 64, sizeof(float) * used))
+        return NULL;
+    memset(block, 0, sizeof(float) * used);
+    for (size_t i = 0, at = 0; i < count; i++) {
+        *arrays[i] = (float *)block + at;
+        at += (counts[i] + line - 1) / line * line;
+    }
+    w->table.bin = (int *)bins;
+    w->table.place = (int *)places;
+    w->words = (int16_t *)grouped;
+    return block;
 }
 
 /* `offsets.align_row` for four RX. words: int16 [position][chirp][sample][2][RX]; valid [position][chirp]; [a, b): linear
@@ -302,11 +315,9 @@ int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int c
               .groups = (chirps + LANES - 1) / LANES, .parts = blocks < PARTS ? blocks : PARTS, .taps = taps,
               .flat = flat};
     Chirps c = {.usable = {0}};
-    Memory memory = {NULL, 0};
-    lay_out(&w, &memory);
-    if (!reserve(&memory))
+    void *block = allocate(&w);
+    if (!block)
         return 1;
-    lay_out(&w, &memory);
     fill_table(&w.table);
     for (int p = 0; p < w.parts; p++) {
         w.edges[p + 1] = (p + 1) * blocks / w.parts;
@@ -318,6 +329,6 @@ int NAME(align)(const int16_t *words, const uint8_t *valid, int positions, int c
                              amplitude + at, gain + at, error + 2 * at, error + 2 * at + chirps, coherence + at, clipped + at};
         align_position(&w, &c, &e, words + at * samples * WORDS, valid + at, full_scale, out);
     }
-    free(memory.block);
+    free(block);
     return 0;
 }

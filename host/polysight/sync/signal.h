@@ -67,29 +67,6 @@ static inline double angle(Complex a)
     return a.im < 0 ? -sum : sum;
 }
 
-/* Parts of one block of memory, each on its own cache lines; without a block their size is only counted. */
-typedef struct { char *block; size_t used; } Memory;
-
-/* The next part of the memory, for `count` values of `size` bytes; NULL, and only counted, without a block. */
-static inline void *take(Memory *memory, size_t count, size_t size)
-{
-    void *here = memory->block ? memory->block + memory->used : NULL;
-    memory->used += (count * size + 63) / 64 * 64;
-    return here;
-}
-
-static inline float *floats(Memory *memory, size_t count) { return take(memory, count, sizeof(float)); }
-
-/* Allocate zeroed memory of the size counted, to be taken from its beginning and freed; returns 0 if there is not enough. */
-static inline int reserve(Memory *memory)
-{
-    void *block;
-    if (posix_memalign(&block, 64, memory->used + 64))
-        return 0;
-    *memory = (Memory){memset(block, 0, memory->used + 64), 0};
-    return 1;
-}
-
 /* As many floats as the processor handles at once: a part of LANES. Compilers do well with these vectors, except for the
    conversion of words to floats (`counts`), and sums of products (`add_product`), which `-fassociative-math` takes apart. */
 #define STEP (WIDTH / 32)

@@ -37,7 +37,7 @@ _ALIVE_INTERVAL_S = 1.0
 # Time in which a scan accepts a command; chosen.
 _TIMEOUT_S = 5.0
 LAPSE_S = 15.0
-"""Without a sign of life for so long, a scan's program hangs, or runs on a machine that is gone; chosen."""
+"""After this time without a sign of life a scan's program hangs, or its machine has failed; chosen."""
 # Characters of the name of who gave a command; more of it is cut off.
 MAX_ASKER = 60
 Doing = Literal["rows", "materials"]
@@ -160,7 +160,7 @@ class Life(msgspec.Struct, frozen=True):
 
     @property
     def killed(self) -> bool:
-        """True if the process ran on this machine and is gone: a scan that ends by itself removes the file."""
+        """True if the process ran on this machine and no longer exists: a scan that ends by itself removes the file."""
         return self.is_here and read_start_ticks(self.pid) != self.ticks
 
 

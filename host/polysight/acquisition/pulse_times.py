@@ -5,7 +5,7 @@ the card dropped unnoticed leave no other trace. Arrival times do. The packets o
 between two silences. The *shift* of a train is the number of bytes that are missing before it: 0 in a perfect row, a
 frame more after a missed pulse, a frame less after a spurious edge. Arrival times bound it:
 
-* Upper bound: when the last byte of a train came, the pulse of its frame had been sent. It holds whatever was delayed.
+* Upper bound: when the last byte of a train came, the pulse of its frame had been sent. It holds for any delay.
 * Lower bound: the first packet of a train came as soon as it was full, unless something held it back. This bound is
   used only for a train of a single frame, as frames that were held back come together. If the train came at no pulse's
   time, the first pulse of its burst counts.
@@ -229,7 +229,7 @@ def _find_trains(
     # When the first packet was full, the radar had sent all frames before that pulse's, and at least one sample of that
     # frame. The bytes of these that are beyond `first_stop` are missing.
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
-    # Frames that come faster than pulses are sent catch up with a delay, however long it was.
+    # Frames that come faster than pulses are sent make up for a delay of any length.
     to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
     catches_up = (low > 0) & (to_next_ns < _CATCHING_UP * period_ns)
     low[catches_up] = -_NO_BOUND
@@ -401,7 +401,7 @@ def _predict_arrivals(
     narrowest = int(np.argmin(widths))
     if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
         raise _DisturbedError("the delays of the bursts differ too much to tell their pulses apart")
-    # Of the bursts that agree, the quickest: what is slower was held back.
+    # Of the bursts that agree, the quickest one counts: slower ones were delayed.
     pulses = pulses_ns.reshape(-1)
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]
 

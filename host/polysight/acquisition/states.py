@@ -1,4 +1,4 @@
-"""The states of a scan as people read them: the one table that page, list, terminal and `polysight ask` speak from.
+"""The states of a scan as people read them: the one table that page, list, terminal and `polysight ask` use.
 
 Each state has a colour, words, the buttons that may be pressed, and phrases that are never shown with it. Words in
 braces are filled in: `{folder}`, `{safe}` (rows that are safe), `{all_safe}` (that all are, and how many with gaps),

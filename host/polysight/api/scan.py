@@ -564,7 +564,7 @@ class Scan:
         if self._saved is not None:
             return self._saved
         # Cached properties that were computed are in their instance's dict; asking for them would compute them. If
-        # `_processing` was not, `self` stands for it, which has no `referenced` in its dict.
+        # `_processing` was not, `self` takes its place, which has no `referenced` in its dict.
         processing = vars(self).get("_processing", self)
         return vars(processing).get("referenced")
 

@@ -68,8 +68,8 @@ class SourceScan(msgspec.Struct, frozen=True):
 class CalibrationFile(msgspec.Struct, frozen=True, kw_only=True):
     """Fields that all files have.
 
-    `kind` is the key in the rig file's [calibration] that names the file (`start_frequency` is none), `made_utc` date
-    and time in ISO 8601, `versions` are those of the programs, `format` is that of the file.
+    `kind` is the key in the rig file's [calibration] that names the file (`start_frequency` has no such key),
+    `made_utc` date and time in ISO 8601, `versions` are those of the programs, `format` is that of the file.
     """
 
     kind: str
@@ -379,7 +379,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Calibration files of a rig; None for what is not calibrated. `paths` are their paths by kind."""
+    """Calibration files of a rig; None for uncalibrated parts. `paths` are their paths by kind."""
 
     places: PlacesFile | None = None
     filters: FilterFile | None = None

@@ -1,6 +1,6 @@
 """Control of one DCA1000 over UDP: start, stop and reset it, program its EEPROM, and check every hop to it.
 
-The socket is never connected: replies come from the card's port 1024, whatever port the command went to. Only commands
+The socket is never connected: replies come from the card's port 1024, for any port of the command. Only commands
 that are safe to repeat are retried. If no reply comes before the timeout, the error names the hop that does not work.
 `program_eeprom` writes new addresses and a new MAC address, which take effect when the card is next switched on.
 `survey_cards` checks the hops between each card and the host's memory, in order.
@@ -417,7 +417,7 @@ HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
 PULSES = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
 # The hops of a silent card that are not the card itself.
 _FAULTY_HOP = {Hop.ROUTE: "route", Hop.LINK: "link"}
-# Time between two looks at what has come from a radar (chosen).
+# Time between two queries for data of a radar (chosen).
 _POLL_S = 0.05
 
 

@@ -23,7 +23,7 @@ REQUEST_MAGIC = 0xA55A
 FOOTER = 0xEEAA
 # Largest body of a request, bytes.
 MAX_REQUEST_DATA = 504
-# The card sends replies and data from this port, whatever port it listens on.
+# The card sends replies and data from this port, for any port that it listens on.
 CARD_SOURCE_PORT = 1024
 PACKET_HEADER_BYTES = 10
 MAX_PAYLOAD_BYTES = 1456

@@ -121,8 +121,8 @@ class Report:
     that of every antenna, over the same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC
     counts. `clipped` counts values at full scale in all of the payload, `left_over_bytes` the bytes after the last
     complete chirp. `chirps` are those in the file, of which the first `MAX_CHIRPS` make the other statistics. `remarks`
-    are sentences on what is suspicious; `card` is None unless the file is a packet capture. `simulated` is set by the
-    caller.
+    are sentences on suspicious properties; `card` is None unless the file is a packet capture. `simulated` is set by
+    the caller.
     """
 
     path: Path
@@ -279,7 +279,7 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
 
 
 def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
-    """List what is suspicious in a recording; `mirrored`: most power is at negative frequencies."""
+    """List suspicious properties of a recording; `mirrored`: most power is at negative frequencies."""
     remarks = []
     if max(r.rx_rms) == 0:
         return ["every sample is zero: nothing was recorded"]

@@ -171,7 +171,7 @@ class BatchReceiver:
         self.times_ns: NDArray[np.int64] = np.zeros(batch, dtype=np.int64)
         self.strangers = 0
         self.is_drained = True
-        # Memory of the last packets in the kernel, whoever sent them: at least this many bytes.
+        # Memory of the last packets in the kernel, from any sender: at least this many bytes.
         self._kernel_bytes = 0
         # Wall clock minus monotonic clock at the last reception: a jump of it says that somebody set the wall clock.
         self._clocks_differ_ns = measure_clock_difference()
@@ -297,7 +297,7 @@ def check_receive_buffer(
     DeviceError
         if the buffer holds less than two bursts; the remedy is the command that raises the limit.
     """
-    # Two bursts and two packets, at what the kernel needs for each; Linux grants twice the bytes that are asked for.
+    # Two bursts and two packets, with the kernel's memory for each; Linux grants twice the requested bytes.
     enough = max(needed_bytes, (2 * burst_bytes // MAX_PAYLOAD_BYTES + 2) * KERNEL_BYTES_A_PACKET // 2)
     remedy = f"`sysctl -w net.core.rmem_max={enough}`, and the same in /etc/sysctl.d/ to keep it"
     try:

@@ -73,7 +73,7 @@ def take_core(core: int | None, exclusive: bool = True, urgent: bool = True) -> 
 
 
 def take_priority(real_time: int = REAL_TIME) -> tuple[str, str]:
-    """Give this process real-time priority, or else a lower nice value; return the priority and what was not permitted.
+    """Give this process real-time priority, otherwise a lower nice value; return the priority and the refusals.
 
     Real time (round robin) and negative nice values need CAP_SYS_NICE. A receiver sleeps for a millisecond between
     batches, so it never occupies a whole core.
@@ -156,7 +156,7 @@ class Report(_Message, frozen=True):
 class Opened(_Message, frozen=True):
     """The socket is bound to `data_port`, with a receive buffer of `granted_bytes`.
 
-    `scheduling` has core and priority as text, `warnings` what the system did not permit.
+    `scheduling` has core and priority as text, `warnings` the refusals of the system.
     """
 
     granted_bytes: int

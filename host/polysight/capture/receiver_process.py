@@ -141,7 +141,7 @@ class Receiver:
             self._row.segment.discard()
 
     def _answer(self, request: messages.Request) -> messages.Answer:
-        """Do what a request says and return the answer; between rows the progress is that of no row (-1)."""
+        """Execute a request and return the answer; between rows the progress is that of no row (-1)."""
         if isinstance(request, messages.Open):
             return self._open(request)
         if isinstance(request, messages.BeginRow):

@@ -360,7 +360,7 @@ def _restore_rows(scan: Path, changed_ns: int) -> Pipeline | None:
 
 
 def _convert_to_db(value: complex) -> float | None:
-    """Return the level of an amplitude in dB; None for zero and for what is not finite."""
+    """Return the level of an amplitude in dB; None for zero and for values that are not finite."""
     if value and np.isfinite(value):
         return round(float(20 * np.log10(abs(value))), 2)
     return None

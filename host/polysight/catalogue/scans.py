@@ -74,7 +74,7 @@ class Summary(msgspec.Struct, frozen=True):
     state
         One of :data:`polysight.acquisition.BADGES`: `lost` (its program was killed), `frozen` (it gives no sign of
         life), `begun` (a folder in which a program was started and no scan is yet), `products` (without rows),
-        `silent` (its folder does not answer: a network drive that is gone), ...
+        `silent` (its folder does not answer: a disconnected network drive), ...
     rows, committed
         Of the plan, and those that count.
     reason
@@ -93,7 +93,7 @@ class Summary(msgspec.Struct, frozen=True):
     labelled
         Names of boxes drawn by hand.
     notes, tags
-        The operator's; `notes` says what is wrong with a damaged file of them.
+        The operator's; `notes` has the problem if their file is damaged.
     """
 
     name: str
@@ -155,7 +155,7 @@ def summarise(folder: Path, name: str) -> Summary:
     try:
         notes = read_notes(folder)
     except DataError as e:
-        # The list shows what is wrong where the notes would stand.
+        # The list shows the problem in place of the notes.
         notes = Notes(e.what)
     summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_read_modified_s(folder))
     with suppress(PolysightError):
@@ -219,7 +219,7 @@ def _add_products(folder: Path, summary: Summary) -> Summary:
         if places[0] == folder:
             summary = replace(summary, scan_id=products.scan_id, simulated=products.simulated)
     except PolysightError:
-        # The page of the scan says what is wrong.
+        # The page of the scan shows the problem.
         return replace(summary, verdict="damaged")
     return summary
 
@@ -452,7 +452,8 @@ class Scans:
         """Return every scan, the newest first; what has changed since the last call is read again.
 
         A folder that takes longer than `READ_S` is listed as `silent`. Its thread cannot be ended: the folder is read
-        again when that has returned. After `within_s` the list is what was read so far; the next call goes on.
+        again when that has returned. After `within_s` the list has the entries that were read so far; the next call
+        continues.
         """
         with self._lock:
             if self.only is not None:
@@ -499,7 +500,7 @@ class Scans:
         self._indexed_at = time.monotonic()
 
     def _read_all(self, waiting: deque[str], until_s: float) -> None:
-        """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread goes on.
+        """Read entries of the root in a thread; when it makes no progress for `READ_S`, another thread continues.
 
         After `until_s` (monotonic clock) no further entry is read.
         """

@@ -28,7 +28,7 @@ from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError, ErrorCode
 
-# Limits of options are chosen, far beyond what a rig has, where nothing else is said.
+# Limits of options are chosen, far beyond values of a rig, unless a comment says otherwise.
 _bursts = number(int, "a whole number from 1 to 16", lambda value: 1 <= value <= 16)
 # Nearer than a few wavelengths (4 mm) no antenna sees a plane wave.
 _distance = number(float, "a distance from 20 to 10000 mm", lambda value: 20 <= value <= 10_000)

@@ -75,7 +75,7 @@ class Redactor:
                 for path in sorted(p for p in folder.iterdir() if p.is_file()):
                     with suppress(OSError, DataError):
                         text = read_bounded(path, _KEY_BYTES).decode("utf-8", "replace")
-                        # A key may follow a "=", or have one inside. Shorter words are no keys: removing them would
+                        # A key may follow a "=", or have one inside. Shorter words are not keys: removing them would
                         # make the files unreadable.
                         parts = re.split(r"[\s\"']+", text) + re.split(r"[\s\"'=]+", text)
                         words |= {word for word in parts if len(word) >= 16}

@@ -428,7 +428,7 @@ class StageWindow:
         columns_px = np.arange(profile.size, dtype=np.float64)
         seen_px = find_ends(profile, lit, inside_px)
         # Where plates touch, |H| does not fall to half between them, or does so elsewhere: there the end is that of the
-        # segmentation. A plate that is segmented up to the end of the illuminated part goes on: it has no end.
+        # segmentation. A plate that is segmented up to the end of the illuminated part continues: it has no end.
         touching = np.abs(seen_px - mask_ends_px) > SAME_END_PX
         light_ends_px = np.flatnonzero(lit)[[0, -1]]
         in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX

@@ -157,7 +157,9 @@ class Illumination:
         is_lit = np.abs(self.footprints).min(axis=0) >= _VISIBLE * np.abs(self.footprints).max()
         level = np.where(is_lit & np.isfinite(h), np.abs(h), np.nan)
         if along == 1:
-            level, mask, plate = level.T, mask.T, plate.T
+            level = level.T
+            mask = mask.T
+            plate = plate.T
         lines = level[mask.any(axis=1)]
         if not np.isfinite(lines).any():
             return slope

@@ -224,7 +224,7 @@ def board_facts(board: BoardSamples) -> BoardImaging:
 
 
 def _round_pair(pair: tuple[float, float]) -> Pair:
-    """Return (x, y) with three decimals, None for what is not finite."""
+    """Return (x, y) with three decimals, None for values that are not finite."""
     x, y = (round(value, 3) if np.isfinite(value) else None for value in pair)
     return x, y
 

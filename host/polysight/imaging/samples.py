@@ -41,8 +41,9 @@ from polysight_shared.errors import DataError
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# `Reduction.maps` is fitted to echoes from so much before the direct path to so much behind the gate, and at least so
-# far behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude relative to the noise (chosen).
+# `Reduction.maps` is fitted to echoes from `_BESIDE_M` before the direct path to `_BESIDE_M` behind the gate, and at
+# least to `_PASSED_M` behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude relative to the
+# noise (chosen).
 _BESIDE_M = 0.1
 _PASSED_M = 1.0
 _ECHO = 30.0
@@ -51,9 +52,9 @@ _NOISE = 1e-3
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
-# Multiplications of a matrix product: for more, OpenBLAS copies both matrices first, a fifth slower with AVX-512
+# Largest number of multiplications of a matrix product: for more, OpenBLAS copies both matrices first, a fifth slower.
 _PRODUCT = 1_000_000
-# Columns of such a product come in whole groups of so many: 22 take an eighth longer than 24 (OpenBLAS, AVX2)
+# The columns of such a product fill groups of this size: 22 columns take an eighth longer than 24 (OpenBLAS, AVX2).
 _COLUMNS = 8
 
 
@@ -448,7 +449,7 @@ class BoardSamples:
         self._invalidate()
 
     def copy_samples(self, coarse: BoardSamples, steps: tuple[int, int]) -> None:
-        """Take the samples of a coarser scan, one for every `steps` (rows, columns) of this; others stay missing."""
+        """Copy the samples of a coarser scan, one for every `steps` (rows, columns) of this; others stay missing."""
         rows, columns = steps
         self._cube[:, :, ::rows, ::columns] = coarse._cube
         self._direct[:, ::rows, ::columns] = coarse._direct
@@ -591,7 +592,7 @@ class BoardSamples:
     def dispersion(self, grid: geometry.ImageGrid | None = None) -> Image:
         """Return the change of ln(image / footprint) from the first to the last frequency, complex64 [ny, nx].
 
-        NaN where nothing is seen. For an echo that grows as 1 + s (f - f0) the slope of :meth:`range_slope` exceeds the
+        NaN where no echo is seen. For an echo that grows as 1 + s (f - f0) the slope of :meth:`range_slope` exceeds the
         mirror's by -j 2 pi s var(f) / c, where the window's var(f) follows from the mirror's own second derivative.
 
         Parameters

@@ -47,7 +47,7 @@ from polysight_shared.files import read_json
 SUMMARY = "processed.json"
 """File of the outcomes of all scans, in the folder that holds their products."""
 Status = Literal["done", "skipped", "failed", "stopped"]
-# Files without which products do not count as finished, whatever their mark says.
+# Files without which products do not count as finished, even if they have the mark.
 _PRODUCTS = (IMAGE, QUALITY)
 PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
@@ -437,7 +437,7 @@ def _count_positions(data: Path) -> int:
             return int(settings["total_x"]) * int(settings["total_y"])
         return ScanFolder.load(data).plan.positions
     except (PolysightError, OSError, ValueError, KeyError, TypeError):
-        # The program that processes the scan will say what is wrong.
+        # The program that processes the scan will report the problem.
         return 350 * 200
 
 
@@ -504,7 +504,7 @@ def _read_results(products: Path) -> tuple[str, str, str]:
 
 
 def exit_with_parent(pipe: str | None) -> None:
-    """Exit when the other end of a pipe closes, so that nothing goes on after the parent was killed.
+    """Exit when the other end of a pipe closes, so that no process continues after the parent was killed.
 
     `pipe` is the number of this end, as text; None: no parent waits for this program.
     """

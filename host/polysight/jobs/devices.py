@@ -257,7 +257,7 @@ def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
     name = str(words.facts.get("board", ""))
     if not as_json:
         sys.stdout.write(f"replayed from {trace}, not a board\n")
-    # The trace stands for both the clock and the link to the board.
+    # The trace replaces both the clock and the link to the board.
     return _run_check(_load_native_rig(config, name), name, words, lambda: words, as_json)
 
 
@@ -325,7 +325,7 @@ def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[]
 
 
 def _format_step(name: str, row: StepResult) -> str:
-    """Return a step of a board's check as a line; a failed one with what was expected and what to do."""
+    """Return a step of a board's check as a line; a failed one with the expected outcome and the remedy."""
     lines = [f"{name}  {row.step:12} {_WORDS[row.passed]:6}  {row.outcome}"]
     if not row.passed:
         lines += [f"      expected: {row.expected}", f"      do: {row.remedy}"]
@@ -333,7 +333,7 @@ def _format_step(name: str, row: StepResult) -> str:
 
 
 def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
-    """Write the flash and show the progress; if stopped by Ctrl-C, say what the flash holds.
+    """Write the flash and show the progress; if stopped by Ctrl-C, print the content of the flash.
 
     Raises DeviceError, ConfigError.
     """

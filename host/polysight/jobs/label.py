@@ -86,8 +86,8 @@ class Edits:
 def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None = None) -> int:
     """Draw, name and save the boxes of a scan or of its products; return the exit status.
 
-    Without `edits` the person is asked for the name of each patch. If nobody can be asked (`ask` is None), or with
-    `list_only`, boxes and patches are printed and nothing is written.
+    Without `edits` the person is asked for the name of each patch. If there is no person to ask (`ask` is None), or
+    with `list_only`, boxes and patches are printed and nothing is written.
 
     Raises
     ------

@@ -43,7 +43,7 @@ from polysight.materials import (
     read_materials,
 )
 from polysight.products import MATERIALS, REPORT, SCAN, ProcessedScan, find_products, read_products
-from polysight.results import NoResult, PatchFigures, PermittivityFigures, one_line, to_plain
+from polysight.results import NoResult, PatchFigures, PermittivityFigures, format_one_line, to_plain
 from polysight.store import is_source
 from polysight_shared.config import Chirp, load_instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, quote
@@ -515,7 +515,7 @@ def _print_names(content: dict[str, Any], several: bool) -> None:
         place = ""
         if several:
             place = f" in {refused['products']}"
-        text = one_line(Finding("error", refused["what"], refused["why"], refused["do"]))
+        text = format_one_line(Finding("error", refused["what"], refused["why"], refused["do"]))
         sys.stdout.write(f"{refused['label']:>3}  not judged{place}: {text}\n")
 
 

@@ -39,7 +39,7 @@ from polysight.process import (
     why_unnamed,
 )
 from polysight.products import IMAGE, REPORT, check_products_folder, making_products, raw_dropped, write_json
-from polysight.results import one_line, rules
+from polysight.results import format_one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
@@ -125,7 +125,7 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     with making_products(out, pipeline.source.scan_id) as new:
         scan = collect_imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
         save_images(new, scan)
-    # If the terminal was closed, processing goes on all the same.
+    # If the terminal was closed, processing still continues.
     with suppress(OSError):
         sys.stderr.write(f"image: {out / IMAGE}\n")
 
@@ -320,7 +320,7 @@ class LiveProcessing:
             # Reported with the row that shows it, not after the scan.
             new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in told[name]}
             for finding in rules.judge_dead_rx(name, new, rows=1):
-                _log.warning("row %d: %s", row, one_line(finding))
+                _log.warning("row %d: %s", row, format_one_line(finding))
         if self._source.complete:
             publish_images(self._pipeline, self._folder / PRODUCTS)
 

@@ -126,7 +126,7 @@ def find_scan(file: Path) -> ScanFolder | None:
     try:
         return ScanFolder.load(folders[2])
     except PolysightError:
-        # `polysight validate` says what is wrong with it.
+        # `polysight validate` reports the problem.
         return None
 
 

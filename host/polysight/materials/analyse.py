@@ -82,7 +82,7 @@ from polysight_shared.config import Instrument
 from polysight_shared.findings import Finding
 
 LEAST_LEAKAGE_STD = 5e-4
-"""Least standard deviation of the leakage, whatever the rig file says; chosen."""
+"""Least standard deviation of the leakage, even if the rig file has less; chosen."""
 MEASURED_RIG = RigPrior(theta_std_rad=1e-3, leakage_std=0.003, leakage_measured=True)
 """Prior of a rig whose leakage was measured and found to be zero; the standard deviations are chosen."""
 
@@ -625,7 +625,7 @@ def _weigh_metal(
 ) -> MetalReference:
     """Return the metal reference with the evidence for metal and against.
 
-    If nobody declared the metal, it is weighed with each possible sign of the phases, and the sign with the least
+    If the metal was not declared, it is weighed with each possible sign of the phases, and the sign with the least
     evidence for metal counts.
     """
     evidence = []

@@ -429,7 +429,7 @@ class Classifier:
         """Name the patches of one scan, or of several scans of the same patches under different angles.
 
         `patches` are the features of each patch's pixels, [n, 4 * angles] (:func:`feature_matrix`); pixels that are not
-        finite are unknown. `evidence` is what each scan says of each patch; None where only the pixels are known. The
+        finite are unknown. `evidence` is that of each scan on each patch; None where only the pixels are known. The
         paper's KNN uses the pixels alone.
         """
         if self.model == PAPER:

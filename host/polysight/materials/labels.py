@@ -32,7 +32,7 @@ def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     """Return the plates in the content of truth.json: name, centre_mm, size_mm, and what it is of: permittivity,
     metal, layers or strips.
 
-    What is marked as background, such as a table, is left out: nobody asks for its name. Raises DataError if the
+    Plates that are marked as background, such as a table, are left out: they need no name. Raises DataError if the
     content is invalid.
     """
     try:
@@ -337,7 +337,7 @@ RESERVED = ("unknown", "none of these", "possible layer")
 # Boxes may overlap, or leave the image, by so much. Label files hold three decimals, so that edges that touch may be
 # off by 0.001 mm; chosen ten times as large, far below a pixel.
 _TOLERANCE_MM = 0.01
-# Characters that nobody sees: two names that differ by one of them look the same.
+# Invisible characters: two names that differ by one of them look the same.
 _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")
 
 

@@ -37,7 +37,7 @@ Complex = npt.NDArray[np.complex128]
 # Frequencies of a sub-band at which a layer is modelled; chosen.
 _FREQUENCIES = 24
 METAL = complex(np.inf, 0.0)
-"""Permittivity that stands for a layer of metal: a perfect conductor."""
+"""Permittivity that means a layer of metal: a perfect conductor."""
 
 
 @dataclass(frozen=True)
@@ -477,7 +477,7 @@ class _Model:
         thickness_range_m: tuple[float, float] | None,
     ) -> None:
         self.fits_thickness = thickness_range_m is not None
-        # Any thickness stands for one that is fitted.
+        # Any thickness replaces one that is fitted.
         check_stack(
             [
                 replace(layer, thickness_m=1.0) if self.fits_thickness and i == layer_index else layer

@@ -122,7 +122,7 @@ def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> 
 def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms over places of the mean of H and of V, in squares of a plate's size away from all patches.
 
-    What lies behind the plates, such as a table, adds to them as well, with a phase that nobody knows. It changes
+    What lies behind the plates, such as a table, adds to them as well, with an unknown phase. It changes
     little over a plate, so that neither averaging nor the scatter of the plate's pixels shows it: on the published
     picture the mean over a plate's size is only 6 dB below the background itself. 0 without such places.
     """

@@ -42,12 +42,12 @@ Complex = npt.NDArray[np.complex128]
 
 DOUBTFUL_V_DB = -2.5
 WEAK_V_DB = -7.0
-"""V / H relative to the direct path. Below the first value a patch that nobody declared is not metal; below the second
+"""V / H relative to the direct path. Below the first value an undeclared patch is not metal; below the second
 even a declared one is not. At 55 degrees half spaces of eps' up to 8 have -8 dB or less, of 10 -7 dB, bare water has
 -4 dB, and metal 0 dB. The patterns of the antennas are added: -4 dB with those of an independent generator."""
 LEAST_SCORE = 1.7
 SURE_MARGIN = 1.5
-"""Score from which a patch that nobody declared counts as metal beside one other patch, and how much more makes it
+"""Score from which an undeclared patch counts as metal beside one other patch, and how much more makes it
 certain. The first is multiplied by the square root of the number of other patches, for each may be an odd one. With the
 direct path, the reference counts as metal in none of 125 drawn scenes without metal (open water comes closest, and is
 doubtful by its V / H), and in all of 75 with metal (tests/materials/test_metal_evidence.py)."""
@@ -118,7 +118,7 @@ class MetalEvidence:
 
     @property
     def needed_score(self) -> float:
-        """Least `compared_score` with which a patch that nobody declared counts as metal; inf without other patches."""
+        """Least `compared_score` with which an undeclared patch counts as metal; inf without other patches."""
         if self.others == 0:
             return np.inf
         return LEAST_SCORE * float(np.sqrt(self.others))
@@ -146,7 +146,7 @@ class MetalEvidence:
 
     @property
     def enough(self) -> bool:
-        """True if a patch that nobody declared counts as metal: enough score, and V / H not below `DOUBTFUL_V_DB`."""
+        """True if an undeclared patch counts as metal: enough score, and V / H not below `DOUBTFUL_V_DB`."""
         doubtful = self.channel_ratio_db is not None and self.channel_ratio_db < DOUBTFUL_V_DB
         return self.compared_score >= self.needed_score and not doubtful
 

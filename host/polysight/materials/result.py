@@ -45,7 +45,8 @@ drawn scenes and ripple of the published picture up to 3; sheets bent to a radiu
 class Tilts:
     """Tilts of the plates: patch number to rise along x and y, radians; patches without an estimate are missing.
 
-    `across` is the index of the axis across the plane of incidence; `steep` are the patches beyond what is modelled.
+    `across` is the index of the axis across the plane of incidence; `steep` are the patches that are steeper than the
+    model allows.
     """
 
     rises: dict[int, Rise]
@@ -54,7 +55,7 @@ class Tilts:
 
     @classmethod
     def estimate(cls, images: Images, illumination: Illumination, segmentation: Segmentation) -> Tilts:
-        """Estimate the rise of each patch from its phase; patches that are steeper than what is modelled are marked."""
+        """Estimate the rise of each patch from its phase; patches that are steeper than the model allows are marked."""
         rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in segmentation.patches}
         bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in segmentation.patches}
         steep = frozenset(
@@ -62,7 +63,7 @@ class Tilts:
             for label, rise in rises.items()
             if max(map(abs, rise)) > MAX_RISE or max(map(abs, bends[label])) > MAX_BEND
         )
-        # A rise that is steeper than what is modelled counts as none.
+        # A rise that is steeper than the model allows counts as none.
         usable_rises = {
             label: (x if abs(x) < MAX_RISE else 0.0, y if abs(y) < MAX_RISE else 0.0) for label, (x, y) in rises.items()
         }
@@ -337,7 +338,7 @@ def _add_name(figures: PatchFigures, name: PatchName) -> PatchFigures:
 
 
 def _replace_infinite(value: float) -> float | None:
-    """Return a number for a file; None for infinity and for what is not a number."""
+    """Return a number for a file; None for infinity and NaN."""
     return value if math.isfinite(value) else None
 
 

@@ -82,7 +82,7 @@ class SegmentSettings:
     dimmest_db
         Regions below this level, relative to the brightest, count as sidelobes.
     least_contrast_db
-        Least difference between a patch and what is around it.
+        Least difference between a patch and its surroundings.
     least_scatter
         The same relative to the scatter of the background's level, standard deviations.
     """
@@ -390,7 +390,7 @@ class _Growing:
         return self.masks[-1][1]
 
     def cut(self, around_db: float) -> Mask:
-        """Return the mask at the mean of its own amplitude and that of what is around it."""
+        """Return the mask at the mean of its own amplitude and that of its surroundings."""
         edge_db = 20 * float(np.log10((10 ** (self.level_db / 20) + 10 ** (around_db / 20)) / 2))
         return min(self.masks, key=lambda step: abs(step[0] - edge_db))[1]
 
@@ -402,7 +402,7 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
 
     The threshold falls from the brightest level, and connected regions grow with it. A region is complete when its
     median lies `EDGE_DB` above the threshold (half of its own amplitude), or before it runs into another region or into
-    a background that is not that far below. It is taken out with its skirt; the threshold goes on falling for the rest.
+    a background that is not that far below. It is taken out with its skirt; the threshold falls further for the rest.
     """
     opening_px = (cfg.smallest_mm / pixel_mm - 1) / 2
     skirt_px = max(1.0, cfg.margin_mm / pixel_mm)
@@ -440,9 +440,9 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
 
 
 def _smooth_outline(mask: Mask) -> Mask:
-    """Fill the holes of a region, cut off what is narrower than `BODY` of its width (speckle, bridges to a neighbour).
+    """Fill the holes of a region, cut off parts narrower than `BODY` of its width (speckle, bridges to a neighbour).
 
-    Of what is left the largest part stays, with a smooth outline.
+    Of the rest the largest part stays, with a smooth outline.
     """
     # The Gaussian below ends after 4 pixels.
     window = _find_window(mask, 5)
@@ -457,7 +457,7 @@ def _smooth_outline(mask: Mask) -> Mask:
 
 
 def _open_mask(mask: Mask, radius_px: float) -> Mask:
-    """Remove what is narrower than a disk of this radius (morphological opening, by distances)."""
+    """Remove parts that are narrower than a disk of this radius (morphological opening, by distances)."""
     window = _find_window(mask)
     inside = mask[window]
     opened = np.zeros_like(mask)

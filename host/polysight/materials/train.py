@@ -515,7 +515,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     names = np.unique(samples.names)
     tables = [_confusions(samples.names[learnt], p[learnt], names) for p in (of_pixel, in_scan, of_patch)]
     judged = np.isin(names, samples.names[learnt])
-    # One pixel stands for each patch: patches of learnt materials, and those of them that were named.
+    # Each patch is represented by one pixel: patches of learnt materials, and those of them that were named.
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
     named = first[~unknown[first]]

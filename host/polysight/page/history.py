@@ -86,7 +86,7 @@ def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:
 
 
 def notice_of_fault(event: Fault) -> Finding:
-    """Return the notice of a fault of the Pi: a note if somebody asked for it, a warning if the rig can go on."""
+    """Return the notice of a fault of the Pi: a note if a person requested it, a warning if the rig can continue."""
     table = explain(event.number)
     passing_faults = (PiFault.HOST_LOST, PiFault.POINTS_MISMATCH)
     level: Level = "error"
@@ -236,7 +236,7 @@ class ScanHistory:
 
     @property
     def ended(self) -> store.ScanEnded | None:
-        """Last fact of a run that ended; None while it goes on, or if it was killed."""
+        """Last fact of a run that ended; None while it runs, or if it was killed."""
         return self.content.ended
 
     @property

@@ -102,7 +102,7 @@ class LifeSigns:
     life
         What the scan program wrote last; None where there is nothing.
     alive, killed
-        True if it wrote of late or, without `life`, the manifest grew; if its process is gone without having said so.
+        True if it wrote of late or, without `life`, the manifest grew; if its process has ended without a note of it.
     alive_s
         Time of the last sign of life of a program that is not alive.
     pi_silent_s, pi_limit_s
@@ -361,7 +361,9 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
         row = max(rows)
         sync = rows[row]
         for dead in rules.judge_dead_rx(board, {rx: [row] for rx in sync.dead_rx}, rows=1):
-            what, why, do = sentence(dead.what), sentence(dead.why), sentence(dead.do)
+            what = sentence(dead.what)
+            why = sentence(dead.why)
+            do = sentence(dead.do)
             notices.append(Finding("warning", what, why, do, where=f"row {row}"))
         if sync.masked > MASKED_SHARE * columns:
             problem = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
@@ -447,7 +449,7 @@ def _judge_start(inputs: Inputs) -> Status:
 
 
 def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
-    """True unless the scan goes on or materials are computed: products of an earlier run may lie there then."""
+    """True unless the scan runs or materials are computed: products of an earlier run may lie there then."""
     life = inputs.signs.life
     computing = life is not None and life.doing == "materials" and inputs.signs.alive
     return history.ended is not None and not computing
@@ -581,7 +583,7 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
 def _find_late_since_s(history: ScanHistory, signs: LifeSigns) -> float:
     """Return when the last row ended, if that is much longer ago than a row takes; otherwise 0.
 
-    The first row alone is no measure.
+    The first row alone is not a measure.
     """
     if history.row_seconds is None:
         return 0.0

@@ -492,7 +492,7 @@ class Watch:
     def _read(self) -> None:
         """Read what was appended to the files."""
         facts = self._manifest.look()
-        # A folder that is gone may be renamed back; a new one of its name has no manifest yet.
+        # A folder that disappeared may be renamed back; a new one of its name has no manifest yet.
         is_new_folder = self._history is not None and self.folder.is_dir() and not self._manifest.file.path.exists()
         if self._manifest.file.replaced or is_new_folder:
             self._close_parts()

@@ -440,7 +440,7 @@ def _check_radar(rig: Instrument) -> Iterator[Finding]:
     """Yield findings about the constraints of the radars, and the unknown IF."""
     native = rig.radar.control == "native"
     offsets_known = native or any(board.start_offset_hz for board in rig.boards)
-    # Another program that configures the radars may do what this release would refuse.
+    # Another program that configures the radars may accept settings that this release would refuse.
     level = "error" if native else "note"
     for constraint in constraints(rig, rig.grid.columns * rig.burst.pulses):
         about_if = constraint.name.startswith("IF")

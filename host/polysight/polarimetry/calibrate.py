@@ -179,7 +179,7 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
 # in each channel; chosen.
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
-# A smaller area of metal is no plate that covers the plane; chosen.
+# A smaller area of metal is not a plate that covers the plane; chosen.
 MIN_PIXELS = 100
 
 

@@ -180,7 +180,7 @@ def conjugate(images: Images) -> Images:
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    """Read all arrays of an .npz file. Raises DataError if it is damaged, or is no .npz file."""
+    """Read all arrays of an .npz file. Raises DataError if it is damaged, or is not an .npz file."""
     try:
         with open_npz(path) as archive:
             return {name: archive[name] for name in archive}
@@ -273,7 +273,7 @@ def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.
 def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.bool_]:
     """Return the pixels to use, bool [ny, nx]: those in `valid` where a channel is not zero.
 
-    Raises DataError if `valid` is no mask of the image, one of its pixels is not finite, none is left, or a channel
+    Raises DataError if `valid` is not a mask of the image, one of its pixels is not finite, none is left, or a channel
     holds nothing or too small or large numbers.
     """
     h = arrays["h"]

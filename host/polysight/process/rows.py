@@ -216,8 +216,8 @@ class KeptSamples:
     def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
         """Return the gate of the samples on disk if it covers the needed one, else the needed one.
 
-        Without samples on disk, or if they are damaged, the usual gate stands for theirs. If the needed gate is
-        returned, samples on disk are not used, and no rows are kept.
+        Without samples on disk, or if they are damaged, the usual gate is taken instead of theirs. If the needed gate
+        is returned, samples on disk are not used, and no rows are kept.
         """
         gate_on_disk = tuple(self._head.get("gate_m", usual))
         if self._head and not _has_frequencies(self._head, rig, gate_on_disk, usual):

@@ -219,7 +219,7 @@ def _summarise_result(scan: products.ProcessedScan, result: MaterialsResult) -> 
     head = f"scan {scan.scan_id}: {len(patches)} patches; metal {result.metal.how}"
     if scan.simulated:
         head = f"simulated {head}"
-    count = scan.plates_named
+    count = scan.named_plates
     if count is None:
         return (head,)
     names = f"{count.right} of {count.plates} plates named right{_describe_accuracy(result)}"

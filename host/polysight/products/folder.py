@@ -81,7 +81,7 @@ class FolderLock:
         """Unlock."""
         os.close(self._descriptor)
         if self._beside is not None:
-            # Another program may hold it by now.
+            # Another program may hold it now.
             with suppress(OSError):
                 self._beside.unlink()
 

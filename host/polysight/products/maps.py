@@ -194,7 +194,7 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
 
     The permittivity is analytic in 1 / P, so the error of P adds the same variance to both parts; that of the angle
     adds its own.
-    `Images.p_sigma`, the standard deviation of P, holds noise, metal reference, and what is left of the leakage.
+    `Images.p_sigma`, the standard deviation of P, holds noise, metal reference, and the remaining leakage.
     Without an incidence angle nothing is known.
     """
     budget = None
@@ -244,7 +244,8 @@ def _estimate_angle(theta_rad: Real, budget: ErrorBudget | None) -> Real:
 def _remove_leakage(inverse: Complex, leakage: LeakageError) -> Complex:
     """Return V / H with the estimated leakage removed, in place of the known one that was removed from the pixels.
 
-    `inverse` is V / H of the pixels, complex [ny, nx]; it is not changed if the products do not say what was removed.
+    `inverse` is V / H of the pixels, complex [ny, nx]; it is not changed if the products do not give the removed
+    leakage.
     """
     removed_h = _join_parts(leakage.removed_h)
     removed_v = _join_parts(leakage.removed_v)

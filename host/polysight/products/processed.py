@@ -154,7 +154,7 @@ def write_json(path: Path, content: Any) -> None:
 def rx_gains(images: Images) -> dict[str, list[RxGain]]:
     """Return gain and phase of each RX relative to its board's first, by board, as divided out of the images.
 
-    None for a dead RX; the first one with a signal stands for a dead first one.
+    None for a dead RX; the first one with a signal replaces a dead first one.
     """
     gains = {}
     for board, values in images.rx_gains.items():
@@ -327,7 +327,7 @@ class ProcessedScan:
         return predict_pixel_accuracy(self.analysis)
 
     @property
-    def plates_named(self) -> PlatesNamed | None:
+    def named_plates(self) -> PlatesNamed | None:
         """Count the plates of the scene by their names, also those that were not found; None without truth or names.
 
         Only plates with a permittivity count: metal is the reference, not a result, and strips and stacks of layers

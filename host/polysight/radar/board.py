@@ -220,7 +220,7 @@ class BringUp:
         return f"{image.name} in RAM"
 
     def _boot_from_ram(self, image: Image) -> None:
-        """Wait for the start from RAM. Without its report go on: the versions show later if the image runs."""
+        """Wait for the start from RAM. Without its report continue: the versions show later if the image runs."""
         try:
             booted = self._wait_for_boot()
         except NotReportedError as error:
@@ -258,7 +258,7 @@ class BringUp:
     def _verify(self, patch: str, before: str, image: Image) -> None:
         """Raise DeviceError if the patch is still the old one; warn if it is not the file's.
 
-        Its place in the file is not documented by TI, so the latter is no error.
+        Its place in the file is not documented by TI, so the latter is not an error.
         """
         mismatch = (
             f"{self._board.name}: reports patch {patch} after the download, {image.name} contains {image.patches[0]}"

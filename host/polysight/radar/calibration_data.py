@@ -31,7 +31,7 @@ ALL = 0x1FF0
 NO_DIE = "-".join(["00000000"] * 4)
 UNKNOWN_DIE = "unknown"
 NO_DIES = (NO_DIE, UNKNOWN_DIE)
-# A larger file is none of ours: it has 1,344 hexadecimal digits and little else.
+# A larger file is not ours: it has 1,344 hexadecimal digits and little else.
 _MAX_FILE_BYTES = 2**16
 # Offset of the temperature at the calibration in the data, int16 in degrees Celsius.
 _TEMPERATURE_BYTE = 16

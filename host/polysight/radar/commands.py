@@ -435,7 +435,7 @@ MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}
 class Constraint(NamedTuple):
     """One rule: `low <= value <= high`, all in `unit`; a limit of None does not apply.
 
-    `name` says what it is about, `formula` in words how the value is computed, `remedy` what to change if it is broken.
+    `name`: its subject; `formula`: the computation of the value in words; `remedy`: the change if it is violated.
     """
 
     name: str

@@ -268,7 +268,7 @@ class NativeRadars(RadarControl):
             names_by_die[die] = name
 
     def _open(self, name: str) -> WordLink:
-        """Open a board's link, with a trace if the rig file wants one. Raises DeviceError."""
+        """Open a board's link, with a trace if the rig file requests one. Raises DeviceError."""
         words = self._open_words(self._rig.radar.native[name].place)
         folder = self._rig.radar.trace_dir
         if not folder:

@@ -2,7 +2,7 @@
 
 A *word* is the 16 bits that SPI shifts at a time; a *word link* shifts them through the capture card's USB chip, and
 has the board's reset and interrupt lines. A trace has one JSON object a line; docs/spec/mmwavelink.md ("Traces") has
-the format. A replay (`ReplayedWords`) stands for the board, so that a failure can be examined without it. Not run on
+the format. A replay (`ReplayedWords`) replaces the board, so that a failure can be examined without it. Not run on
 hardware yet.
 """
 
@@ -398,7 +398,7 @@ class ReplayedWords:
             raise DeviceError(line.error or "", "as in the trace", "see the error of the traced run")
 
     def _replay_action(self, action: str, agrees: Callable[[TraceLine], bool]) -> TraceLine:
-        """Replay up to the next line that is no change of the interrupt, and return it.
+        """Replay up to the next line that is not a change of the interrupt, and return it.
 
         Raises DeviceError if `agrees` is False for that line, or the trace ends before it, and errors of the trace.
         """
@@ -456,7 +456,7 @@ def read_trace(file: Path) -> tuple[dict[str, Any], list[TraceLine]]:
 
 
 def _parse_trace_line(file: Path, number: int, value: object) -> TraceLine:
-    """Return a line of a trace from its decoded JSON. Raises ConfigError if it is none."""
+    """Return a line of a trace from its decoded JSON. Raises ConfigError if it is not one."""
     try:
         return msgspec.convert(value, TraceLine)
     except ValueError:

@@ -117,7 +117,7 @@ def check_image(data: bytes, name: str) -> Image:
     expected = int.from_bytes(data[-4:], "little")
     if actual != expected:
         raise _file_error(name, f"CRC-32 {actual:08x} instead of {expected:08x}", "damaged during the copy")
-    # Parts are aligned to four bytes; one that begins too late to hold its versions and the CRC is none.
+    # Parts are aligned to four bytes; one that begins too late to hold its versions and the CRC is not a patch.
     last_offset = len(data) - 4 - _VERSION_BYTES - _PATCH_AT
     part_offsets = [
         offset for offset in range(_HEADER_BYTES, last_offset, 4) if data[offset : offset + len(_PART)] == _PART

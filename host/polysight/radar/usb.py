@@ -69,7 +69,7 @@ _NO_LOOPBACK = 0x85
 # The clock is 60 MHz / (2 x (divisor + 1)): 10 MHz, and 1 MHz for a slow link.
 SPI_DIVISOR = 2
 SLOW_DIVISOR = 29
-# One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; TI's ICD, 3.2.4, wants two at least.
+# One pin command holds its pins for 0.2 us (FTDI AN_114), two clocks at 10 MHz; TI's ICD, 3.2.4, requires at least two.
 _SELECT_COMMANDS = 2
 _IDLE_COMMANDS = 3
 # Pause between two words of a slow link; chosen.

@@ -99,7 +99,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
             inside.append(part / np.abs(part))
     if not inside:
         return None
-    # Every patch counts alike, whatever its size.
+    # Every patch counts alike, for any size.
     middle = np.angle(sum(part.mean() for part in inside))
     from_middle = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
     low, high = np.percentile(from_middle, _PERCENTILES) + np.degrees(middle)
@@ -113,7 +113,7 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
 
 
 def _name_amplitude_unit(scan: ProcessedScan) -> str:
-    """Return the unit of amplitudes, which says what 0 dB is: the metal, or a reference that may be no metal.
+    """Return the unit of amplitudes, which says what 0 dB is: the metal, or a reference that may not be metal.
 
     The latter where the scan has no result (`judged`). Without a reference 0 dB means nothing.
     """

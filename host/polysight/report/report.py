@@ -68,7 +68,7 @@ ALTERNATIVE_TEXTS = {
 }
 # Figures of a board that have a table or a map of their own, or that only programs read.
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
-# Last word of a key to the unit that it stands for.
+# Last word of a key to the unit that it means.
 UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
 
 
@@ -398,7 +398,7 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
     def add(value: str, what: str) -> None:
         out.append({"value": value, "text": what})
 
-    if count := scan.plates_named:
+    if count := scan.named_plates:
         aside = ""
         if count.strange:
             aside = f", {count.strange} recognised as not in the library"

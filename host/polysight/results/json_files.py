@@ -47,7 +47,7 @@ def to_plain(value: Any) -> Any:
     return str(value)
 
 
-def one_line(finding: Finding) -> str:
+def format_one_line(finding: Finding) -> str:
     """Return a finding as one line of text: what, why and remedy."""
     head = ": ".join(part for part in (finding.what, finding.why) if part)
     return "; ".join(part for part in (head, finding.do) if part)

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from polysight.results.json_files import convert, one_line, read_object
+from polysight.results.json_files import convert, format_one_line, read_object
 from polysight.results.verdict import Verdict, read_verdict
 from polysight_shared.findings import Finding
 
@@ -434,7 +434,7 @@ class PatchFigures(msgspec.Struct, frozen=True, kw_only=True):
     )  # fmt: skip
     refused: Finding | None = None
     refused_text = derive_if_known(
-        str, lambda patch: patch.refused and one_line(patch.refused),
+        str, lambda patch: patch.refused and format_one_line(patch.refused),
         Column("refused", "why the patch was not judged, and what to do", ""),
     )  # fmt: skip
     ratio: ComplexNumber | None = None

@@ -191,7 +191,7 @@ class Recording(msgspec.Struct, frozen=True, kw_only=True):
 class GivenImages(msgspec.Struct, frozen=True, kw_only=True):
     """Images of another program that were processed instead of rows.
 
-    `incidence_from` is "option", "file" or "rig file"; `assumed` says what the file left open. `other_sign` is the
+    `incidence_from` is "option", "file" or "rig file"; `assumed` lists what had to be assumed. `other_sign` is the
     probability that the phases have the other sign than was taken.
     """
 

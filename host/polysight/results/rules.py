@@ -210,7 +210,7 @@ def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
 
 
 def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
-    """Judge the patches; `refused` maps numbers of patches that are no plates to why (noise, several materials).
+    """Judge the patches; `refused` maps numbers of patches that are not plates to why (noise, several materials).
 
     `left_out` bright regions of a plate's size do not stand out enough to be patches, or touch a larger patch.
     """

@@ -430,7 +430,7 @@ def _fit_layers(site: Site, scan: Named, body: LayersRequest) -> None:
 
 
 class SavedLabels(msgspec.Struct, frozen=True):
-    """The file of boxes drawn by hand, "" if there are none any more, and what was noticed about them."""
+    """The file of boxes drawn by hand, "" if there are none any more, and notices about them."""
 
     file: str
     notes: list[str] = []

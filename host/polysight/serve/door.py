@@ -60,7 +60,7 @@ class Door:
         listener.setblocking(False)
         pages.setblocking(False)
         self._loop.add_reader(listener, self._accept)
-        # It never sends anything: readable means that it is gone.
+        # It never sends anything: readable means that it has ended.
         self._loop.add_reader(pages, self.ended.set)
 
     def _accept(self) -> None:
@@ -71,7 +71,7 @@ class Door:
             except BlockingIOError:
                 return
             except OSError:
-                # No file is left for another connection, or the client is gone already.
+                # There is no free descriptor for another connection, or the client has closed it already.
                 self._drop_silent()
                 return
             client.setblocking(False)
@@ -161,7 +161,7 @@ def close_after_each(app: ASGIApp) -> ASGIApp:
 
 
 async def _keep_door(listener: socket.socket, pages: socket.socket, token: str, config: uvicorn.Config) -> None:
-    """Run the door until the pages' process is gone; `config` is that of the commands' application."""
+    """Run the door until the pages' process has ended; `config` is that of the commands' application."""
     config.load()
     make_protocol = partial(H11Protocol, config=config, server_state=ServerState(), app_state={})
     loop = asyncio.get_running_loop()
@@ -205,7 +205,7 @@ def open_door(listener: socket.socket, token: str, config: uvicorn.Config) -> It
 
 
 class PagesServer(EndingServer):
-    """The server of the pages, which ends when the door is gone.
+    """The server of the pages, which ends when the door has ended.
 
     Its connections come over the socket `door`; each gets a new object of the class `protocol`.
     """
@@ -223,7 +223,7 @@ class PagesServer(EndingServer):
         asyncio.get_running_loop().add_reader(self._door, self._take)
 
     def _take(self) -> None:
-        """Take connections that the door has sent; end when the door is gone."""
+        """Take connections that the door has sent; end when the door has ended."""
         loop = asyncio.get_running_loop()
         make_protocol = partial(
             self._protocol, config=self.config, server_state=self.server_state, app_state=self.lifespan.state

@@ -58,7 +58,7 @@ MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+
 READER_PATIENCE_S = 20.0
 CONNECT_INTERVAL_S = 0.1
 CHUNK_BYTES = 1 << 16
-# Running scans are looked for at most this often, however many pages ask; chosen.
+# Running scans are looked for at most this often, for any number of pages; chosen.
 RUNNING_AGE_S = 0.5
 # The header of every page shows a killed scan for this long (chosen); later, only the list of scans does.
 KILLED_SHOWN_S = 3600.0
@@ -296,7 +296,7 @@ class Reader:
         self._path = path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Forward one request, and its answer until the browser is gone."""
+        """Forward one request, and its answer until the browser has closed the connection."""
         # The guard has read the body already, and passes it on as one message.
         body = b""
         if scope["method"] == "POST":
@@ -384,7 +384,7 @@ async def _relay_answer(connection: h11.Connection, reader: asyncio.StreamReader
 class ConnectionLimit:
     """The most connections at a time. When there are more, one without a request is closed: the longest silent one.
 
-    Each step takes the same time however many there are. Nothing is measured in seconds: a process that is busy must
+    Each step takes the same time for any number of them. Nothing is measured in seconds: a process that is busy must
     not take its own delay for a client's. A connection of which bytes wait to be read is not closed.
     """
 
@@ -490,7 +490,7 @@ class CountedConnection(H11Protocol):
 
 
 class EndingServer(uvicorn.Server):
-    """A server whose connections end with it, whatever their clients read or send, and wait in a queue of `BACKLOG`."""
+    """A server whose connections end with it, even if clients still read or send, and wait in a queue of `BACKLOG`."""
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begin to accept connections from `sockets`."""

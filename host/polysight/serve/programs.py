@@ -7,8 +7,8 @@ in `<scan>/control/`; no signal is ever sent to a process number that a file nam
 
 In the queue scans wait one after another over night. Each is a file with its request in `<scans>/.polysight/queue/`, so
 that the queue survives a restart of the server. The next one is started when the rig is free. After a scan that did not
-finish, whoever started it, the queue waits for a person: what stopped one scan may stop all of them, or somebody works
-at the rig.
+finish, even if a person started it, the queue waits for a person: what stopped one scan may stop all of them, or
+somebody works at the rig.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class Programs:
                 self._running.remove(pid)
 
     def close(self) -> None:
-        """End the thread; started programs go on."""
+        """End the thread; started programs continue."""
         self._thread.shutdown()
 
 
@@ -191,7 +191,7 @@ class Queue:
                     path.unlink(missing_ok=True)
 
     def release(self) -> None:
-        """Go on after a scan that did not finish."""
+        """Continue after a scan that did not finish."""
         with self._lock:
             self._seen = self._find_unfinished(self._list_states())
             self._held = ""
@@ -225,7 +225,7 @@ class Queue:
             if seen is None:
                 seen = unfinished - set(list(states)[:1])
             self._seen = unfinished
-            # Whoever started it: what has stopped it may stop all of them.
+            # Also if a person started it: the cause of its stop may stop all of them.
             for new in sorted(unfinished - seen):
                 self._held = f"{new}: {states[new]}"
                 return

@@ -1,7 +1,7 @@
 """`polysight serve` and `polysight preview`: the address, the token, and the processes until Ctrl-C.
 
 Three processes: this one answers requests for pages (`front`), a second one accepts connections and answers commands to
-scans at once (`door`; only with control, and without TLS, which hides what a connection brings; else this one does
+scans immediately (`door`; only with control, and without TLS, which hides the requests; otherwise this one does
 both), and the reading process reads scans, behind a socket in a folder that only this user may enter. This process
 starts the other two, restarts the reading process if it ends, and prints the server's addresses with the token, what
 they allow, and a QR code for a phone.
@@ -54,7 +54,7 @@ from polysight.serve.stage import StageControl
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, quote
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
-# Nice value of the reading process, chosen: it gives way to capture and scan.
+# Nice value of the reading process, chosen: capture and scan have priority over it.
 NICE = 10
 # A browser opens up to six connections for a page. The number is chosen.
 MAX_CONNECTIONS = 2048
@@ -74,7 +74,7 @@ TOKEN_BYTES = 18
 
 @dataclass(frozen=True)
 class Place:
-    """Address of a server: port 0 is any that is free, `hosts` are further names, `certificate` and `key` PEM files."""
+    """Address of a server: port 0 is any free one, `hosts` are further names, `certificate` and `key` PEM files."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -116,7 +116,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Shown:
-    """What is served: a folder of scans, or `only` one in it; programs are started with the rig file `config`."""
+    """Served scans: a folder of scans, or `only` one in it; programs are started with the rig file `config`."""
 
     root: Path
     only: str | None
@@ -146,11 +146,11 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
 
 
 def _make_folder(root: Path, control: bool) -> None:
-    """Make the folder of scans here. Raises ConfigError for one elsewhere, or if the server only shows."""
+    """Make the folder of scans here. Raises ConfigError for one elsewhere, or without control."""
     if root.exists() or not control or root.absolute().parent != Path.cwd():
         raise ConfigError(
             f"{root}: no such folder",
-            "scans are listed under it; one that is not here may lie on a drive that is not mounted, so it is not made",
+            "scans are listed under it; one elsewhere may lie on a drive that is not mounted, so it is not made",
             f"mkdir -p {quote(root)}, or give another",
             code=ErrorCode.FILE_MISSING,
         )
@@ -191,8 +191,8 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             sys.stderr.write(describe_server(access, what, listener.getsockname()[:2]))
             sys.stderr.flush()
             server = make_server(front, place, door)
-            # By itself it takes signals only once its event loop runs: Ctrl-C before that would break off making the
-            # loop, and leave it half made.
+            # By itself it handles signals only once its event loop runs: Ctrl-C before that would interrupt the
+            # creation of the loop, and leave it unfinished.
             with server.capture_signals():
                 server.run(sockets=[listener])
     finally:
@@ -201,8 +201,8 @@ def _run(shown: Shown, place: Place, what: str) -> int:
 
 
 def make_access(place: Place, listener: socket.socket, control: bool) -> Access:
-    """Return who may use the page; a token is required for control and for other machines."""
-    # Behind a reverse proxy everybody comes from this machine.
+    """Return the access rules of the page; a token is required for control and for other machines."""
+    # Behind a reverse proxy all clients have this machine's address.
     is_private = place.loopback and not place.hosts
     token = ""
     if control or not is_private:
@@ -216,7 +216,7 @@ def make_access(place: Place, listener: socket.socket, control: bool) -> Access:
 def load_token() -> str:
     """Return the token of this user's servers, made at the first call: open pages keep control when a server restarts.
 
-    Raises ConfigError if its file can be read by others, is another user's, no plain file, or too short. If it is
+    Raises ConfigError if its file can be read by others, is another user's, not a plain file, or too short. If it is
     removed, the next server makes and prints a new one.
     """
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
@@ -267,13 +267,13 @@ def _bind(place: Place) -> socket.socket:
 def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Iterator[None]:
     """Keep the reading process running for the block: the `first` one, which runs already, and others after it."""
     ended = threading.Event()
-    # Threads do not survive a fork, and there are some by now.
+    # Threads do not survive a fork, and there are some now.
     context = multiprocessing.get_context("spawn")
 
     def keep_running() -> None:
         process = first
         while True:
-            # `ended` is looked at every 0.2 s (chosen).
+            # `ended` is checked every 0.2 s (chosen).
             while process.is_alive() and not ended.is_set():
                 process.join(0.2)
             if ended.wait(RESTART_S):
@@ -319,7 +319,7 @@ def fork_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Iter
 
 
 def run_reader(shown: Shown, path: Path) -> None:
-    """Run the reading process until it is ended, or the process that started it is gone."""
+    """Run the reading process until it is ended, or the process that started it has ended."""
     # Ctrl-C ends the server, which ends this process; without this line it would end first, with a traceback.
     ignore_interrupts(signal.SIGINT)
     programs = None
@@ -423,7 +423,7 @@ def _allow_files() -> None:
 
 # linux/sockios.h
 SIOCGIFADDR = 0x8915
-# A documentation address (RFC 5737) and any port: it stands for every network that is reached by the default route.
+# A documentation address (RFC 5737) and any port: it represents every network that is reached by the default route.
 ELSEWHERE = ("203.0.113.1", 9)
 # One character shows two modules of the code, the keys say whether the upper and the lower one are dark. Colours are
 # given, black on white, since the terminal's own may be either way round and a camera reads no inverted code.

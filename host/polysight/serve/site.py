@@ -32,7 +32,7 @@ from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 READ_S = 30.0
 """Time limit of one read. Longer ones are refused, and so is their folder until they have returned."""
 SIZE_S = 30.0
-"""When the count of a folder's size takes longer, another thread goes on with the other folders; chosen."""
+"""When the count of a folder's size takes longer, another thread continues with the other folders; chosen."""
 HIDDEN = ".polysight"
 """Hidden folder in the folder of scans: logs of programs without a scan, the queue, the archive, the list's index."""
 LIBRARIES = "libraries"
@@ -158,7 +158,7 @@ class Site:
         return {path.stem: path for path in files}
 
     def close(self) -> None:
-        """Close the live views and the queue; started programs go on."""
+        """Close the live views and the queue; started programs continue."""
         self.watches.close()
         if self._queue is not None:
             self._queue.close()
@@ -217,7 +217,7 @@ def _compare(first: Path, second: Path, *stamps: tuple[Path, str]) -> catalogue.
 class Readers:
     """Threads for reads, with a time limit each; one folder never takes all of them.
 
-    A read that hangs (a network drive that is gone) cannot be ended: its thread is left behind, and further reads of
+    A read that hangs (a disconnected network drive) cannot be ended: its thread is left behind, and further reads of
     the same folder are refused until it returns.
     """
 
@@ -276,7 +276,7 @@ def _no_answer_error(folder: str) -> DeviceError:
 
 
 class Sizes:
-    """Sizes of folders, counted in the background one after another; one that hangs holds up no other for long."""
+    """Sizes of folders, counted in the background one after another; one that hangs does not delay others for long."""
 
     def __init__(self) -> None:
         self._counted: dict[Path, tuple[int, float]] = {}

@@ -1,4 +1,4 @@
-"""Home and jog of the stage from the page: the Pi decides what may move, and stops a jog whose server is gone.
+"""Home and jog of the stage from the page: the Pi decides if it may move, and stops a jog whose server has ended.
 
 It works in the server's process, each request in a thread of its own, so that no page that reads scans delays a stop.
 While a scan runs, the Pi refuses these commands.

@@ -1,7 +1,7 @@
 """The manifest of a scan: an append-only log with one JSON line per fact (docs/spec/scan-folder.md).
 
 `Manifest` is the one reader: `read` takes a whole file, `Manifest.feed` what was appended to a growing one. Facts are
-the structs below; unknown keys and kinds are passed over, keys of later releases have defaults. It also says what the
+the structs below; unknown keys and kinds are ignored, keys of later releases have defaults. It also says what the
 facts add up to: the committed rows, the state of the scan, and the faults of the file.
 
 A line is valid if it is complete and its CRC is right. A last line torn by a kill or power cut is reported by readers
@@ -165,7 +165,7 @@ class RowRejected(Fact, frozen=True, kw_only=True, tag="row_rejected"):
 
 
 class RowWithdrawn(Fact, frozen=True, kw_only=True, tag="row_withdrawn"):
-    """A committed row whose files are not what was committed: it counts as missing and is taken again."""
+    """A committed row whose files have changed since: it counts as missing and is retaken."""
 
     row: int
     take: int = 0
@@ -357,7 +357,7 @@ class Manifest:
     started
         The first fact; None if it is not there or cannot be read.
     ended
-        The end of the last run; None while it goes on, or if it was killed.
+        The end of the last run; None while it runs, or if it was killed.
     paused
         True while the scan is paused on request.
     rows
@@ -620,7 +620,7 @@ class ManifestWriter(Closing):
         return True
 
     def append(self, fact: Fact | Mapping[str, Any]) -> None:
-        """Append one fact durably. After a DeviceError it does not count: the next overwrites what is left of it."""
+        """Append one fact durably. After a DeviceError it does not count: the next one overwrites its remains."""
         line = encode_line(fact, count=self._count, previous=self._digest)
         self._file.append(line)
         self._count += 1

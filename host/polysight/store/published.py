@@ -459,7 +459,7 @@ class PublishedScan(_Published):
         return RowData(split_pieces(payload), gaps, frames)
 
     def _open_stream(self, board_name: str, row: int) -> Stream | None:
-        """Read what a board's card sent in a row; None if there is no file of it."""
+        """Read the data that a board's card sent in a row; None if there is no file of it."""
         file = self._files.get(board_name, {}).get(row)
         if file is None:
             return None

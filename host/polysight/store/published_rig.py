@@ -149,7 +149,7 @@ def _scale_if_below(value: float, least: float, factor: float) -> float:
 
 
 def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tuple[MountStep, ...]:
-    """Return the base rig's mount with the angles and offsets of the scan; append to `notices` what was read otherwise.
+    """Return the base rig's mount with the angles and offsets of the scan; append to `notices` deviations from them.
 
     The last turn about y points the board at the object, and the last about z tilts the receivers; the V board has
     another turn about y before. The last shift but one is the offset of the tilt, and the last step, if it is a shift,

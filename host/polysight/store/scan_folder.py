@@ -9,7 +9,7 @@ file; `check_same_scan` refuses one that differs in anything else. A folder may 
 
 Kept samples (docs/spec/samples.md) are the synchronised rows, cut to the ranges of the image: small, and enough to make
 images when the raw rows are dropped. `process/rows.py` makes and restores them. What their files say of themselves is
-read here, without anything of the processing, so that `validate` and `drop-raw` check them.
+read here, without the processing, so that `validate` and `drop-raw` check them.
 """
 
 from __future__ import annotations
@@ -438,7 +438,7 @@ def dropped_files(scan: ScanFolder) -> dict[str, RawDropped]:
 
 
 def dropped_rows(scan: ScanFolder) -> set[int]:
-    """Return the rows of which a dropped file is gone."""
+    """Return the rows of which a dropped file was deleted."""
     return {fact.row for file, fact in dropped_files(scan).items() if not (scan.path / file).exists()}
 
 
@@ -567,7 +567,7 @@ def utc_now() -> str:
 def check_inside(folder: Path, name: str, within: str = "") -> Path:
     """Return the path of a file that a manifest names, relative to the scan folder and inside its folder `within`.
 
-    Only the name is foreign: `folder` is the user's own path, in whatever form.
+    Only the name is foreign: `folder` is the user's own path, in any form.
 
     Raises
     ------

@@ -263,7 +263,7 @@ def _evaluate_polynomials(d: Array, degree: int) -> Array:
 
 
 def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
-    """Return the coefficients of `values` [n] in `basis` [n, terms], and what is left; outliers lose their weight."""
+    """Return the coefficients of `values` [n] in `basis` [n, terms], and the residuals; outliers lose their weight."""
     coefficients = np.zeros(basis.shape[1], values.dtype)
     rest = values
     # Five rounds, and weights that halve at two standard deviations: chosen.
@@ -292,7 +292,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
     middle = np.average(metal.arrival, axis=0, weights=weight)
     departure_middle = np.average(metal.departure, axis=0, weights=weight)
-    # Few points of wrong directions do not widen what is covered.
+    # Few points of wrong directions do not widen the covered range.
     low, high = np.percentile(metal.arrival, [3, 97], axis=0)
     degree = DEGREE if float(np.min(high - low)) > LEAST_SPAN_RAD else 0
     basis = _evaluate_polynomials(metal.arrival - middle, degree)
@@ -330,9 +330,9 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
 
 
 def _compute_misfit_std(rest: Complex, noise2: Array, at_m: Array) -> tuple[float, float]:
-    """Return the standard deviation of each part of what a fit leaves, and its part by noise of variance `noise2` [n].
+    """Return the standard deviation of each part of a fit's residuals, and its part by noise of variance `noise2` [n].
 
-    It is the root mean square over blocks of the mean of what is left, `rest` [n], in each block.
+    It is the root mean square over blocks of the mean residual, `rest` [n], in each block.
     """
     # Outliers count as five times the median (chosen).
     clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))

@@ -276,7 +276,7 @@ def correlate_windows(d: Array) -> tuple[Array, Array]:
     """Correlations [2, n, n] of the errors of both slopes of windows at the offsets `d` [n, 2], by noise and by ripple.
 
     Windows share data as far as they overlap; s is their distance over the width of a window. A sample's noise acts on
-    the slope in proportion to its distance from the window's middle along the slope's axis, whatever its place across:
+    the slope in proportion to its distance from the window's middle along the slope's axis, for any place across:
     hence the correlation is 1 - 3 s + 2 s^3 along that axis and 1 - s across it. Ripple is as long as a window or
     longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and 24 mm, about 1 - s.
     """

@@ -174,7 +174,7 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
 def clip_permittivity(eps: NDArray) -> Complex:
     """Return permittivities, of any shape, limited to `REAL_LIMITS` and `IMAGINARY_LIMITS`; 4 where not finite.
 
-    So an iteration that leaves the range can go on.
+    So an iteration that leaves the range can continue.
     """
     finite = np.where(np.isfinite(eps), eps, 4.0)
     return np.clip(np.real(finite), *REAL_LIMITS) + 1j * np.clip(np.imag(finite), *IMAGINARY_LIMITS)

@@ -212,7 +212,7 @@ class BoardFit:
 def _find_gate(board: Samples) -> tuple[float, float]:
     """Return the excess paths between which the model's gain is judged: a fifth of its unambiguous range."""
     reach = SPEED_OF_LIGHT_M_S / (board.frequencies_hz[1] - board.frequencies_hz[0])
-    # A mirror at 0.5 m, about the published rig's object plane, stands for the objects' paths (chosen).
+    # A mirror at 0.5 m, about the published rig's object plane, is used for the objects' paths (chosen).
     centre = find_mirror_path(board, 0.5) - board.direct_m.mean()
     return centre - reach / 10, centre + reach / 10
 

@@ -102,11 +102,11 @@ def build(folder: Path = HERE, target: str = "") -> Path:
             list(workers.map(_run, commands))
         library = f"{build_folder}/{LIBRARY}"
         objects = [f"{build_folder}/{name}" for _, name in jobs]
-        # ziglang links its own checks of undefined behaviour unless it is told not to.
+        # ziglang links its own checks of undefined behaviour unless an option forbids it.
         _run([*compiler, "-O3", "-fno-sanitize=undefined", "-s", "-shared", "-o", library, *objects, "-lm"])
         new = folder / f".{LIBRARY}-{os.getpid()}"
         new.write_bytes(Path(library).read_bytes() + source_digest().encode())
-        # Replaced by a rename: programs that have loaded the old library go on with it.
+        # Replaced by a rename: programs that have loaded the old library keep it.
         new.replace(folder / LIBRARY)
     return folder / LIBRARY
 

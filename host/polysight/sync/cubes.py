@@ -83,7 +83,8 @@ class CubeForm:
         samples = cube * self.turn[:, None]
         hz = np.zeros(valid.size)
         amplitude = hz
-        turned, has_data = samples, valid
+        turned = samples
+        has_data = valid
         if self.path is not None:
             samples, valid, hz, amplitude = _reference_cube(turned, has_data, self.path, self.chirp)
         # Neighbouring positions hold nearly the same signals.

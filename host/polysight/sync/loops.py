@@ -274,7 +274,7 @@ def reduce_chirps(
 def against_others(
     reduced: NDArray[np.complex64], good: NDArray[np.bool_]
 ) -> tuple[Tone, NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Find the tone between each chirp and the sum of all others, and what that sum does not explain of the chirp.
+    """Find the tone between each chirp and the sum of all others, and the rest of the chirp.
 
     Parameters
     ----------
@@ -625,7 +625,7 @@ class Library:
         steps: int,
     ) -> FirstLook:
         """See `NumpyLoops.find`."""
-        positions, blocks = halves.shape[0], halves.shape[-1]
+        positions, _, _, blocks = halves.shape
         out = FirstLook(
             peaks=np.empty((2, positions)),
             median=np.empty(positions),

@@ -59,7 +59,7 @@ def to_json(finding: Finding) -> dict[str, Any]:
 def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
     """Run `check(*args)`. A text it returns becomes a finding of level `ok`, an error it raises one of level `error`.
 
-    `name` is what the finding is about.
+    `name` is the subject of the finding.
     """
     try:
         result = check(*args)

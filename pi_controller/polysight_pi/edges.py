@@ -201,7 +201,7 @@ class EdgeTimes:
             stops.append(distance)
 
     def note_edge(self, edge_ns: int) -> str:
-        """Add an edge; return what is wrong with it, or ""."""
+        """Add an edge; return its problem, or ""."""
         self._edges_ns.append(edge_ns)
         if len(self._edges_ns) < 2:
             return ""
@@ -222,7 +222,7 @@ class EdgeTimes:
         return f"a spurious edge: {edges} edges came before {points} points were passed"
 
     def judge(self, was_held: bool, done_ns: int) -> str:
-        """Judge a row whose counts are right, with its `done` written by `done_ns`; return what is wrong, or "".
+        """Judge a row whose counts are right, with its `done` written by `done_ns`; return the problem, or "".
 
         `was_held`: the stage says in its `done` that it was held.
         """
@@ -242,7 +242,7 @@ class EdgeTimes:
         return fault
 
     def _judge_motion(self, stops: list[int], done_ns: int) -> str:
-        """Compare all intervals with a motion that rests at these distances; return what is wrong, or ""."""
+        """Compare all intervals with a motion that rests at these distances; return the problem, or ""."""
         points_s, end_s = self._motion.time_points(stops)
         for point in range(1, self._motion.points):
             interval_s = (self._edges_ns[point] - self._edges_ns[point - 1]) * 1e-9
@@ -264,7 +264,7 @@ class EdgeTimes:
         return ""
 
     def _compare(self, point: int, interval_s: float, expected_s: float) -> str:
-        """Compare the interval before the edge of `point` with the expected one; return what is wrong, or ""."""
+        """Compare the interval before the edge of `point` with the expected one; return the problem, or ""."""
         tolerance_s = TOLERANCE * max(self._interval_s, expected_s)
         late_s = interval_s - expected_s
         lost_edges = round(late_s / self._interval_s)

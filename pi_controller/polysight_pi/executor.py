@@ -4,7 +4,7 @@ It executes the host's commands and manages the run; machine.py controls stage a
 command that has to be journalled or replayed is answered by the journal's thread, test pulses when they have ended, and
 what comes while a run begins or ends when it has; all others immediately. docs/spec/wire.md describes each command.
 
-`Machine.happen` applies the rule that a state has for an event, if there is one; `Machine.command` does the same for a
+`Machine.handle_event` applies a state's rule for an event, if there is one; `Machine.command` does the same for a
 command, and refuses it without a rule. Both name their event by a string, a key of machine.py's table of rules. What
 the host receives are *events*, too: entries of the journal.
 """
@@ -241,7 +241,7 @@ class Executor:
         self._machine.check_deadlines()
         late = self._find_late()
         if late and self.unresponsive_s > LATE_S:
-            # After a pause of the whole program, whoever wakes first finds the others late.
+            # After a pause of the whole program, the first thread to wake finds the others late.
             late += f", nor has the executor turned for {self.unresponsive_s:.1f} s: the computer was too busy or slept"
         if late:
             self._machine.stop_motion(PiFault.PROGRAM_LATE, late)
@@ -270,7 +270,7 @@ class Executor:
 
         def answer(error: PolysightError | OSError | None) -> None:
             if error is not None:
-                self._inbox.put(lambda: self._machine.happen("lasting fault", PiFault.JOURNAL_FULL, str(error)))
+                self._inbox.put(lambda: self._machine.handle_event("lasting fault", PiFault.JOURNAL_FULL, str(error)))
             for request, reply in behind_journal:
                 if error is not None:
                     reply = refuse(error)
@@ -300,7 +300,7 @@ class Executor:
         elif isinstance(item, Reply):
             machine.on_stage(item)
         elif isinstance(item, StageLost):
-            machine.happen("stage lost", PiFault.STAGE_LOST, item.reason)
+            machine.handle_event("stage lost", PiFault.STAGE_LOST, item.reason)
         else:
             item()
         if row is not None and machine.row is not row:
@@ -340,13 +340,13 @@ class Executor:
             return None
         owned = isinstance(command, OWNED)
         if run and isinstance(command, m.Home):
-            # A run whose host is gone keeps nobody from homing; a host of an older release sends no owner.
+            # A run whose host is lost does not prevent homing; a host of an older release sends no owner.
             owned = run.owns_home and self._machine.host_lives
         if run and isinstance(command, m.Jog):
             owned = self._machine.host_lives
         jog = self._machine.jog
         if jog is not None and isinstance(command, m.Abort) and command.owner == jog.command.owner:
-            # Whoever started a jog may stop it, also in the run of a host that is gone.
+            # The client that started a jog may stop it, also in the run of a lost host.
             owned = False
         if run and owned and getattr(command, "owner", "") not in (run.owner, self.take_over_key):
             raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
@@ -452,10 +452,10 @@ class Executor:
                 "wait for that scan's end, or stop it there",
             )
         if self._machine.row is not None:
-            # The host that started the row is gone, or begins its run again: nothing of the row is committed. An abort
+            # The host that started the row is lost, or begins its run again: nothing of the row is committed. An abort
             # never ends a row immediately; when it has ended, `_end_row` executes the request.
             self._after_row = request
-            self._machine.happen("Abort", f"run {run.scan_id} was begun again")
+            self._machine.handle_event("Abort", f"run {run.scan_id} was begun again")
         return self._machine.row is not None
 
     def _begin(self, request: Request, run: m.BeginRun) -> None:
@@ -481,7 +481,7 @@ class Executor:
         self._run = None
         self._last_row = None
         self._takes = {}
-        self._machine.happen("EndRun")
+        self._machine.handle_event("EndRun")
 
     def _end_run(self, request: Request, command: m.EndRun) -> m.Accepted | None:
         """End the run; the reply follows when `RunStopped` is on the disk. Accept a repeated request immediately."""
@@ -492,7 +492,7 @@ class Executor:
         self._machine.require("EndRun")
 
         def write(journal: Journal) -> None:
-            # Try to write again: the full disk may have space by now.
+            # Try to write again: the full disk may have space now.
             journal.broken = False
             journal.write([NewEvent.now(m.RunStopped, exit_status=command.exit_status, reason=command.reason)])
 
@@ -519,7 +519,7 @@ class Executor:
             if isinstance(error, JournalFullError) and self.journal.is_broken:
                 if isinstance(request.command, m.BeginRun):
                     self._forget_run()
-                self._machine.happen("lasting fault", error.number, str(error))
+                self._machine.handle_event("lasting fault", error.number, str(error))
             try:
                 reply = written() if error is None else refuse(error)
             except PolysightError as e:

@@ -5,8 +5,8 @@ little-endian u32) and the packed event. Sequence numbers count from 1, without 
 continues after the host's last event. A torn or damaged tail, as after a power cut, is cut off at the last good record
 when the file is opened. Specification: docs/spec/wire.md.
 
-A disk can hang for a minute without an error. So the program uses the journal through `JournalThread`: nobody waits for
-storage, and whatever depends on it is called back.
+A disk can hang for a minute without an error. So the program uses the journal through `JournalThread`: no other thread
+waits for storage; functions that depend on it are called afterwards.
 """
 
 from __future__ import annotations

@@ -120,7 +120,7 @@ class Machine:
             for state in rule.states.split()
         }
 
-    def happen(self, event: str, *args: Any) -> bool:
+    def handle_event(self, event: str, *args: Any) -> bool:
         """Apply the rule of this event in the current state; `args` are its action's. Return False without a rule.
 
         Raises RuntimeError if the action leads to a state that the rule does not name, and what the action raises.
@@ -145,7 +145,7 @@ class Machine:
         self._deadline_s = self._clock() + timeout_s
         # The row is judged after the bursts that are still in the queue.
         if state == "ending":
-            self._post(partial(self.happen, "settled"))
+            self._post(partial(self.handle_event, "settled"))
 
     def require(self, event: str) -> None:
         """Raise RefusedError if this command has no rule in the current state."""
@@ -161,7 +161,7 @@ class Machine:
     def command(self, event: str, *args: Any) -> None:
         """Execute a command. Raises RefusedError."""
         self.require(event)
-        self.happen(event, *args)
+        self.handle_event(event, *args)
 
     @property
     def wire_state(self) -> m.State:
@@ -183,7 +183,7 @@ class Machine:
         jog = self.jog
         if jog is None or jog.command.owner != owner:
             return False
-        # Never back: the calls of several threads may come out of order.
+        # Never to an earlier time: the calls of several threads may come out of order.
         jog.alive_s = max(jog.alive_s, self._clock())
         return True
 
@@ -212,7 +212,7 @@ class Machine:
     def check_deadlines(self) -> None:
         """Handle deadlines that have passed."""
         if self._clock() >= self._deadline_s:
-            self.happen("timeout")
+            self.handle_event("timeout")
         if self._clock() >= self._host_lost_s:
             timeout_s = self._host_timeout_s if self.jog is None else self.jog.timeout_s
             reason = f"no heartbeat of the host for {timeout_s * 1e3:.0f} ms"
@@ -221,12 +221,12 @@ class Machine:
     def stop_motion(self, number: int, reason: str) -> None:
         """Stop a row, jog or homing, if there is one, with this fault."""
         if self.jog is not None and self.jog.status is not None:
-            # The stage was already told to stop.
+            # The stage has already been sent a stop.
             return
         if self.state in ("running", "held", "jogging"):
-            self.happen("row fault", number, reason)
+            self.handle_event("row fault", number, reason)
         elif self.state == "homing":
-            self.happen("lasting fault", number, reason)
+            self.handle_event("lasting fault", number, reason)
 
     # --- events of trigger loop and stage ---------------------------------------------------------------------------
 
@@ -238,7 +238,7 @@ class Machine:
             return
         time_problem = row.edges.note_edge(sent.edge_ns)
         if time_problem:
-            self.happen("row fault", PiFault.EDGE_TIME, time_problem)
+            self.handle_event("row fault", PiFault.EDGE_TIME, time_problem)
         # Without a pulse there is nothing to journal: the trigger loop reports its fault next.
         if not record.pulses:
             return
@@ -249,15 +249,15 @@ class Machine:
         )  # fmt: skip
         row.bursts += 1
         if row.bursts >= row.row.points:
-            self.happen("all sent")
+            self.handle_event("all sent")
 
     def on_loop_fault(self, fault: LoopFault) -> None:
         """Handle a fault of the trigger loop, which ends the row; one without a job has ended the loop itself."""
         if fault.job is None:
             self._lines_dead = True
-            self.happen("lasting fault", fault.number, fault.detail)
+            self.handle_event("lasting fault", fault.number, fault.detail)
         elif self.row is not None and fault.job is self.row.job:
-            self.happen("row fault", fault.number, fault.detail)
+            self.handle_event("row fault", fault.number, fault.detail)
 
     def on_stage(self, reply: Reply) -> None:
         """Handle a line of the stage: a status, the `ok` of a command, an alarm, a banner or the end of a motion."""
@@ -273,22 +273,22 @@ class Machine:
             # Sent before HOME was accepted, so it says nothing about the homing.
             pass
         elif reply.kind == "banner":
-            self.happen("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")
+            self.handle_event("stage lost", PiFault.STAGE_LOST, "the stage was reset: it sent its banner")
         elif reply.kind == "alarm" and reply.number == StageError.STOPPED:
-            self.happen("stopped")
+            self.handle_event("stopped")
         elif reply.kind == "alarm":
             e = explain(reply.number)
             summary = f"stage alarm {reply.number}: {e.problem} ({e.cause}); {e.remedy}"
-            self.happen("stage lost", PiFault.STAGE_ALARM, summary)
+            self.handle_event("stage lost", PiFault.STAGE_ALARM, summary)
         elif reply.kind == "done" and homing and answers_home:
             self.stage.note_position(reply)
-            self.happen("homed", reply)
+            self.handle_event("homed", reply)
         elif reply.kind == "done" and self.jog is not None and reply.sequence == self.jog.sequence:
             self.stage.note_position(reply)
-            self.happen("moved", reply)
+            self.handle_event("moved", reply)
         elif reply.kind == "done" and not homing and self.row and reply.sequence == self.row.sequence:
             self.stage.note_position(reply)
-            self.happen("passed", reply)
+            self.handle_event("passed", reply)
 
     def _on_status(self, reply: Reply) -> None:
         """Handle a status; request the end of a motion again if the stage rests without having reported it."""
@@ -306,7 +306,7 @@ class Machine:
         if self._rests > RESTS * MAX_REPEAT_REQUESTS:
             self._rests = 0
             reason = "it rests, and does not say how its motion ended: it was reset"
-            self.happen("stage lost", PiFault.STAGE_LOST, reason)
+            self.handle_event("stage lost", PiFault.STAGE_LOST, reason)
         elif self._rests and self._rests % RESTS == 0:
             # Ask the stage to repeat the end of its motion. The lambda reads `link` inside `_tell_stage`, which handles
             # a link that is lost.
@@ -316,11 +316,11 @@ class Machine:
         """Compare a status with the trigger edges of the row, and resume a held row once the stage rests."""
         row.points = max(0, _read_integer(reply, "points"))
         if time_problem := row.edges.note_status(row.points, reply.asked_ns, reply.written_ns):
-            self.happen("row fault", PiFault.EDGE_TIME, time_problem)
+            self.handle_event("row fault", PiFault.EDGE_TIME, time_problem)
         edges = self._loop.counts.edges
         if self.state != "stopping" and self._watch.is_silent(row.points, edges):
             reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
-            self.happen("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
+            self.handle_event("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
         if self.state in ("running", "held") and reply.fields.get("state") == "hold":
             row.edges.note_stop(_read_integer(reply, "x"), row.points)
             self._rests_in_hold = True
@@ -332,7 +332,7 @@ class Machine:
         try:
             send()
         except StageLostError as e:
-            self._post(partial(self.happen, "stage lost", e.number, str(e)))
+            self._post(partial(self.handle_event, "stage lost", e.number, str(e)))
 
     def _publish_status(self, reply: Reply) -> None:
         """Publish a status of the stage, but not more often than a page needs it."""
@@ -373,9 +373,9 @@ class Machine:
             self.stage.connect()
             self._homing = self.stage.home()
         except StageRefusedError as e:
-            self.happen("stage lost", PiFault.STAGE_ALARM, str(e))
+            self.handle_event("stage lost", PiFault.STAGE_ALARM, str(e))
         except StageLostError as e:
-            self.happen("stage lost", e.number, str(e))
+            self.handle_event("stage lost", e.number, str(e))
 
     def _note_homed(self, reply: Reply) -> str:
         """Store the lost steps and return the next state; `fault` if homing did not end at the origin."""
@@ -433,11 +433,11 @@ class Machine:
         try:
             sequence = start()
         except StageLostError as e:
-            self.happen("stage lost", e.number, str(e))
+            self.handle_event("stage lost", e.number, str(e))
             raise
         except StageRefusedError as e:
             if e.number in POSITION_LOST:
-                self.happen("not homed")
+                self.handle_event("not homed")
             raise
         self._is_placed = False
         self._rests = 0
@@ -567,7 +567,7 @@ class Machine:
     def terminate(self) -> bool:
         """Stop the stage because the program is being ended. Returns True if a row has to end first."""
         self._terminating = True
-        self.happen("Abort", "polysight-pi was ended")
+        self.handle_event("Abort", "polysight-pi was ended")
         # Nobody waits for the end of a jog: the stage stops it by itself.
         self._finish_jog()
         if self.state == "stopping":

@@ -35,7 +35,7 @@ from polysight_shared.faults import PiFault
 from polysight_shared.program import die_with_parent
 from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier
 
-# How long closed sockets go on sending (chosen).
+# Time for which closed sockets still send (chosen).
 LINGER_MS = 200
 # Longest time of a turn of a socket's thread that has nothing to do; chosen.
 POLL_MS = 250
@@ -155,7 +155,7 @@ class Server:
     def _authenticate(self) -> None:
         """Answer an authentication request of ZeroMQ (ZAP, RFC 27): a client with an allowed public key may connect.
 
-        In this thread: pyzmq's own authenticator is a second one with asyncio, whose death nobody notices, and which
+        In this thread: pyzmq's own authenticator is a second one with asyncio, whose end is not noticed, and which
         waits for ever when it is closed then.
         """
         version, number, _, _, _, mechanism, *credentials = self._zap.recv_multipart()
@@ -191,7 +191,7 @@ class Server:
         try:
             self._commands.send_multipart([*envelope, raw], zmq.NOBLOCK)
         except zmq.ZMQError:
-            # The client is gone, or does not read and will retry.
+            # The client is disconnected, or does not read and will retry.
             return
 
     def close(self) -> None:

@@ -56,7 +56,7 @@ SILENT_HEARTBEATS = 0.5
 SILENT_AT_REST_S = 3.0
 # Interval of status requests to a stage at rest; chosen.
 IDLE_STATUS_S = 1.0
-# Longest interval of status requests to a moving stage, however long its heartbeat: shorter than at rest.
+# Longest interval of status requests to a moving stage, for any heartbeat: shorter than at rest.
 MOVING_STATUS_S = 0.5
 # Longest time from STOP to standstill; chosen.
 STOP_TIMEOUT_S = 3.0

@@ -75,7 +75,7 @@ def notify_systemd(state: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if address:
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as s:
-            # "@" stands for the zero byte that begins the name of an abstract socket.
+            # "@" is shown for the zero byte that begins the name of an abstract socket.
             if address.startswith("@"):
                 address = "\0" + address[1:]
             s.sendto(state.encode("ascii"), address)

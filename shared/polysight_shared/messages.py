@@ -420,7 +420,7 @@ def pack(message: AnyEvent | AnyCommand | AnyReply) -> bytes:
 def _unpack(raw: bytes, kind: Any, what: str) -> Any:
     """Decode a message of the union `kind`; `what` names it in errors.
 
-    Raises VersionError for another major version, ProtocolError for anything else that is wrong.
+    Raises VersionError for another major version, ProtocolError for any other fault.
     """
     try:
         node = msgpack.unpackb(raw, raw=False, strict_map_key=True)

@@ -157,7 +157,7 @@ def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
 def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the Pi's ROUTER socket, bound, for REQ sockets. `context`: from `make_server_context`.
 
-    A longer message than MAX_COMMAND_BYTES closes its connection. Sending to a client that is gone raises zmq.ZMQError
+    A longer message than MAX_COMMAND_BYTES closes its connection. Sending to a disconnected client raises zmq.ZMQError
     (ROUTER_MANDATORY) instead of dropping the reply silently.
     """
     options: dict[int, int | bytes] = {zmq.MAXMSGSIZE: MAX_COMMAND_BYTES, zmq.ROUTER_MANDATORY: 1}
@@ -182,7 +182,7 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
 
     The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that was
-    stopped, or whose machine is gone. The host's own `subscriber` is rather kept: it must lose no events.
+    stopped, or whose machine has failed. The host's own `subscriber` is rather kept: it must lose no events.
     """
     # Times in ms: a heartbeat each second; after five seconds without one the Pi drops this subscriber. Chosen.
     options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}

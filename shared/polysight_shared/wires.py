@@ -124,14 +124,14 @@ class WireClient:
         return self._socket.fileno()
 
     def send(self, *messages: WireMessage) -> None:
-        """Send messages in one write. Raises DeviceError if the hub is gone."""
+        """Send messages in one write. Raises DeviceError if the hub is disconnected."""
         try:
             self._socket.sendall(b"".join(map(encode, messages)))
         except OSError as e:
             raise DeviceError(f"simulated wires at {self._path} broke: {e}", *_RIG_ENDED) from None
 
     def receive(self, timeout_s: float | None) -> WireMessage | None:
-        """Return the next message, or None after `timeout_s`. Raises DeviceError if the hub is gone."""
+        """Return the next message, or None after `timeout_s`. Raises DeviceError if the hub is disconnected."""
         line = self._read_line(timeout_s)
         return None if line is None else parse(line)
 

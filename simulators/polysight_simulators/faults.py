@@ -21,9 +21,9 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     `corrupt` (a flipped payload bit), `status_loss` (of asynchronous status messages), `twin` (a second card with the
     same address).
     The card: `overflow` (half a frame is lost before packetising: no sequence gap, status bit 9), `mute` (no replies),
-    `boot_s` (hears no request for so many seconds after a power cycle).
+    `boot_s` (ignores requests for so many seconds after a power cycle).
     The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame), `spurious_edges` (pairs: pulse
-    number, and ms after that pulse at which an edge comes that nobody sent). Its control server:
+    number, and ms after that pulse at which a spurious edge comes). Its control server:
     `retrigger_fails` (these lines have no effect), `retrigger_resets` (the connection is reset at these lines). Under
     native control: `radar_fault_pulses` (the RF core faults at these pulses).
     """

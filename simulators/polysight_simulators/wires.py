@@ -51,7 +51,7 @@ class _Client:
 class WireHub:
     """Relay S lines to the clients that subscribed with L, M lines to those that sent W, except to the sender.
 
-    Two faults change that: a cut GPIO line reaches nobody; of two joined lines, the second repeats the edges of the
+    Two faults change that: a cut GPIO line reaches no client; of two joined lines, the second repeats the edges of the
     first, and that copy also reaches the sender, as it would on a short circuit.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Images of simulated scenes by vector physical optics: an opinion of its own about what the instrument sees.
+"""Images of simulated scenes by vector physical optics: an independent prediction of the instrument's images.
 
 `draw_world` and `draw_nuisances` make a scene and what disturbs its scan, `simulate` gives the pair of images. Curved
 and tilted pieces (`sphere`, `cylinder`, `plate`; more in `shapes`) are seen by `record_shapes`: the samples of both

@@ -1,6 +1,6 @@
 """Draw a scene and write its images: `python -m polysight_worlds --seed 1 --out scene.npz`.
 
-Writes the arrays h, v, x_m, y_m, incidence_deg, simulated and, beside them, a JSON file of what is true. *Nuisances*
+Writes the arrays h, v, x_m, y_m, incidence_deg, simulated and a JSON file of the truth in the same folder. *Nuisances*
 disturb the scan: noise, leakage, errors of position and others.
 """
 

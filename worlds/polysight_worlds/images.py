@@ -20,7 +20,7 @@ from polysight_worlds.world import Nuisances, Plate, World, disturb_plates
 
 @dataclass(frozen=True)
 class ImagePair:
-    """Images of one scan in the rig frame, and what is true.
+    """Images of one scan in the rig frame, and the truth.
 
     h, v: complex64 [ny, nx], row 0 at the smallest y, relative to the direct path. Phases fall with the path, as fields
     of exp(+j omega t) do: H / V of a plate over that of metal is r_s / r_p, and a lossy permittivity eps' - j eps''.
@@ -255,7 +255,7 @@ def _draw_fringes(rng: Generator, rig: Rig) -> NDArray:
 
 
 def _draw_drift(rng: Generator, shape: tuple[int, int], nuisances: Nuisances) -> NDArray:
-    """Complex gain over the scan [rows, columns]: smooth in time, row after row; its span is what the nuisances say.
+    """Complex gain over the scan [rows, columns]: smooth in time, row after row; its span is that of the nuisances.
 
     The shape is chosen: a line, and 1, 2 and 3 half waves of falling size.
     """

@@ -131,7 +131,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Waves:
-    """Waves between the antennas and points, whatever lies there: unit directions and fields [3, ...], distances [...].
+    """Waves between the antennas and points, for any surface: unit directions and fields [3, ...], distances [...].
 
     `out_m` and `incident` lead from TX to the point, `back_m` and `scattered` from there to RX. `field` and `received`
     are the electric fields of TX, and of RX if it sent, towards the point at unit distance; `received_magnetic` is

@@ -129,7 +129,7 @@ class PlateEchoes:
         self._height_path_m = self._rise_mean * surface.height_m + bend_mean / 2 * surface.height_m**2
         k = 2 * np.pi * rig.frequencies_hz[-1] / LIGHT_M_PER_S
         rms_phase = k * np.abs(surface.height_m).max() * np.sqrt(np.sum(weight * self._rise_deviation**2))
-        # Twice the rms stands for the largest phase. The series has one term at least, and twelve at most (chosen).
+        # Twice the rms is taken as the largest phase. The series has one term at least, and twelve at most (chosen).
         self._orders = 1
         term = 2 * rms_phase
         while term > SERIES_ERROR and self._orders < 12:

@@ -310,7 +310,9 @@ def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
             grown = np.abs(above) > 1e100
             if grown.any():
                 shrink = np.where(grown, 1e-200, 1.0)
-                above, value, total = above * shrink, value * shrink, total * shrink
+                above = above * shrink
+                value = value * shrink
+                total = total * shrink
                 values[n:] *= shrink
     scale = np.exp(unit * x) / total
     values = values * (scale if np.iscomplexobj(x) else scale.real)
@@ -324,7 +326,7 @@ def _hankel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
     values[1] = special.hankel1(0, x)
     values[0] = -special.hankel1(1, x)
     for n in range(count - 1):
-        # Orders far above the argument grow without end: they stay at 1e150, and nobody uses them.
+        # Orders far above the argument grow without end: they are limited to 1e150, and not used.
         grown = np.abs(values[n + 1]) > 1e150
         values[n + 2] = np.where(grown, 1e150, 2 * n / x * np.where(grown, 0, values[n + 1]) - values[n])
     return values[:-1], values[1:]
@@ -432,7 +434,7 @@ def sum_orders(
         wave = q_m * (m * p_m + coupling * p_n) + q_n * (n * p_n + coupling * p_m)
         wave_back = q_m_back * (m * p_m_back - coupling * p_n_back) + q_n_back * (n * p_n_back - coupling * p_m_back)
         wave_back[orders == 0] = 0
-        # Powers of `turn`, exp(i n phi) with phi the angle from TX to RX, go on from the last block of orders.
+        # Powers of `turn`, exp(i n phi) with phi the angle from TX to RX, continue from the last block of orders.
         factors = np.repeat(turn[None], len(orders), axis=0)
         factors[0] = power
         powers = np.cumprod(factors, axis=0)

@@ -35,7 +35,7 @@ PLANE_M = 0.499
 
 @dataclass(frozen=True)
 class ShapeScene:
-    """Shapes of one object, and what is true of it.
+    """Shapes of one object, and its truth.
 
     `permittivity` is None for metal; `radius_m`: the smaller radius of its front, infinite for a plate. `is_uniform` is
     False for a thin wall, which has no single surface to look at. `background`: a table or nothing.
@@ -63,7 +63,7 @@ class ShapeScene:
             # The antennas do not see the back of a body.
             is_seen = facing[:, 2] < 0
             if len(self.shapes) > 1:
-                # The surface of a piece goes on beyond its edges, through other pieces.
+                # The surface of a piece continues beyond its edges, through other pieces.
                 is_seen &= shape.cover(a, b) > 0
             nearer = is_seen & (np.abs(distance) < np.abs(distances))
             distances = np.where(nearer, distance, distances)
@@ -124,7 +124,7 @@ def scan_shapes(
     cubes = record_shapes(shapes, true_boards, frequencies_hz, offsets_m)
     gain_rng = np.random.default_rng([nuisances.seed, 12])
     noise_rng = np.random.default_rng([nuisances.seed, 13, number])
-    # Each of the fewer frequencies stands for several samples of the chirp, whose noise averages.
+    # Each of the fewer frequencies represents several samples of the chirp, whose noise averages.
     sigma = nuisances.noise * NOISE_A_SAMPLE * np.sqrt(len(frequencies_hz) / SAMPLES)
     for channel, cube in cubes.items():
         level = gain_rng.normal()

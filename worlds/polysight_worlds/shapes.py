@@ -88,7 +88,7 @@ class Shape:
 
     # True for a plane with sharp edges, which `shape_echoes` sums facet by facet.
     is_flat_plate = False
-    # False for a plane, whatever its edges.
+    # False for a plane with any edges.
     is_bent = True
 
     def rotate(self, axis: NDArray, angle_deg: float) -> Shape:
@@ -130,7 +130,7 @@ class Shape:
     def project(self, points_m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Nearest place of the surface to points [n, 3]: signed distances (positive in front), a, b; each [n].
 
-        The surface goes on beyond the edges of the piece.
+        The surface continues beyond the edges of the piece.
         """
         points = np.asarray(points_m, float).T
         a, b = self.grid()

@@ -83,7 +83,7 @@ def _check_arguments(args: argparse.Namespace, board_names: tuple[str, ...]) -> 
 def _make_source(
     args: argparse.Namespace, rig: Instrument, scene: Scene | None, names: tuple[str, ...]
 ) -> SignalSource:
-    """Return what the radars send: a counting pattern, or the signals of the scene."""
+    """Return the data of the radars: a counting pattern, or the signals of the scene."""
     if scene is None or args.pattern:
         return PatternSource(rig)
     radars = SimulatedRig(rig, scene, args.seed, args.cache)

@@ -494,7 +494,7 @@ class SimulatedCard:
             wait_for_receiver=wait_for_receiver,
         )
         self._burst = rig.burst
-        # Time after a pulse in which the radar hears no other: chirps after the first, the last ramp, and recovery.
+        # Time after a pulse in which the radar ignores others: chirps after the first, the last ramp, and recovery.
         later_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
         dead_s = (later_us + rig.chirp.ramp_end_us + RECOVERY_US) * 1e-6
         native = rig.radar.control == "native"

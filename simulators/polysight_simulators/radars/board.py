@@ -282,7 +282,7 @@ class RadarBoard:
             )
 
     def _deliver(self) -> None:
-        """Make messages readable that are due by now, and raise the host interrupt for the first."""
+        """Make messages readable that are due now, and raise the host interrupt for the first."""
         for due_s, raw in sorted(self._later, key=lambda p: p[0]):
             if due_s <= self.now():
                 self._later.remove((due_s, raw))

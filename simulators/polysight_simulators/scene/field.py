@@ -289,9 +289,11 @@ class _Plane:
         # A plate's echo is a sum over orders. Either each plate has a kernel, which holds the sum, or each order has
         # one, which plates share by their weights.
         if len(plates) < orders:
-            shares, kernel_series = np.eye(len(plates), dtype=np.complex128), weights
+            shares = np.eye(len(plates), dtype=np.complex128)
+            kernel_series = weights
         else:
-            shares, kernel_series = weights.T, np.eye(orders, dtype=np.complex128)
+            shares = weights.T
+            kernel_series = np.eye(orders, dtype=np.complex128)
         maps = [_sum_outer_products(y, np.repeat(share, strips_of_plate), x) for share in shares]
         return list(zip(maps, kernel_series, strict=True))
 

@@ -216,7 +216,7 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
 
 
 def turn_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Complex, Complex]:
-    """Return what a plate sends back in the polarisations of H and V for a wave with equal s and p there.
+    """Return the reflection of a plate in the polarisations of H and V for a wave with equal s and p there.
 
     A plate that rises by w across the plane of incidence (its height grows along y) turns this plane about x, and both
     waves meet its s axis at d = w sin(theta). To first order the incident wave has 1 - d of s and 1 + d of p, and

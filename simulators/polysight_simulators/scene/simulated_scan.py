@@ -194,7 +194,7 @@ def simulate(
             progress(row.index + 1, plan.rows)
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}
     (writer.folder / "truth.json").write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    # Last: whatever ends the program before leaves an unfinished scan.
+    # This is done last: if the program ends before, the scan is unfinished.
     writer.end()
     if layout == "authors":
         # The authors' files contain neither geometry nor filter nor leakage.

@@ -400,7 +400,7 @@ class StageLogic:
         farthest = travel + travel // 10 + PULL_OFF
         if self._homing_leg_made and step == 0 and self._engine.reached:
             self._found_switches |= its_switch
-        # A first search goes on leg by leg, until it has found the switch or gone as far as there is travel.
+        # A first search moves leg by leg, until it has found the switch or the whole travel.
         searches_on = step == 0 and not self._found_switches & its_switch and self._searched_steps < farthest
         if self._homing_leg_made and not searches_on:
             # Search and release end at the switch; the leg that pulls off does not meet it.

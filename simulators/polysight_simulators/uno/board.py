@@ -169,7 +169,7 @@ class EmulatedUno:
         self._apply_action("reset")
 
     def hang(self) -> None:
-        """Stop the main program until the next reset; interrupts go on."""
+        """Stop the main program until the next reset; interrupts continue."""
         self._apply_action("hang")
 
     def watch(self, *pins: int) -> None:

@@ -8,7 +8,7 @@ import importlib
 import sys
 from pathlib import Path
 
-from benchmarks.measure import one_thread_each
+from benchmarks.measure import limit_threads
 
 NAMES = (
     "capture",
@@ -34,7 +34,7 @@ NAMES = (
 
 def main(argv: list[str]) -> int:
     """Run one benchmark or all; each prints its own table. Return the highest exit status."""
-    one_thread_each()
+    limit_threads()
     modules = {name: importlib.import_module(f"benchmarks.{name}") for name in NAMES}
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--out", type=Path, default=None, help="folder for each benchmark's figures as NAME.json")

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.signal
 from numpy.typing import NDArray
 
-from benchmarks.data import as_synced, point_row, published_scene
-from benchmarks.measure import Line, add_arguments, one_core, show, write
+from benchmarks.data import make_synced_row, point_row, published_scene
+from benchmarks.measure import Line, add_arguments, keep_on_one_core, show, write
 from benchmarks.published import Synchroniser
 from polysight.capture.dca1000 import raw_words
 from polysight.imaging import ImageBuilder, backproject
@@ -117,7 +117,7 @@ def alignment(rig: Instrument, snr_db: float, positions: int = 120) -> Alignment
     return Alignment(snr_db, *errors(aligned.frequency), *errors(divided), truth.size)
 
 
-def one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
+def measure_one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
     """Return rms error over Cramer-Rao bound of frequency and of phase (at the record's centre), one tone in noise."""
     rng = np.random.default_rng([SEED, 1, round(10 * snr_db)])
     # The linear samples of the published chirp.
@@ -135,7 +135,7 @@ def one_tone(snr_db: float, trials: int = 4000) -> tuple[float, float]:
     return float(np.sqrt((f_error**2).mean()) / f_bound), float(np.sqrt((p_error**2).mean()) / p_bound)
 
 
-def at_bins(rig: Instrument, board: Board, bins: float) -> Instrument:
+def move_direct_path_to_bin(rig: Instrument, board: Board, bins: float) -> Instrument:
     """Return the rig with its object plane moved so that echo and direct path are `bins` FFT bins apart.
 
     The echo is that of the specular midpoint at the board's first RX, the FFT one of the linear samples.
@@ -166,7 +166,7 @@ def two_tones(rig: Instrument, board: Board, bins: float, snr_db: float, trials:
     path was not found are left out.
     """
     rng = np.random.default_rng([SEED, 2, round(10 * snr_db), round(100 * bins)])
-    rig = at_bins(rig, board, bins)
+    rig = move_direct_path_to_bin(rig, board, bins)
     chirp = rig.chirp
     a, b = chirp.linear_samples
     direct, echo = _simulate_paths(rig, board)
@@ -242,7 +242,7 @@ def image_error(rig: Instrument, board: Board) -> float:
         if valid.any():
             echoes = point_row(rig, antennas, row, points, sweep, valid)
             received[:, valid] = echoes + 1 / antennas.direct_m[:, None, None]
-        builder.add_row(board.name, row.index, as_synced(rig, received, valid))
+        builder.add_row(board.name, row.index, make_synced_row(rig, received, valid))
         samples.append(received[:, valid])
         shifts.append(np.pad(row_offsets_m(rig, row)[valid], ((0, 0), (0, 1))))
     image, _, _ = builder.boards[board.name].image()
@@ -313,14 +313,14 @@ def run(args: argparse.Namespace) -> int:
     few = 1
     if args.quick:
         few = 20
-    with one_core():
+    with keep_on_one_core():
         aligned = [alignment(rig, snr, positions=240 // few) for snr in ALIGN_SNR_DB]
-        tones = {snr: one_tone(snr, trials=30_000 // few) for snr in TONE_SNR_DB}
+        tones = {snr: measure_one_tone(snr, trials=30_000 // few) for snr in TONE_SNR_DB}
         pairs = {b.name: two_tones(rig, b, BINS, TWO_TONE_SNR_DB, trials=6000 // few) for b in rig.receivers}
         images = {b.name: image_error(rig, b) for b in rig.receivers}
     lines = [*_alignment_lines(aligned), *_tone_lines(tones, pairs), _image_line(images)]
     show("accuracy, simulated signals of known truth", lines, args.quick)
-    write(args.json, "accuracy", lines, alignment=[asdict(a) for a in aligned], one_tone=tones, two_tones=pairs)
+    write(args.json, "accuracy", lines, alignment=[asdict(a) for a in aligned], measure_one_tone=tones, two_tones=pairs)
     return 0
 
 
@@ -355,7 +355,7 @@ def _alignment_lines(aligned: Sequence[Alignment]) -> list[Line]:
 
 
 def _tone_lines(tones: Mapping[float, tuple[float, float]], pairs: Mapping[str, tuple[float, float]]) -> list[Line]:
-    """Return the lines about tones: results of `one_tone` by ratio in dB, and of `two_tones` by board."""
+    """Return the lines about tones: results of `measure_one_tone` by ratio in dB, and of `two_tones` by board."""
     return [
         Line(
             "one tone, 7-30 dB: rms error over Cramer-Rao",

@@ -147,7 +147,7 @@ class Cubes:
         return CubeRow(np.ascontiguousarray(cube[:, :: self.plan.row(row).direction]))
 
     def recording_facts(self) -> dict[str, Any]:
-        """Return what is known of the recording: nothing."""
+        """Return the facts of the recording: none are known."""
         return {"recording": Recording()}
 
 

@@ -184,7 +184,9 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     cube.flush()
 
 
-def as_synced(rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None) -> SyncedRow:
+def make_synced_row(
+    rig: Instrument, samples: NDArray[np.complex64], valid: NDArray[np.bool_] | None = None
+) -> SyncedRow:
     """Return the part of a synchronised row that imagers read: samples [rx, position, sample], valid [position].
 
     Without `turn` the stage's motion in a burst is not undone.

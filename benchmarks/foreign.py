@@ -1,4 +1,4 @@
-"""Names of what no library has: foreign plates, dishes, thin sheets, in scenes of the independent generator.
+"""Names of materials that are not in the library: plates, dishes, thin sheets, in scenes of the independent generator.
 
 The library holds Table 2. Foreign plates are 30 common materials with values rounded from open tables near 100 GHz
 (Lamb, Int. J. Infrared Millim. Waves 17, 1996; Jepsen, Cooke and Koch, Laser Photonics Rev. 5, 2011; ITU-R P.2040;

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from benchmarks.data import published_scene, temporary, write_point_cube
 from benchmarks.image import Image, worst
-from benchmarks.measure import add_arguments as add_common, count_repeats, one_core, write
+from benchmarks.measure import add_arguments as add_common, count_repeats, keep_on_one_core, write
 from polysight.imaging import spectral
 from polysight.imaging.direct import DirectImager
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m, scene_gate_m
@@ -185,7 +185,7 @@ def run(args: argparse.Namespace) -> int:
         chain = Chain(rig, board, path)
         samples = random_samples(chain.aperture)
         print(f"\nimaging of one board, simulated: {usable[0].card}; wall seconds until the result is in host memory")
-        with one_core():
+        with keep_on_one_core():
             cpu = Figures.of_numpy(chain, samples)
         cpu.print()
         figures["one CPU core"] = cpu.seconds

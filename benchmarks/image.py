@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.data import as_synced, published_scene, temporary, write_point_cube
-from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
+from benchmarks.data import make_synced_row, published_scene, temporary, write_point_cube
+from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, keep_on_one_core, show, write
 from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder, spectral
 from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m, scene_gate_m
@@ -48,7 +48,7 @@ class Bench:
         """Form the image from disk: all rows, then the image; `live`: an image that every row updates."""
         board_samples = ImageBuilder(self.rig, live=live).boards[self.board.name]
         for row, cube_row in self._read_rows():
-            board_samples.add_row(row, as_synced(self.rig, cube_row))
+            board_samples.add_row(row, make_synced_row(self.rig, cube_row))
         # Beside the image there are the footprint and a notice.
         image, _, _ = board_samples.current() if live else board_samples.image()
         return image
@@ -92,7 +92,7 @@ class Bench:
         return form_image(cube, self.rig, self.board, image_grid(self.rig), points, tuned)
 
 
-def in_turn(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Seconds]:
+def time_alternately(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Seconds]:
     """Run every job once a round, one after another; return their times."""
     took = {name: Seconds() for name in jobs}
     for _ in range(rounds):
@@ -113,7 +113,7 @@ def rms(image: Image, true: Image) -> float:
     return float(np.linalg.norm(factor * image - true) / np.linalg.norm(true))
 
 
-def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
+def compare_with_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
     """Compare with the published method, from the cube on disk; return lines of the table and figures for the file."""
     bench.ours()
     jobs = {
@@ -122,7 +122,7 @@ def against_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, 
         "published": bench.theirs,
         "published, tuned": lambda: bench.theirs(tuned=True),
     }
-    took = in_turn(jobs, min(rounds, ROUNDS))
+    took = time_alternately(jobs, min(rounds, ROUNDS))
     aperture, samples = bench.reduce_cube("boxcar")
     # Our sum over all samples, without a window, as the published method has none. It stands for the exact one; its own
     # tests compare it with a plain sum.
@@ -174,7 +174,7 @@ def against_time_domain(bench: Bench, rounds: int) -> tuple[list[Line], dict[str
     theirs_s: list[float] = []
     image: Image = np.empty(0, np.complex64)
     for _ in range(min(rounds, ROUNDS)):
-        ours_s += in_turn({"ours": lambda: choose_imager(aperture)[0].image(samples)}, rounds)["ours"].cpu
+        ours_s += time_alternately({"ours": lambda: choose_imager(aperture)[0].image(samples)}, rounds)["ours"].cpu
         # Its seconds are scaled to all rows there.
         image, seconds = time_domain.timed_image(aperture, samples, EVERY)
         theirs_s.append(seconds)
@@ -225,7 +225,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     }
     for job in jobs.values():
         job()
-    took = in_turn(jobs, rounds)
+    took = time_alternately(jobs, rounds)
     lines = []
     for placement, rows, batch, limits in (
         ("the cube on disk", "rows from disk", "batch from disk", (5.0, 3.0)),
@@ -270,11 +270,11 @@ def run(args: argparse.Namespace) -> int:
     rig, _ = published_scene(args.quick)
     lines: list[Line] = []
     figures_of_parts: dict[str, Any] = {}
-    with temporary(args.folder) as folder, one_core():
+    with temporary(args.folder) as folder, keep_on_one_core():
         path = folder / "cube.npy"
         write_point_cube(path, rig, rig.receivers[0])
         bench = Bench(rig, rig.receivers[0], path)
-        for part in (against_published, against_time_domain, against_batch):
+        for part in (compare_with_published, against_time_domain, against_batch):
             part_lines, figures = part(bench, count_repeats(args.quick, REPEATS))
             lines += part_lines
             figures_of_parts[part.__name__] = figures

@@ -95,7 +95,7 @@ class Case:
         return self.error < ENOUGH and self.thickness_error < ENOUGH
 
     @property
-    def flagged(self) -> bool:
+    def is_flagged(self) -> bool:
         """True if the program reports that the error may exceed 5 %: ambiguous, or an error bar that long."""
         return self.ambiguous or 2 * self.relative_std > ENOUGH
 
@@ -262,7 +262,7 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
     """
     fits = [r for r in rows if r.fitted is not None]
     unrivalled = np.array([r.distance2 for r in fits if not r.rivals])
-    sure = [r for r in fits if not r.flagged]
+    sure = [r for r in fits if not r.is_flagged]
     if not fits:
         return {}
     d = np.array([r.distance2 for r in sure])
@@ -270,7 +270,7 @@ def table(rows: list[Case], title: str) -> dict[str, float]:
         "cases": float(len(rows)),
         "not fitted": float(len(rows) - len(fits)),
         "right": float(np.mean([r.right for r in fits])),
-        "ambiguous": float(np.mean([r.flagged for r in fits])),
+        "ambiguous": float(np.mean([r.is_flagged for r in fits])),
         "rivals": float(np.mean([r.rivals > 0 for r in fits])),
         "wrong, not flagged": float(sum(not r.right for r in sure)),
         "in_68, no rivals": _mean_or_nan(unrivalled < CHI2_68),
@@ -325,5 +325,5 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         args.json.write_text(json.dumps({"summary": out, "cases": [asdict(r) for r in rows]}, indent=1) + "\n")
-    sure = [r for r in rows if not r.flagged]
+    sure = [r for r in rows if not r.is_flagged]
     return int(sum(not r.right for r in sure) > 0.05 * len(sure))

@@ -26,14 +26,14 @@ ROOT = Path(__file__).parents[1]
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
-def one_thread_each() -> None:
+def limit_threads() -> None:
     """Keep libraries from starting threads of their own. Call it before NumPy is imported."""
     os.environ.update(dict.fromkeys(THREADS, "1"))
 
 
 @contextmanager
-def one_core() -> Iterator[None]:
-    """Keep this thread, and what it starts in the block, on one core; threads that run already stay where they are."""
+def keep_on_one_core() -> Iterator[None]:
+    """Keep this thread, and all that it starts in the block, on one core; running threads are not moved."""
     allowed = os.sched_getaffinity(0)
     # Which one does not matter.
     os.sched_setaffinity(0, {max(allowed)})

@@ -49,7 +49,7 @@ HEAD = (
 )
 
 
-def as_scanned(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilder]:
+def build_scanned_images(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, ImageBuilder]:
     """Simulate, synchronise and reduce every row into two sets of samples.
 
     In the first, bursts lie at their true places, in the second at their triggers: motion is then not compensated.
@@ -175,13 +175,13 @@ Made = tuple[str, Instrument, Images, int]
 
 def published_plan(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan by the rig file's plan."""
-    yield "published", rig, as_scanned(rig, scene)[0].finish(), 1
+    yield "published", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
 def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan at 100 mm/s with shorter bursts, whose rows fill whole packets; then leave rows out of it."""
     rig = Changes(speed_mm_s=100.0, pulses=13, period_us=750.0).apply(rig)
-    builder, uncompensated = as_scanned(rig, scene)
+    builder, uncompensated = build_scanned_images(rig, scene)
     yield "fast", rig, builder.finish(), 1
     yield "fast, motion not compensated", rig, uncompensated.finish(), 1
     for step in (2, 3, 4):
@@ -193,19 +193,19 @@ def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
 def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan at 100 mm/s with fewer chirps."""
     rig = Changes(speed_mm_s=100.0, period_us=750.0, pulses=6).apply(rig)
-    yield "fast, 6 chirps", rig, as_scanned(rig, scene)[0].finish(), 1
+    yield "fast, 6 chirps", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
 def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan with the published burst, rows twice as far apart, at the speed of `first_proposal`."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm).apply(rig)
-    yield "half the rows, published burst", rig, as_scanned(rig, scene)[0].finish(), 1
+    yield "half the rows, published burst", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
 def first_proposal(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan by the first proposal of `polysight plan --minutes 30` for the published rig."""
     rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
-    yield "first proposal for 30 minutes", rig, as_scanned(rig, scene)[0].finish(), 1
+    yield "first proposal for 30 minutes", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
 SCANS = (fast, published_plan, wide, short, first_proposal)
@@ -228,7 +228,7 @@ def main() -> int:
     disturbances = scene.disturbances
     still = scene.with_disturbances(ideal=True, leakage_h=disturbances.leakage_h, leakage_v=disturbances.leakage_v)
     # Without noise and motion a burst of two pulses is as good as a long one.
-    ideal = as_scanned(Changes(pulses=2).apply(rig), still)[0].finish()
+    ideal = build_scanned_images(Changes(pulses=2).apply(rig), still)[0].finish()
     plates = truth_plates(truth(rig, scene, scene.seed))
     print(HEAD, flush=True)
     measure("ideal", rig, ideal, ideal, plates)

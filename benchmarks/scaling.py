@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.chain import Chain
 from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary
-from benchmarks.measure import Seconds, add_arguments as add_common, machine, one_core, write
+from benchmarks.measure import Seconds, add_arguments as add_common, keep_on_one_core, machine, write
 from polysight.pipeline import Pipeline
 from polysight.process import map_rows
 from polysight_shared.config import Instrument
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure threads, then sizes; print both. Return 0."""
     rig, scene = published_scene()
     with temporary(args.folder) as folder:
-        # Two recorded rows of each board, which stand in turn for all rows.
+        # Two recorded rows of each board, which are used alternately for all rows.
         files: dict[str, list[Path]] = {}
         for name, rows in recorded_rows(rig, scene, 2).items():
             files[name] = [folder / f"{name}{i}.bin" for i in range(len(rows))]
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         threads = time_threads(rig, files, ROWS_OF_THREADS, ROUNDS_OF_THREADS if not args.quick else 1)
         if args.quick:
             largest = 0.25
-        with one_core():
+        with keep_on_one_core():
             lines = time_sizes(folder, files, largest)
     wall = threads[1].median_wall / threads[2].median_wall
     cpu = threads[2].median / threads[1].median

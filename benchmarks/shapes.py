@@ -39,7 +39,7 @@ RIG_FILE = find_packaged(Path("instrument.toml"))
 GATE_M = (1.45, 2.2)
 # Points farther from the object's surface than this (chosen) are of something else.
 STRAY_M = 0.01
-# Arguments of `ShapeNuisances` by disturbance: what is wrong with the rig.
+# Arguments of `ShapeNuisances` for each disturbance of the rig.
 DISTURBANCES: dict[str, dict[str, float]] = {
     "none": {},
     "misplaced": {"misplaced_mm": 1.0},

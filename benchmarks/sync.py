@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from benchmarks.data import RepeatedRows, published_scene, recorded_rows, temporary
-from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, one_core, show, write
+from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, keep_on_one_core, show, write
 from benchmarks.published import Synchroniser
 from polysight.imaging import ImageBuilder
 from polysight.pipeline import Pipeline
@@ -120,7 +120,7 @@ def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, 
 def run(args: argparse.Namespace) -> int:
     """Measure all methods on one core and print the table; return 0."""
     rig, scene = published_scene(args.quick)
-    with temporary(args.folder) as folder, one_core():
+    with temporary(args.folder) as folder, keep_on_one_core():
         files = {}
         for name, rows in recorded_rows(rig, scene, 1).items():
             files[name] = folder / f"{name}.bin"

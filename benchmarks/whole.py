@@ -19,8 +19,8 @@ from benchmarks.measure import (
     Seconds,
     add_arguments as add_common,
     count_repeats,
+    keep_on_one_core,
     line_at_most,
-    one_core,
     show,
     write,
 )
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     most_rows = args.rows
     if args.quick:
         most_rows = 4
-    with temporary(args.folder) as folder, one_core():
+    with temporary(args.folder) as folder, keep_on_one_core():
         count = rows_that_fit(rig, most_rows, folder)
         # A few simulated rows by board, which the scan's files repeat.
         rows = recorded_rows(rig, scene)

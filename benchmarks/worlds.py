@@ -204,7 +204,7 @@ def table_2_classifier(theta_rad: float) -> Classifier:
 
 
 def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illumination:
-    """Return what the phase says about tilts on the published rig; the footprints are not known, and taken as even."""
+    """Return the relation of phase and tilts for the published rig; footprints are unknown, and taken as uniform."""
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2
     plane_m = rig.geometry.object_distance_mm / 1e3

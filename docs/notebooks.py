@@ -1,4 +1,4 @@
-"""Run notebooks without Jupyter: the code cells from the first to the last, and what the last line of each shows."""
+"""Run notebooks without Jupyter: the code cells from the first to the last, and the output of the last line of each."""
 
 from __future__ import annotations
 

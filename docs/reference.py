@@ -48,7 +48,7 @@ _as_evaluated = inspect.formatannotation
 _TO_PRIVATE = re.compile(r'<a href="[^"#]*#_[^"]*">(.*?)</a>')
 
 
-def modules_of(name: str) -> Iterator[str]:
+def list_modules(name: str) -> Iterator[str]:
     """Names of a module and of everything in it that has a page of its own. Imports them."""
     module = import_module(name)
     yield name
@@ -60,7 +60,7 @@ def modules_of(name: str) -> Iterator[str]:
         # pdoc takes no other imported name for a public one.
         vars(module)["__all__"] = names
     elif hasattr(module, "__path__"):
-        yield from (page for child in _children(module) for page in modules_of(child))
+        yield from (page for child in _children(module) for page in list_modules(child))
 
 
 def list_public_imports(module: ModuleType) -> list[str]:
@@ -168,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pages")
     parser.add_argument("--quick", action="store_true", help="without results of notebooks, without the gallery")
     args = parser.parse_args(argv)
-    names = list(dict.fromkeys(name for package in PACKAGES for name in modules_of(package)))
+    names = list(dict.fromkeys(name for package in PACKAGES for name in list_modules(package)))
     build(names, args.out)
     pages = build_site(args.out, run=not args.quick)
     faults = link_faults(args.out)

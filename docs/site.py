@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 
 import nbformat
-from docs.check.pages import ROOT, all_pages, inline_parts, slug_of
+from docs.check.pages import ROOT, all_pages, inline_parts, make_slug
 from docs.notebooks import run_notebook
 from markdown_it import MarkdownIt
 
@@ -93,7 +93,7 @@ def _from_markdown(path: Path) -> str:
     for number, token in enumerate(tokens):
         if token.type == "heading_open":
             heading = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
-            token.attrSet("id", slug_of(heading, used))
+            token.attrSet("id", make_slug(heading, used))
     return parser.renderer.render(tokens, parser.options, {})
 
 

@@ -1,4 +1,4 @@
-"""`python -m docs.check [--run] [PAGE ...]`: look at README and docs; with --run, run what they show."""
+"""`python -m docs.check [--run] [PAGE ...]`: check README and docs; with --run, run their commands."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class _Captured(BaseException):
 
 
 @cache
-def parser_of(module: str) -> argparse.ArgumentParser | None:
+def find_parser(module: str) -> argparse.ArgumentParser | None:
     """The argument parser that a module's `main` uses; None when it takes no arguments.
 
     Raises ModuleNotFoundError when there is no such module to run.
@@ -88,7 +88,8 @@ def simple_commands(line: str) -> list[list[str]]:
 def _without_runner(words: list[str]) -> list[str]:
     """Return a command without the programs that run it, their options and values, and variables that are set."""
     while words and (words[0] in _BEFORE or re.fullmatch(r"[A-Za-z_]+=.*|-\w*|\$|!", words[0])):
-        runner, words = words[0], words[1:]
+        runner = words[0]
+        words = words[1:]
         if runner == "ssh":
             # The first word that is not an option is the machine.
             words = words[next((n for n, word in enumerate(words) if not word.startswith("-")), 0) + 1 :]
@@ -135,7 +136,7 @@ def command_faults(line: str) -> list[str]:
 def _parse_faults(module: str, arguments: list[str]) -> list[str]:
     """What the module's own parser says against the arguments; empty when it takes them."""
     try:
-        parser = parser_of(module)
+        parser = find_parser(module)
     except ModuleNotFoundError as e:
         return [str(e)]
     if parser is None:
@@ -170,7 +171,7 @@ def mention_faults(text: str) -> list[str]:
 def _walk(module: str, words: list[str]) -> list[str]:
     """The first subcommand or option among the words that the module's parser does not have; empty without one."""
     try:
-        parser = parser_of(module)
+        parser = find_parser(module)
     except ModuleNotFoundError as e:
         return [str(e)]
     known = set(parser._option_string_actions) if parser else set()

@@ -1,4 +1,4 @@
-"""What is wrong with a page, found without running anything."""
+"""Faults of a page that are found without running its commands."""
 
 from __future__ import annotations
 

@@ -66,7 +66,8 @@ class Block:
     def commands(self) -> list[tuple[int, str]]:
         """Its commands, joined over line ends in quotes and after a backslash; no comments, no here-documents."""
         commands: list[tuple[int, str]] = []
-        goes_on, end_of_document = False, ""
+        goes_on = False
+        end_of_document = ""
         for number, text in self.shell_lines():
             if end_of_document:
                 end_of_document = "" if text.strip() == end_of_document else end_of_document
@@ -116,7 +117,7 @@ def _is_open(command: str) -> bool:
     return False
 
 
-def slug_of(heading: str, used: dict[str, int]) -> str:
+def make_slug(heading: str, used: dict[str, int]) -> str:
     """The anchor that GitHub gives a heading."""
     slug = re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
     used[slug] = used.get(slug, -1) + 1
@@ -158,5 +159,5 @@ def read_page(path: Path) -> Page:
                 spans.append((line, part.content))
         if token.type == "heading_open":
             heading = "".join(p.content for p in inline_parts(tokens[number + 1]) if p.type in ("text", "code_inline"))
-            anchors.add(slug_of(heading, used))
+            anchors.add(make_slug(heading, used))
     return Page(path, tuple(links), frozenset(anchors), tuple(blocks), tuple(spans))

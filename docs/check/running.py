@@ -19,7 +19,7 @@ LIMIT_S = 900.0
 # Scene of the simulated rig, and its seconds per second.
 RIG_SCENE = "examples/nine-materials.toml"
 RIG_TIME_SCALE = 40
-# Not copied: what is large, or made by the programs.
+# Not copied: large files, and those made by the programs.
 _LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "out", "build", "__pycache__", ".*_cache", "*.egg-info", "scans")
 
 
@@ -43,7 +43,7 @@ def scratch_copy(folder: Path, root: Path = ROOT) -> Path:
     return copy
 
 
-def script_of(page: Page) -> str:
+def make_script(page: Page) -> str:
     """A shell script whose line numbers are the page's: all but the commands to be run is left blank."""
     lines = [""] * len(page.path.read_text(encoding="utf-8").splitlines())
     for block in page.blocks:
@@ -65,8 +65,8 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
     script = work / "page.sh"
-    script.write_text(script_of(page), encoding="utf-8")
-    # Holds the line of the command that runs, see `script_of`.
+    script.write_text(make_script(page), encoding="utf-8")
+    # Holds the line of the command that runs, see `make_script`.
     at = work / "at"
     at.write_text("0")
     environment = {
@@ -90,7 +90,7 @@ def run_page(page: Page, copy: Path, limit_s: float = LIMIT_S) -> PageRun:
                 status = 124
         finally:
             if shell is not None:
-                # The shell, or what it left running.
+                # The shell, or programs that it left running.
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(shell.pid, signal.SIGKILL)
                 shell.wait()

@@ -27,7 +27,7 @@ def _loss(permittivity: dict[str, float]) -> str:
 
 
 def draw(products: Path, to: Path) -> None:
-    """Draw both channels and their ratio in dB, and what each patch was named, with its relative permittivity."""
+    """Draw both channels and their ratio in dB, and each patch's name, with its relative permittivity."""
     image = np.load(products / "image.npz", allow_pickle=False)
     materials = json.loads((products / "materials.json").read_text(encoding="utf-8"))
     if not materials["simulated"]:
@@ -56,7 +56,7 @@ def draw(products: Path, to: Path) -> None:
         colour = PALETTE[names.index(part["name"] or "")]
         axes[3].add_patch(Polygon(part["outline_mm"], facecolor=colour + "99", edgecolor=INK, linewidth=1.2))
         x0, y0, x1, y1 = part["box_mm"]
-        # The name without what stands in brackets, in two lines.
+        # The name without the part in brackets, in two lines.
         name = (part["name"] or "metal").split(" (")[0].replace(" ", "\n", 1)
         eps = part["permittivity"]
         value = "reference" if eps is None else f"{eps['real']:.1f} ± {eps['real_std']:.1f}\n{_loss(eps)}"

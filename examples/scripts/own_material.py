@@ -3,7 +3,7 @@
 #
 # What a material of known permittivity should look like, what the scan of it gave (run `own_scene.py` first), and a
 # library that knows it: `polysight process NEXT --library out/own-library.npz` then names it in the next scan. A
-# library wants two scans at least, because a classifier is judged by leaving whole scans out.
+# library needs two scans at least, because a classifier is judged by leaving whole scans out.
 
 # %%
 from pathlib import Path

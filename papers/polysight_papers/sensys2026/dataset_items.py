@@ -539,7 +539,7 @@ class Estimate:
 
     @property
     def metal_like(self) -> bool:
-        """True for metal, and for what has no permittivity or no standard error of one."""
+        """True for metal, and for materials without a permittivity or without its standard error."""
         return self.material.number == 1 or self.clean.value is None or self.clean.real_std is None
 
 
@@ -595,7 +595,7 @@ def _estimate_materials(data: AuthorsData, source: str, leakage: float) -> list[
         if pixels is None or not pixels[0].size:
             continue
         p, angle, scans = pixels
-        # Only H / V is known: it stands for H, with V = 1.
+        # Only H / V is known: it is used as H, with V = 1.
         ones = np.ones(p.size, np.complex128)
         theta = np.radians(angle)
         as_is = estimate_permittivity(p, ones, theta)

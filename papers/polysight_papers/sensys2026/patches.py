@@ -244,7 +244,7 @@ def draw_at_angles(group: str, angles_deg: tuple[float, ...], errors: Errors, se
 
 
 @cache
-def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, float], quick: bool) -> SpecimenScore:
+def add_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, float], quick: bool) -> SpecimenScore:
     """Judge the discriminant on new specimens and scans, and Bayes' rule on the same errors."""
     test_scans = TEST_SCANS
     if quick:
@@ -257,7 +257,7 @@ def with_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, 
     calibration = calibration_error(sure[named], right[named])
     share = float((named & right).mean())
     bound = bayes(group, angles_deg, errors, quick)
-    return SpecimenScore(share, bound, calibration, strangers_named(taught, test, quick))
+    return SpecimenScore(share, bound, calibration, count_named_strangers(taught, test, quick))
 
 
 def by_patch(model: Model, test: Samples) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_], Real]:
@@ -321,7 +321,7 @@ def _compute_features(eps: npt.NDArray[np.complex128], angles_deg: tuple[float, 
     return np.stack(columns, axis=-1)
 
 
-def strangers_named(taught: Samples, test: Samples, quick: bool) -> tuple[int, int, int, int]:
+def count_named_strangers(taught: Samples, test: Samples, quick: bool) -> tuple[int, int, int, int]:
     """Count patches of unlearnt materials: named of all, named of those outside every 95 % region.
 
     Returns the two pairs (named, of how many).
@@ -385,7 +385,7 @@ def spread_table(quick: bool) -> Table:
     rows = []
     for group, angles in tasks:
         for spread in spreads:
-            f = with_spread(group, angles, spread, quick)
+            f = add_spread(group, angles, spread, quick)
             row_title = f"{len(groups()[group].materials)} {group}{', two angles' if len(angles) > 1 else ''}"
             label = f"{100 * spread[0]:g} / {100 * spread[1]:g} %"
             rows.append(

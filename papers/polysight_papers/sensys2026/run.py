@@ -149,7 +149,7 @@ def make_items(
     pictures: dict[str, bytes] = {}
     failed: dict[str, str] = {}
     chosen = list(dict.fromkeys(keys) or makers)
-    # `steps` prints what is being made, and how long it took.
+    # `steps` prints the item that is being made, and its duration.
     for key in steps(chosen, [f"making {TITLES[key]}" for key in chosen]):
         try:
             item = makers[key]()

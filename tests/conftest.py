@@ -15,8 +15,8 @@ from polysight_shared.config import Instrument
 # Until all is imported and collected, which makes objects that live to the end (pytest_collection_finish).
 gc.disable()
 
-# The tests start some hundred programs: our modules are compiled once for all of them, whatever the shell says; and one
-# thread each for linear algebra, for two that spin against each other on few cores are ten times slower than one.
+# The tests start some hundred programs: our modules are compiled once for all of them, for any setting of the shell;
+# and one thread each for linear algebra, because two that compete for few cores are ten times slower than one.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -27,14 +27,14 @@ pytest.register_assert_rewrite("tests.support")
 from tests.support import preloaded  # noqa: E402
 from tests.support.page.chromium import Browser, find_chromium  # noqa: E402
 from tests.support.rigs import published_rig  # noqa: E402
-from tests.support.suite import ByFile, Costs, longest_first  # noqa: E402
+from tests.support.suite import ByFile, Costs, sort_longest_first  # noqa: E402
 
-# A shell that starts the tests in the background has Ctrl-C ignored, and so would every program the tests start.
+# A shell that starts the tests in the background ignores Ctrl-C, and so would every program of the tests.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # No test asserts on wall-clock speed, Hypothesis' deadline included: the machine may be busy.
-# The same examples every time; `--long` looks for new ones.
+# The same examples every time; `--long` draws new ones.
 settings.register_profile(
     "patient", max_examples=50, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
@@ -70,8 +70,8 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if hasattr(config, "workerinput"):  # with one worker alone, as they are
-        longest_first(items)
+    if hasattr(config, "workerinput"):  # with one worker: in the order of collection
+        sort_longest_first(items)
 
 
 def pytest_collection_finish() -> None:
@@ -118,5 +118,5 @@ def _browser_of_worker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bro
 def browser(_browser_of_worker: Browser) -> Iterator[Browser]:
     """A browser, the same for all tests of a worker."""
     yield _browser_of_worker
-    # The page of a server that has ended asks for it again and again.
+    # The page of a server that has ended keeps sending requests to it.
     _browser_of_worker.open("about:blank")

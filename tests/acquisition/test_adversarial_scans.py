@@ -26,7 +26,7 @@ class AdversarialCard(FakeCard):
     def __init__(self, board: Board, row_bytes: int, frame_bytes: int, chance: random.Random) -> None:
         self._chance = chance
         self._frame = frame_bytes
-        self.rate = 0.5  # of records with troubles
+        self.rate = 0.5  # share of records with faults
         self.adversary = Adversary(chance, frame_bytes)
         self.sent: list[tuple[int, int, tuple[str, ...]]] = []
         super().__init__(board, row_bytes)
@@ -111,7 +111,7 @@ def test_committed_bytes_are_right_or_masked(request, tmp_path):
                 break
             else:
                 for card in rig.cards.values():
-                    # The trouble is over: the scan comes to its end
+                    # The fault has ended, so the scan completes
                     card.rate = 0.0
                 assert resume_scan(folder).exit_status == "success"
                 check(folder, rig, ScanFolder.load(folder).recording_facts()["rows_incomplete"])

@@ -11,7 +11,7 @@ import pytest
 from tests.support.page.live_view import open_control
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.small_scan import SmallScan
 
 from polysight.acquisition import control as control_module, scan as host_run
@@ -111,7 +111,7 @@ def test_after_the_rows_no_command_is_obeyed(tmp_path):
         control.end_rows()
         wait_for(lambda: (life := read_life(tmp_path)) is not None and life.doing == "materials", "the end of the rows")
         (tmp_path / CONTROL / "pause").touch()
-        # Commands are looked for before each sign of life.
+        # Commands are read before each sign of life.
         stop.request("a signal")
         wait_for(lambda: (life := read_life(tmp_path)) is not None and life.asked != "", "a sign of life after it")
         assert not stop.paused
@@ -183,7 +183,7 @@ def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
 
 
 def facts(path: Path) -> list[str]:
-    return [f["fact"] for f in facts_of(path)]
+    return [f["fact"] for f in load_facts(path)]
 
 
 def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
@@ -199,7 +199,7 @@ def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
     return scan
 
 
-def when_paused(folder: Path, act: Callable[[], None]) -> None:
+def call_when_paused(folder: Path, act: Callable[[], None]) -> None:
     """Call `act` in a thread once the manifest says that the scan is paused."""
 
     def wait() -> None:
@@ -214,7 +214,7 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
 
     def pause() -> None:
         stop.paused = True
-        when_paused(tmp_path / "scan", lambda: setattr(stop, "paused", False))
+        call_when_paused(tmp_path / "scan", lambda: setattr(stop, "paused", False))
 
     scan = scan_with(samples, tmp_path, stop, pause)
     answer = [f for f in facts(scan.path) if f != "radars"]
@@ -231,7 +231,7 @@ def test_a_paused_scan_can_be_stopped(samples, tmp_path):
 
     def pause() -> None:
         stop.paused = True
-        when_paused(tmp_path / "scan", stop.request)
+        call_when_paused(tmp_path / "scan", stop.request)
 
     scan = scan_with(samples, tmp_path, stop, pause)
     assert facts(scan.path)[-1] == "scan_ended"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from tests.support.acquisition.fake_rig import PI_AHEAD_NS, FakeRig
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.plain_scan import errors
 
 from polysight.acquisition import pulse_times
@@ -57,7 +57,7 @@ def test_missed_pulses_are_found_and_the_row_is_taken_again(timed_rig, payload, 
         timed_rig.cards["RV"].missed[0, take] = {0, 47}
     result = run_scan(timed_rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 3)
-    for fact in facts_of(result.folder, "row_rejected"):
+    for fact in load_facts(result.folder, "row_rejected"):
         assert fact["row"] == 0
         assert [fault["kind"] for fault in fact["faults"]] == ["pulses_missed"] * 2
         assert all("SYNC_IN" in reason for reason in fact["reasons"])
@@ -75,7 +75,7 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(timed_rig, paylo
     assert errors(result.folder.path) == []
     for name, pulses in missed.items():
         assert check_unmasked(result, payload, name)[sorted(pulses)].all()
-        assert facts_of(result.folder, "row_committed")[0]["boards"][name]["pulses_missed"] == len(pulses)
+        assert load_facts(result.folder, "row_committed")[0]["boards"][name]["pulses_missed"] == len(pulses)
 
 
 def test_a_card_is_reset_behind_a_row_whose_frames_came_at_other_times(timed_rig, tmp_path):

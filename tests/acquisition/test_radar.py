@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import run_scan
 from polysight.radar.control import LINE, BoardState, Endless, LineServers, RadarControl, RadarState, radar_control
@@ -196,7 +196,7 @@ class Native(RadarControl):
 
 
 def rejection_reasons(scan: ScanFolder) -> list[str]:
-    return [reason for fact in facts_of(scan, "row_rejected") for reason in fact["reasons"]]
+    return [reason for fact in load_facts(scan, "row_rejected") for reason in fact["reasons"]]
 
 
 def test_radars_are_armed_for_every_take_and_let_go_at_the_end(rig, tmp_path):
@@ -214,7 +214,7 @@ def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
     assert (result.exit_status, result.retakes) == ("success", 1)
     # The first take was never sent to the stage
     assert rig.pi.rows_run[0] == (0, 2)
-    (fact,) = facts_of(result.folder, "row_rejected")
+    (fact,) = load_facts(result.folder, "row_rejected")
     assert fact["faults"] == [{"kind": "radar_stopped", "board": "RH"}, {"kind": "radar_stopped"}]
     assert any("RF core fault 7" in reason for reason in fact["reasons"])
 
@@ -244,7 +244,7 @@ def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
     radars.waiting = {2: ["LS"]}
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    (fact,) = facts_of(result.folder, "row_rejected")
+    (fact,) = load_facts(result.folder, "row_rejected")
     assert (fact["row"], fact["faults"]) == (1, [{"kind": "radar_waits", "board": "LS"}])
 
 
@@ -262,7 +262,7 @@ def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
 
     result = run_scan(msgspec.structs.replace(rig.instrument, limits=limits), tmp_path / "s", progress=progress)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    faults = facts_of(result.folder, "row_rejected")[0]["faults"]
+    faults = load_facts(result.folder, "row_rejected")[0]["faults"]
     assert faults[0] == {"kind": "no_data"}, "of the row that was aborted"
     assert {"kind": "no_data", "board": "RH"} in faults
 

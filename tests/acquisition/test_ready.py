@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition import ready
 from polysight.acquisition.control import StopRequest
@@ -115,19 +115,19 @@ def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_ol
     right = rig.pi.stage
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
     scan = ScanFolder.load(tmp_path / "s")
-    assert facts_of(scan, "scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placement_settings
+    assert load_facts(scan, "scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placement_settings
     rows = list(scan.rows())
-    facts = len(facts_of(scan))
+    facts = len(load_facts(scan))
     assert not scan.complete
     rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     with refused(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
         resume_scan(tmp_path / "s")
     scan.reload()
-    assert (list(scan.rows()), len(facts_of(scan))) == (rows, facts), "nothing was written"
+    assert (list(scan.rows()), len(load_facts(scan))) == (rows, facts), "nothing was written"
     rig.pi.stage = right
     assert resume_scan(tmp_path / "s").folder.complete
     scan.reload()
-    assert facts_of(scan, "scan_resumed")[0]["pi"] == {
+    assert load_facts(scan, "scan_resumed")[0]["pi"] == {
         "release": "t",
         "firmware": "t",
         "backend": "fake",
@@ -170,7 +170,7 @@ def start_scan(rig, folder, **stage):
     """Run a scan with these settings of [stage]; return its result and its `scan_ended`."""
     replace = msgspec.structs.replace
     result = run_scan(replace(rig.instrument, stage=replace(rig.instrument.stage, **stage)), folder)
-    return result, facts_of(folder, "scan_ended")[-1]
+    return result, load_facts(folder, "scan_ended")[-1]
 
 
 @pytest.mark.parametrize(("lost_mm", "answer"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((0.0, -1.2), True)])
@@ -207,6 +207,6 @@ def test_only_a_scan_that_has_all_its_rows_is_homed_after(rig, tmp_path):
     assert rig.pi.homings == 1
     assert resume_scan(tmp_path / "s").exit_status == "success"
     homings = rig.pi.homings
-    assert "lost_mm" in facts_of(tmp_path / "s", "scan_ended")[-1]
+    assert "lost_mm" in load_facts(tmp_path / "s", "scan_ended")[-1]
     assert resume_scan(tmp_path / "s").exit_status == "success"
     assert rig.pi.homings == homings

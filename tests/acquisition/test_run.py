@@ -14,7 +14,7 @@ from tests.support.acquisition.fake_cards import FULL, FakeCard, make_payload
 from tests.support.acquisition.fake_rig import FakeRig
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.plain_scan import errors
 
 from polysight.acquisition import capture_rig
@@ -67,7 +67,7 @@ def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
     rig.pi.lose_events = 7
     assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     assert errors(tmp_path / "s") == []
-    ended = facts_of(tmp_path / "s", "scan_ended")[0]
+    ended = load_facts(tmp_path / "s", "scan_ended")[0]
     assert ended["events_refetched"] >= 7
 
 
@@ -91,7 +91,7 @@ def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, droppe
     scan = ScanFolder.load(tmp_path / "s")
     assert scan.committed_rows()[1].take == 2
     assert scan.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
-    rejected = facts_of(scan, "row_rejected")
+    rejected = load_facts(scan, "row_rejected")
     assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
     assert "RV" in rejected[0]["reasons"][0]
     assert errors(tmp_path / "s") == []
@@ -104,7 +104,7 @@ def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
         run_scan(rig.instrument, tmp_path / "s")
     scan = ScanFolder.load(tmp_path / "s")
     assert list(scan.committed_rows()) == [0]
-    assert facts_of(scan, "scan_ended")[0]["exit_status"] == "fail"
+    assert load_facts(scan, "scan_ended")[0]["exit_status"] == "fail"
     assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
     result = resume_scan(tmp_path / "s")
     assert result.exit_status == "success"
@@ -117,7 +117,7 @@ def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
         rig.cards["RV"].drop[1, take] = {3, 4, 9}
     result = run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
     assert (result.exit_status, result.incomplete_rows) == ("success", [1])
-    assert facts_of(result.folder, "row_committed")[1]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
+    assert load_facts(result.folder, "row_committed")[1]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
     data = ScanFolder.load(tmp_path / "s").read_row("RV", 1)
     assert data.missing == [(3 * 1456, 5 * 1456), (9 * 1456, 10 * 1456)]
     want = np.frombuffer(payload("RV", 1, rig.instrument.row_bytes), dtype=np.uint8)
@@ -248,7 +248,7 @@ def test_existing_scan_is_not_overwritten(rig, tmp_path):
     assert digests(ScanFolder.load(tmp_path / "s")) == state_before
 
 
-TAIL_S = 0.6  # from the last data to the short last packet; 2 s of a real card
+TAIL_S = 0.6  # time from the last data to the short last packet; a real card takes 2 s
 CONFIGURE = int(Code.CONFIGURE_FPGA)
 
 
@@ -262,9 +262,9 @@ class LateCard(FakeCard):
         # number of the record
         self._lag_s = lag_s
         self._record = 0
-        self._tail: tuple[int, bytes] | None = None  # of which record, and what
+        self._tail: tuple[int, bytes] | None = None  # record and content
         self._lock = threading.Lock()
-        # (row, take): so many bytes are all that come
+        # (row, take): number of bytes that arrive
         self.cut: dict[tuple[int, int], int] = {}
         super().__init__(board, row_bytes)
 
@@ -314,7 +314,7 @@ def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tm
     finally:
         rig.close()
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert [(f["row"], f["take"]) for f in facts_of(result.folder, "row_rejected")] == [(1, 1)]
+    assert [(f["row"], f["take"]) for f in load_facts(result.folder, "row_rejected")] == [(1, 1)]
     assert result.folder.read_row("RV", 1).payload.tobytes() == payload("RV", 1, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
 
@@ -338,7 +338,7 @@ def test_a_scan_is_not_resumed_with_the_cards_of_two_boards_exchanged(rig, tmp_p
     monkeypatch.setattr(card, "neighbour_mac", macs.get)
     stop = StopRequest()
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
-    row = facts_of(tmp_path / "s", "row_committed")[0]
+    row = load_facts(tmp_path / "s", "row_committed")[0]
     assert {name: board["card_mac"] for name, board in row["boards"].items()} == {
         "RH": "12:34:56:78:90:RH",
         "RV": "12:34:56:78:90:RV",

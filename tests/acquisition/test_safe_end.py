@@ -13,7 +13,7 @@ import msgspec
 import pytest
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition import pi_client, scan as running
 from polysight.acquisition.control import StopRequest, ignore_hangup
@@ -97,7 +97,7 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     assert f"1 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
     assert commands(rig.pi).count(m.Home) == 1, "the one at the start"
     assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
-    ended = facts_of(tmp_path / "s", "scan_ended")[0]
+    ended = load_facts(tmp_path / "s", "scan_ended")[0]
     assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
 
 
@@ -290,7 +290,7 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", streams[0])
         patch.setattr(sys, "stdout", streams[1])
-        with suppress(OSError):  # of the summary, which comes last
+        with suppress(OSError):  # one of the summary's lines, which come last
             live.scan(config, tmp_path / "s", DEFAULT, None, False, True)
     for stream in streams:
         stream.close()
@@ -336,4 +336,4 @@ def test_a_complete_scan_succeeds_if_the_pi_run_cannot_be_ended(rig, tmp_path, m
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.folder.complete) == ("success", True)
     assert any("the Pi did not write it down" in w for w in result.warnings)
-    assert [f["exit_status"] for f in facts_of(result.folder, "scan_ended")] == ["success"]
+    assert [f["exit_status"] for f in load_facts(result.folder, "scan_ended")] == ["success"]

@@ -4,7 +4,7 @@ import re
 
 import pytest
 from tests.support.paths import REPO
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.row import ON_REQUEST, FaultKind, TakeFault
@@ -61,7 +61,7 @@ def test_a_rejected_take_has_the_kind_and_board_of_its_fault(rig, tmp_path, spoi
     spoil(rig)
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
-    (fact,) = facts_of(result.folder, "row_rejected")
+    (fact,) = load_facts(result.folder, "row_rejected")
     assert fact["faults"] == [fault]
     assert len(fact["reasons"]) == 1
     assert fact["reasons"][0].startswith("RV: ") == ("board" in fault)
@@ -81,7 +81,7 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
     card.send_row = overflowing
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
-    (fact,) = facts_of(result.folder, "row_rejected")
+    (fact,) = load_facts(result.folder, "row_rejected")
     assert fact["faults"] == [{"kind": "card_dropped", "board": "RV"}]
     assert [bool(fact["boards"][name]["card_status"] & bit) for name in ("RH", "RV")] == [False, True]
 
@@ -96,7 +96,7 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
             stop.request()
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
-    (fact,) = facts_of(result.folder, "row_rejected")
+    (fact,) = load_facts(result.folder, "row_rejected")
     assert (fact["reasons"], fact["faults"]) == ([str(ON_REQUEST)], [{"kind": "on_request"}])
     assert (result.exit_status, list(result.folder.committed_rows())) == ("abort", [])
     assert not list((tmp_path / "s" / "raw").rglob("*.part"))

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from tests.support.page.live_view import add_fact, begin_history
 from tests.support.rigs import published_rig
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition import scan as running
 from polysight.acquisition.control import StopRequest
@@ -85,7 +85,7 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "success"
-    assert [f["fact"] for f in facts_of(result.folder, "scan_paused")] == ["scan_paused"]
+    assert [f["fact"] for f in load_facts(result.folder, "scan_paused")] == ["scan_paused"]
     assert [t for t in answer if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
     assert [remaining for word, remaining in answer if isinstance(word, str)] == [2 * ROW_S] * 2, (
         "before the pause and after it"
@@ -96,7 +96,7 @@ def test_the_page_has_the_same_time_left(rig, tmp_path):
     """Facts of a scan with changed times: rows a minute apart, a pause of a day before the last."""
     run_scan(rig.instrument, tmp_path / "s")
     utc = "2026-05-{:02d}T02:{:02d}:00.000+00:00"
-    started, *facts = facts_of(tmp_path / "s")
+    started, *facts = load_facts(tmp_path / "s")
     history = begin_history(started | {"started_utc": utc.format(1, 0)})
     for fact in facts:
         if fact["fact"] == "row_committed" and fact["row"] < 3:

@@ -13,7 +13,7 @@ import pytest
 import zmq
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition import ready, row, scan as running
 from polysight.acquisition.control import StopRequest
@@ -85,7 +85,7 @@ def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
 
 
 def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, receivers, payload, tmp_path, monkeypatch):
-    """The receivers are stopped (SIGSTOP) before they are told to write row 1, until the notice appears."""
+    """The receivers are stopped (SIGSTOP) before the request to write row 1, until the notice appears."""
     monkeypatch.setattr(row, "_DISK_NOTICE_S", 0.05)
     notices: list[tuple[int, str]] = []
 
@@ -116,7 +116,7 @@ def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path,
     with refused(ErrorCode.DISK_FULL):
         run_scan(rig.instrument, tmp_path / "s")
     assert rig.pi.rows_run == [(0, 1), (1, 1)]
-    ended = facts_of(tmp_path / "s", "scan_ended")[0]
+    ended = load_facts(tmp_path / "s", "scan_ended")[0]
     assert ended["exit_status"] == "fail"
     monkeypatch.undo()
     assert resume_scan(tmp_path / "s").exit_status == "success"
@@ -163,7 +163,7 @@ def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
     rig.pi.notes[1, 1] = "held on the way: some positions were passed below full speed"
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
-    facts = {f["row"]: f for f in facts_of(result.folder, "row_committed")}
+    facts = {f["row"]: f for f in load_facts(result.folder, "row_committed")}
     assert facts[1]["take"] == 1
     assert facts[1]["note"].startswith("held")
     assert "note" not in facts[0]
@@ -228,7 +228,7 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     points = []
     requests = []
     aborted = []
-    sleeps: list[float] = []  # of the loop, in ms; None would be for ever
+    sleeps: list[float] = []  # timeouts of the loop, in ms; None would be endless
 
     class Poller(zmq.Poller):
         def poll(self, timeout=None):
@@ -249,7 +249,7 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     assert until - first == 1, "the turn in hand is the last one"
     assert 0 <= max(sleeps[:until]) <= 100, "ms: a request is seen though nothing comes"
     assert isinstance(rig.pi.commands[commands], m.Abort)
-    ended = facts_of(result.folder, "scan_ended")[0]
+    ended = load_facts(result.folder, "scan_ended")[0]
     assert (ended["exit_status"], ended["reason"]) == ("abort", "stopped on request, 4 of 4 rows are missing")
 
 
@@ -283,6 +283,6 @@ def test_every_end_is_written_down(rig, tmp_path, monkeypatch):
     with pytest.raises(BugError):
         run_scan(rig.instrument, tmp_path / "s")
     monkeypatch.undo()
-    ended = facts_of(tmp_path / "s", "scan_ended")
+    ended = load_facts(tmp_path / "s", "scan_ended")
     assert [(f["exit_status"], f["reason"]) for f in ended] == [("fail", "BugError: oops")]
     assert resume_scan(tmp_path / "s").exit_status == "success"

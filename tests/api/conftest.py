@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from tests.support.products import skip_rendering
 from tests.support.rigs import published_rig
-from tests.support.scenes import scene_of
+from tests.support.scenes import make_scene
 
 from polysight.cli.main import main
 from polysight_simulators.scene import decode_scene, simulate
@@ -23,7 +23,7 @@ def simulate_plates(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
     """A scan of plates on the grid of examples/own-scene.toml, or an empty one on a coarse grid."""
     columns, rows, step_mm = (31, 27, (10.0, 6.0)) if plates else (15, 17, (14.0, 8.0))
     image = {"columns": 90, "rows": 60, "pixel_mm": 2.0}
-    scene = scene_of(*plates, columns=columns, rows=rows, step_mm=step_mm, image=image)
+    scene = make_scene(*plates, columns=columns, rows=rows, step_mm=step_mm, image=image)
     return simulate(published_rig(), decode_scene(scene, "test"), folder, **more)
 
 

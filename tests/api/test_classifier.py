@@ -10,7 +10,7 @@ from polysight import Classifier, Library, PaperKNeighborsClassifier
 from polysight.materials import SIMULATED_LIBRARY, Samples, ratio_columns
 from polysight.materials.classify import PAPER, PaperKnn, Weights
 
-# What scikit-learn leaves out by itself here: array API without its switch, and what has no decision_function.
+# Checks that scikit-learn skips by itself here: array API without its switch, and estimators without decision_function.
 NOT_CHECKED = {"check_array_api_input", "check_classifiers_multilabel_output_format_decision_function"}
 
 
@@ -75,7 +75,7 @@ def test_a_classifier_is_an_estimator(library, model):
     ("model", "others"),
     [
         ("knn", set()),
-        # Its clouds of points are anywhere in X, and no reflection of materials.
+        # Its clouds of points are anywhere in X, and do not look like reflections of materials.
         ("discriminant", {"check_classifiers_train"}),
     ],
 )

@@ -10,7 +10,7 @@ import pytest
 import xarray
 from msgspec.structs import replace
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 import polysight
 from polysight import open_scan, read_netcdf
@@ -33,7 +33,7 @@ def scan(folder):
 def without_rows(folder: Path, out: Path, *rows: int) -> Path:
     """A copy of a scan folder in which these rows were never committed."""
     shutil.copytree(folder, out)
-    kept_facts = [f for f in facts_of(out) if f["fact"] != "row_committed" or f["row"] not in rows]
+    kept_facts = [f for f in load_facts(out) if f["fact"] != "row_committed" or f["row"] not in rows]
     (out / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept_facts))
     return out
 
@@ -382,7 +382,7 @@ def test_products_that_say_nothing_of_the_scan_still_open(products, tmp_path):
     assert "number of rows not known" in repr(scan)
     assert "interior" not in scan.patches()
     assert "incidence_deg" not in scan.image()
-    # materials.json says so
+    # as in materials.json
     assert scan.simulated is True
     for name in ("rig", "rows"):
         with refused(ErrorCode.KEY_MISSING, name):

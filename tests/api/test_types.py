@@ -19,7 +19,7 @@ NOT_TYPED = {
 """Names whose type may be `Any`, and the reason."""
 
 
-def functions_of(cls: type) -> Iterator[tuple[str, Callable[..., Any]]]:
+def list_functions(cls: type) -> Iterator[tuple[str, Callable[..., Any]]]:
     """Public functions of a class that this project wrote, its constructor and the getters of its properties."""
     for owner in cls.__mro__:
         if not owner.__module__.startswith("polysight"):
@@ -42,7 +42,7 @@ def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
     for name in polysight.__all__:
         value = getattr(polysight, name)
         if inspect.isclass(value):
-            yield from functions_of(value)
+            yield from list_functions(value)
         elif callable(value):
             for overload in get_overloads(value) or [value]:
                 yield name, overload

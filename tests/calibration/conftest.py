@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 from tests.support.rigs import Change, rig_with
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.store import MANIFEST, manifest
 from polysight_shared.config import Instrument
@@ -29,7 +29,7 @@ def set_rig() -> Callable[[Path, Instrument], None]:
     """`set_rig(folder, rig)`: replace the rig in the manifest of a scan."""
 
     def change(folder: Path, rig: Instrument) -> None:
-        facts = facts_of(folder)
+        facts = load_facts(folder)
         facts[0]["instrument"] = to_builtins(rig)
         (folder / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
 
@@ -37,8 +37,8 @@ def set_rig() -> Callable[[Path, Instrument], None]:
 
 
 @pytest.fixture(scope="session")
-def scan_of(set_rig: Callable[[Path, Instrument], None]) -> Callable[..., Path]:
-    """`scan_of(folder, true, believed, **scene)`: scan with the true rig; the manifest contains the believed one."""
+def make_scan(set_rig: Callable[[Path, Instrument], None]) -> Callable[..., Path]:
+    """`make_scan(folder, true, believed, **scene)`: scan with the true rig; the manifest contains the believed one."""
 
     def make(folder: Path, true: Instrument, believed: Instrument | None = None, **scene: Any) -> Path:
         simulate(true, decode_scene({"name": "test", **scene}, "test"), folder)

@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from tests.support.calibration import SOURCES, filter_file, metal_reference
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.calibration.files import (
     FilterFile,
@@ -104,7 +104,7 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
     dispersion = (0.1 - 0.2j, 0.05j)
     metal = write_metal(replace(metal_reference(make_rig()), dispersion=dispersion), SOURCES, hpf.parent)
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
-    assert sorted(facts_of(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
+    assert sorted(load_facts(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
     assert not [f for f in validate(scan.path) if f.level == "error"]
     copies_before = calibration_of_scan(scan)
     for original in hpf.parent.iterdir():

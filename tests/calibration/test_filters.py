@@ -19,7 +19,7 @@ TRUE_KHZ = (235.0, 700.0)
 
 
 @pytest.fixture(scope="module")
-def scans(tmp_path_factory, make_rig, scan_of):
+def scans(tmp_path_factory, make_rig, make_scan):
     """One power cycle of a rig whose filters differ from its rig file, at several start frequencies."""
     folder = tmp_path_factory.mktemp("sweep")
     folders = []
@@ -34,7 +34,7 @@ def scans(tmp_path_factory, make_rig, scan_of):
         believed = make_rig(set_offsets, **tables)
         corners = {"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}
         true = make_rig(set_offsets, chirp=corners, **tables)
-        folders.append(scan_of(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
+        folders.append(make_scan(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
     return folders
 
 
@@ -64,11 +64,11 @@ def test_unknown_corners_are_recovered(scans, filter_run):
     assert (file.simulated, len(file.sources)) == (True, len(scans))
 
 
-def test_processing_uses_the_filter_that_the_rig_file_names(filter_run, tmp_path, make_rig, scan_of):
+def test_processing_uses_the_filter_that_the_rig_file_names(filter_run, tmp_path, make_rig, make_scan):
     rig = make_rig(
         grid={"columns": 4, "rows": 2}, image={"columns": 20, "rows": 20}, calibration={"hpf": str(filter_run)}
     )
-    pipeline = Pipeline(ScanFolder.load(scan_of(tmp_path / "scan", rig)))
+    pipeline = Pipeline(ScanFolder.load(make_scan(tmp_path / "scan", rig)))
     for name, setup in pipeline.synchroniser.setups.items():
         measured = HighPass(
             tuple(1e3 * c for c in read_calibration(filter_run, FilterFile, "hpf").boards[name].corners_khz)

@@ -112,8 +112,8 @@ BANDS = 2
 
 
 @pytest.fixture(scope="module")
-def plate(make_rig, scan_of, tmp_path_factory):
-    return scan_of(tmp_path_factory.mktemp("metal") / "plate", make_rig(**SMALL), plates=[PLATE])
+def plate(make_rig, make_scan, tmp_path_factory):
+    return make_scan(tmp_path_factory.mktemp("metal") / "plate", make_rig(**SMALL), plates=[PLATE])
 
 
 def calibrate(plate, out, *options):
@@ -148,17 +148,17 @@ def taken_with(plate, make_rig, set_rig, tmp_path):
     return make
 
 
-def test_a_scan_without_metal_is_refused(tmp_path, make_rig, scan_of):
+def test_a_scan_without_metal_is_refused(tmp_path, make_rig, make_scan):
     small = {"grid": {"columns": 4, "rows": 3}, "image": {"columns": 20, "rows": 20}}
     point = {"position_mm": [0.0, 0.0], "amplitude": [1e-3, 0.0]}
-    folder = scan_of(tmp_path / "air", make_rig(**small), points=[point])
+    folder = make_scan(tmp_path / "air", make_rig(**small), points=[point])
     assert main(["calibrate", "metal", str(folder), "--out", str(tmp_path / "c")]) == 3
     assert not (tmp_path / "c").exists()
 
 
-def test_a_plastic_sheet_is_no_metal_plate(tmp_path, make_rig, scan_of):
+def test_a_plastic_sheet_is_no_metal_plate(tmp_path, make_rig, make_scan):
     sheet = {k: v for k, v in PLATE.items() if k != "metal"} | {"name": "acrylic", "permittivity": [4.0, 0.4]}
-    folder = scan_of(tmp_path / "sheet", make_rig(**SMALL), plates=[sheet])
+    folder = make_scan(tmp_path / "sheet", make_rig(**SMALL), plates=[sheet])
     with refused(ErrorCode.NO_DATA, "no metal"):
         load_reference(folder)
 
@@ -173,9 +173,9 @@ def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
         reference.check_rig(ImagedWith.from_rig(msgspec.structs.replace(rig, geometry=deeper), {}))
 
 
-def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, scan_of, tmp_path):
+def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, make_scan, tmp_path):
     """The board V moved between the two scans: its axes are the same, but not its phases."""
-    other_scan = scan_of(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
+    other_scan = make_scan(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
     out = tmp_path / "out"
     assert main(["process", str(other_scan), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3
     assert not (out / "image.npz").exists()

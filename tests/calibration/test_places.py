@@ -32,7 +32,7 @@ def laid(points):
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory, make_rig, scan_of):
+def case(tmp_path_factory, make_rig, make_scan):
     """A scan of a displaced rig whose manifest contains the same rig file."""
 
     def shift_boards(table):
@@ -48,7 +48,7 @@ def case(tmp_path_factory, make_rig, scan_of):
     believed = make_rig(**tables)
     true = make_rig(shift_boards, **tables)
     points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in laid(POINTS)]
-    folder = scan_of(tmp_path_factory.mktemp("places") / "scan", true, believed, points=points, seed=5)
+    folder = make_scan(tmp_path_factory.mktemp("places") / "scan", true, believed, points=points, seed=5)
     target = folder.parent / "target.toml"
     target.write_text(tomli_w.dumps({"name": "five balls", "points": [{"position_mm": list(p)} for p in POINTS]}))
     return folder, target, believed, true
@@ -62,7 +62,7 @@ def places_run(case, tmp_path_factory):
     bytes_before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
     options = ("--target", target, "--out", out)
     output = read_output("calibrate", "direct-path", folder, *options)
-    # The scan is not touched
+    # The scan is not changed
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == bytes_before
     return output, next(out.iterdir())
 
@@ -95,7 +95,7 @@ def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
     for name, board in file.boards.items():
         antennas = Antennas.from_rig(true, true.by_name(name))
         direct_mm = np.linalg.norm(antennas.rx_m[0] - antennas.tx_m) * 1e3
-        # What was wrong
+        # The error that was removed
         assert abs(board.direct_path_was_mm - direct_mm) > 0.5
         assert board.direct_path_mm == pytest.approx(direct_mm, abs=5 * board.direct_path_standard_error_mm)
 

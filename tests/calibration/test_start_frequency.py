@@ -59,12 +59,12 @@ def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
     assert direct_if_hz(rig, better) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
 
 
-def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_rig, scan_of, tmp_path, capsys):
+def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_rig, make_scan, tmp_path, capsys):
     """The boards were programmed 260 kHz away from what the rig file says, and their crystals differ."""
     wrong = {"if_offset_hz": 260e3, "crystal_ppm": {"receive_h": 0.8, "receive_v": -1.1}}
 
     def advice(rig, name):
-        folder = scan_of(tmp_path / name, rig, seed=4, disturbances=wrong)
+        folder = make_scan(tmp_path / name, rig, seed=4, disturbances=wrong)
         assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / name / "c")]) == 0
         boards = read_calibration(next((tmp_path / name / "c").iterdir()), StartFile, "start_frequency").boards
         output = capsys.readouterr().out
@@ -86,8 +86,8 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
         assert board["direct_if_hz"] == pytest.approx(board["middle_hz"], abs=5 * error)
 
 
-def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, scan_of, tmp_path):
+def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, make_scan, tmp_path):
     rig = make_rig(offset(790e3), **TABLES)
-    folder = scan_of(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
+    folder = make_scan(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
     with refused(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
         fit_start(open_raw(folder), "RH")

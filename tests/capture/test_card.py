@@ -288,7 +288,7 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
 
 
 def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_card, monkeypatch):
-    """Cards were exchanged, or a second one answers now. It is no error if the kernel has forgotten the address."""
+    """Cards were exchanged, or a second one answers now. A missing address in the kernel is not an error."""
     client, _ = scripted_card(lambda code, _: [reply(code, 0)])
     known = {"mac": "12:34:56:78:90:12"}
     monkeypatch.setattr(card, "neighbour_mac", lambda _: known["mac"])

@@ -53,7 +53,7 @@ def test_every_hop_of_every_card(cards, card):
         elif receiver["verdict"] == "ok":
             assert "real-time priority" in receiver["found"]
         else:
-            # A right is missing: which, and what to do
+            # The message names the missing right and the remedy
             assert (receiver["verdict"], receiver["why"] != "") == ("warning", True)
             assert "limits.d" in receiver["remedy"]
     text = card().out
@@ -160,7 +160,7 @@ def test_listening_ends_with_a_row_and_without_loss_wherever_the_last_record_end
     packetiser = running_cards.endpoints["RH"].card._packetiser
     packetiser.sequence = 77_777
     packetiser.byte_count = 77_776 * packetiser.payload_bytes
-    # Twice the time after which a test has hung.
+    # Twice the time after which a test counts as hung.
     process = card("--listen", "3600", "--json")
     for name in ("RH", "RV"):
         radar = verdicts(process)[name]["radar"]

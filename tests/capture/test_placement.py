@@ -114,7 +114,7 @@ def test_every_disorder_at_once(
     """Loss, duplicates, reordering, late and truncated packets, leftovers and nonsense, each up to 5 %."""
     size = max(1, packets * FULL // frame) * frame
     record = Record.make(size, count, sequence)
-    sent: list[tuple[float, int, bytes]] = []  # when, its place, what
+    sent: list[tuple[float, int, bytes]] = []  # time, position, packet
     for k, packet in enumerate(record.packets):
         if chance.random() < loss:
             continue

@@ -326,7 +326,7 @@ def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, ca
         assert receiver.packets[0, :13].tobytes() == b"0123456789abc"
         assert receiver.lengths[:2].tolist() == [13, 10]
         first, second = receiver.times_ns[:2].tolist()
-        # The clock of the day may run differently by a little.
+        # The wall clock may run at a slightly different rate.
         assert before_ns - 1_000_000 < first < second <= time.monotonic_ns()
         assert receiver.receive() == 0
 

@@ -44,7 +44,8 @@ def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
     inside_mm = 0.01
     assert pixels.nearest(left + inside_mm, low + inside_mm) == (0, 0)
     assert pixels.nearest(right - inside_mm, high - inside_mm) == (rows - 1, columns - 1)
-    middle_x, middle_y = (left + right) / 2, (low + high) / 2
+    middle_x = (left + right) / 2
+    middle_y = (low + high) / 2
     for place in (
         (left - inside_mm, middle_y),
         (right + inside_mm, middle_y),

@@ -10,7 +10,7 @@ import pytest
 from msgspec import structs
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.catalogue import NOTES, PROGRAM, Notes, Scans, find_program, read_notes, scans, write_notes
 from polysight.catalogue.scans import Program, explain_failure, is_scan
@@ -25,7 +25,7 @@ def root(processed: Path, tmp_path: Path) -> Path:
     """A folder with a finished scan, one that was stopped, one whose program died, and products alone."""
     for name in ("done", "week/stopped", "week/lost"):
         shutil.copytree(processed / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures"))
-    facts = facts_of(tmp_path / "done")
+    facts = load_facts(tmp_path / "done")
     ended = {"fact": "scan_ended", "exit_status": "abort", "reason": "asked to", "rows_committed": 3}
     for name, kept_facts in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):
         (tmp_path / name / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept_facts))
@@ -78,7 +78,7 @@ def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
 def test_rows_are_counted_as_the_scan_folder_counts_them(root):
     """Taken again, withdrawn, torn and damaged lines included."""
     path = root / "done" / MANIFEST
-    facts = facts_of(path)
+    facts = load_facts(path)
     again = [facts[5] | {"take": 2}, {"fact": "row_withdrawn", "row": facts[2]["row"], "take": 1, "reasons": ["x"]}]
     lines = [manifest.encode_line(f) for f in [*facts, *again]]
     lines[7] = lines[7].replace(b'"row":', b'"rov":')

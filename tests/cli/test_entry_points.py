@@ -24,7 +24,7 @@ PROGRAMS = [
         for name in ("cards", "radars", "rig", "stage", "uno", "wires")
     ),
 ]
-# The words after `env` are the same, and `env` is not a program of ours.
+# The arguments after `env` are the same, and `env` is not a program of ours.
 REAL = ("env",)
 
 

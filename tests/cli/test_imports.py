@@ -37,7 +37,7 @@ sys.stdout.write(json.dumps([status, sorted(sys.modules)]))
 """
 
 
-def loaded_by(*words: str | Path) -> set[str]:
+def list_loaded_modules(*words: str | Path) -> set[str]:
     """Modules that a new process has loaded after a command succeeded in it."""
     command = [sys.executable, "-c", RUN, *map(str, words)]
     process = subprocess.run(command, capture_output=True, text=True, check=True, cwd=RIG_FILE.parent)
@@ -48,37 +48,37 @@ def loaded_by(*words: str | Path) -> set[str]:
 
 def test_help_needs_no_numbers():
     for words in (["--help"], ["--version"]):
-        assert loaded_by(*words) & (NUMBERS | SCIPY | HEAVY) == set(), words
+        assert list_loaded_modules(*words) & (NUMBERS | SCIPY | HEAVY) == set(), words
 
 
 @pytest.mark.parametrize("command", [names[0] for names in FAMILIES.values()])
 def test_help_of_a_command_needs_no_numbers(command):
     """One command of each family; a family is one module."""
-    assert loaded_by(command, "--help") & (NUMBERS | SCIPY | HEAVY) == set()
+    assert list_loaded_modules(command, "--help") & (NUMBERS | SCIPY | HEAVY) == set()
 
 
 @pytest.mark.parametrize("command", ["materials", "report", "permittivity"])
 def test_saved_products_are_shown_without_mathematics(tmp_path, command):
     products = judged_products(tmp_path / "products", "good")
     (products / "report.html").write_text("<p>here</p>")
-    assert loaded_by(command, products) & HEAVY == set()
+    assert list_loaded_modules(command, products) & HEAVY == set()
 
 
 def test_a_scan_is_validated_without_scipy(tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(6, 3))
     simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
-    assert loaded_by("validate", tmp_path / "scan") & (SCIPY | HEAVY) == set()
+    assert list_loaded_modules("validate", tmp_path / "scan") & (SCIPY | HEAVY) == set()
 
 
 def test_images_are_made_without_report_and_figures(tmp_path):
     (tmp_path / "scene.toml").write_text(small_scene(6, 3))
     simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
-    loaded = loaded_by("image", tmp_path / "scan", "--out", tmp_path / "out")
+    loaded = list_loaded_modules("image", tmp_path / "scan", "--out", tmp_path / "out")
     assert loaded & {"jinja2", "matplotlib", "polysight.report", "sklearn"} == set()
 
 
 def test_a_plan_is_made_without_scipys_parts():
-    assert loaded_by("plan", "--config", RIG_FILE) & HEAVY == set()
+    assert list_loaded_modules("plan", "--config", RIG_FILE) & HEAVY == set()
 
 
 def test_jobs_load_what_they_compute_with_when_they_compute():

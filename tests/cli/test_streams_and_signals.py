@@ -51,7 +51,7 @@ def test_output_that_cannot_be_written_is_an_error(products, command):
     assert "Exception ignored" not in messages
 
 
-# A module that takes long to load, as extensions do. It ends when it is interrupted, or when the file `go` is there.
+# A module that takes long to load, as extensions do. Loading ends by an interrupt, or when the file `go` exists.
 SLOW_MODULE = """
 import sys
 from pathlib import Path

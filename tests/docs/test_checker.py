@@ -138,6 +138,6 @@ def test_the_commands_of_a_page_end_with_the_check(tmp_path):
         time.sleep(0.05)
     check.terminate()
     assert check.wait() == 128 + signal.SIGTERM
-    # Orphans of a killed program stay until the system's first process has looked after them.
+    # Orphans of a killed program stay until the system's first process has awaited them.
     commands = int(pid.read_text())
     wait_for(lambda: not runs(commands), "the page's commands end with the check")

@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from docs.check.commands import command_faults, parser_of
+from docs.check.commands import command_faults, find_parser
 from docs.check.pages import ROOT
 
 MODULES = (
@@ -25,7 +25,7 @@ def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]
 
 
 def parsers() -> list[argparse.ArgumentParser]:
-    all_parsers = [parser_of(module) for module in MODULES]
+    all_parsers = [find_parser(module) for module in MODULES]
     return [leaf for parser in all_parsers if parser is not None for leaf in leaves(parser)]
 
 
@@ -42,7 +42,7 @@ def test_help_has_an_example_that_works(parser):
 
 
 def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
-    root = parser_of("polysight.cli.main")
+    root = find_parser("polysight.cli.main")
     assert root is not None
     for parser in [p for p in leaves(root) if p is not root]:
         text = parser.format_help()
@@ -70,7 +70,7 @@ def test_every_option_is_explained(parser):
 def test_readme_names_every_command():
     block = (ROOT / "README.md").read_text(encoding="utf-8").split("## Commands")[1]
     for module, program in (("polysight.cli.main", "polysight"), ("polysight_pi.cli", "polysight-pi")):
-        parser = parser_of(module)
+        parser = find_parser(module)
         assert parser is not None
         for action in parser._actions:
             if isinstance(action, argparse._SubParsersAction):

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from docs.reference import ROOMS, build, link_faults, modules_of
+from docs.reference import ROOMS, build, link_faults, list_modules
 from docs.site import build_site, draw_pictures
 
 import polysight
@@ -16,7 +16,7 @@ def reference(tmp_path_factory) -> Path:
     """Pages of the public interface and of the rooms behind it."""
     out = tmp_path_factory.mktemp("reference")
     rooms = ("polysight", "polysight.api", *(f"polysight.{room}" for room in ROOMS))
-    names = [name for room in rooms for name in modules_of(room)]
+    names = [name for room in rooms for name in list_modules(room)]
     assert names == list(rooms), "a package that names its public functions has one page"
     build([*names, "polysight_shared"], out)
     build_site(out, run=False)
@@ -84,5 +84,5 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path, link):
 
 
 def test_a_package_without_public_names_has_a_page_for_each_module():
-    modules = list(modules_of("polysight_shared"))
+    modules = list(list_modules("polysight_shared"))
     assert {"polysight_shared", "polysight_shared.errors", "polysight_shared.config"} <= set(modules)

@@ -7,14 +7,14 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from docs.check.commands import PROGRAMS, command_faults, mention_faults, parser_of
+from docs.check.commands import PROGRAMS, command_faults, find_parser, mention_faults
 from tests.support.paths import RIG_FILE
 
 ROOT = RIG_FILE.parent
 SUBCOMMANDS = {
     name
     for module in PROGRAMS.values()
-    for action in parser_of(module)._actions
+    for action in find_parser(module)._actions
     if isinstance(action, argparse._SubParsersAction)
     for name in action.choices
 }
@@ -49,7 +49,7 @@ def list_texts(path: Path) -> list[tuple[int, str]]:
     return texts
 
 
-def commands_in(text: str) -> list[str]:
+def list_commands(text: str) -> list[str]:
     """Command lines that a message names; a sentence about a program names none."""
     phrases = [phrase for phrase in PLAIN.findall(QUOTED.sub("", text)) if phrase.split()[1] in SUBCOMMANDS]
     return QUOTED.findall(text) + phrases
@@ -64,11 +64,11 @@ def is_whole(command: str) -> bool:
 
 
 def test_commands_are_found_in_messages():
-    assert commands_in("do: `polysight process 8 --out DIR`, then go") == ["polysight process 8 --out DIR"]
-    assert commands_in("polysight label 8 --metal NAME, or measure") == ["polysight label 8 --metal NAME"]
-    assert commands_in("polysight label 8 --box A=1,2,3,4; then go") == ["polysight label 8 --box A=1,2,3,4"]
-    assert commands_in("the polysight of today") == []
-    commands = [command for path in SOURCES for _, text in list_texts(path) for command in commands_in(text)]
+    assert list_commands("do: `polysight process 8 --out DIR`, then go") == ["polysight process 8 --out DIR"]
+    assert list_commands("polysight label 8 --metal NAME, or measure") == ["polysight label 8 --metal NAME"]
+    assert list_commands("polysight label 8 --box A=1,2,3,4; then go") == ["polysight label 8 --box A=1,2,3,4"]
+    assert list_commands("the polysight of today") == []
+    commands = [command for path in SOURCES for _, text in list_texts(path) for command in list_commands(text)]
     assert len(commands) > 100
     assert sum(map(is_whole, commands)) > 50
 
@@ -77,7 +77,7 @@ def test_commands_are_found_in_messages():
 def test_a_command_that_a_message_names_is_one(path):
     faults = []
     for line, text in list_texts(path):
-        for command in commands_in(text):
+        for command in list_commands(text):
             pasted = command.removesuffix("...").replace("COMMAND", "scan")
             problems = command_faults(pasted) if is_whole(command) else mention_faults(pasted)
             faults += [f"{path}:{line}: {command}: {fault}" for fault in problems]

@@ -109,7 +109,7 @@ def test_types_follow_from_names_as_the_page_says():
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
         for message in declared_types(union):
             for field in msgspec.structs.fields(message):
-                # Whatever its bounds
+                # For any bounds
                 is_float = getattr(field.type, "__origin__", field.type) is float
                 assert is_float == field.name.endswith(("_mm", "_mm_s", "_us")), (message.__name__, field.name)
 

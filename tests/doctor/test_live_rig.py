@@ -13,7 +13,7 @@ from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import run_scan
 from polysight.calibration.files import write_calibration
@@ -104,7 +104,7 @@ def test_a_sync_in_wire_that_is_cut(live):
     with live.cut(live.instrument.pi.sync_out[0]):
         findings = live.doctor(pulse=True)
     assert_failed(findings, "radar RH", "radar RV")
-    # The Pi cannot know
+    # The Pi cannot detect it
     assert findings["pulses"].level == "ok"
 
 
@@ -133,7 +133,7 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     live.home()
     scan = run_scan(load_instrument(config), live.folder / "scan").folder
     path.unlink()
-    fact = facts_of(scan, "scan_started")[0]["calibration"]
+    fact = load_facts(scan, "scan_started")[0]["calibration"]
     assert fact == {
         "hpf": {"file": f"calibration/{path.name}", "crc32": fact["hpf"]["crc32"], "copied_from": str(path)}
     }

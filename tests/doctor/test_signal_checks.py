@@ -52,10 +52,10 @@ def test_a_direct_path_beyond_the_band_is_an_error_with_a_better_start_offset(of
     assert findings.level == "error"
     unshifted = programmed_rig(0.0)
     middle = 0.45 * RIG.chirp.sample_rate_hz - direct_if_hz(unshifted, unshifted.by_name("RH"))
-    assert offset_in(findings) == pytest.approx(middle, abs=1e3)
+    assert read_offset(findings) == pytest.approx(middle, abs=1e3)
 
 
-def offset_in(finding):
+def read_offset(finding):
     """The start_offset_hz that the remedy gives."""
     return float(finding.do.split("= ")[1].split(" ")[0])
 
@@ -63,14 +63,14 @@ def offset_in(finding):
 def test_a_direct_path_at_the_edge_of_the_band_is_an_error():
     findings = judge_signal("RH", RIG, if_offset_hz=-850e3)
     assert findings.level == "error"
-    assert offset_in(findings) == pytest.approx(RIG.by_name("RH").start_offset_hz + 850e3, abs=100e3)
+    assert read_offset(findings) == pytest.approx(RIG.by_name("RH").start_offset_hz + 850e3, abs=100e3)
 
 
 def test_another_start_frequency_than_in_the_rig_file_is_recovered():
     """The board was programmed 490 kHz higher than the rig file says; its crystal's share is removed."""
     findings = judge_signal("RH", programmed_rig(300e3), if_offset_hz=490e3, crystal_ppm={"receive_h": 1.5})
     assert findings.level == "warning"
-    assert offset_in(findings) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
+    assert read_offset(findings) == pytest.approx(790e3, abs=5 * 2.1e-9 / 32**0.5 * 38.8e12)
 
 
 @pytest.mark.parametrize(("skew_ns", "verdict"), [(0.0, "ok"), (-13.0, "warning"), (21.5, "error")])

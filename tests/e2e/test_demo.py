@@ -55,5 +55,5 @@ def test_from_boards_with_an_empty_flash_to_the_report(bench, scene_file):
         assert answer["main_firmware"].endswith("patch 2.2.2.0")
         assert answer["die_id"]
     assert (scan / "products" / "report.html").is_file()
-    # 7: a scan as small as this one has no result, and says so
+    # 7: a scan as small as this one has no result, and reports that
     assert ended.status in (0, 7), ended.err

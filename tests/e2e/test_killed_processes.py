@@ -23,7 +23,7 @@ import pytest
 from tests.support.paths import REPO
 from tests.support.products import skip_rendering
 from tests.support.scenes import small_scene
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.pipeline import Pipeline
 from polysight.store import manifest
@@ -101,7 +101,7 @@ class Killed:
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        # Kinds of places that programs came to, each with who
+        # Kinds of places that programs reached, with the name of the program
         self.met: Counter[str] = Counter()
         self.armed = 0
         self.restart_pi(list_kinds(PI_PLACES))
@@ -226,7 +226,7 @@ def retaken(folder: Path) -> set[int]:
     """Rows that the last resume has retaken, by the manifest, without those that it rejected itself."""
     if not begun(folder):
         return set()
-    facts = facts_of(folder)
+    facts = load_facts(folder)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     first_takes: dict[int, int] = {}
     for fact in facts[since:]:
@@ -270,7 +270,7 @@ def test_every_kind_of_place_is_reached(killed_rig: Killed):
         return [place for place in list_kinds(places) if not killed_rig.met[f"{program} {place[0]}:{place[1]}"]]
 
     for number, place in ((100, ("pwrite", "manifest.jsonl", 4)), (101, ("pwrite", "events.msgpack", 3))):
-        # Run alone, or not by the kills above: of a torn manifest, of torn events
+        # Needed if this test runs alone, or the kills above left no torn manifest or torn events
         if never("resume", RESUME_PLACES):
             killed_rig.check(Kill(number, host=True, pi=False, place=place))
     for program, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
@@ -283,7 +283,7 @@ def test_products_of_a_killed_scan(killed_rig: Killed):
     scan = killed_rig.scan(folder, [("rename", ".bin", 5)], *METAL)
     assert scan.wait().status == -signal.SIGKILL
     resumed = killed_rig.scan(folder, (), *METAL).wait()
-    assert resumed.status == NO_RESULT, resumed.err  # one plate alone: every row is there, and nothing is named
+    assert resumed.status == NO_RESULT, resumed.err  # one plate only: all rows are there, and no patch is named
     out = killed_rig.rig.folder / "products"
     with skip_rendering():
         processed = killed_rig.rig.here("process", killed_rig.rig.folder / "undisturbed", "--out", out, *METAL)
@@ -300,7 +300,7 @@ def test_products_of_a_killed_scan(killed_rig: Killed):
 def test_pi_is_lost_with_its_journal(killed_rig: Killed):
     """Without a Pi the error says so; a Pi with an empty card continues after the host's last event, with a notice."""
     folder = killed_rig.rig.folder / "lost"
-    # It dies by itself: on a busy machine the scan may end before a test that looks at its rows kills it.
+    # It kills itself: on a busy machine the scan might end before the test sees its rows and kills it.
     killed_rig.restart_pi([("fsync", ".journal", 6)])
     ended = killed_rig.scan(folder).wait()
     assert ended.status == 5

@@ -130,7 +130,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
     lab.wait_rows(folder, rows + 1)
     lab.click("pause")
     lab.wait_headline("Paused")
-    # While nothing moves: however slow this machine is, rows are left
+    # While the stage rests: rows remain, even on a slow machine
     lab.click("stop")
     lab.wait_headline("Stopped on request")
     lab.wait_end(folder)
@@ -150,7 +150,7 @@ def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
     lab.wait_rows(folder, 1)
     program_before = json.loads((folder / PROGRAM / "scan.json").read_text())
     pid = program_before["pid"]
-    # The priority of a terminal's program, not of the process that reads
+    # The priority of a program in a terminal, not that of the reading process
     assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
     assert (
         Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()

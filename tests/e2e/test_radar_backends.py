@@ -8,7 +8,7 @@ from typing import Any
 
 import tomli_w
 from tests.support.rigs import rig_table
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition.progress import ScanResult
 from polysight.acquisition.scan import run_scan
@@ -63,7 +63,7 @@ def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
     words = data.payload.view("<u4") & 0x0FFFFFFF
     # The pattern counts on through every chirp
     assert (words == range(words[0], words[0] + words.size)).all()
-    first, *rows = facts_of(result.folder, "radars")
+    first, *rows = load_facts(result.folder, "radars")
     for answer in first["boards"].values():
         assert answer["state"] == "configured"
         assert answer["rf_firmware"] != ""

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from docs.check.commands import parser_of
+from docs.check.commands import find_parser
 from tests.support.paths import RIG_FILE
 from tests.support.scenes import small_scene
 
 from polysight.cli.main import main
 from polysight_simulators.__main__ import main as simulators
 
-# They serve, wait for a rig, or run for minutes; tests of their own give them wrong input.
+# They serve, wait for a rig, or run for minutes; other tests give them wrong input.
 NOT_DRAWN = ("serve", "preview", "demo", "simulate", "reproduce", "scan", "resume", "doctor", "card", "radar", "ask")
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e308", "5e-324", "9" * 20, "1_000", "0x10", "half", "1,2", "1,2,3,4,5")
 BOXES = ("0,0,nan,40", "1,2,3,4", "0,0,0,0", "-60,0,1e9,40", "a=1,2,3", "=b", "a=")
@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def commands() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that are drawn."""
-    parser = parser_of("polysight.cli.main")
+    parser = find_parser("polysight.cli.main")
     assert parser is not None
     subcommands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     return {name: sub for name, sub in subcommands.choices.items() if name not in NOT_DRAWN}
@@ -109,7 +109,7 @@ def check_end(words: list[str]) -> None:
     assert isinstance(status, int), words
     assert output.strip() or status == 0, words
     assert "Traceback" not in output, words
-    # A note says what was written into it; the last line of a list of scans names the folder as it was typed.
+    # A note contains the text of the option; the last line of a list of scans names the folder as it was typed.
     told = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
     numbers = {word.strip("(),;:+-").lower() for word in told.split()}
     assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())

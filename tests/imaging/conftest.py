@@ -78,7 +78,7 @@ def points_rows(synced_row):
                     point - u - antennas.rx_m[:, None], axis=2
                 )
                 turn_per_hz = 2j * np.pi / SPEED_OF_LIGHT_M_S * (d - antennas.direct_m[:, None])
-                # Each sample turns on by the same angle: faster than as many exponentials.
+                # Each sample advances by the same angle: this is faster than as many exponentials.
                 waves = np.repeat(np.exp(turn_per_hz * rig.chirp.hz_per_sample)[..., None], rig.chirp.samples, axis=2)
                 waves[..., 0] = amplitude * np.exp(turn_per_hz * rig.chirp.first_sample_hz)
                 s += np.cumprod(waves, axis=2)

@@ -102,7 +102,7 @@ def image_error(found, whole):
     return np.linalg.norm(factor * found.h_raw - whole.h_raw) / np.linalg.norm(whole.h_raw)
 
 
-# Columns twice as far apart make no ghosts in this image: there is little to gain.
+# Columns twice as far apart make no ghosts in this image, so that there is little to remove.
 @pytest.mark.parametrize(
     ("name", "factor"), [("every second row", 10), ("every second column", 1.2), ("a random quarter", 10)]
 )

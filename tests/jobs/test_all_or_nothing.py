@@ -96,7 +96,7 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_b
         if fault in ("full", "short"):
             assert not list(folder.rglob(".*.part")), "what failed leaves nothing behind"
         if not committed:
-            # A picture may be new already: the file that makes it count is the old one.
+            # A picture may be new already, but it does not count until its file is replaced.
             assert remaining.get(committing) == old.get(committing), (position, disk.done[position - 1])
         assert command(folder) == 0, (position, disk.done[position - 1])
         assert written(folder) == new

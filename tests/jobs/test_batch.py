@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
-from tests.support.scenes import scene_of
+from tests.support.scenes import make_scene
 from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
@@ -176,7 +176,7 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     batch.process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
     assert done()
     sample_file.write_text("other samples")
-    assert not done()  # they are all that is left
+    assert not done()  # these are the remaining files
 
 
 def raw_digests(folder):
@@ -192,7 +192,7 @@ def test_ended_early_its_programs_end_too(tmp_path):
     # Slow2, which is not slow
     first = next(results)
     assert (first.name, first.status) == ("slow2", "done")
-    # Else this takes the 600 s that it sleeps, more than a test may
+    # Otherwise the test takes 600 s, the sleep of the program
     results.close()
     assert not batch.is_finished(todo[0])
 
@@ -241,7 +241,7 @@ def test_a_wrong_folder_fails_and_the_status_says_so(tmp_path, capsys):
     command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
     assert main([*command, "--jobs", "1"]) == 1
     assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
-    # A single one as ever: no worker, its own error
+    # A single scan: no worker, and its own error
     assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0
     assert "out/one" not in capsys.readouterr().out
     (tmp_path / "file").touch()
@@ -262,7 +262,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
     scans(tmp_path / "in", "a", "bad", "c")
     todo = jobs(tmp_path / "in", "a", "bad", "c")
-    # Threads of this process stand for the workers: the programs they start are their own all the same.
+    # Threads of this process replace the workers; each still starts its own programs.
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp"
     ) as cluster:
@@ -341,7 +341,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
 def test_real_scans_end_to_end(tmp_path, capsys):
     """The real program processes a simulated scan and a damaged one; then both are marked as finished."""
     plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
-    scene = scene_of(plate, name="plate", columns=13, rows=15, image={"columns": 30, "rows": 30, "pixel_mm": 4.0})
+    scene = make_scene(plate, name="plate", columns=13, rows=15, image={"columns": 30, "rows": 30, "pixel_mm": 4.0})
     simulate(published_rig(), decode_scene(scene, "t"), tmp_path, layout="authors")
     broken = tmp_path / "unsynced" / "broken"
     broken.mkdir()

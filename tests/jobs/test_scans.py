@@ -9,7 +9,7 @@ from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
-from tests.support.scenes import COPPER, scene_of
+from tests.support.scenes import COPPER, make_scene
 
 from polysight.catalogue import Notes, read_notes
 from polysight.cli.main import build_parser, main
@@ -20,7 +20,7 @@ from polysight_simulators.scene import decode_scene, simulate
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A folder with a small simulated scan and with made-up products."""
-    simulate(published_rig(), decode_scene(scene_of(COPPER, columns=4, rows=3), "t"), tmp_path / "scans" / "one")
+    simulate(published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "t"), tmp_path / "scans" / "one")
     judged_products(tmp_path / "scans" / "two", "good")
     return tmp_path / "scans"
 

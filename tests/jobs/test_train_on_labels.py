@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.support.paths import RIG_FILE
 from tests.support.rigs import published_rig
-from tests.support.scenes import scene_of
+from tests.support.scenes import make_scene
 
 from polysight.cli.main import main
 from polysight.jobs.train import training_scan
@@ -28,7 +28,7 @@ BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")
 def scene(seed: int) -> dict[str, Any]:
     copper = {"name": "copper", "centre_mm": PLACES[0], "size_mm": [50.0, 50.0], "metal": True}
     board = {"name": "board", "centre_mm": PLACES[1], "size_mm": [50.0, 50.0], "permittivity": [3.2, 0.4]}
-    return scene_of(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003})
+    return make_scene(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003})
 
 
 @pytest.fixture(scope="session")
@@ -66,7 +66,7 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     assert trained_library.scans == ("small", "small (2)")
     assert {e.specimen for e in trained_library.entries if e.name == MINE} == {"board 7"}
     assert {e.specimen for e in trained_library.entries if e.name == "copper"} == {None}
-    assert trained_library.simulated  # without a truth it is simulated all the same, and says so
+    assert trained_library.simulated  # without a truth it still counts as simulated
     assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == 3
     assert "is given twice" in capsys.readouterr().err
 

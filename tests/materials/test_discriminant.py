@@ -163,7 +163,7 @@ def test_two_angles_are_independent_and_tell_more():
     assert score(both_angles, DISCRIMINANT).pixels > score(first_angle, DISCRIMINANT).pixels
 
 
-def with_lonely(samples, scans=1):
+def add_lonely_material(samples, scans=1):
     """The same scans; the first few have an additional material that is unlike all others."""
     only = drawn(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
     names = np.full(len(only.x), "lonely")
@@ -176,7 +176,7 @@ def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
     """The material cannot be learnt from other scans: the accuracy is that of the others, and a note names it."""
     some = drawn(12, scans=4, pixels=4)
     without = score(some, model)
-    beside = score(with_lonely(some), model)
+    beside = score(add_lonely_material(some), model)
     assert (without.not_judged, beside.not_judged) == ((), ("lonely",))
     assert beside.pixels == pytest.approx(without.pixels, abs=0.02)
     assert beside.patches == pytest.approx(without.patches, abs=0.02)
@@ -187,7 +187,7 @@ def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
 
 def test_a_library_says_which_materials_could_not_be_judged():
     few = drawn(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
-    fit = fit_samples(with_lonely(few))
+    fit = fit_samples(add_lonely_material(few))
     assert (fit["materials"], fit["not_judged"]) == (4, ["lonely"])
     assert fit["pixel_accuracy"] == fit["patch_accuracy"] == 1.0
 
@@ -195,13 +195,13 @@ def test_a_library_says_which_materials_could_not_be_judged():
 def test_the_channels_alone_are_judged_on_the_same_materials():
     some = drawn(0, scans=4, pixels=6)
     without = fit_weights(some).by_channel
-    beside = fit_weights(with_lonely(some)).by_channel
+    beside = fit_weights(add_lonely_material(some)).by_channel
     assert [beside[c] for c in "hv"] == pytest.approx([without[c] for c in "hv"])
 
 
 def test_a_material_of_two_scans_among_many_is_judged():
     """This holds for any split of the scans into folds."""
-    assert score(with_lonely(drawn(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
+    assert score(add_lonely_material(drawn(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
 
 
 def test_scans_without_a_common_material_are_refused():

@@ -78,7 +78,7 @@ def test_ratio_there_and_back(ar, ai, br, bi, rr, ri, tr, ti):
     rho = complex(rr, ri)
     t = complex(tr, ti)
     assert true_ratio(measured_ratio(t, a, b, rho), a, b, rho) == pytest.approx(t, abs=1e-12)
-    # Metal is the reference, whatever leaks
+    # Metal is the reference, with any leakage
     assert measured_ratio(1.0, a, b) == pytest.approx(1.0)
 
 
@@ -133,7 +133,7 @@ def test_where_even_plates_tell_the_leakage_it_is_found():
     leak = (0.05j, 0.05j)
     patches = world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
     result = invert(patches, RigPrior(1e-5, reference_std=5e-4, brightness_range=(0.002, 0.002)))
-    assert result.leakage_std[1] < 0.3 * result.prior_std  # of s into V, which decides
+    assert result.leakage_std[1] < 0.3 * result.prior_std  # leakage of s into V, which matters most
     for p, truth in zip(result.patches, EPS, strict=True):
         assert abs(p.permittivity - truth) < 0.03 * abs(truth)
 
@@ -231,7 +231,7 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     # The patches are of the library, which with the leakage that was measured before the turn none of them fits.
     plates = [Kind(f"plate {i}", complex(e), spread=(0.02, 0.1)) for i, e in enumerate(PUBLISHED)]
     kinds = Kinds([*literature(), *plates], float(THETA))
-    # With 0.05 one draw of four says 0.89: two of the plates have nearly the same V / H, and count for less than two.
+    # With 0.05 one draw of four has 0.89: two of the plates have nearly the same V / H, and count for less than two.
     prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
     turned = world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
     model = SceneLikelihood(turned, prior, kinds)

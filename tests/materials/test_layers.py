@@ -134,7 +134,7 @@ def test_a_solution_at_the_end_of_what_is_looked_for_says_so():
     beyond = fit_layer(measure_bands([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
     assert any("at the limit" in words for words in beyond.warnings())
     lossless = fit_layer(measure_bands([Layer("clear", 4 - 0j)]), [Layer("clear")], THETA)
-    assert not any("at the limit" in words for words in lossless.warnings())  # no loss is an answer
+    assert not any("at the limit" in words for words in lossless.warnings())  # zero loss is a valid result
 
 
 def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept():
@@ -151,7 +151,7 @@ def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept(
     loose = fit_layer(Bands(BANDS, q * 1.08, np.full(q.size, 0.002)), [Layer("sheet", None, 3e-3)], THETA)
     assert stiff.stretch == 1
     assert loose.stretch > 2
-    # Kept all the same
+    # It is kept nevertheless
     assert loose.rivals[0].chi2 - loose.chi2 > 9
     assert loose.rivals[0].permittivity == pytest.approx(stiff.rivals[0].permittivity, rel=1e-3)
 

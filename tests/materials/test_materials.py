@@ -99,7 +99,7 @@ def test_at_least_eight_of_nine_named_right(name_placement):
             assert 0 < r.verdict.confidence <= 1
             assert sum(r.verdict.votes.values()) == pytest.approx(1)
     right, expected = np.mean(shares, axis=0)
-    # Six scans teach little: the classifier is rather too cautious
+    # Six scans are few training data: the classifier is rather too cautious
     assert 0.75 < expected < right + 0.05
 
 

@@ -203,7 +203,7 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
     our_names, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(queries.x)
     scaled = [d.x[:, :2] * [3.0, 0.7] for d in (data, queries)]
     sklearn_names = KNeighborsClassifier(7, metric="manhattan").fit(scaled[0], data.names).predict(scaled[1])
-    # Ties may fall either way
+    # Ties may be decided either way
     assert (our_names == sklearn_names).mean() > 0.99
 
 

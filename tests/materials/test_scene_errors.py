@@ -43,7 +43,8 @@ def images(h, v):
 def dimmed(h, v):
     """The same with copper at the end of the scan, which lights V less than H, and less towards the edge."""
     light = np.linspace(0.3, 1.0, 23)[:, None]
-    h, v = h.copy(), v.copy()
+    h = h.copy()
+    v = v.copy()
     h[20:43, 20:43] *= np.sqrt(light)
     v[20:43, 20:43] *= light
     return images(h, v)

@@ -38,7 +38,7 @@ def draw(seed, plates, strips=1.8, amplitude=0.25, phase_deg=13.0, background_db
         lit[:, -2:] *= strips
         h[y0:y1, x0:x1] = lit
         v[y0:y1, x0:x1] = ratio * lit
-    # The ripple of V / H is what a metal plate shows; both channels have their half of it.
+    # The ripple of V / H is that of a metal plate; each channel has half of it.
     share = np.sqrt(0.5)
     out = []
     for channel in (h, v):
@@ -268,7 +268,7 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
 
 
 def test_a_dim_plate_that_is_no_patch_is_no_background_but_a_table_is():
-    """A dim plate is no measure of the background of others; a table behind is as dim, but larger than any plate."""
+    """A dim plate is not a measure of the background of others; a table behind is as dim, but larger than any plate."""
     usable = np.ones((AXIS.size, AXIS.size), bool)
     patch_mask = np.zeros_like(usable)
     patch_mask[20:45, 20:45] = True

@@ -40,7 +40,7 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     h, v, segmentation, labels = _scene()
     valid = np.ones(h.shape, bool)
     valid[:, :12] = valid[:, 58:] = False
-    h[~valid] = v[~valid] = 0  # as images have it
+    h[~valid] = v[~valid] = 0  # the sign of images
     pair = Images(h, v, X_M, Y_M, valid)
     optics = Optics(THETA, smooth_px=1.0)
     result = analyse(pair, optics, KnownScene(segmentation, labels["metal"]))

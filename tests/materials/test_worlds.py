@@ -49,7 +49,8 @@ def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
     """One plate along x, one along y, and a level one."""
     stacks = (half_space(3.5 - 0.3j), half_space(4 - 0.4j), half_space(4 - 0.4j))
     copper, level, *tilted = world(*stacks).plates
-    along, across = replace(tilted[0], tilt_x_deg=5.0), replace(tilted[1], tilt_y_deg=5.0)
+    along = replace(tilted[0], tilt_x_deg=5.0)
+    across = replace(tilted[1], tilt_y_deg=5.0)
     analysis, plates = analyse_world(simulate(World((copper, level, along, across))))
     found = {plates[patch.patch.label].name: patch for patch in analysis.patches}
     for name in (along.name, across.name):

@@ -90,11 +90,11 @@ def mutate(mutant: Mutant) -> str:
         return ""
     try:
         with warnings.catch_warnings():
-            # An identity with a text or number is told by Python itself.
+            # Python itself warns of an identity with a text or number.
             warnings.simplefilter("error", SyntaxWarning)
             compile(mutated, str(mutant.file), "exec")
     except SyntaxError:
-        # Two stars before a dictionary are no power, but the operator takes them for one.
+        # Two stars before a dictionary are not a power, but the operator takes them for one.
         return ""
     return mutated
 

@@ -3,7 +3,7 @@
 import pytest
 from msgspec import structs
 from tests.support.page.live_view import add_fact, begin_history
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.page.history import seconds
 from polysight.page.status import estimate_time_left
@@ -24,7 +24,7 @@ def answer(facts):
 @pytest.fixture
 def begun(finished):
     """A history whose scan began at 02:00 and has committed rows 0 and 1 at 02:01 and 02:02."""
-    facts = facts_of(finished)
+    facts = load_facts(finished)
     rows = [f for f in facts if f["fact"] == "row_committed"]
     history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
     for minute, row in enumerate(rows[:2], 1):
@@ -33,7 +33,7 @@ def begun(finished):
 
 
 def test_counts_are_those_of_the_scan_folder(finished):
-    history = answer(facts_of(finished))
+    history = answer(load_facts(finished))
     scan = ScanFolder.load(finished)
     rows = scan.committed_rows()
     assert history.takes == {row: r.take for row, r in rows.items()}
@@ -45,7 +45,7 @@ def test_counts_are_those_of_the_scan_folder(finished):
 
 
 def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished):
-    history = answer(facts_of(finished))
+    history = answer(load_facts(finished))
     row = history.content.rows[1]
     boards = {
         name: structs.replace(part, missing_bytes=part.bytes // 8) if name == "RV" else part
@@ -57,7 +57,7 @@ def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished):
 
 
 def test_trigger_health_is_the_worst_of_all_bursts(finished):
-    history = answer(facts_of(finished))
+    history = answer(load_facts(finished))
     events = read_events(finished / EVENTS).events
     history.add_events(events)
     captures = [e for e in events if isinstance(e, Capture)]
@@ -66,7 +66,7 @@ def test_trigger_health_is_the_worst_of_all_bursts(finished):
 
 
 def test_a_fault_told_twice_is_one(finished):
-    history = answer(facts_of(finished))
+    history = answer(load_facts(finished))
     fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, problem="a trigger edge was lost")
     history.add_events([fault])
     history.add_events([fault])
@@ -95,7 +95,7 @@ def test_a_pause_is_no_time_of_a_row(begun):
 
 
 def test_time_left_before_the_first_row_is_the_plan_s(finished):
-    started = facts_of(finished)[0]
+    started = load_facts(finished)[0]
     real = begin_history(started | {"simulated": False})
     simulated = begin_history(started | {"simulated": True})
     row_s = real.row_seconds
@@ -131,7 +131,7 @@ def test_withdrawn_is_missing_until_taken_again(begun):
 
 
 def test_resumed_is_not_ended(finished):
-    history = answer(facts_of(finished))
+    history = answer(load_facts(finished))
     add_fact(history, {"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0})
     assert history.ended is None
 

@@ -25,7 +25,7 @@ def pi(tmp_path):
     context = make_server_context()
     events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
-    # Nobody could answer there
+    # No Pi could answer there
     addresses = {"event_address": address, "command_address": "tcp://127.0.0.1:1"}
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **addresses))
     listener = PiListener(instrument, "mine")
@@ -129,7 +129,7 @@ def test_the_pi_forgets_a_view_that_hangs(tmp_path):
             view, _ = listener.accept()
             with view, socket.create_connection(("127.0.0.1", port)) as pi:
                 received = b""
-                # Before its first sign of life the Pi cannot know how often it gives one.
+                # Before its first sign of life the Pi does not know their interval.
                 while PING not in received:
                     readable, _, _ = select.select([view, pi], [], [], HANG_S)
                     if pi in readable:

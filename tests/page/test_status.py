@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace as replace_struct
 from tests.support.page.live_view import add_fact, begin_history
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition import STATES
 from polysight.acquisition.control import Life
@@ -29,7 +29,7 @@ REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
 @pytest.fixture
 def history(finished):
     """One of three rows is committed."""
-    facts = facts_of(finished)
+    facts = load_facts(finished)
     history = begin_history(facts[0])
     add_fact(history, next(f for f in facts if f["fact"] == "row_committed"))
     return history
@@ -39,7 +39,7 @@ def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), **more):  # noqa
     return judge(Inputs(FOLDER, history, signs, heard, shown, **more))
 
 
-def signs_asked(command, doing="rows"):
+def make_signs(command, doing="rows"):
     return replace(LIVELY, life=Life(asked=command, asker="the page", doing=doing))
 
 
@@ -50,7 +50,7 @@ def test_all_is_well_needs_nothing_done(history):
 
 
 def test_a_dead_program_outranks_everything_but_the_end(history):
-    killed_signs = replace(signs_asked("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
+    killed_signs = replace(make_signs("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
     s = status(history, killed_signs, replace(RUNNING, state="fault"))
     assert (s.level, s.headline) == ("bad", "The scan program was killed")
     assert f"polysight resume {FOLDER}" in s.do
@@ -74,7 +74,7 @@ def test_a_started_program_hangs_once_its_run_has_begun(history):
 def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
     """The program writes its first sign of life when it begins."""
     started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
-    facts = facts_of(finished)
+    facts = load_facts(finished)
     history = begin_history(facts[0])
     quiet = replace(LIVELY, life=None)
     between_rows = replace(RUNNING, row=-1)
@@ -147,13 +147,13 @@ def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, le
 
 
 def test_requests_are_said_with_who_sent_them_until_they_come_to_pass(history):
-    s = status(history, signs_asked("pause"))
+    s = status(history, make_signs("pause"))
     assert (s.headline, s.press) == ("Pausing after this row", ("continue", "stop", "abort"))
     assert "the page" in s.detail
     add_fact(history, {"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
-    assert status(history, signs_asked("pause")).headline == "Paused"
-    assert status(history, signs_asked("stop")).press == ("abort",)
-    assert status(history, signs_asked("abort")).headline == "Stopping now"
+    assert status(history, make_signs("pause")).headline == "Paused"
+    assert status(history, make_signs("stop")).press == ("abort",)
+    assert status(history, make_signs("abort")).headline == "Stopping now"
 
 
 def test_an_abort_is_no_fault(history):
@@ -163,14 +163,14 @@ def test_an_abort_is_no_fault(history):
     fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, problem="aborted"))
     history.notices.append(fault)
     stopped = replace(RUNNING, state="fault", faults=(fault,))
-    assert status(history, signs_asked("abort"), stopped).key == "aborting"
+    assert status(history, make_signs("abort"), stopped).key == "aborting"
     assert [notice.level for notice in history.notices] == ["note", "note"]
     end = {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request", "asked": "abort"}
     add_fact(history, end | {"asker": "the page"})
     s = status(history, replace(LIVELY, alive=False, life=None))
     assert (s.key, s.press) == ("aborted", ("resume", "repeat"))
     assert "the page" in s.detail
-    # The program's own words on leaving, which are those of an error.
+    # The program's last message, which is that of an error.
     failure = Finding("error", "scans/one: stopped on request, 2 of 3 rows are missing")
     told = make_snapshot(Inputs(FOLDER, history, replace(LIVELY, alive=False, life=None), failure=failure))
     assert [notice.level for notice in told.notices] == ["note", "note"]
@@ -183,15 +183,15 @@ def test_there_is_no_result_before_materials(history):
     assert status(history, heard=replace(RUNNING, row=-1)).key == "finishing"
     add_fact(history, {"fact": "scan_ended", "exit_status": "success", "reason": ""})
     good = Verdict("good")
-    # Its program runs still, and has not said that it computes materials.
+    # Its program still runs, and has not reported that it computes materials.
     assert status(history).key == "finishing"
-    assert status(history, signs_asked("", "materials"), verdict=good).key == "materials"
-    assert make_snapshot(Inputs(FOLDER, history, signs_asked("", "materials"), verdict=good)).verdict is None
+    assert status(history, make_signs("", "materials"), verdict=good).key == "materials"
+    assert make_snapshot(Inputs(FOLDER, history, make_signs("", "materials"), verdict=good)).verdict is None
     for level in ("good", "care", "none"):
         assert status(history, replace(LIVELY, life=None), verdict=Verdict(level)).key == f"result_{level}"
     running = Program("process", True, None, (), "2026-01-01T00:00:00", "")
     assert status(history, replace(LIVELY, life=None), verdict=good, program=running).key == "processing"
-    killed = replace(signs_asked("", "materials"), alive=False, killed=True)
+    killed = replace(make_signs("", "materials"), alive=False, killed=True)
     assert "killed" in status(history, killed).detail
 
 

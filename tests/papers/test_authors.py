@@ -111,7 +111,7 @@ def dataset(tmp_path_factory):
 def out(dataset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
-        # Pixels of a task, and weights tried: it is the page that is tested
+        # Few pixels and weights: the page is tested, not the classifier
         patch.setattr(authors_items, "JUDGED_PIXELS", 240)
         patch.setattr(classify, "GRID", (1.0,))
         assert main(["reproduce", "--authors", str(dataset), "--out", str(folder)]) == 0
@@ -136,7 +136,7 @@ def test_table_2_is_recovered_from_both_kinds_of_files(out):
         true = ROWS[number].permittivity
         without_leakage = complex(*row["without_leakage"].values())
         assert abs(without_leakage - true) < 0.08 * abs(true)
-        # The files hold leakage
+        # The files contain leakage
         assert abs(complex(*row["as_is"].values()) - true) > abs(without_leakage - true)
 
 
@@ -312,7 +312,7 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
 
 
 def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, capsys, monkeypatch):
-    """Metal is the reference of both scans, so that its recognition is no result."""
+    """Metal is the reference of both scans, so that its recognition is not a result."""
     monkeypatch.setattr(classify, "GRID", (1.0,))
     for k, material_index in enumerate((3, 12)):
         for number in (1, material_index):

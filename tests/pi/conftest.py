@@ -29,7 +29,7 @@ def instrument(tmp_path: Path) -> Instrument:
         rig,
         grid=replace(rig.grid, columns=8, rows=4),
         burst=replace(rig.burst, pulses=4),
-        stage=replace(rig.stage, port=str(tmp_path / "no-stage"), heartbeat_ms=20_000),  # this process may be held
+        stage=replace(rig.stage, port=str(tmp_path / "no-stage"), heartbeat_ms=20_000),  # this process may be delayed
         pi=replace(
             rig.pi,
             command_address="tcp://127.0.0.1:*",

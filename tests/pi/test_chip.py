@@ -101,7 +101,7 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
     if wire_time or report.status == "done":
         assert (report.points, report.edges, report.bursts, report.pulses) == (POINTS, POINTS, POINTS, 4 * POINTS)
     else:
-        # In real time a machine may be too busy for a row, and then it says so.
+        # In real time a machine may be too busy for a row, which is then a fault.
         busy = (PiFault.EDGE_DURING_BURST, PiFault.PERIOD_TOO_SHORT, PiFault.EDGE_TIME)
         assert report.fault in busy, report.reason
     memory = Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
@@ -351,7 +351,7 @@ def test_rights_that_are_missing_are_reported_once_and_the_program_runs(start, g
     def without_rights():
         libc = ctypes.CDLL(None)
         for capability in (CAP_SYS_NICE, CAP_IPC_LOCK):
-            # Root's; others have none
+            # A right of root; other users do not have it
             libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
         for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
             resource.setrlimit(limit, (0, 0))

@@ -21,7 +21,7 @@ STEP_MM = 2.0
 ROW = Row(index=0, y_mm=0.0, x_start_mm=-300.0, step_mm=STEP_MM, points=POINTS)
 SPEEDS_AND_ACCELERATIONS = [(20, 200), (60, 200), (20, 100), (100, 400)]
 STATUS_S = 0.125
-# 107: edges that stay away for two statuses, as those that are late after a hold may.
+# 107: edges are missing for two statuses, which also late edges after a hold may cause.
 FAULTS = (PiFault.EDGE_TIME, PiFault.EDGE_DURING_BURST, PiFault.POINTS_MISMATCH, PiFault.TRIGGER_LINE_LOST)
 # The USB serial port; the time of the line's bytes is known and subtracted
 LINK_S = 0.001

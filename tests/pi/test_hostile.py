@@ -108,7 +108,7 @@ def stranger(pi):
         ((BEGIN, PULSE), "period_us", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN, PULSE), "width_us", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN, JOG), "speed_mm_s", (NAN, INF, -INF, 1e300, 1e70)),
-        ((BEGIN,), "heartbeat_ms", (2**40,)),  # it would keep every other host out for 35 years
+        ((BEGIN,), "heartbeat_ms", (2**40,)),  # it would block every other host for 35 years
         ((JOG,), "distance_mm", (NAN, INF, -INF, 100.1, -100.1)),
         ((JOG,), "from_mm", (NAN, INF, -INF, 1e70)),
         ((JOG,), "heartbeat_ms", (0, -1, 2**40)),
@@ -351,7 +351,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     assert highest[0] < HIGHEST_BYTES
     # Events were cut off, too: they come again
     host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)
-    # What is left of the messages may have the connections cut once more, and a command or an event with them.
+    # The remaining messages may cause another cut of the connections, with a command or an event.
     host.limit_s = 5.0
     takes = itertools.count(1)
 

@@ -15,7 +15,7 @@ from tests.support.rigs import published_rig
 
 PI = REPO / "pi_controller"
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
-# Stands for a command that would change this machine; what it was asked is kept.
+# Replaces a command that would change this machine; its arguments are recorded.
 STUB = '#!/bin/sh\necho "$(basename "$0") $*" >> "$LOG"\n'
 STUBS = {
     **dict.fromkeys(("groupadd", "useradd", "udevadm", "systemctl", "chown", "pip"), STUB),
@@ -91,7 +91,7 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
     rig = published_rig()
     assert Path(rig.pi.journal_dir).is_relative_to(service["ReadWritePaths"])
     assert Path(rig.pi.journal_dir).is_relative_to(Path("/var/lib") / service["StateDirectory"])
-    # The executor feeds the watchdog; a lost stage blocks it for 25 s.
+    # The executor notifies the watchdog; a lost stage blocks it for 25 s.
     assert (service["Type"], service["Restart"]) == ("notify", "on-failure")
     assert 25 < int(service["WatchdogSec"]) <= 60
 

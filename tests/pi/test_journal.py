@@ -86,7 +86,7 @@ def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
     published = []
     journal = Journal(tmp_path, published.extend)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
-    thread = JournalThread(journal)  # not started: its jobs are done here
+    thread = JournalThread(journal)  # not started: its jobs are run here
     for _ in range(2):
         thread.add(RunStopped, exit_status="abort")
     assert (journal.last_seq, journal.read("s", 1, 9)[0], published) == (0, [], [])

@@ -104,7 +104,7 @@ def test_stop_does_not_wait_for_the_burst_under_way(event, monkeypatch):
         return disarm()
 
     monkeypatch.setattr(bench.loop, "disarm", note_and_disarm)
-    bench.machine.happen(*event)
+    bench.machine.handle_event(*event)
     assert sent[-1:] == [Immediate.STOP]
 
 
@@ -274,7 +274,7 @@ def test_the_first_fault_wins():
     bench = Bench().begin_and_home()
     bench.start()
     bench.machine.on_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
-    bench.machine.happen("stage lost", PiFault.STAGE_LOST, "silent")
+    bench.machine.handle_event("stage lost", PiFault.STAGE_LOST, "silent")
     bench.run_posted()
     assert (bench.machine.fault, bench.machine.reason) == (PiFault.EDGE_LOST, "2 edges lost")
     assert [e.number for e in bench.list_events(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST], "both are told"
@@ -347,7 +347,7 @@ ACTIONS: dict[str, Callable[[Bench], object]] = {
     "edge lost": lambda b: (
         b.machine.row and b.machine.on_loop_fault(LoopFault(b.machine.row.job, PiFault.EDGE_LOST, "lost"))
     ),
-    "stage lost": lambda b: b.machine.happen("stage lost", PiFault.STAGE_LOST, "silent"),
+    "stage lost": lambda b: b.machine.handle_event("stage lost", PiFault.STAGE_LOST, "silent"),
     "time": lambda b: b.later(0.45),
 }
 
@@ -375,8 +375,8 @@ def test_any_order_of_events(start, actions):
             )
         assert (machine.jog is not None) == (machine.state == "jogging")
     if machine.row is not None:
-        # A held row waits for somebody
-        machine.happen("Resume")
+        # A held row waits for a person
+        machine.handle_event("Resume")
         bench.later(400.0)
         assert machine.row is None, "every row ends"
 

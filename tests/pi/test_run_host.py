@@ -59,7 +59,7 @@ class Bench:
         self.stage = SlowDriver(self)
         loop = TriggerLoop(FakeLines(), lambda _: None, lambda: None)  # not started: no edge comes
         self.journal = Journal(folder, lambda raws: self.events.extend(map(m.unpack_event, raws)))
-        self.journal_thread = JournalThread(self.journal)  # not started: its jobs are done between turns
+        self.journal_thread = JournalThread(self.journal)  # not started: its jobs are run between turns
         stage: Any = self.stage
         self.executor = Executor(stage, loop, self.journal_thread)
         self.executor._machine._clock = lambda: self.t
@@ -354,7 +354,7 @@ def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
     def is_silent() -> bool:
         if not host.subscriber.poll(300):
             return True
-        # One that was on its way
+        # An event that was on its way
         host.subscriber.recv_multipart()
         return False
 
@@ -387,7 +387,7 @@ def test_the_watchdog_is_fed_by_the_executor_alone(pi, hang, monkeypatch, tmp_pa
         while select.select([listener], [], [], 0)[0]:
             listener.recv(100)
         listener.settimeout(2 * executors.TURN_S)
-        # The server is alive
+        # The server still answers
         pi.host.ask(m.Status())
         with pytest.raises(TimeoutError):
             listener.recv(100)

@@ -186,7 +186,7 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     beats = HostHeartbeat(host.context, msgspec.structs.replace(instrument, pi=pi_settings), "scan", 0.05)
     host.start_row()
     host.wait(m.Capture)
-    # Three times the silence that a row is allowed
+    # Three times the allowed silence in a row
     pi.clock.sleep(1.2)
     assert host.ask(m.Status()).state == "running"
     beats.stop()
@@ -239,7 +239,7 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
     raised = []
     monkeypatch.setattr("threading.excepthook", lambda args: raised.append(args.exc_type))
     monkeypatch.setattr("polysight_pi.machine.Machine.on_burst", fail)
-    # The reply to the row goes out before its first edge comes
+    # The reply to the row is sent before its first edge comes
     stage.stays_after = 0
     host.start_row()
     stage.stays_after = None

@@ -108,7 +108,7 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
 
 
 def test_a_moving_stage_that_hears_but_is_not_heard_is_stopped(dry_stage, connect):
-    # Its own heartbeat would let it go on for longer than the half second that docs/spec/wire.md promises.
+    # With its own heartbeat it would continue for longer than the half second of docs/spec/wire.md.
     link, news = connect(heartbeat_s=0.2)
     dry_stage.deaf = True
     link.ask_status_every(0.02)

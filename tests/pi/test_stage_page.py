@@ -32,7 +32,7 @@ def home(view: Served, pi) -> None:
     pi.host.until_state("homed")
 
 
-def moves_of(stage) -> list[object]:
+def list_moves(stage) -> list[object]:
     return [line for line in stage.seen if line.verb == "MOVE"]
 
 
@@ -51,7 +51,7 @@ def test_a_jog_before_homing_past_a_limit_or_too_far_is_refused_and_moves_nothin
     assert post(view, "/api/stage/jog", {**jog, "distance_mm": -1.0})[0] == 409
     assert post(view, "/api/stage/jog", {**jog, "distance_mm": 100.1})[0] == 400
     assert post(view, "/api/stage/jog", {**jog, "axis": "z"})[0] == 400
-    assert not moves_of(stage)
+    assert not list_moves(stage)
 
 
 def test_a_jog_is_stopped_by_another_request_and_a_second_one_waits(view, pi, stage):
@@ -70,7 +70,7 @@ def test_a_jog_is_stopped_by_another_request_and_a_second_one_waits(view, pi, st
     assert status == 409
     assert "stopped" in answer["what"]
     assert pi.host.wait(m.Jogged).status == "aborted"
-    assert len(moves_of(stage)) == 1
+    assert len(list_moves(stage)) == 1
 
 
 @SIZES
@@ -86,7 +86,7 @@ def test_the_stage_is_homed_and_jogged_between_its_limits(browser: Browser, view
 
     browser.value("document.getElementById('stage-home').click()")
     forward = ",".join(f"Move {axis} by {step} mm" for axis in "xy" for step in (1, 10, 100))
-    # The stage is at the corner: nothing leads back.
+    # The stage is at the corner: it cannot move further back.
     browser.wait(f"{enabled} == '{forward}'", "buttons that lead within the limits")
     browser.value("document.querySelector('[aria-label=\"Move x by 10 mm\"]').click()")
     place = "document.getElementById('axes').innerText"

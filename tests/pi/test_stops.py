@@ -203,7 +203,7 @@ def test_a_full_queue_keeps_its_bound(tmp_path):
 
 
 def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
-    """Status requests of the polling thread are no sign of life of the executor."""
+    """Status requests of the polling thread are not a sign of life of the executor."""
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
     host.must_accept(host.begin())

@@ -22,7 +22,7 @@ SELECT = 0x00
 SET = 0x1C
 CLEAR = 0x28
 LEVEL = 0x34
-# Only what hangs reaches these: a busy computer has needed 5 minutes to boot.
+# Only hanging programs reach these limits: a busy computer once needed 5 minutes to boot.
 BOOT_LIMIT_S = 3600.0
 COMMAND_LIMIT_S = 1800.0
 KERNEL_LINE = "console=ttyAMA0,115200 root=/dev/mmcblk0 rw rootwait net.ifnames=0 loglevel=3"
@@ -94,11 +94,11 @@ class Box:
         forwards = "".join(f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for inner, outer in forward.items())
         command = ["qemu-system-aarch64", "-M", "raspi3b", "-display", "none", "-msg", "timestamp=on"]
         command += ["-kernel", str(image / "vmlinuz"), "-initrd", str(image / "initrd"), "-dtb", str(image / "pi.dtb")]
-        # A Pi has no battery for its clock either, but the net
+        # A Pi has no battery for its clock either, but it has the network
         clock = f"systemd.clock_usec={time.time_ns() // 1000}"
         command += ["-append", f"{KERNEL_LINE} {clock}", "-serial", f"file:{self.console}", "-D", str(self._trace)]
         command += ["-drive", f"if=sd,format=raw,snapshot=on,file={image / 'root.img'}"]
-        # Restricted: nothing but the forwarded ports leads in or out; what a release needs is on the card.
+        # Restricted: only the forwarded ports connect in or out; packages of a release are on the card.
         command += ["-netdev", f"user,id=net,restrict=on{forwards}", "-device", "usb-net,netdev=net"]
         command += ["-qmp", f"unix:{work / 'qmp'},server=on,wait=off"]
         command += ["-chardev", f"serial,id=stage,path={stage}"]

@@ -51,7 +51,7 @@ class InstalledPi:
 
     def install(self) -> str:
         """Run `make pi-install`, as on a host; return its output."""
-        # For make: the environment of these tests is the one that it would make.
+        # For make: the environment of these tests counts as up to date.
         (self.work / "installed").touch()
         make = ["make", "pi-install", f"HOST=-F {self.box.ssh_config} box", f"OUT={self.work / 'out'}"]
         make += [f"VENV={self.work}", f"BIN={BIN}"]

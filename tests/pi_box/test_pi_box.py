@@ -154,7 +154,7 @@ def test_check_finds_everything_that_is_there(bench: InstalledPi):
     verdicts = {name: f["verdict"] for name, f in findings.items()}
     print_figure("check: " + ", ".join(f"{name} {verdict}" for name, verdict in verdicts.items()))
     assert "fail" not in verdicts.values(), findings
-    # Rights of the unit, which a shell lacks; and Debian's driver does not say what dead programs' lines become.
+    # Rights of the unit, which a shell lacks; and Debian's driver does not say if lines of dead programs are released.
     assert {n for n, v in verdicts.items() if v == "warn"} <= {"real time", "line release"}
     assert findings["GPIO chip"]["found"].endswith("is 'pinctrl-bcm2835'")
     assert verdicts["keys"] == verdicts["stage"] == "ok"
@@ -182,7 +182,7 @@ def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
 def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
     """No pulse stays high when the program dies within it, which `check` cannot see with Debian's driver."""
     holding_command = (
-        f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 >/dev/null & echo $!"  # its end is not waited for
+        f"gpioset --mode=signal pinctrl-bcm2835 {SYNC_OUT}=1 >/dev/null & echo $!"  # the test does not wait for its end
     )
     number = bench.box.run(f"sudo sh -c '{holding_command}' </dev/null 2>/dev/null").strip()
     bench.box.wait(lambda: bench.box.level(SYNC_OUT) == 1, "the line is high")

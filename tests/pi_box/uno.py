@@ -28,7 +28,7 @@ class Uno:
     def __init__(self, config: Path, work: Path) -> None:
         self.port = work / "ttyUNO"
         wires = work / "wires"
-        # The last change of it
+        # Time of its last change
         self.motion: WireMotion | None = None
         self._heard_s = time.monotonic()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

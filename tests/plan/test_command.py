@@ -9,8 +9,8 @@ import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 from tests.support.rigs import rig_table, rig_with
-from tests.support.scenes import EVERYWHERE, scene_of
-from tests.support.store.facts import facts_of
+from tests.support.scenes import EVERYWHERE, make_scene
+from tests.support.store.facts import load_facts
 
 from polysight.cli.main import main
 from polysight.planning import Changes, row_motion_s
@@ -141,7 +141,7 @@ def scan(rig, tmp_path_factory):
 
 def taken_by_a_pi(scan, rig, gap_s: float) -> None:
     """Add events of a Pi to the scan, with `gap_s` seconds from a row's last trigger to the next one's first."""
-    facts = facts_of(scan)
+    facts = load_facts(scan)
     facts[0]["pi"] = {"release": "test"}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
     (scan / EVENTS).unlink(missing_ok=True)
@@ -200,7 +200,7 @@ def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
 
 def test_noise_is_measured_in_a_scan_with_two_antennas(tmp_path):
     two = rig_with(antennas={"rx_mm": rig_table()["antennas"]["rx_mm"][:2]})
-    scene = scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, disturbances={"direct_snr_db": SNR_DB})
+    scene = make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, disturbances={"direct_snr_db": SNR_DB})
     scan = simulate(two, decode_scene(scene, "test"), tmp_path / "scan")
     assert measure_noise(ScanFolder.load(scan)).direct_snr_db == pytest.approx(SNR_DB, abs=0.7)
 

@@ -22,7 +22,7 @@ angle = st.floats(0.0, 1.4)
 frequency = st.floats(76e9, 81e9)
 
 
-def by_tmm(eps, thickness_m, frequency_hz, theta):
+def reflect_by_tmm(eps, thickness_m, frequency_hz, theta):
     """(r_s, r_p) in our signs, and the transmitted powers (T_s, T_p); a half space ends the stack."""
     index = [1.0, *(np.conj(np.sqrt(complex(e))) for e in eps)]
     inside = [np.inf, *thickness_m, np.inf]
@@ -38,7 +38,7 @@ def test_random_stacks_agree_with_tmm(layers, last, f, theta):
     """The host sums echoes, the simulator calculates transmission lines in series."""
     eps = [e for e, _ in layers] + [last]
     inside = [d for _, d in layers]
-    expected, _ = by_tmm(eps, inside, f, theta)
+    expected, _ = reflect_by_tmm(eps, inside, f, theta)
     np.testing.assert_allclose(multilayer(eps, inside, f, theta), expected, rtol=1e-8, atol=1e-10)
     stack = [Layer((e.real, -e.imag), 1e3 * d) for e, d in layers] + [Layer((last.real, -last.imag))]
     np.testing.assert_allclose(reflect_layers(stack, f, theta), expected, rtol=1e-8, atol=1e-10)
@@ -47,8 +47,10 @@ def test_random_stacks_agree_with_tmm(layers, last, f, theta):
 @settings(max_examples=60)
 @given(media, thickness, frequency, angle)
 def test_interfaces_and_plates_of_the_simulator_agree_with_tmm(eps, d, f, theta):
-    np.testing.assert_allclose(half_space(eps, theta), by_tmm([eps], [], f, theta)[0], rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(slab(eps, d, f, theta), by_tmm([eps, 1.0], [d], f, theta)[0], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(half_space(eps, theta), reflect_by_tmm([eps], [], f, theta)[0], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(
+        slab(eps, d, f, theta), reflect_by_tmm([eps, 1.0], [d], f, theta)[0], rtol=1e-8, atol=1e-10
+    )
 
 
 @settings(max_examples=40)
@@ -57,7 +59,7 @@ def test_energy_is_conserved_by_lossless_layers(layers, f, theta):
     eps, inside = zip(*layers, strict=True)
     # Air follows
     r = multilayer(list(eps), list(inside), f, theta)
-    _, passed = by_tmm([*eps, 1.0], inside, f, theta)
+    _, passed = reflect_by_tmm([*eps, 1.0], inside, f, theta)
     np.testing.assert_allclose(np.abs(r) ** 2 + passed, 1.0, atol=1e-9)
     mirrored = multilayer([*eps, 1 - 1e16j], list(inside), f, theta)
     np.testing.assert_allclose(np.abs(mirrored), 1.0, atol=1e-6)
@@ -83,7 +85,7 @@ def test_an_infinite_or_invisible_second_medium_is_fresnel(eps, second, f, theta
 
 def test_water_behind_glass():
     """Water at 75 GHz behind 3 mm of glass, 55 degrees, 78.6 GHz."""
-    expected, _ = by_tmm([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0))
+    expected, _ = reflect_by_tmm([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0))
     assert multilayer([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0)) == pytest.approx(expected)
 
 

@@ -8,7 +8,7 @@ import pytest
 from tests.support.paths import EXAMPLES
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig, rig_with
-from tests.support.scenes import COPPER, PET, scene_of
+from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.imaging import Images
 from polysight.materials import TruthPlate, read_truth
@@ -52,8 +52,8 @@ def image_scene(tmp_path_factory: pytest.TempPathFactory) -> Make:
 
 
 @pytest.fixture(scope="session")
-def scan_of() -> Callable[..., Path]:
-    """`scan_of(folder, scene, rig)`: a simulated scan, in a scan folder."""
+def make_scan() -> Callable[..., Path]:
+    """`make_scan(folder, scene, rig)`: a simulated scan, in a scan folder."""
 
     def make(folder: Path, scene: dict[str, Any], rig: Instrument | None = None, **more: Any) -> Path:
         return simulate(rig or published_rig(), decode_scene(scene, "test"), folder, **more)
@@ -62,9 +62,9 @@ def scan_of() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def two_plates(scan_of: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def two_plates(make_scan: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A scan of copper and PET; a test that writes into it takes a copy."""
-    scan = scan_of(tmp_path_factory.mktemp("two") / "scan", scene_of(COPPER, PET, columns=15, rows=17))
+    scan = make_scan(tmp_path_factory.mktemp("two") / "scan", make_scene(COPPER, PET, columns=15, rows=17))
     files = sorted(scan.rglob("*"))
     yield scan
     assert sorted(scan.rglob("*")) == files, "a test changed the scan that all share"

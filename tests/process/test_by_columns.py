@@ -6,7 +6,7 @@ import tomli_w
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import read_output
 from tests.support.rigs import rig_with
-from tests.support.scenes import COPPER, PET, scene_of
+from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.store.open import open_source
 from polysight_shared.files import read_json
@@ -20,9 +20,9 @@ RIG = rig_with(image=IMAGE)
 
 
 @pytest.fixture(scope="module")
-def scan(scan_of, tmp_path_factory):
-    scene = scene_of(COPPER, PET, columns=COLUMNS, rows=ROWS)
-    return scan_of(tmp_path_factory.mktemp("columns"), scene, RIG, layout="authors", by_columns=True)
+def scan(make_scan, tmp_path_factory):
+    scene = make_scene(COPPER, PET, columns=COLUMNS, rows=ROWS)
+    return make_scan(tmp_path_factory.mktemp("columns"), scene, RIG, layout="authors", by_columns=True)
 
 
 def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.processes import read_output
-from tests.support.scenes import EVERYWHERE, scene_of
-from tests.support.store.facts import facts_of
+from tests.support.scenes import EVERYWHERE, make_scene
+from tests.support.store.facts import load_facts
 
 from polysight.calibration.files import SourceScan, write_metal
 from polysight.jobs.calibrate import load_reference
@@ -14,20 +14,20 @@ from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST
 from polysight_shared.files import read_json
 
-SCENE = scene_of(EVERYWHERE, columns=10, rows=8) | {"image": {"columns": 24, "rows": 24, "pixel_mm": 4.0}}
+SCENE = make_scene(EVERYWHERE, columns=10, rows=8) | {"image": {"columns": 24, "rows": 24, "pixel_mm": 4.0}}
 
 
 @pytest.fixture(scope="module")
-def products(scan_of, tmp_path_factory):
+def products(make_scan, tmp_path_factory):
     """Products of a scan whose metal calibration has known gains in the left half of the image only."""
     folder = tmp_path_factory.mktemp("metal")
-    scan = scan_of(folder / "scan", SCENE)
+    scan = make_scan(folder / "scan", SCENE)
     plate = load_reference(scan)
     is_known = plate.valid & (plate.x_m < plate.x_m.mean())
     gains = np.broadcast_to(np.exp((4 + 10j) * (plate.x_m - plate.x_m.mean())), plate.h.shape)
     partial_reference = replace(plate, h=(plate.h * gains).astype(np.complex64), valid=is_known)
     path = write_metal(partial_reference, [SourceScan("plate", str(scan), True, 8)], scan / "calibration")
-    facts = facts_of(scan)
+    facts = load_facts(scan)
     facts[0]["instrument"]["calibration"] = {"metal": str(path)}
     (scan / MANIFEST).write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
     read_output("process", scan, "--out", folder / "out", "--model", "none")
@@ -42,7 +42,7 @@ def test_each_pixel_is_divided_by_its_own_gain_where_that_is_known(products):
     assert not (valid & ~is_known).any()
     assert (valid & is_known).sum() > 0.9 * is_known.sum() > 100
     assert np.abs(gains[valid] - 1).max() > 0.4
-    # What is left: noise, smoothing, and leakage that is not metal's any more.
+    # The remaining errors are noise, smoothing, and leakage that differs from metal's.
     np.testing.assert_allclose((p * gains)[valid], 1.0, atol=0.08)
     quality = read_json(out / "quality.json")
     assert quality["calibration"]["metal"]["file"] == str(path)

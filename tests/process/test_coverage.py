@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import read_output
-from tests.support.scenes import EVERYWHERE, scene_of
+from tests.support.scenes import EVERYWHERE, make_scene
 
 from polysight.imaging import Images
 from polysight.products import ProcessedScan
@@ -79,9 +79,9 @@ class Lossy:
         return RowData(row_data.pieces, missing, row_data.frames_expected)
 
 
-def test_lost_positions_of_odd_rows_are_counted_by_column(scan_of, tmp_path):
-    scene = scene_of(EVERYWHERE, columns=7, rows=4, pulses=PULSES)
-    source = Lossy(ScanFolder.load(scan_of(tmp_path / "scan", scene)))
+def test_lost_positions_of_odd_rows_are_counted_by_column(make_scan, tmp_path):
+    scene = make_scene(EVERYWHERE, columns=7, rows=4, pulses=PULSES)
+    source = Lossy(ScanFolder.load(make_scan(tmp_path / "scan", scene)))
     quality = make_pipeline(source).quality.result()
     for board in quality.boards.values():
         assert board.masked_columns == {0: [(0, 2), (4, 5)], 1: [(2, 3), (5, 7)], 3: [(0, 1)]}

@@ -61,7 +61,7 @@ class Mangled:
         return replace(recorded, pieces=split_pieces(words.reshape(-1).view(np.uint8)))
 
 
-def noise_of(row: int, words: np.ndarray, rms: float) -> np.ndarray:
+def draw_noise(row: int, words: np.ndarray, rms: float) -> np.ndarray:
     rng = np.random.default_rng(row)
     if np.iscomplexobj(words):
         return rms * (rng.standard_normal(words.shape[:-1]) + 1j * rng.standard_normal(words.shape[:-1]))
@@ -74,7 +74,7 @@ def kill(board: str, *rx: int, rms: float = 6.0, rows: range = range(1000), valu
     def mangle(name: str, row: int, words: np.ndarray) -> None:
         if name == board and row in rows:
             for k in rx:
-                words[..., k - 1] = noise_of(100 * row + k, words, rms) if value is None else value
+                words[..., k - 1] = draw_noise(100 * row + k, words, rms) if value is None else value
 
     return mangle
 

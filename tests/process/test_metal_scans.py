@@ -53,7 +53,7 @@ def scan(rig: Instrument, tmp_path_factory):
         if key not in folders:
             raw = {
                 "name": name,
-                # Another power cycle each, whatever was scanned before.
+                # Each is another power cycle, independent of earlier scans.
                 "seed": 3 + list(PLATES).index(name) + 10 * len(disturbances),
                 "grid": {"columns": 16, "rows": 12, "step_x_mm": 12.0, "step_y_mm": 10.0},
                 "burst": {"pulses": 4},
@@ -250,7 +250,7 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
         bands = bands_of_row(row, rig.chirp, BANDS)
         assert bands is not None
         fit = fit_layer(bands, [parse_layer(layer) for layer in layers], np.radians(row.incidence_deg))
-        # All plates are thin, which half spaces explain by boards that have turned: its errors say so.
+        # All plates are thin, which half spaces explain by turned boards; the errors include that.
         error = fit.permittivity - truth
         assert abs(error.real) < 2.5 * fit.std_real, name
         assert abs(error.imag) < 2.5 * fit.std_loss, name

@@ -12,7 +12,7 @@ import pytest
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import read_output
 from tests.support.refusals import refused
-from tests.support.scenes import COPPER, PET, scene_of
+from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.cli.main import main
 from polysight.jobs import process
@@ -92,9 +92,9 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
 
 @pytest.mark.parametrize("is_steep", [True, False])
 def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
-    scan_of: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_steep: bool
+    make_scan: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_steep: bool
 ) -> None:
-    scan = scan_of(tmp_path / "scan", scene_of(COPPER, PET, columns=10, rows=11))
+    scan = make_scan(tmp_path / "scan", make_scene(COPPER, PET, columns=10, rows=11))
     examine = Pipeline.examine
 
     def examine_tilted(self: Pipeline, *words: object) -> object:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.support.processes import read_output
 from tests.support.rigs import published_rig, rig_table, rig_with
-from tests.support.scenes import EVERYWHERE, scene_of
-from tests.support.store.facts import facts_of
+from tests.support.scenes import EVERYWHERE, make_scene
+from tests.support.store.facts import load_facts
 
 from polysight.calibration.files import BoardFilter, FilterFile, SourceScan, make_header, write_calibration
 from polysight.store import manifest
@@ -20,7 +20,7 @@ NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad
 
 
 @pytest.fixture(scope="module")
-def scan(scan_of, tmp_path_factory):
+def scan(make_scan, tmp_path_factory):
     """A scan whose filters were measured before it."""
     folder = tmp_path_factory.mktemp("sync")
     true_filter = BoardFilter(
@@ -36,8 +36,8 @@ def scan(scan_of, tmp_path_factory):
     path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
     true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     scene_changes = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
-    scan = scan_of(
-        folder / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **scene_changes), true
+    scan = make_scan(
+        folder / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **scene_changes), true
     )
     _believe_programmed(scan)
     return scan
@@ -45,14 +45,14 @@ def scan(scan_of, tmp_path_factory):
 
 def _believe_programmed(scan):
     """Set the filters in the scan's manifest to those of the published rig."""
-    facts = facts_of(scan)
+    facts = load_facts(scan)
     facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}
     (scan / "manifest.jsonl").write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
 
 
-def test_a_scan_with_two_antennas_has_a_report_and_an_image(scan_of, tmp_path):
+def test_a_scan_with_two_antennas_has_a_report_and_an_image(make_scan, tmp_path):
     two = rig_with(antennas={"rx_mm": rig_table()["antennas"]["rx_mm"][:2]})
-    scan = scan_of(tmp_path / "scan", scene_of(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES), two)
+    scan = make_scan(tmp_path / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES), two)
     read_output("sync-report", scan, "--out", tmp_path / "report")
     read_output("image", scan, "--out", tmp_path / "image")
     assert (tmp_path / "report" / "sync.json").exists()
@@ -71,7 +71,7 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
         stages = report["boards"][name]["stages"]
         assert (figures["positions"], figures["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
         assert str(figures["chirps"]) in output
-        # Two boards sample the trigger, each evenly within SYNC_NS; the direct path's phase then is any.
+        # Two boards sample the trigger, each evenly within SYNC_NS; the direct path's phase is then random.
         two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
         assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
         assert stages["received"]["phase_rad_std"] == pytest.approx(np.pi / np.sqrt(3), rel=0.15)

@@ -5,7 +5,7 @@ import pytest
 import tomli_w
 from tests.support.processes import read_output
 from tests.support.rigs import published_rig
-from tests.support.scenes import COPPER, PET, scene_of
+from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.cli.main import main
 from polysight.materials import Library
@@ -17,7 +17,7 @@ NAMES = ("PET", "copper", "rubber")
 
 def scene(name: str):
     """A scene with the same power cycle under another name."""
-    return scene_of(COPPER, PET, MORE, columns=15, rows=21, pulses=1, seed=7) | {"name": name}
+    return make_scene(COPPER, PET, MORE, columns=15, rows=21, pulses=1, seed=7) | {"name": name}
 
 
 @pytest.fixture
@@ -27,10 +27,10 @@ def rig_file(tmp_path):
     return path
 
 
-def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_path):
+def test_scans_and_their_scenes_give_the_same_library(make_scan, rig_file, tmp_path):
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(scene("second")).encode())
-    scan = scan_of(tmp_path / "first", scene("first"))
+    scan = make_scan(tmp_path / "first", scene("first"))
     out = tmp_path / "library.npz"
     options = ("--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
     output = read_output("train", scan, *options)
@@ -51,7 +51,7 @@ def test_scans_and_their_scenes_give_the_same_library(scan_of, rig_file, tmp_pat
     assert 0.2 < level["PET"] < level["rubber"] < 0.9
 
 
-def test_a_scan_without_metal_cannot_be_trained_on(scan_of, rig_file, tmp_path):
-    scan = scan_of(tmp_path / "scan", scene_of(PET, columns=6, rows=4))
+def test_a_scan_without_metal_cannot_be_trained_on(make_scan, rig_file, tmp_path):
+    scan = make_scan(tmp_path / "scan", make_scene(PET, columns=6, rows=4))
     assert main(["train", str(scan), "--config", str(rig_file), "--out", str(tmp_path / "l.npz")]) == 3
     assert not (tmp_path / "l.npz").exists()

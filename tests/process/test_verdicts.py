@@ -90,7 +90,7 @@ def test_a_measured_rig_and_a_plain_scene_are_good(plain):
     assert sum(r.verdict is not None and r.verdict.name.startswith(true[r.patch.label].name)
                for r in findings.analysis.patches) >= 4  # fmt: skip
     (reference,) = [r for r in findings.analysis.rows() if r.metal_reference]
-    assert reference.name is None  # never judged by itself
+    assert reference.name is None  # not judged by itself
 
 
 def test_an_undeclared_thin_sheet_is_reported_and_affects_no_other_patch(examine):
@@ -118,7 +118,7 @@ def test_without_metal_there_is_no_result(examine, names):
 @pytest.mark.parametrize("leak", [(0.0, 0.0), (0.0, 0.05), (-0.05, 0.05)])
 def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
     findings, true = examine(world(disturbances={"leakage_h": list(leak), "leakage_v": list(leak), "crystal_ppm": {}}))
-    if leak == (0.0, 0.0):  # a rig without leakage would be known to have none
+    if leak == (0.0, 0.0):  # the rig file must not say that there is no leakage
         assert findings.verdict.level == "good"
         return
     inversion = findings.analysis.inversion

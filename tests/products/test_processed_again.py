@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import tomli_w
 from tests.support.rigs import published_rig
-from tests.support.scenes import scene_of
-from tests.support.store.facts import facts_of
+from tests.support.scenes import make_scene
+from tests.support.store.facts import load_facts
 
 from polysight.cli.main import main
 from polysight.materials import Library
@@ -19,7 +19,7 @@ from polysight.store.scan_folder import MANIFEST, ScanFolder
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate
 
-SCENE = scene_of(
+SCENE = make_scene(
     {"name": "copper", "centre_mm": [-34.0, 0.0], "size_mm": [46.0, 60.0], "metal": True},
     {"name": "mine", "centre_mm": [34.0, 0.0], "size_mm": [46.0, 60.0], "permittivity": [4.0, 0.4]},
     columns=14,
@@ -126,7 +126,7 @@ def test_at_another_angle_than_the_librarys_nothing_is_named(made_folder, other_
     assert other_patch["name"] is None
     assert (other_patch["permittivity"] is None) == (
         other_patch["refused"] is not None
-    )  # so coarse a scan may give no result
+    )  # such a coarse scan may give no result
     assert "other.npz" in (made_folder / "out" / "report.html").read_text()
 
 
@@ -156,7 +156,7 @@ def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made_fold
 def test_retaken_and_incomplete_rows_of_every_run_are_counted(made_folder):
     """They come from the manifest, however often the scan was resumed."""
     scan = ScanFolder.load(made_folder / "scan")
-    rows = {f["row"]: f for f in facts_of(scan, "row_committed")}
+    rows = {f["row"]: f for f in load_facts(scan, "row_committed")}
     with scan.writer() as writer:
         for row, take in ((2, 1), (2, 2), (5, 1)):
             writer.append({"fact": "row_rejected", "row": row, "take": take, "reasons": ["x"], "boards": {}})

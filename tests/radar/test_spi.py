@@ -67,7 +67,7 @@ def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sen
     board.inject(fault)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (2, True)]
-    # Obeyed once
+    # Executed once
     assert board.executed == [*state_before, LOW_POWER_OFF.ID]
     assert "sent 2 times" in link.warnings[-1]
     link.call(LOW_POWER_OFF)

@@ -31,7 +31,7 @@ def broken(rig: Instrument, frames: int = FRAMES) -> set[str]:
     return {c.name for c in constraints(rig, frames) if not c.holds}
 
 
-def of_receiver(rig: Instrument, **values) -> Instrument:
+def change_receiver(rig: Instrument, **values) -> Instrument:
     boards = tuple(msgspec.structs.replace(b, **values) if b.name == "RH" else b for b in rig.boards)
     return msgspec.structs.replace(rig, boards=boards)
 
@@ -121,7 +121,7 @@ ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
 # The sum is infinite
 @example({("chirp", "start_hz"): 9e307}, {}, 9e307, 0)
 def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
-    rig = of_receiver(native_rig(), start_offset_hz=offset_hz)
+    rig = change_receiver(native_rig(), start_offset_hz=offset_hz)
     wrong = floats | ints
     for table in sorted({table for table, _ in wrong}):
         rig = change_rig(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
@@ -202,15 +202,15 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
     ("complex2x", 0.0, True), ("complex2x", -1.1e6, False), ("complex2x", 700e3, False),
 ])  # fmt: skip
 def test_if_budget(rig, mode, offset, holds):
-    wrong = change_rig(of_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
+    wrong = change_rig(change_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
     assert ("IF budget of RH" not in broken(wrong)) is holds
 
 
 def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
-    wrong = of_receiver(rig, start_offset_hz=0.0)
+    wrong = change_receiver(rig, start_offset_hz=0.0)
     result = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
     offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
-    mended = of_receiver(rig, start_offset_hz=offset)
+    mended = change_receiver(rig, start_offset_hz=offset)
     assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
 
 

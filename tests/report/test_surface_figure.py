@@ -14,11 +14,15 @@ def make_surface() -> Surface:
     """A patch of permittivity 6 before a table of 2, whose points come last."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.1, 0.1, 60), np.linspace(-0.1, 0.1, 60)))
     is_near = np.hypot(x, y) < 0.05
-    x, y = np.concatenate([x, x[is_near]]), np.concatenate([y, y[is_near]])
+    x = np.concatenate([x, x[is_near]])
+    y = np.concatenate([y, y[is_near]])
     z = np.full(x.size, 0.7)
     z[is_near.size :] = 0.5
     number = (z == 0.5).astype(int)
-    x, y, z, number = x[::-1], y[::-1], z[::-1], number[::-1]
+    x = x[::-1]
+    y = y[::-1]
+    z = z[::-1]
+    number = number[::-1]
     count = x.size
     medium = (2.0 + 0j, 6.0 + 0j)
     segments = tuple(

@@ -84,7 +84,7 @@ def open_connections(port: int, rate: int, opened: Synchronized[int]) -> None:
                 socket.create_connection(("127.0.0.1", port)).close()
                 opened.value += 1
         else:
-            # Nothing is due: the rate is what is asked for.
+            # All due packets are sent: the rate is the requested one.
             time.sleep(0.002)
 
 

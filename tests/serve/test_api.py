@@ -145,7 +145,7 @@ def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
     def together(site: object) -> None:
         real(site)
         with suppress(threading.BrokenBarrierError):
-            # Neither sees the other's program unless checking and starting are one step
+            # Without one step for checking and starting, neither would see the other's program
             barrier.wait()
 
     monkeypatch.setattr(control, "_check_free", together)
@@ -211,7 +211,7 @@ def test_a_request_can_be_repeated_and_is_checked_again(view, scans):
     (scans / "one" / "program" / "request.json").write_text(json.dumps({"name": "other", "plan": plan}))
     request = get(view, "/api/request?scan=one")
     assert (request["name"], request["plan"]["rows"], request["plan"]["columns"]) == ("one", 5, 7)
-    assert post(view, "/api/again?scan=one")[0] == 400  # it holds products: it could start
+    assert post(view, "/api/again?scan=one")[0] == 400  # it has products, so it could start
     (scans / "one" / "program" / "request.json").write_text('{"plan": {"rows": 0}}')
     assert post(view, "/api/again?scan=one")[0] == 400
     assert ask(view, "/api/request?scan=two")[0] == 404

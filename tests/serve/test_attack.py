@@ -70,7 +70,7 @@ def test_an_abort_gets_through_whoever_else_asks(processed: Path, tmp_path: Path
     (tmp_path / "state").mkdir()
     took_s = []
     with serving(tmp_path / "scans", tmp_path / "state") as server, attacking(server.port, attack, tmp_path):
-        # They say once a second what they have done: by then all are at it.
+        # They report once a second; after the first report all are running.
         wait_for(lambda: "answers" in (tmp_path / "attackers.txt").read_text(), "the attack")
         for _ in range(attack.aborts):
             took_s.append(abort_once(server, tmp_path / "scans" / f"s{VIEWS}"))

@@ -13,7 +13,7 @@ RUNS = 2
 LONG_RUNS = 20
 # Verdict and seed of the images of the two generations.
 GENERATIONS = (("good", 2), ("none", 5))
-# What the page shows of the products: badges, reasons, patches, scale of the image, and the place that is probed.
+# Parts of the products on the page: badges, reasons, patches, scale of the image, and the place that is probed.
 PARTS = "['badges', 'reasons', 'rows', 'scale', 'probe-facts'].map(id => document.getElementById(id).innerText)"
 # Seen 20 times a second and at each change of the document.
 RECORD = f"""(() => {{

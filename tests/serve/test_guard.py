@@ -110,7 +110,7 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
         assert (status, "httponly" in cookie.lower(), "samesite=strict" in cookie.lower()) == (200, True, True)
         cookie = cookie.partition(";")[0]
         assert get(view, "/api/scans", Cookie=cookie)["scans"]
-        assert ask(view, "/api/notes?scan=one", "POST", {}, Cookie=cookie)[0] == 403  # it reads, and does nothing else
+        assert ask(view, "/api/notes?scan=one", "POST", {}, Cookie=cookie)[0] == 403  # it can only read
         assert get(view, "/api/scans", Host=f"192.168.7.7:{view.port}", Cookie=cookie)["scans"]
         # A port that is forwarded
         assert get(view, "/api/page", Host="192.168.7.7:9000", Cookie=cookie)["known"]
@@ -320,7 +320,7 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
             for data in part:
                 s = socket.create_connection(("127.0.0.1", view.port), HANG_S)
                 s.sendall(data)
-                # Left open: nobody reads the answer, nobody closes
+                # Left open: the answer is not read, the connection not closed
                 open_sockets.append(s)
 
         threads = [threading.Thread(target=send, args=(requests[k::8],)) for k in range(8)]
@@ -351,7 +351,7 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     subject = ["-subj", "/CN=127.0.0.1", "-addext", "subjectAltName=IP:127.0.0.1"]
     command = [program, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *files, *subject]
     subprocess.run([str(w) for w in command], check=True, capture_output=True)
-    # Twice the same, and so neither belongs to the other
+    # Two equal processes that are independent of each other
     for wrong in ("key.pem", "certificate.pem"):
         with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
             Place("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()

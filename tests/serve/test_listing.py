@@ -18,7 +18,7 @@ def make_scan(name: str, size: int) -> ListedScan:
 def test_who_applies_the_changes_has_the_list():
     rng = random.Random(SEED)
     changing = ChangingList()
-    # Pages that ask in a drawn order; the last one begins with the stamp of another server.
+    # Pages that send requests in random order; the last one begins with the stamp of another server.
     pages: list[dict[str, ListedScan]] = [{}, {}, {}]
     stamps = ["", "", "00000000-3"]
     for _ in range(200):

@@ -32,7 +32,7 @@ from polysight_shared.config import CheckPlate
 from polysight_shared.errors import DataError
 from polysight_shared.findings import Finding
 
-# What each page shows when it is complete. Cards of the list have no text before they are painted (`content-visibility`
+# Condition for each page to be complete. Cards of the list have no text before they are painted (`content-visibility`
 # in catalogue.css).
 PAGES = {
     "/": "document.querySelectorAll('#list li').length == 2 && document.getElementById('list').innerText",
@@ -45,7 +45,7 @@ PAGES = {
 }
 
 
-# What each scan's rig file says of its check plate: the truth, and what no measurement of it agrees with.
+# Check plate in each scan's rig file: the truth, and values that disagree with every measurement.
 KNOWN_PERMITTIVITY = {"one": (3.78, 0.7), "two": (9.0, 0.01)}
 
 
@@ -188,7 +188,7 @@ def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page,
             browser.size(*size)
             browser.wait(f"innerWidth == {size[0]}", "the other size")
             browser.wait("document.querySelector('#running button.danger')?.checkVisibility()", "the abort")
-            # No Pi is there: the page says so, and the console has its refusal.
+            # There is no Pi: the page reports it, and the console shows the refused request.
             browser.errors[:] = [error for error in browser.errors if not error.endswith("/api/stage/look")]
             page.check_whole()
             # A table's last columns, too.

@@ -43,7 +43,7 @@ class Server:
     def _find_child(self, is_wanted: Callable[[int], bool]) -> int | None:
         own = os.getpriority(os.PRIO_PROCESS, self.program.pid)
         children = Path(f"/proc/{self.program.pid}/task").glob("*/children")
-        # One may end while it is looked at.
+        # A process may end while it is examined.
         with suppress(FileNotFoundError, ProcessLookupError):
             for pid in map(int, " ".join(path.read_text() for path in children).split()):
                 # The tracker of the standard library's shared resources is not a process of the server.
@@ -106,7 +106,7 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_no
         wait_for(lambda: server.reading_process() is not None, "the reading process")
         door = server.door()
         assert door is not None
-        # They come for the whole group, and the server ends its door by itself.
+        # Signals come to the whole group, and the server ends its door by itself.
         os.kill(door, signal.SIGTERM)
         os.kill(door, signal.SIGINT)
         os.kill(server.program.pid, signal.SIGSTOP)

@@ -61,7 +61,7 @@ def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
     finally:
         os.killpg(pid, 9)
         os.waitpid(pid, 0)
-    # Killed: it could not say
+    # Killed, so it left no exit status
     assert find_program(tmp_path, "scan").status is None
 
 
@@ -147,7 +147,7 @@ def test_a_scan_starts_with_its_plan_and_a_pi_that_refuses_it_says_why(refusing_
         rig = tomllib.loads((folder / PROGRAM / "instrument.toml").read_text())
         assert rig["grid"]["rows"] == 3
         assert get(view, "/api/scan?scan=week/one")["state"] == "begun"
-        assert post(view, "/api/start", {"name": "two"})[0] == 409  # one rig
+        assert post(view, "/api/start", {"name": "two"})[0] == 409  # there is one rig
         assert not (root / "two").exists()
         refuse()
         end_program(folder, "scan")

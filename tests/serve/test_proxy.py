@@ -18,9 +18,9 @@ from tests.support.processes import wait_for
 from polysight.catalogue import read_notes
 from polysight.serve.guard import Access
 
-# Browsers take every name under `localhost` for this machine.
+# Browsers resolve every name under `localhost` to this machine.
 NAME = "lab.localhost"
-# Caddy's own: no port of the system's, no certificate from the network, nothing installed.
+# Caddy's certificate: no system port, no certificate from the network, no installation.
 GLOBAL_OPTIONS = """{
   admin off
   skip_install_trust
@@ -58,7 +58,7 @@ def address(scans: Path, tmp_path: Path, browser: Browser) -> Iterator[str]:
         pytest.skip("no caddy here: sudo apt-get install caddy")
     port = find_free_port()
     places = {f"XDG_{kind}_HOME": str(tmp_path / kind) for kind in ("DATA", "CONFIG")}
-    # As `polysight serve --allow-host` makes it: everybody comes from this machine.
+    # As `polysight serve --allow-host` makes it: all clients have this machine's address.
     access = Access(TOKEN, loopback=False, hosts=(NAME,), control=True)
     with served_folder(scans, access=access) as view, (tmp_path / "caddy.log").open("wb") as log:
         (tmp_path / "Caddyfile").write_text(read_example(port, view.port))

@@ -18,7 +18,7 @@ class Rig:
 
     def __init__(self) -> None:
         self.started: list[str] = []
-        # How often it was asked to start a scan.
+        # Number of requests to start a scan.
         self.asked = 0
         self.is_busy = True
         self.is_broken = False

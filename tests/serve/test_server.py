@@ -143,7 +143,7 @@ def test_connections_wait_in_a_long_queue():
         """No requests come."""
 
     with socket.create_server(("127.0.0.1", 0), backlog=BACKLOG) as listener:
-        # At most what the kernel allows, net.core.somaxconn.
+        # At most the kernel's limit, net.core.somaxconn.
         longest = read_queue_length(listener)
         server = EndingServer(uvicorn.Config(ignore, lifespan="off", log_config=None, backlog=100))
         thread = threading.Thread(target=server.run, args=([listener],))

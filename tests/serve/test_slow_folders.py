@@ -101,7 +101,7 @@ def test_a_list_shows_a_folder_that_does_not_answer_and_what_it_knew_of_it(dead,
     silent = {"alive": "products", "dead": "silent", "other": "products"}
     for _ in range(3):
         wait_for(lambda: {s.name: s.state for s in listed.list()} == silent, "that only one folder is silent")
-    # Of the folder that hangs, however often it is listed.
+    # Reads of the hanging folder, for any number of listings.
     wait_for(lambda: threading.active_count() - threads <= 1, "that one thread is left")
     dead.back.set()
     wait_for(lambda: {s.state for s in listed.list()} == {"products"}, "that the folder is listed again")

@@ -11,7 +11,7 @@ from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
 from tests.support.page.live_view import Served, begin_history
 from tests.support.paths import RIG_FILE
 from tests.support.products import REASON
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition import STATES
 from polysight.acquisition.control import Life
@@ -64,7 +64,7 @@ class StillWatch:
 
 @pytest.fixture
 def still(finished: Path, tmp_path: Path) -> Iterator[tuple[StillWatch, Served]]:
-    watch = StillWatch(tmp_path / "one", begin_history(facts_of(finished)[0]))
+    watch = StillWatch(tmp_path / "one", begin_history(load_facts(finished)[0]))
     watch.show("rows")
     watches = Watches(True, {"one": watch})  # type: ignore[dict-item]
     site = Site(Scans(tmp_path, "one"), watches, Programs(), RIG_FILE)
@@ -137,7 +137,7 @@ def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, 
         state = STATES[key]
         if key == "offline":
             view.close()
-        # One look: it may find back at once.
+        # The state is read only once, because the page may reconnect immediately.
         browser.wait(
             f"document.getElementById('headline')?.innerText == {state.headline!r}"
             f" && document.getElementById('status').dataset.level == {state.level!r}"

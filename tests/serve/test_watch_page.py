@@ -90,7 +90,7 @@ def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, wa
         open_page(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert browser.text("headline") == STATES["offline"].headline
-    # Some of its attempts to come back fail
+    # Some of its attempts to reconnect fail
     time.sleep(0.5)
     with served(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")

@@ -64,7 +64,7 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
     for index in (10, 11):
         row = plan_raster(RIG.grid).row(index)
         track = StageTrack(RIG, d.burst_motion, d.backlash_mm)
-        bursts = [at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
+        bursts = [make_burst_at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
         sent = [pulse for burst in bursts for pulse in burst]
         offsets_mm = track.offsets_mm([pulse.t_ns for pulse in sent])
         for answer, true in zip(offsets_mm, row_offsets_mm(radar, row), strict=True):
@@ -73,7 +73,7 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
         assert [p.number for p in track.places(sent)] == list(range(first, first + len(sent)))
 
 
-def at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
+def make_burst_at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
     """The stage raises its trigger at a point of the plan; the pulses of its burst, with arbitrary numbers."""
     plan = plan_raster(RIG.grid)
     centre = (RIG.stage.centre_x_mm, RIG.stage.centre_y_mm)
@@ -90,5 +90,5 @@ def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column:
     first = (row * RIG.grid.columns + point) * RIG.burst.pulses
     track = StageTrack(RIG)
     for base_ns in (0, 10**11):
-        numbered = track.places(at_point(track, row, column, t_ns + base_ns))
+        numbered = track.places(make_burst_at_point(track, row, column, t_ns + base_ns))
         assert [p.number for p in numbered] == list(range(first, first + RIG.burst.pulses))

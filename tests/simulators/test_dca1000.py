@@ -26,9 +26,9 @@ def messages(outputs: list[Output]) -> list[bytes]:
         ("5aa5 0e00 0000 aaee", "5aa5 0e00 0204 aaee"),
         ("5aa5 0400 1200 1e21a8c0 b421a8c0 129078563412 0010 0210 aaee", "5aa5 0400 0000 aaee"),
         ("5aa5 0400 0300 010203 aaee", "5aa5 0400 0100 aaee"),  # EEPROM of the wrong length
-        ("5aa5 0300 0200 0101 aaee", "5aa5 0300 0000 aaee"),  # malformed, answered all the same
+        ("5aa5 0300 0200 0101 aaee", "5aa5 0300 0000 aaee"),  # malformed, but still answered
         ("5aa5 0b00 ff00 be05 aaee", "5aa5 0b00 0000 aaee"),
-        ("5aa5 0b00 0600 000035 0c0000 aaee", "5aa5 0b00 0100 aaee"),  # packets of no size
+        ("5aa5 0b00 0600 000035 0c0000 aaee", "5aa5 0b00 0100 aaee"),  # packets of size zero
         ("5aa5 7700 0000 aaee", "5aa5 7700 0100 aaee"),
     ],
 )

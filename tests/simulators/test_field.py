@@ -43,7 +43,7 @@ def test_interpolation_between_frequencies_is_exact() -> None:
     assert len(field.nodes_hz) < 16
     everywhere = read(field, offset, samples, 0, samples)
     exact = optics.field_exact(rig, scene, board, offset, samples)
-    # What a common factor cannot explain is the interpolation over frequency alone.
+    # The difference beyond a common factor is the error of the interpolation over frequency.
     common = np.vdot(everywhere, exact) / np.vdot(everywhere, everywhere)
     assert np.abs(everywhere * common - exact).max() < 1e-4 * np.abs(exact).max()
 

@@ -32,7 +32,7 @@ def test_dialogue(talker, path: Path):
     play(talker, path)
 
 
-# In an order in which each is obeyed after the one before.
+# In an order in which each command is accepted after the previous one.
 COMMANDS = (
     ("HELLO", ()), ("CLEAR", ()), ("SET", (0, 30_000)), ("MOVE", (12_000, 340, 4000)),
     ("ROW", (8000, -400, 5, 1000, 4000)), ("HOME", ()), ("ENABLE", (0,)),
@@ -58,7 +58,7 @@ def test_every_damaged_line_is_refused(talker):
         assert talker.status() == at_rest
         talker.run_ms(20)
         assert talker.still()
-        # Undamaged it is obeyed
+        # Undamaged it is executed
         assert talker.command(verb, *args).kind == "ok"
 
 
@@ -77,7 +77,7 @@ def test_random_bytes(talker, request: pytest.FixtureRequest):
     talker.run_ms(200)
     assert talker.still()
     talker.resync()
-    # A STOP may have been among them
+    # Some of the bytes may have been a STOP
     assert talker.command("CLEAR").kind == "ok"
     done, _ = talker.motion("MOVE", 500, 400, 4000)
     assert (done.kind, done.integer("x"), done.integer("y")) == ("done", 500, 400)

@@ -56,7 +56,7 @@ def test_random_rows(stage, seed: int):
         spacing_ns = abs(pitch) / rate * 1e9
         assert all(abs(e.t_ns - first - i * spacing_ns) <= 500 for i, e in enumerate(rising))
         # Constant speed from one pitch before the first point to one pitch after the last.
-        latest = {m.t_ns: m for m in motions(wires)}  # of several at one time, the last holds
+        latest = {m.t_ns: m for m in motions(wires)}  # of several at one time, the last counts
         cruise = [m for t, m in latest.items() if first - spacing_ns - 500 <= t <= rising[-1].t_ns]
         sign = 1 if pitch > 0 else -1
         assert all(m.vx_um_s == sign * rate * UM for m in cruise)
@@ -106,7 +106,7 @@ def test_ramps_keep_to_the_acceleration(stage, accel: int):
     for (t0, v0), (t1, v1) in itertools.pairwise(speeds.items()):
         assert abs(v1 - v0) <= 1.1 * accel * (t1 - t0) * 1e-9 + 5
     assert max(speeds.values()) == 6000
-    # The whole move takes what the trapezium says: cruise time plus one ramp.
+    # The whole move takes the time of a trapezium: cruise time plus one ramp.
     took_s = (wires[-1].t_ns - wires[0].t_ns) * 1e-9
     assert took_s == pytest.approx(60_000 / 6000 + 6000 / accel, rel=0.02)
 

@@ -130,7 +130,7 @@ def test_a_short_hold_is_told_and_costs_no_step(host):
 def test_no_command_is_lost_silently(host, chatty: bool):
     """A host that does not wait for answers: every line is answered, or a loss is reported."""
     lines = [host.line("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.line("CLEAR") for i in range(100)]
-    # Six times as many bytes of answer: the board is kept busy writing
+    # Six times as many bytes of answers, so that the board is busy writing
     gap = b"?\n" * 12 if chatty else b""
     host.uno.feed(b"".join(gap + line for line in lines))
     host.uno.settle()
@@ -142,9 +142,9 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     expected_sequence = set(range(host.sequence - 99, host.sequence + 1))
     assert answered <= expected_sequence
     assert answered == expected_sequence or any(r.number == 3 for r in unread)
-    # This was a test of the loss
+    # Packets were lost, as this test needs
     assert (answered == expected_sequence) != chatty
-    # The conversation goes on: greet, then any number may follow.
+    # The conversation continues: greet, then any number may follow.
     host.uno.feed(b"\n")
     host.replies()
     assert host.command("HELLO").kind == "ok"

@@ -29,7 +29,7 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         rig,
         grid=replace(rig.grid, columns=6, rows=2),
         burst=replace(rig.burst, pulses=4),
-        # The journey there is short, and a busy machine must not count as a silent host.
+        # The travel there is short, and a busy machine must not count as a silent host.
         stage=replace(rig.stage, centre_x_mm=15.0, centre_y_mm=4.0, heartbeat_ms=5000),
     )
     config = tmp_path / "rig.toml"

@@ -21,7 +21,7 @@ DRIVERS_OFF = 7
 WATCHDOG_MS = 250 * 1.1
 # Highest rate of the stage, steps per second.
 TOP_RATE = 20_000
-# By kind: what comes within a millisecond, more than the line carries at 115,200 baud.
+# By kind: bytes within a millisecond, more than the line carries at 115,200 baud.
 CHATTER = {
     "silence": lambda _: b"",
     "yes": lambda _: b"y\n" * 6,
@@ -84,7 +84,7 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
 
     host.uno.hang()
     hung = host.uno.cycle
-    # The host notices nothing and goes on asking for the status.
+    # The host does not notice it and still requests the status.
     for _ in range(20):
         host.uno.feed(bytes([Immediate.STATUS]))
         host.uno.run_ms(25)
@@ -96,7 +96,7 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     assert replies[0].kind == "banner"
     assert replies[-1].integer("homed") == 0
 
-    # After a reset it asks for everything again: a greeting, motors on, homing.
+    # After a reset it requires everything again: a greeting, motors on, homing.
     assert host.command("MOVE", 0, 0, 4000).number == StageError.SEQUENCE
     host.must_obey("HELLO")
     assert host.command("MOVE", 0, 0, 4000).number == StageError.DISABLED

@@ -57,7 +57,7 @@ def busiest_step(host: Host) -> int:
             host.uno.rest()
             assert host.replies()[-1].kind == "done"
         cost = host.uno.cost()
-        # 8 us: what a step may wait
+        # 8 us: longest wait of a step
         assert max(v for k, v in cost.interrupts.items() if k != STEP_VECTOR) <= 128
         most = max(most, cost.interrupts[STEP_VECTOR])
         assert cost.step_pulse >= 4 * US

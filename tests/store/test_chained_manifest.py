@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.store.facts import facts_of, parse_fact
+from tests.support.store.facts import load_facts, parse_fact
 from tests.support.store.plain_scan import errors, write_scan
 
 from polysight.store import manifest
@@ -65,7 +65,7 @@ def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, d
 def test_a_manifest_without_chain_reads_as_before_and_goes_on_with_one(tmp_path):
     path = tmp_path / MANIFEST
     path.write_bytes(b"".join(map(encode_line, SOME)))
-    assert (facts_of(path), manifest.read(path).faults) == (SOME, [])
+    assert (load_facts(path), manifest.read(path).faults) == (SOME, [])
     with ManifestWriter(path, create=False) as writer:
         writer.append({"fact": "scan_resumed"})
         writer.append({"fact": "scan_ended"})
@@ -111,7 +111,7 @@ def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
 
 
 def test_a_row_taken_again_makes_the_gap_a_note(scan):
-    lost_row = facts_of(scan, "row_committed")[2]
+    lost_row = load_facts(scan, "row_committed")[2]
     remove_line(scan, 4)
     with ScanFolder.load(scan).writer() as writer:
         writer.append({"fact": "scan_resumed", "rows_missing": 1})

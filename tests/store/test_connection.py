@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from tests.support.page.live_view import add_fact, begin_history
 from tests.support.rigs import rig_table
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import resume_scan
 from polysight.cli.main import main
@@ -67,7 +67,7 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
         try:
             given_rig = decode(table, Instrument, "given")
         except ConfigError:
-            continue  # no rig file says this
+            continue  # a value that no rig file has
         assert given_rig != begun
         if may_change(path):
             check_same_scan(begun, given_rig, "mine.toml")
@@ -105,8 +105,8 @@ def test_new_connection_settings_hold_from_then_on(undisturbed_scan, tmp_path):
         assert resume_scan(small.path).folder.instrument == now
     scan = ScanFolder.load(small.path)
     assert scan.instrument == now
-    started = facts_of(scan, "scan_started")[0]
-    first, second = facts_of(scan, "scan_resumed")
+    started = load_facts(scan, "scan_started")[0]
+    first, second = load_facts(scan, "scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
     assert (first["rig"], "rig" in second) == (extract_connection(now), False)
     story = begin_history(started)

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgpack
 import pytest
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.small_scan import SmallScan
 
 from polysight.store.logs import read_events
@@ -47,7 +47,7 @@ def resume(scan: SmallScan, undisturbed_scan, image: bool = False, damaged_lines
     assert scan.rows() == undisturbed_scan.digests
     if image:
         assert scan.image() == undisturbed_scan.final_image
-    facts = facts_of(scan.path)
+    facts = load_facts(scan.path)
     since = max(i for i, f in enumerate(facts) if f["fact"] == "scan_resumed")
     resumed = [f["row"] for f in facts[since:] if f["fact"] == "row_committed"]
     assert len(resumed) == len(set(resumed))
@@ -98,7 +98,7 @@ def turn(path: Path, bit: int) -> None:
     path.write_bytes(raw)
 
 
-def ends_of_events(raw: bytes) -> list[int]:
+def list_event_ends(raw: bytes) -> list[int]:
     unpacker = msgpack.Unpacker()
     unpacker.feed(raw)
     return [0, *(unpacker.tell() for _ in unpacker)]
@@ -109,8 +109,8 @@ def ends_of_events(raw: bytes) -> list[int]:
 def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
     """Events that the host has lost come from the Pi's journal; no row is retaken."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
-    start = ends_of_events(raw)[-1 - record]
-    stop = ends_of_events(raw)[-record]
+    start = list_event_ends(raw)[-1 - record]
+    stop = list_event_ends(raw)[-record]
     for cut in sample(range(start, stop), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "events.msgpack").write_bytes(raw[:cut] + tail)
@@ -126,7 +126,7 @@ def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
 def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
     """Faults that validate cannot see in the format, it sees by the digest; unreadable events come from the journal."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
-    committed = facts_of(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
+    committed = load_facts(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
     for bit in sample(range(8 * committed), 16):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "events.msgpack", bit)
@@ -175,7 +175,7 @@ def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, left):
     else:
         find_journal(scan).write_bytes(left)
     manifest_path = scan.path / "manifest.jsonl"
-    # Row 2 is to be taken yet
+    # Row 2 is not recorded yet
     manifest_path.write_bytes(b"".join(read_lines(manifest_path)[:-2]))
     events = len(read_events(scan.path / "events.msgpack").events)
     check_resumed_journal(scan, undisturbed_scan, lost=events, rows={2})
@@ -206,9 +206,9 @@ def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
         if suffix == ".bin":
             with refused(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
-        # Row 1 is taken last now
+        # Row 1 is recorded last now
         assert resume(scan, undisturbed_scan, image=not cut) == {1}
-        withdrawn = facts_of(scan.path, "row_withdrawn")
+        withdrawn = load_facts(scan.path, "row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
         assert name in withdrawn[0]["reasons"][0]
 

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 from tests.support.store.small_scan import Samples, SmallScan
@@ -15,7 +15,7 @@ from tests.support.store.small_scan import Samples, SmallScan
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 
-# Draws of what is left, for each place
+# Number of random remains for each place
 POWER_CUTS = 12
 pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # a killed program closes no file
@@ -25,7 +25,7 @@ pytestmark = [
 
 def list_retaken_rows(path: Path) -> set[int]:
     """Rows that were retaken since the last resume, by the manifest."""
-    facts = facts_of(path)
+    facts = load_facts(path)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     return {f["row"] for f in facts[since:] if f["fact"] == "row_committed" and f["take"] > 1}
 

@@ -188,7 +188,7 @@ def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling, first_s
         end = min(start + PACKET, raw.size) - 1
         true_end = end if end < cut.start else end + FRAME
         pulse_time = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
-        # The card holds what is left, not a whole packet, back
+        # The card keeps the remaining bytes, which do not fill a packet
         pulse_time += late_s if end + 1 == raw.size else 0.0
         lines.append(f"{k + first_sequence},{end + 1 - start},{pulse_time:.6f}")
     log.write_text("\n".join(lines))

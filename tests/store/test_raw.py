@@ -13,7 +13,7 @@ import pytest
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
 from tests.support.scenes import small_scene
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import FaultyDisk
 from tests.support.store.plain_scan import errors
 
@@ -85,7 +85,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     products = contents(scan / "products")
     # Arrivals and gaps stay, where there were any
     assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)
-    facts = facts_of(scan, "raw_dropped")
+    facts = load_facts(scan, "raw_dropped")
     assert [f["row"] for f in facts] == list(range(ROWS))
     said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
     assert said == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
@@ -142,7 +142,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
         with refused(code, named):
             drop_raw(scan, None, yes=True)
     assert payloads(scan) == state_before
-    assert not facts_of(scan, "raw_dropped")
+    assert not load_facts(scan, "raw_dropped")
 
 
 def flip(path: Path, row: int) -> None:
@@ -195,7 +195,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     with refused(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
     assert payloads(scan) == state_before
-    assert not facts_of(scan, "raw_dropped")
+    assert not load_facts(scan, "raw_dropped")
 
 
 def test_only_rows_in_the_products_are_dropped(scan):
@@ -261,7 +261,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
     drop(ScanFolder.load(scan), digests, scan / "products")
     assert not payloads(scan)
     assert errors(scan) == []
-    assert [f["row"] for f in facts_of(scan, "raw_dropped")] == list(range(ROWS))
+    assert [f["row"] for f in load_facts(scan, "raw_dropped")] == list(range(ROWS))
 
 
 def test_what_remains_is_on_the_disk_before_raw_data_is_deleted(scan):
@@ -289,7 +289,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
     drop(ScanFolder.load(copy), find_processed_digests(copy / "products"), copy / "products")
     raw = (copy / MANIFEST).read_bytes()
     line = raw.splitlines(keepends=True)[-1]
-    # The rows before the last are gone
+    # The rows before the last are deleted
     for name in ("0000.bin", "0001.bin", "0002.bin"):
         for board in ("RH", "RV"):
             (scan / "raw" / board / name).unlink()
@@ -302,7 +302,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
 def test_a_row_taken_again_is_there_again(scan):
     drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
     folder = ScanFolder.load(scan)
-    committed = facts_of(folder, "row_committed")[1]
+    committed = load_facts(folder, "row_committed")[1]
     with folder.writer() as writer:
         writer.append({**committed, "take": 2})
     folder.reload()

@@ -95,7 +95,7 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     assert [r.changed for r in replace_rows(scan)] == [False, False]
 
 
-# Who is killed closes nothing
+# A killed program does not close files
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("fault", ["killed within", "power cut", "worst power cut"])
 def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fault):
@@ -112,7 +112,7 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
         assert errors(scan.path) == [], counting.done[position - 1]
         replace_rows(scan)
         holds(scan, data, [(9 * 1456, 10 * 1456)])
-    # Files that nobody closed are this test's, not the next one's
+    # Unclosed files must be reported in this test, not in the next one
     gc.collect()
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.acquisition.fake_rig import small_instrument
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of, parse_fact
+from tests.support.store.facts import load_facts, parse_fact
 from tests.support.store.plain_scan import write_scan
 
 from polysight.store import manifest
@@ -112,7 +112,7 @@ def test_whole_scan_is_valid_and_reads_back(whole_scan):
 
 def test_last_take_wins(whole_scan):
     scan = ScanFolder.load(whole_scan)
-    fact = facts_of(scan, "row_committed")[2]
+    fact = load_facts(scan, "row_committed")[2]
     with scan.writer() as writer:
         writer.append({**fact, "take": 7})
     scan.reload()
@@ -170,7 +170,7 @@ def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed
 )
 def test_validate_compares_with_the_plan(whole_scan, change, what):
     scan = ScanFolder.load(whole_scan)
-    fact = facts_of(scan, "row_committed")[0]
+    fact = load_facts(scan, "row_committed")[0]
     with scan.writer() as writer:
         writer.append({**fact, **change})
     assert any(what in f.what for f in validate(whole_scan) if f.level == "error")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.plain_scan import errors
 from tests.support.store.small_scan import Samples, SmallScan
@@ -130,5 +130,5 @@ def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_pat
         disk.free_space()
         writer.append({"fact": "scan_resumed"})
     folder.reload()
-    assert facts_of(folder)[-1] == {"fact": "scan_resumed"}
-    assert len(facts_of(folder)) == len(raw.splitlines()) + 1
+    assert load_facts(folder)[-1] == {"fact": "scan_resumed"}
+    assert len(load_facts(folder)) == len(raw.splitlines()) + 1

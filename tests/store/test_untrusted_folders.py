@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 from polysight.calibration import calibration_of_scan
 from polysight.capture import read_index, read_packets
@@ -46,7 +46,7 @@ def scan(undisturbed_scan, tmp_path) -> ScanFolder:
 
 def committed_as(scan: ScanFolder, file: str) -> None:
     """Commit the first row once more, with its first board's payload in this file."""
-    fact = next(f for f in facts_of(scan, "row_committed") if f["row"] == 0)
+    fact = next(f for f in load_facts(scan, "row_committed") if f["row"] == 0)
     name = next(iter(fact["boards"]))
     boards = {**fact["boards"], name: {**fact["boards"][name], "file": file}}
     with scan.writer() as writer:
@@ -223,7 +223,7 @@ def test_calibration_outside_the_scan_is_not_read(scan, file):
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
-    rig = facts_of(scan)[0]["instrument"]
+    rig = load_facts(scan)[0]["instrument"]
     with refused(ErrorCode.PATH_OUTSIDE):
         calibration_of_scan(
             ScanFolder.load(

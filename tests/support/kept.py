@@ -1,6 +1,6 @@
 """Figures that change only on purpose: a file beside a test keeps them, and the test compares.
 
-They are no truth, and say nothing about what is right: laws do that. They notice a change of what no law mentions. To
+They are not a truth, and do not show what is right: laws do that. They show changes that no law mentions. To
 accept new ones, remove the file, run the test, which writes it again and fails once, and read the difference.
 """
 

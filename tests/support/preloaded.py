@@ -53,11 +53,11 @@ WORKER = "worker"
 KILLED_AT = str(Path(__file__).with_name("killed_at.py"))
 STARTING_OTHERS = ("polysight_simulators.rig", "polysight_simulators", WORKER)
 COMMANDS_STARTING_OTHERS = frozenset({"demo", "doctor", "process", "resume", "scan", "serve"})
-# Variables that only a new process takes notice of.
+# Variables that affect only a new process.
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
 # Descriptors below are the program's; above are those on their way to it.
 FIRST_SPARE = 700
-# Length of the server's own command line, over which a program's words are written.
+# Length of the server's own command line, over which a program's arguments are written.
 ROOM_FOR_WORDS = 8000
 # <linux/prctl.h>
 PR_SET_CHILD_SUBREAPER = 36
@@ -236,7 +236,7 @@ def serve(connection: socket.socket) -> list[str]:
         try:
             message, files, _, _ = socket.recv_fds(connection, 1 << 20, 64)
         except ConnectionResetError:
-            # Who asked was killed before it had read the last answer.
+            # The asking process was killed before it had read the last answer.
             os._exit(0)
         if not message:
             os._exit(0)
@@ -249,7 +249,7 @@ def serve(connection: socket.socket) -> list[str]:
             answer = near.recv(32)
             # From the end of the middle process on, the program's parent is the process that asked.
             os.waitpid(middle, 0)
-            # Who asked may have been killed meanwhile: there is no further request then.
+            # The asking process may have been killed meanwhile: then there is no further request.
             with suppress(BrokenPipeError):
                 connection.send(answer)
             near.close()

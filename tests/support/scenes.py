@@ -33,7 +33,7 @@ def small_scene(
     return tomli_w.dumps(scene)
 
 
-def scene_of(
+def make_scene(
     *plates: dict[str, Any],
     columns: int,
     rows: int,

@@ -82,7 +82,7 @@ def worker_group(node_id: str) -> str:
     return room if room in ROOMS else TOGETHER.get(file, file)
 
 
-def longest_first(items: list[pytest.Item]) -> None:
+def sort_longest_first(items: list[pytest.Item]) -> None:
     """Sort tests in place: those of the longest files first, the others in the old order."""
     place = {file: n for n, file in enumerate(FIRST)}
     items.sort(key=lambda item: place.get(worker_group(item.nodeid), len(place)))
@@ -100,7 +100,7 @@ class ByFile(LoadScopeScheduling):
         super().schedule()
 
 
-def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Folder `name` of this run. The first worker that needs it fills it by `make`; tests must not change it."""
     base = factory.getbasetemp()
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
@@ -129,7 +129,7 @@ class ProcessTimes:
     """
 
     def __init__(self) -> None:
-        # Process number and time of start (numbers are given again), with the parent's number and ticks until now
+        # Process number and time of start (numbers are reused), with the parent's number and ticks until now
         self._followed: dict[tuple[int, str], tuple[int, int]] = {}
         self._orphans_ticks = 0
 

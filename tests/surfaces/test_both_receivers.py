@@ -40,7 +40,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[Seen, Shape]:
     patch = solid.evaluate(*find_specular(solid, *antennas))
     points = patch.point.T
     normals = patch.normal.T
-    # Tangents of the world as columns, and what turns the estimator's into them.
+    # Tangents of the world as columns, and the rotation of the estimator's to them.
     own_tangents = np.einsum("ijn,jcn->nci", patch.tangents(), np.array([patch.d_a, patch.d_b]))
     turned = np.swapaxes(tangents(normals), 1, 2) @ own_tangents
     curvature = turned @ np.moveaxis(patch.curvature(), -1, 0) @ np.swapaxes(turned, 1, 2)
@@ -98,7 +98,9 @@ def find_pattern(antenna: Antenna, points: np.ndarray, at_m: np.ndarray) -> np.n
 @pytest.mark.parametrize("axis", [None, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)], ids=["sphere", "upright", "level"])
 def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
     """Beyond the first order, with known gains. The error was once stated twice as large, and in any direction."""
-    x, y, z = CENTRE_M[0], CENTRE_M[1], 0.5
+    x = CENTRE_M[0]
+    y = CENTRE_M[1]
+    z = 0.5
     solid: WorldShape = sphere("solid", Stack(below=medium), (x, y, z + 0.1), 0.1)
     if axis is not None:
         solid = cylinder("solid", Stack(below=medium), (x, y, z + 0.15), 0.15, 4.0, axis=axis)

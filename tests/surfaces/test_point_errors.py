@@ -184,5 +184,5 @@ def test_noise_of_the_points_of_a_reference_is_no_property_of_its_gains(wave, le
     metal = replace(metal, b=-gain * (1 + 0.003 * noise), std=np.full((len(at_m), 2), 0.003), arrival=0.8 * at_m)
     gains = learn_gains(metal, WAVE_NUMBER)
     assert least <= gains.std < most
-    # Both move what the polynomials say.
+    # Both change the values of the polynomials.
     assert np.linalg.norm(gains.terms_root) > 0

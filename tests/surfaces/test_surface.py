@@ -29,7 +29,7 @@ from polysight_worlds.media import Stack
 from polysight_worlds.shape_scenes import ShapeScene
 from polysight_worlds.shapes import cylinder, sphere
 
-# A rig that stands as its file says: what is left are noise and the method's own errors.
+# A rig that stands as its file says: only noise and the method's own errors remain.
 EXACT = Uncertainty(leakage=1e-4, axis_rad=1e-4, place_m=1e-6)
 CENTRE_M = (-0.01, 0.104, 0.5)
 

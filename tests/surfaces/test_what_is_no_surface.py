@@ -185,7 +185,7 @@ def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(met
     assert find_depth_behind(*add_echo(0.02), 1) is None
     assert find_depth_behind(*add_echo(0.2, shift_m=0.5), 1) is None
 
-    # It seems to be of a small ball: that its shape is reliable would be wrong.
+    # It looks like an echo of a small ball, so its shape must not count as reliable.
     echoes, shape = add_echo(0.2)
     front, echo = (describe_segment(number, shape[echoes.segment == number]) for number in (0, 1))
     echo = replace(echo, radius_mm=18.0, reason="radius 18 mm: below 40 mm only the shape is reliable")

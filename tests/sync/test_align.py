@@ -18,7 +18,8 @@ def burst(paths, noise, rig, counts):
         rng = np.random.default_rng(seed)
         signal, _ = paths(rig.receivers[0], positions, echo, rng)
         n = np.arange(signal.shape[-1]) - CENTRE
-        df, phase = rng.uniform(-0.1, 0.1, (positions, chirps)), rng.uniform(-np.pi, np.pi, (positions, chirps))
+        df = rng.uniform(-0.1, 0.1, (positions, chirps))
+        phase = rng.uniform(-np.pi, np.pi, (positions, chirps))
         turn = np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))
         frames = signal[:, :, None] * turn[:, None]
         frames = frames + noise(frames.shape, -snr_db, rng)
@@ -106,7 +107,8 @@ def test_a_common_frequency_and_phase_of_all_chirps_has_no_other_effect(burst, c
     received = (frames[..., 0, :] + 1j * frames[..., 1, :]).transpose(3, 0, 1, 2) / 1000
     shifted = counts(received * np.exp(1j * (2 * np.pi * 0.07 * n + 1.0)))
     valid = np.ones(df.shape, bool)
-    result, shifted_result = align_row(frames, valid, LINEAR), align_row(shifted, valid, LINEAR)
+    result = align_row(frames, valid, LINEAR)
+    shifted_result = align_row(shifted, valid, LINEAR)
     relative = [a.frequency - a.frequency.mean(axis=1, keepdims=True) for a in (result, shifted_result)]
     np.testing.assert_allclose(*relative, atol=1e-5)
     # Within a hundredth of the direct path.

@@ -20,7 +20,8 @@ def echoes(rig):
         radar = SimulatedRig(rig, decode_scene(raw, "t").with_disturbances(backlash_mm=backlash_mm))
         board = radar.rig.receivers[0]
         setup = BoardSetup.from_rig(radar.rig, board)
-        weights, out = object_filter(radar.rig, board, setup.path.sweep_hz), {}
+        weights = object_filter(radar.rig, board, setup.path.sweep_hz)
+        out = {}
         for row in plan_raster(radar.rig.grid):
             x, y = row_offsets_mm(radar, row)
             words = radar.chirps(board.name, x, y, row.index * len(x)).reshape(-1, 256, 2, 4)

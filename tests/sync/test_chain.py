@@ -14,7 +14,8 @@ from polysight.sync.loops import estimate_tone
 from polysight_shared.errors import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-POSITIONS, PULSES = 9, 6
+POSITIONS = 9
+PULSES = 6
 
 
 @pytest.fixture(scope="module")
@@ -100,12 +101,15 @@ def test_errors_shrink_from_received_to_averaged(row, setup):
 
 def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     """Object and direct path are the same at every position, so their scatter is the error."""
-    positions, snr_db, board = 400, 12.0, rig.receivers[1]
+    positions = 400
+    snr_db = 12.0
+    board = rig.receivers[1]
     signal, _ = paths(board, 1, 1.0, np.random.default_rng(8))
     rng = np.random.default_rng(3)
     shape = (positions, PULSES)
     n = np.arange(256)
-    df, phase = 0.35 + rng.uniform(-0.08, 0.08, shape), rng.uniform(-np.pi, np.pi, shape)
+    df = 0.35 + rng.uniform(-0.08, 0.08, shape)
+    phase = rng.uniform(-np.pi, np.pi, shape)
     frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
     frames = 800 * (frames + noise(frames.shape, -snr_db, rng))
     full_setup = replace(setup, examined=positions)
@@ -121,7 +125,8 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
 
 
 def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, noise, setup):
-    signal, rng = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))[0], np.random.default_rng(3)
+    signal = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))[0]
+    rng = np.random.default_rng(3)
     turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
     frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
     frames = (frames + 800 * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)

@@ -45,7 +45,8 @@ def loops(library_file, tmp_path_factory, request):
 
 def bursts(positions=5, chirps=6, samples=256, seed=4):
     """Noisy tones with a frequency and phase per chirp: int16 [position, chirp, sample, 2, rx]."""
-    rng, n = np.random.default_rng(seed), np.arange(samples)[:, None]
+    rng = np.random.default_rng(seed)
+    n = np.arange(samples)[:, None]
     f = 0.2 + 0.02 * rng.standard_normal((positions, chirps, 1, 1))
     tones = np.exp(2j * np.pi * (f * n + rng.uniform(size=(positions, chirps, 1, 1)))) * np.exp(1j * np.arange(4))
     tones = tones * (1 + 0.6 * np.exp(0.12j * n)) + 0.2 * rng.standard_normal((positions, chirps, samples, 4))
@@ -94,7 +95,8 @@ def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, othe
 
 
 def test_a_row_in_pieces_is_the_same_row(loops):
-    words, valid = bursts(7), np.ones((7, 6), bool)
+    words = bursts(7)
+    valid = np.ones((7, 6), bool)
     valid[2:4, 1] = False
     memory = np.empty_like(words[:3])
 
@@ -120,7 +122,8 @@ def test_pieces_that_are_not_the_row_are_refused(loops, positions):
 @pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
 @pytest.mark.parametrize("filtered", [True, False])
 def test_any_linear_part(loops, rig, linear, filtered):
-    words, valid = bursts(), np.ones((5, 6), bool)
+    words = bursts()
+    valid = np.ones((5, 6), bool)
     equaliser = make_equaliser(rig) if filtered else None
     assert_equal_rows(
         align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser)
@@ -130,7 +133,8 @@ def test_any_linear_part(loops, rig, linear, filtered):
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
 def test_any_number_of_samples(loops, rig, samples, linear):
     """The law holds also if samples do not fill whole vectors or blocks."""
-    words, valid = bursts(samples=samples), np.ones((5, 6), bool)
+    words = bursts(samples=samples)
+    valid = np.ones((5, 6), bool)
     equaliser = make_equaliser(rig)
     assert_equal_rows(
         align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser)
@@ -140,7 +144,8 @@ def test_any_number_of_samples(loops, rig, samples, linear):
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
 def test_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed together; a single one has no reference."""
-    words, valid = bursts(positions=3, chirps=chirps), np.ones((3, chirps), bool)
+    words = bursts(positions=3, chirps=chirps)
+    valid = np.ones((3, chirps), bool)
     equaliser = make_equaliser(rig)
     assert_equal_rows(
         align(loops.align, words, valid, (0, 192), equaliser),
@@ -149,11 +154,13 @@ def test_any_number_of_chirps(loops, rig, chirps):
 
 
 def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
-    words, valid = bursts(positions=7, chirps=8), np.ones((7, 8), bool)
+    words = bursts(positions=7, chirps=8)
+    valid = np.ones((7, 8), bool)
     valid[0, :3] = False
     valid[1] = False
     words[2, 4] = 0
-    words[3, 2, 100, 1, 3], words[3, 5, 7, 0, 0] = 32767, -32768
+    words[3, 2, 100, 1, 3] = 32767
+    words[3, 5, 7, 0, 0] = -32768
     rng = np.random.default_rng(3)
     words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other chirp, so another reference is tried
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
@@ -170,7 +177,8 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
 
 @pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
 def test_any_filter(loops, mode):
-    words, valid = bursts(), np.ones((5, 6), bool)
+    words = bursts()
+    valid = np.ones((5, 6), bool)
     for corners in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
         equaliser = Equaliser(HighPass(corners), 10e6, mode == "complex2x", 4, 3 / 192)
         assert_equal_rows(
@@ -180,14 +188,16 @@ def test_any_filter(loops, mode):
 
 
 def test_words_in_another_order_in_memory(loops):
-    words, valid = bursts()[:, :, :, ::-1], np.ones((5, 6), bool)
+    words = bursts()[:, :, :, ::-1]
+    valid = np.ones((5, 6), bool)
     assert not words.flags.c_contiguous
     assert_equal_rows(align(loops.align, words, valid, (0, 192)), align(align_in_numpy, words, valid, (0, 192)))
 
 
 def test_any_number_of_positions_and_none(loops):
     for positions in (0, 1, 17):
-        words, valid = bursts(positions=positions), np.ones((positions, 6), bool)
+        words = bursts(positions=positions)
+        valid = np.ones((positions, 6), bool)
         result = align(loops.align, words, valid, (0, 192))
         assert result.halves.shape == (positions, 2, 4, 48)
         if positions:
@@ -196,11 +206,13 @@ def test_any_number_of_positions_and_none(loops):
 
 def test_the_direct_path(loops, rig, paths, noise, counts):
     """A row with missing positions, noise only, and positions where the second peak is the direct path."""
-    board, rng = rig.receivers[0], np.random.default_rng(5)
+    board = rig.receivers[0]
+    rng = np.random.default_rng(5)
     ideal, _ = paths(board, 37, 1.5, rng)
     ideal[7] = 0
     frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
-    words, valid = counts(frames.transpose(2, 0, 1, 3)), np.ones((37, 4), bool)
+    words = counts(frames.transpose(2, 0, 1, 3))
+    valid = np.ones((37, 4), bool)
     valid[11] = False
     aligned = align(align_in_numpy, words, valid, rig.chirp.linear_samples, make_equaliser(rig))
     path = prepare(rig, board)

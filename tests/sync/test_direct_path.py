@@ -35,8 +35,10 @@ def run(rig, paths, noise, direct_paths, align_single):
         pure, _ = paths(board, positions, 0.0, rng)
         signal = signal + (direct - 1) * pure
         signal *= ((1 + gain * rng.standard_normal(4)) * np.exp(1j * gain * rng.standard_normal(4)))[:, None]
-        n, rate = np.arange(rig.chirp.samples), rig.chirp.sample_rate_hz
-        df, phase = rng.uniform(0.1, 0.8, positions), rng.uniform(-np.pi, np.pi, positions)
+        n = np.arange(rig.chirp.samples)
+        rate = rig.chirp.sample_rate_hz
+        df = rng.uniform(0.1, 0.8, positions)
+        phase = rng.uniform(-np.pi, np.pi, positions)
         cycles = df[:, None] * (n - CENTRE) + 0.5 * drift_hz / rate / 192 * (n - CENTRE) ** 2
         signal *= np.exp(1j * (2 * np.pi * cycles + phase[:, None]))[:, None]
         if snr_db is not None:
@@ -100,8 +102,10 @@ def test_the_object_3_to_4_bins_away_does_not_bias_it(run, board, echo, echoes):
 @pytest.mark.parametrize(("z_mm", "bins"), [(400, 2.35), (499, 3.56), (620, 5.30)])
 def test_the_bias_is_small_for_every_object_distance(rig, align_single, board, z_mm, bins):
     rig = msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=z_mm))
-    rng, n = np.random.default_rng(1), 300
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    rng = np.random.default_rng(1)
+    n = 300
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     direct = np.linalg.norm(rx - tx, axis=1)
     v = np.add(specular_midpoint_m(rig, board), np.column_stack([rng.uniform(-0.05, 0.05, (n, 2)), np.zeros(n)]))
     d = np.linalg.norm(v - tx, axis=1)[:, None] + np.linalg.norm(v[:, None] - rx, axis=2)
@@ -135,8 +139,10 @@ def test_clutter_behind_the_object_hardly_moves_it_and_costs_little_noise(board,
 
 
 def test_clutter_half_as_strong_0_9_m_behind_it_leaves_its_phase(rig, align_single, board, direct_paths):
-    rng, n = np.random.default_rng(8), 300
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    rng = np.random.default_rng(8)
+    n = 300
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     direct = np.linalg.norm(rx - tx, axis=1)
     clutter = direct + 0.9 + rng.uniform(-0.04, 0.04, (n, 1))
     f = (rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(256)) / SPEED_OF_LIGHT_M_S
@@ -160,7 +166,8 @@ def test_unequal_receivers_do_not_bias_it_much(run, board):
 
 def test_noise_is_near_the_cramer_rao_bound(run, board):
     referenced, f, phase = run(board, snr_db=16, positions=600)
-    power, n = 10**-1.6, 192
+    power = 10**-1.6
+    n = 192
     f_bound = np.sqrt(power / 2 / (4 * n * (n**2 - 1) / 12)) / 2 / np.pi * 2.15e6
     assert referenced.found.all()
     assert f.std() < 1.2 * f_bound
@@ -169,8 +176,10 @@ def test_noise_is_near_the_cramer_rao_bound(run, board):
 
 def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig, noise, align_single, board):
     near = msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=412.0))
-    rng, trials = np.random.default_rng(4), 1500
-    tx, rx = np.array(tx_position_m(near)), np.array(rx_positions_m(near, board))
+    rng = np.random.default_rng(4)
+    trials = 1500
+    tx = np.array(tx_position_m(near))
+    rx = np.array(rx_positions_m(near, board))
     v = np.array(specular_midpoint_m(near, board))
     direct = np.linalg.norm(rx - tx, axis=1)
     echo = np.linalg.norm(v - tx) + np.linalg.norm(v - rx, axis=1)
@@ -220,7 +229,8 @@ def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths,
     rng = np.random.default_rng(3)
     only_direct, length = paths(board, 1, 0.0, rng)
     v = np.add(specular_midpoint_m(rig, board), (0.02, -0.03, 0))
-    tx, rx = np.array(tx_position_m(rig)), np.array(rx_positions_m(rig, board))
+    tx = np.array(tx_position_m(rig))
+    rx = np.array(rx_positions_m(rig, board))
     excess = np.linalg.norm(v - tx) + np.linalg.norm(v - rx, axis=1) - length
     f = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * np.arange(256)
     echo = 0.8 * np.exp(2j * np.pi * f * (excess + length)[:, None] / SPEED_OF_LIGHT_M_S)
@@ -252,7 +262,8 @@ def test_of_two_tones_that_look_like_direct_path_and_object_the_one_with_the_row
     rig, paths, noise, direct_paths, align_single, board, loop
 ):
     """A tone as far below the direct path as the object lies above it: in most positions the second search finds it."""
-    rng, path = np.random.default_rng(4), direct_paths[board.name]
+    rng = np.random.default_rng(4)
+    path = direct_paths[board.name]
     signal, _ = paths(board, 60, 0.0, rng)
     signal += noise(signal.shape, -20, rng)
     below = np.mean(path.object_bins) / (256 * 4)

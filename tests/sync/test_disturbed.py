@@ -7,7 +7,8 @@ from polysight.sync import BoardSetup, align_row, loops as sync_loops, synchroni
 from polysight.sync.offsets import align_in_numpy, align_pieces
 
 LINEAR = (0, 192)
-POSITIONS, CHIRPS = 10, 16
+POSITIONS = 10
+CHIRPS = 16
 COUNTS = 1000
 
 
@@ -46,7 +47,8 @@ def receive_bursts(paths, noise, rig):
 
 def cross(frames, chosen, level, rng, samples=40):
     """Add another radar's chirp, which crosses the band of the signal within some samples of the chosen chirps."""
-    out, n = frames.copy(), np.arange(samples) - samples / 2
+    out = frames.copy()
+    n = np.arange(samples) - samples / 2
     for position, chirp in np.argwhere(chosen):
         first = rng.integers(0, LINEAR[1] - samples)
         turns = 0.35 * n + n**2 / samples * rng.uniform(0.15, 0.45) + rng.uniform(size=(4, 1))
@@ -69,7 +71,8 @@ def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, rece
     rng = np.random.default_rng(count)
     chosen = choose(count, rng)
     words = make_words(counts, cross(receive_bursts(), chosen, level, rng))
-    aligned, expected = align(words), align(words, ~chosen)
+    aligned = align(words)
+    expected = align(words, ~chosen)
     np.testing.assert_array_equal(aligned.good, ~chosen)
     np.testing.assert_array_equal(aligned.halves, expected.halves)
     assert not aligned.clipped.any()
@@ -97,7 +100,8 @@ def test_no_chirp_of_an_undisturbed_burst_is_left_out(align, receive_bursts, cou
 def test_motion_in_a_burst_is_no_disturbance(align, receive_bursts, counts, travel_mm):
     """The echo of a plate aside turns by its change of path, up to 1.6 times the travel."""
     moved = np.linspace(-0.5, 0.5, CHIRPS)[:, None, None] * 1.6 * travel_mm / 3.85
-    direct, disturbed = receive_bursts(60.0, seed=3, echo=0.0), receive_bursts(60.0, seed=3)
+    direct = receive_bursts(60.0, seed=3, echo=0.0)
+    disturbed = receive_bursts(60.0, seed=3)
     frames = direct + (disturbed - direct) * np.exp(2j * np.pi * moved)
     assert align(make_words(counts, frames)).good.all()
 
@@ -123,7 +127,8 @@ def test_clipped_chirps_among_others_are_left_out(align, receive_bursts, counts)
     words = make_words(counts, 2.5 * receive_bursts(20.0))
     loud = clip(4 * words, 7000)
     words = np.where(chosen[..., None, None, None], loud, words)
-    aligned, expected = align(words), align(words, ~chosen)
+    aligned = align(words)
+    expected = align(words, ~chosen)
     np.testing.assert_array_equal(aligned.clipped, chosen)
     np.testing.assert_array_equal(aligned.good, ~chosen)
     np.testing.assert_array_equal(aligned.halves, expected.halves)

@@ -44,7 +44,8 @@ def test_three_taps_are_the_inverse_over_the_signals_band(rig, mode, if_hz, wors
     if mode == "complex1x" and if_hz < 0:
         if_hz += rig.chirp.sample_rate_hz  # complex 1x has no negative IF: this is 1.45 MHz
     chirp = msgspec.structs.replace(rig.chirp, if_mode=mode)
-    model, rate = high_pass(chirp), chirp.sample_rate_hz
+    model = high_pass(chirp)
+    rate = chirp.sample_rate_hz
     if mode == "complex2x" and if_hz > rate / 2:
         if_hz -= rate
     taps = Equaliser.from_model(model, chirp, 4).taps(np.array([if_hz / rate]))[0]
@@ -54,8 +55,11 @@ def test_three_taps_are_the_inverse_over_the_signals_band(rig, mode, if_hz, wors
 
 
 def test_two_tones_are_restored_up_to_the_ends_of_the_record(rig):
-    model, chirp = high_pass(rig.chirp), rig.chirp
-    n, step, centre = np.arange(48), 4 / chirp.sample_rate_hz, 500e3
+    model = high_pass(rig.chirp)
+    chirp = rig.chirp
+    n = np.arange(48)
+    step = 4 / chirp.sample_rate_hz
+    centre = 500e3
     tones = np.array([-15e3, 17e3])
     clean = np.exp(2j * np.pi * np.outer(tones, n * step)).sum(axis=0)
     weak = (model.response(centre + tones)[:, None] * np.exp(2j * np.pi * np.outer(tones, n * step))).sum(axis=0)

@@ -18,13 +18,16 @@ def test_a_clean_tone_is_recovered(frequency, phase, n):
 @pytest.mark.parametrize("snr_db", [7, 16, 22, 30])
 def test_error_is_at_the_cramer_rao_bound(noise, snr_db):
     # Rife and Boorstyn 1974: var(w) = sigma^2 / (2 A^2 sum (n - mean)^2), var(central phase) = sigma^2 / (2 A^2 N).
-    rng, n, trials = np.random.default_rng(1), 192, 20_000
+    rng = np.random.default_rng(1)
+    n = 192
+    trials = 20_000
     f = rng.uniform(-0.49, 0.49, trials)
     t = np.arange(n) - (n - 1) / 2
     z = np.exp(2j * np.pi * f[:, None] * t) + noise((trials, n), -snr_db, rng)
     tone = estimate_tone(z.astype(np.complex64))
     power = 10 ** (-snr_db / 10)
-    w_bound, phase_bound = np.sqrt(power / 2 / (t**2).sum()), np.sqrt(power / 2 / n)
+    w_bound = np.sqrt(power / 2 / (t**2).sum())
+    phase_bound = np.sqrt(power / 2 / n)
     assert 0.97 < (tone.frequency - f).std() * 2 * np.pi / w_bound < 1.05
     assert 0.97 < np.angle(tone.amplitude).std() / phase_bound < 1.05
 
@@ -43,7 +46,8 @@ def test_cis_is_on_the_unit_circle_at_its_angle(angle):
 
 
 def test_phasor_is_the_exponential():
-    f, p = np.array([0.3, -0.41]), np.array([1.0, -2.0])
+    f = np.array([0.3, -0.41])
+    p = np.array([1.0, -2.0])
     n = np.arange(250)
     np.testing.assert_allclose(
         phasor(f, p, 250, 95.5), np.exp(1j * (2 * np.pi * f[:, None] * (n - 95.5) + p[:, None])), atol=1e-6

@@ -87,7 +87,7 @@ def home(host: HostSide) -> int:
     raise AssertionError(host.ask(m.Status()))
 
 
-def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
+def run_one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     """Home, run the row, end the Pi's program; return its events."""
     rig = load_instrument(config)
     python = [sys.executable, "-m"]
@@ -97,7 +97,7 @@ def one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
     host.must_accept(host.begin())
     homings = home(host)
-    # What came before the row does not count
+    # Earlier events are not part of the row
     list(chip.changes())
     host.must_accept(m.RunRow(scan_id="scan", row_index=0, take=1))
     finished = host.wait(m.RowFinished, limit_s=LIMIT_S)
@@ -129,7 +129,7 @@ def main() -> None:
     listener.bind(str(WIRES))
     listener.listen()
     wire = TriggerWire(listener, chip)
-    result = one_row(config, chip)
+    result = run_one_row(config, chip)
     result["late_ns"] = wire.late_ns
     changes: list[Change] = list(chip.changes())
     result["changes"] = [[c.t_ns, c.line, c.value] for c in changes]

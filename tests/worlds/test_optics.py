@@ -87,7 +87,7 @@ def test_a_cylinder_reflects_more_than_a_sphere_of_its_radius():
     antenna = looking(np.array([0.0, 0, -1.0]), np.zeros(3))
     cylinder = ellipsoid(np.zeros(3), [0.05, 1e3, 0.05], 0.001, half_widths=[0.05, 0.12])
     received = abs(scatter(antenna, antenna, cylinder, METAL, [FREQUENCY_HZ])[0, 0])
-    # Along its axis the cylinder is a mirror: the wave spreads as if it went on by the same distance.
+    # Along its axis the cylinder is a mirror: the wave spreads as if it continued by the same distance.
     distance_m = 0.95
     focus_m = 1 / (1 / distance_m + 2 / 0.05)
     assert received == pytest.approx(np.sqrt(focus_m / (focus_m + distance_m) / 2) / distance_m, rel=0.1)

@@ -76,7 +76,7 @@ def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
     assert series.scatter_cylinder(back, 0.05, permittivity, FREQUENCY_HZ, path_m) == pytest.approx(exchanged, rel=1e-9)
 
 
-# What creeps around metal is not part of a smooth integrand.
+# Creeping waves around metal are not part of a smooth integrand.
 @pytest.mark.parametrize(("permittivity", "tolerance"), [(None, 0.01), (4 - 0.4j, 0.005)])
 @pytest.mark.parametrize("places", [((-0.25, 0.3, -0.5), (0.3, -0.2, -0.5)), ((-0.4, 0.05, -0.4), (0.4, -0.05, -0.4))])
 @pytest.mark.parametrize(("sent", "received"), [(S_AXIS, S_AXIS), (P_AXIS, P_AXIS), (S_AXIS, P_AXIS)])
@@ -143,7 +143,7 @@ def test_what_physical_optics_misses_is_found_from_the_series():
             arguments = shape, boards.tx, rx, np.array([FREQUENCY_HZ]), offsets, places
             exact = choose_solution(shape)(*arguments)
             ratios.append([optics(*arguments) / exact for optics in (sum_window, sum_bent)])
-        # Only H over V counts: what both have in common is antennas and spreading.
+        # Only H over V counts: antennas and spreading are common to both.
         without, with_bends = np.array(ratios[0]) / np.array(ratios[1])
         missed.append(np.abs(without - 1).max())
         residuals.append(np.abs(with_bends - 1).max())

@@ -44,7 +44,7 @@ class FakeCard:
         self.short: dict[tuple[int, int], int] = {}
         # Pulses that the radar missed, for rows that are sent frame by frame.
         self.missed: dict[tuple[int, int], set[int]] = {}
-        # Before this pulse the radar takes an edge that nobody sent for a pulse: all later frames come one too early.
+        # Before this pulse the radar takes a spurious edge for a pulse: all later frames come one too early.
         self.extra: dict[tuple[int, int], int] = {}
         # Of rows that are sent frame by frame: bytes of the record so far, and when they would arrive.
         self.arrivals_ns: dict[int, int] = {}

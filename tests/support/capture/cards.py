@@ -15,7 +15,7 @@ from polysight_simulators.faults import Faults
 from tests.support.processes import HANG_S
 
 LIMIT_S = 60.0
-# What a radar that streams sends in one turn of the thread, some 5 MB/s in all.
+# Bytes that a streaming radar sends in one turn of the thread, about 5 MB/s in all.
 FRAMES = np.arange(8192, dtype="<u4").view(np.uint8)
 # A card with more bytes unsent gets none for a while.
 MAX_QUEUED_BYTES = 1 << 20

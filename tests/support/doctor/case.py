@@ -11,7 +11,7 @@ from polysight.sync import BoardSetup
 from polysight_simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import programmed_rig
 
-# A computer whose disk and receivers are fast enough, measured without measuring.
+# A computer whose disk and receivers count as fast enough, without a measurement.
 QUICK = System(
     write_speed=lambda _folder: 200e6,
     measure_receivers=lambda _rig, rates: ([LoadResult(r, r, 9, 0) for r in rates], "any core"),

@@ -15,9 +15,9 @@ from tests.support.page.live_view import GrowingScan
 from tests.support.processes import wait_for
 from tests.support.products import skip_rendering
 from tests.support.rigs import published_rig
-from tests.support.scenes import COPPER, PET, scene_of
+from tests.support.scenes import COPPER, PET, make_scene
 from tests.support.store.small_scan import Samples, SmallScan
-from tests.support.suite import made_once
+from tests.support.suite import make_once
 
 
 @pytest.fixture(scope="session")
@@ -63,7 +63,7 @@ def watching() -> Iterator[Callable[..., Watched]]:
 @pytest.fixture(scope="session")
 def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two processed scans, `one` and `two`, of copper and PET with other noise."""
-    scene = decode_scene(scene_of(COPPER, PET, columns=15, rows=17), "test")
+    scene = decode_scene(make_scene(COPPER, PET, columns=15, rows=17), "test")
 
     def make(root: Path) -> None:
         for name, seed in (("one", 3), ("two", 7)):
@@ -71,4 +71,4 @@ def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
             with skip_rendering():
                 assert process(folder, folder / "products", threads=1) == 0
 
-    return made_once(tmp_path_factory, "processed", make)
+    return make_once(tmp_path_factory, "processed", make)

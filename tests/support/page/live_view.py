@@ -19,7 +19,7 @@ from polysight.serve.site import Site, Watches
 from polysight.serve.stage import StageControl
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
 from tests.support.processes import HANG_S, wait_for
-from tests.support.store.facts import facts_of
+from tests.support.store.facts import load_facts
 
 
 def begin_history(started: dict[str, Any]) -> ScanHistory:
@@ -39,7 +39,7 @@ class GrowingScan:
     """A copy of a finished scan whose manifest and events are written line by line; `live` touches its `alive` file."""
 
     def __init__(self, finished: Path, folder: Path) -> None:
-        self._facts = facts_of(finished)
+        self._facts = load_facts(finished)
         self._events = (finished / EVENTS).read_bytes()
         self.path = folder
         folder.mkdir()

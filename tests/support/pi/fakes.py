@@ -31,7 +31,7 @@ class FakeDriver:
         self.x_mm = self.y_mm = 0.0
         self.firmware = "fake"
         self.number = 0
-        # It is its own link: what the machine asks of an open link, it asks of this.
+        # It is its own link: the machine calls the same methods on it as on an open link.
         self.link = self
 
     def connect(self) -> None: ...
@@ -368,7 +368,7 @@ class FakeStage:
         while self.stays_after == self.points:
             if self._stopping.wait(0.005):
                 return StageError.STOPPED
-        # It runs on and slows down.
+        # The stage passes the last point and slows down.
         if self._stopping.wait(2 * self.pace_s):
             return StageError.STOPPED
         self.x, self.y = self.row_end or _rest_after(c)
@@ -379,5 +379,5 @@ class FakeStage:
         if self.wire:
             edges = WireEdge(t_ns, self.trigger, 1), WireEdge(t_ns + 20_000, self.trigger, 0)
             self.wire.send(*edges, WireEdge(t_ns, MARK_LINE, 1))
-            # A wire has no delay: the edge has left the hub before the stage says another word.
+            # A wire has no delay: the edge has left the hub before the stage sends the next line.
             self.wire.receive(HANG_S)

@@ -123,7 +123,7 @@ class HostSide:
         replies: list[Any] = []
 
         def is_reached() -> bool:
-            # A program that gets no processor time refuses the question.
+            # A program without processor time refuses the request.
             replies.append(self.ask(m.Status()))
             return isinstance(replies[-1], m.StatusReply) and replies[-1].state in states
 

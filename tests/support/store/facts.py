@@ -7,7 +7,7 @@ from polysight.store import MANIFEST
 from polysight.store.manifest import decode_line, encode_line, parse
 
 
-def facts_of(scan: Any, kind: str = "") -> list[dict[str, Any]]:
+def load_facts(scan: Any, kind: str = "") -> list[dict[str, Any]]:
     """Return the valid facts of a scan (its folder, manifest, or a `ScanFolder`), of one kind or all, without chain."""
     path = Path(getattr(scan, "path", scan))
     lines = (path / MANIFEST if path.is_dir() else path).read_bytes().split(b"\n")

@@ -58,7 +58,7 @@ class FaultyDisk:
         self._random = random.Random(seed)
         # True once the program was killed; True once there is space again.
         self._dead = self._space = False
-        # What was done: operation and name of the file.
+        # Operations so far, with the name of the file.
         self.done: list[str] = []
         # Content of a touched file that is on the disk for certain.
         self._durable: dict[Path, bytes] = {}
@@ -137,7 +137,7 @@ class FaultyDisk:
                 patch.setattr(io, "open", self._opened)
                 yield self
         finally:
-            # `Killed` passes through here: now the power cut takes what was not synced.
+            # `Killed` passes through here: now the power cut destroys unsynced data.
             if self._dead and self._fault in ("power cut", "worst power cut"):
                 self.lose_power()
 
@@ -180,7 +180,7 @@ class FaultyDisk:
 
     def _fsync(self, fd: int) -> None:
         self._hit("fsync", _descriptor_path(fd))
-        self._sync(_descriptor_path(fd))  # not the real one: this machine's disk need not wait
+        self._sync(_descriptor_path(fd))  # not the real sync, which would only cost time
 
     def _mkdir(self, path: Any, *more: Any, **named: Any) -> None:
         self._hit("mkdir", Path(path))

@@ -72,7 +72,7 @@ class SmallPi:
         self.state: m.State = "ready"
         self.fault = ""
         self.gaps_filled = 0
-        # Always something to look at
+        # Data is always ready to be read
         self.event_socket = os.eventfd(1)
 
     def follow(self, scan_id: str, last_seq: int, on_event: Any) -> None:

@@ -13,10 +13,11 @@ from tests.support.refusals import refused
 
 from polysight import open_scan
 from polysight.cli.main import main
+from polysight.imaging import Images
 from polysight.jobs.batch import find_scans
 from polysight.materials import Labels
 from polysight.process import Inputs, analyse_given_images, read_given_images
-from polysight.products import ProcessedScan
+from polysight.products import ProcessedScan, write_image, write_json
 from polysight.settings import Settings
 from polysight_shared.errors import ErrorCode, PolysightError
 
@@ -297,3 +298,17 @@ def test_the_published_picture_has_nine_plates_and_copper_is_the_reference(rig, 
     x0, y0, x1, y1 = boxes["copper"]
     row = 150 - (y0 + y1) / 2 if form == "labels" else (y0 + y1) / 2  # a folder has its top row first
     assert (metal.centre_x_mm, metal.centre_y_mm) == pytest.approx((x0 + x1 - 150, 2 * row - 150), abs=4)
+
+
+@pytest.mark.parametrize("beside", [True, False], ids=["beside scan.json", "alone"])
+def test_images_of_a_simulated_scan_stay_simulated(tmp_path, rig, pair, beside):
+    """Files of earlier states say it in scan.json only."""
+    name = "image.npz" if beside else "copy.npz"
+    axis_m = 0.002 * (np.arange(len(pair["h"])) - len(pair["h"]) / 2)
+    images = Images(pair["h"], pair["v"], axis_m, axis_m, np.ones(pair["h"].shape, bool), pair["h"] / pair["v"])
+    write_image(tmp_path / name, images, simulated=not beside)
+    if beside:
+        write_json(tmp_path / "scan.json", {"scan_id": "s", "simulated": True})
+    assert read_given_images(tmp_path / name, rig).simulated
+    write_image(tmp_path / "measured.npz", images)
+    assert not read_given_images(tmp_path / "measured.npz", rig).simulated

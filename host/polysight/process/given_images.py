@@ -32,12 +32,13 @@ from polysight.polarimetry import (
 from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
 from polysight.process.quality import scene_reasons
 from polysight.process.save import Findings, assemble_result
-from polysight.products import ProcessedScan
+from polysight.products import IMAGE, SCAN, ProcessedScan
 from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuality, join_reasons, reason
 from polysight.settings import Settings
 from polysight.store import open_npz, versions
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such
+from polysight_shared.files import read_json
 from polysight_shared.findings import Finding
 
 NPZ = ".npz"
@@ -155,7 +156,7 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     images = _sort_axes(h, v, valid, x_m, y_m)
     if "raised_m" in arrays:
         images = replace(images, raised_m=_find_raised(path, arrays, x_m, y_m))
-    simulated = bool(_number(path, arrays, "simulated") or False)
+    simulated = bool(_number(path, arrays, "simulated") or False) or _is_simulated_product(path)
     conjugate_flag = _number(path, arrays, "conjugate")
     # Only our own images hold the error of P.
     is_sign_known = conjugate_flag is not None or OWN_ERROR in arrays
@@ -177,6 +178,17 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
 def conjugate(images: Images) -> Images:
     """Return the images with the other sign of all phases."""
     return replace(images, h=images.h.conj(), v=images.v.conj())
+
+
+def _is_simulated_product(path: Path) -> bool:
+    """Return true for an image.npz of this program if the scan.json beside it says that its data is simulated."""
+    if path.name != IMAGE:
+        return False
+    try:
+        facts = read_json(path.with_name(SCAN))
+    except (OSError, ValueError, DataError):
+        return False
+    return isinstance(facts, dict) and facts.get("simulated") is True
 
 
 def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:

@@ -183,7 +183,7 @@ def _collect_facts(source: Scan, rig: Instrument, images: Images) -> ScanFacts:
 
 def save_images(out: Path, scan: products.ProcessedScan) -> None:
     """Write image.npz, scan.json and quality.json."""
-    products.write_image(out / products.IMAGE, scan.images)
+    products.write_image(out / products.IMAGE, scan.images, simulated=bool(scan.simulated))
     products.write_json(out / products.SCAN, scan.facts)
     products.write_json(out / products.QUALITY, scan.quality)
 

@@ -91,10 +91,10 @@ PixelNames = Mapping[int, tuple[npt.NDArray[np.str_], Mask]]
 _PRODUCTS = "products"
 
 
-def write_image(path: Path, images: Images) -> None:
+def write_image(path: Path, images: Images, simulated: bool = False) -> None:
     """Write image.npz: h, v, p complex64 [ny, nx], x_m, y_m float64, valid bool; row 0 is the smallest y.
 
-    `p_sigma` and `raised_m` float32 [ny, nx] are left out if they are None.
+    `p_sigma` and `raised_m` float32 [ny, nx] are left out if they are None, and `simulated` if it is false.
 
     Raises
     ------
@@ -111,6 +111,9 @@ def write_image(path: Path, images: Images) -> None:
         ) from None  # fmt: skip
     buffer = io.BytesIO()
     stored: dict[str, Any] = {name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()}
+    if simulated:
+        # Else images that are taken from here as given ones would be processed as measured ones.
+        stored["simulated"] = np.bool_(True)
     np.savez_compressed(buffer, **stored)
     write_atomically(path, buffer.getvalue())
 
@@ -331,15 +334,16 @@ class ProcessedScan:
         """Count the plates of the scene by their names, also those that were not found; None without truth or names.
 
         Only plates with a permittivity count: metal is the reference, not a result, and strips and stacks of layers
-        have none. What the library does not hold, and was called unknown, is neither right nor wrong.
+        have none; a scene without such plates has no count. What the library does not hold, and was called unknown, is
+        neither right nor wrong.
         """
-        if not self.plates or not any(patch.name for patch in self.segments):
+        plates = sum(plate.permittivity is not None for plate in self.plates)
+        if not plates or not any(patch.name for patch in self.segments):
             return None
         non_metal_patches = [patch for patch in self.segments if not patch.metal_reference]
         judged = [(patch.name, patch.truth) for patch in non_metal_patches if patch.truth and patch.truth.permittivity]
         right = sum(name == truth.name for name, truth in judged)
         strange = sum(name == UNKNOWN and not truth.in_library for name, truth in judged)
-        plates = sum(plate.permittivity is not None for plate in self.plates)
         return PlatesNamed(right, plates - strange, strange)
 
     @property

@@ -74,7 +74,8 @@ def read_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
         as `read_bounded`.
     """
     try:
-        return json.loads(read_bounded(path, max_bytes).decode("utf-8"))
+        # Editors of Windows write a mark of the byte order first.
+        return json.loads(read_bounded(path, max_bytes).decode("utf-8-sig"))
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
@@ -90,11 +91,36 @@ def name_in_errors(path: Path) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def _name_instead(path: Path) -> Iterator[None]:
+    """Let an OSError of the block name this path, instead of a file that nobody asked for."""
+    try:
+        yield
+    except OSError as e:
+        e.filename = str(path)
+        e.filename2 = None
+        raise
+
+
+def _require_file_or_nothing(path: Path) -> None:
+    """Raise OSError if a folder, a device or a pipe has this path: a rename would fail, or remove it."""
+    if path.is_dir():
+        # ".", "/" and ".." are folders, too, and have no name that a file beside them could have.
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "is a device or a pipe; files are written here", str(path))
+
+
 def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
     """Open a file for writing. Raises OSError, also for a symbolic link, through which nothing is written."""
+    refuse_link(path)
+    return path.open(mode, buffering)
+
+
+def refuse_link(path: Path) -> None:
+    """Raise OSError for a symbolic link."""
     if path.is_symlink():
         raise OSError(errno.ELOOP, "it is a symbolic link; polysight does not write through links", str(path))
-    return path.open(mode, buffering)
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -112,24 +138,26 @@ def write_together(files: Mapping[Path, bytes]) -> None:
     Raises
     ------
     OSError
-        if one cannot be written; nothing has changed then. If one cannot be renamed, those before it are replaced.
+        if one cannot be written, or is no regular file; nothing has changed then. If one cannot be renamed, those
+        before it are replaced.
     DeviceError
         if a folder cannot be made durable; all files are replaced then.
     """
     parts: dict[Path, Path] = {}
     try:
         for path, data in files.items():
+            _require_file_or_nothing(path)
             # A name of its own: two programs may write the same file at the same time.
             part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
             with name_in_errors(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with part.open("xb") as f:
-                    parts[path] = part
-                    f.write(data)
-                    f.flush()
-                    os.fsync(f.fileno())
+            with _name_instead(path), part.open("xb") as f:
+                parts[path] = part
+                f.write(data)
+                f.flush()
+                os.fsync(f.fileno())
         for path, part in parts.items():
-            with name_in_errors(path):
+            with _name_instead(path):
                 part.replace(path)
     except BaseException:
         for part in parts.values():

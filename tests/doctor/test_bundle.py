@@ -8,12 +8,14 @@ import pytest
 import tomli_w
 import zmq
 from tests.support.rigs import rig_table
+from tests.support.store.faulty_disk import FaultyDisk
 from zmq.auth import create_certificates
 
 from polysight.cli.main import main
 from polysight.doctor.bundle import HIDDEN, Redactor, write_bundle
 from polysight.doctor.context import DoctorOptions, ok
 from polysight_shared.config import load_instrument
+from polysight_shared.errors import DeviceError
 
 TOKEN = "f00dfacef00dfacef00dfacef00dface"
 
@@ -139,3 +141,13 @@ def test_tokens_of_known_forms_are_removed_without_a_name() -> None:
 def test_other_text_is_kept() -> None:
     text = 'key_dir = "/home/lab/keys"\nkeyboard: none\nrows = 200'
     assert Redactor([])(text) == text
+
+
+def test_a_bundle_that_cannot_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:
+    """Also on a full disk: no half archive."""
+    file = tmp_path / "found.zip"
+    file.write_bytes(b"earlier")
+    with FaultyDisk(tmp_path, "short", 1)(), pytest.raises(DeviceError):
+        write_bundle(file, DoctorOptions(tmp_path / "instrument.toml"), None, [ok("fine")], "fine")
+    assert file.read_bytes() == b"earlier"
+    assert list(tmp_path.iterdir()) == [file]

@@ -5,6 +5,7 @@ docs/how-to/doctor.md and the archive's README.txt list its files. Each is text 
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import platform
@@ -21,7 +22,7 @@ from polysight.doctor.context import DoctorOptions, finding_to_json, read_interf
 from polysight.store import MANIFEST, utc_now, versions
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError, DeviceError
-from polysight_shared.files import open_to_write, read_bounded
+from polysight_shared.files import read_bounded, refuse_link, write_atomically
 from polysight_shared.findings import Finding
 
 README = """Findings of `polysight doctor --bundle`, {utc}.
@@ -108,10 +109,13 @@ def write_bundle(
     if rig is not None and rig.pi.key_dir:
         keys.append(Path(rig.pi.key_dir))
     redact = Redactor(keys)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in _collect_contents(options, rig, findings, text, root):
+            archive.writestr(name, redact(content))
     try:
-        with open_to_write(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, content in _collect_contents(options, rig, findings, text, root):
-                archive.writestr(name, redact(content))
+        refuse_link(path)
+        write_atomically(path, buffer.getvalue())
     except OSError as e:
         raise DeviceError(
             f"{path}: cannot be written: {e.strerror}", "the disk is full, or the path is wrong", "give another FILE"

@@ -6,6 +6,7 @@ the processing is loaded, so that these commands start without delay.
 
 from __future__ import annotations
 
+import io
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,7 +30,8 @@ from polysight.store import (
     validate,
 )
 from polysight_shared.config import load_instrument
-from polysight_shared.errors import DataError, ErrorCode, PolysightError, os_error
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
+from polysight_shared.files import write_atomically
 
 # Missing ranges that are printed: they fill about one line of a terminal.
 _MAX_RANGES = 8
@@ -179,7 +181,9 @@ def plot_profile(report: Report, path: Path) -> None:
     Raises
     ------
     DataError
-        when the recording holds no chirp, or the file cannot be written.
+        when the recording holds no chirp.
+    OSError
+        when the file cannot be written; nothing is there then.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -206,10 +210,9 @@ def plot_profile(report: Report, path: Path) -> None:
     axes.set_ylim(bottom=BOTTOM_DB)
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small", ncols=5)
-    try:
-        figure.savefig(path, format="png", dpi=120)
-    except OSError as e:
-        raise os_error(e) from None
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120)
+    write_atomically(path, buffer.getvalue())
 
 
 # --- placement of packets ---

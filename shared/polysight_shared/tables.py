@@ -38,16 +38,25 @@ def require(ok: bool, rule: str) -> None:
 def read_toml(path: Path) -> dict[str, Any]:
     """Parse a TOML file. Raises ConfigError if it is missing, unreadable or not TOML."""
     try:
-        return tomllib.loads(read_bounded(path, _MAX_BYTES).decode("utf-8"))
+        # Editors of Windows write a mark of the byte order first.
+        return tomllib.loads(read_bounded(path, _MAX_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         remedy = "give the path of a TOML file"
         raise ConfigError(f"{path}: no such file", "the path is wrong", remedy, code=ErrorCode.FILE_MISSING) from None
     except DataError as e:
         raise ConfigError(e.what, e.why, e.remedy, code=ErrorCode.FILE_UNREADABLE) from None
-    except (OSError, UnicodeDecodeError) as e:
+    except OSError as e:
         summary = f"{path}: cannot be read: {e}"
         cause = "it is not a readable text file"
         raise ConfigError(summary, cause, "check the path", code=ErrorCode.FILE_UNREADABLE) from None
+    except UnicodeDecodeError as e:
+        line = e.object[: e.start].count(b"\n") + 1
+        raise ConfigError(
+            f"{path}: line {line} is not text in UTF-8",
+            "it was saved in another encoding, such as Latin-1 or UTF-16, or it is no text file",
+            "save it as UTF-8 in the editor",
+            code=ErrorCode.FILE_UNREADABLE,
+        ) from None
     except (tomllib.TOMLDecodeError, RecursionError) as e:
         summary = f"{path}: not valid TOML: {e}"
         raise ConfigError(summary, "a typing error", "correct that line", code=ErrorCode.FILE_DAMAGED) from None

@@ -158,6 +158,7 @@ def test_a_missing_table_and_a_second_transmitter_are_refused():
         (None, ErrorCode.FILE_MISSING),
         (b"a = = 1", ErrorCode.FILE_DAMAGED),
         (b"\xff\xfe\x00", ErrorCode.FILE_UNREADABLE),
+        ("# M\xfcnchen".encode("latin-1"), ErrorCode.FILE_UNREADABLE),
     ],
 )
 def test_a_missing_file_bad_toml_and_binary_data_are_refused(tmp_path: Path, content: bytes | None, code: ErrorCode):
@@ -166,6 +167,21 @@ def test_a_missing_file_bad_toml_and_binary_data_are_refused(tmp_path: Path, con
         path.write_bytes(content)
     with refused(code, path):
         load_instrument(path)
+
+
+def test_a_file_in_another_encoding_is_told_so_with_its_line(tmp_path: Path):
+    path = tmp_path / "rig.toml"
+    path.write_bytes("a = 1\n# M\xfcnchen\n".encode("latin-1"))
+    with refused(ErrorCode.FILE_UNREADABLE, path, "line 2", "save it as UTF-8"):
+        read_toml(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_files_of_editors_of_windows_are_read(tmp_path: Path, encoding: str, end: str):
+    path = tmp_path / "rig.toml"
+    path.write_bytes(f"a = 1{end}b = 'ü'{end}".encode(encoding))
+    assert read_toml(path) == {"a": 1, "b": "ü"}
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,8 @@ PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [10.0, 10.0]}
         ),
         ({"name": "t", "plates": [{**PLATE, "permittivity": [0.5, 0.1]}]}, "permittivity"),
         ({"name": "t", "plates": [{**PLATE, "permittivity": [3.0, -0.1]}]}, "permittivity"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "name": " "}]}, "name"),
+        ({"name": "t", "plates": [{**PLATE, "metal": True, "name": "a\x1b[31m"}]}, "printable"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "thickness_mm": 1.0}]}, "thickness_mm"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "size_mm": [0.0, 1.0]}]}, "size_mm"),
         ({"name": "t", "plates": [{**PLATE, "metal": True, "tilt_deg": [30.0, 0.0]}]}, "tilt_deg"),

@@ -163,7 +163,8 @@ class Plate(_Table, frozen=True):
     rough_length_mm: Size = 6.0
 
     def __post_init__(self) -> None:
-        """Check what the types cannot: one kind of material, what goes with it, and the number of facets."""
+        """Check what the types cannot: a name, one kind of material, what goes with it, and the number of facets."""
+        _require(self.name.strip() != "" and self.name.isprintable(), "a plate has a name of printable characters")
         _require(self.strips_deg is None or self.metal, "strips_deg goes with metal = true")
         kinds = (self.metal, self.permittivity is not None, bool(self.layers))
         _require(sum(kinds) == 1, "a plate has one of permittivity = [..], metal = true or [[plates.layers]]")

@@ -9,10 +9,12 @@ this package: `polysight_shared` (configuration, messages, errors), `polysight_p
 `polysight_simulators`, `polysight_papers`.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
 from polysight_shared import __version__
+
+TYPE_CHECKING = False
+"""True for a type checker, as in the module `typing`; Ctrl-C while that is imported would be a traceback."""
 
 if TYPE_CHECKING:
     from polysight.api import Scan, open_scan, read_netcdf, write_netcdf
@@ -56,8 +58,10 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name when it is first used."""
+    from importlib import import_module
+
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOME[name]), name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
@@ -29,9 +30,10 @@ def expand_home(words: Sequence[str]) -> list[str]:
 
 
 def open_standard_streams() -> None:
-    """Open standard streams that the caller has closed (`>&-`) on the null device.
+    """Open standard streams that the caller has closed (`>&-`) on the null device; let every character be written.
 
-    Python has None in their place. Left closed, the next file that is opened would become standard output.
+    Python has None in their place. Left closed, the next file that is opened would become standard output. A character
+    that the terminal's encoding lacks is written as its escape, as Python does on standard error.
     """
     # The system gives the lowest number that is free.
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
@@ -40,6 +42,8 @@ def open_standard_streams() -> None:
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def die_with_parent(sig: signal.Signals = signal.SIGTERM) -> None:

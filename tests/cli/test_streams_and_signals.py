@@ -125,3 +125,36 @@ def test_an_early_interrupt_on_the_pi_is_no_traceback():
     """Its modules take a second to load on a Pi: they are loaded where Ctrl-C is handled."""
     process = subprocess.run([sys.executable, "-c", INTERRUPT_THE_PI], capture_output=True, text=True, check=False)
     assert (process.returncode, process.stderr) == (128 + signal.SIGINT, "")
+
+
+def test_characters_that_the_terminal_lacks_are_no_traceback(products):
+    (products.parent / "Käse").mkdir()
+    products.rename(products.parent / "Käse" / "products")
+    line = "PYTHONIOENCODING=ascii $P materials Käse/products > said"
+    assert run_in_shell(line, products.parent) == (0, "")
+    assert r"K\xe4se" in (products.parent / "said").read_text()
+
+
+INTERRUPT_AN_IMPORT = """
+import signal, sys
+class Interrupting:
+    @staticmethod
+    def find_spec(name, path=None, target=None):
+        if name == sys.argv[1]:
+            sys.stderr.write("interrupted")
+            sys.stderr.flush()
+            signal.raise_signal(signal.SIGINT)
+for name in [name for name in sys.modules if name.partition(".")[0] in ("typing", "importlib", "pathlib")]:
+    del sys.modules[name]
+sys.meta_path.insert(0, Interrupting)
+from polysight.cli.main import main
+sys.exit(main(["plan", "--help"]))
+"""
+
+
+@pytest.mark.parametrize("module", ["typing", "pathlib", "polysight_shared.program", "polysight.cli.options"])
+def test_an_interrupt_while_the_first_modules_load_is_no_traceback(module):
+    command = [sys.executable, "-c", INTERRUPT_AN_IMPORT, module]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode in (128 + signal.SIGINT, -signal.SIGINT)
+    assert done.stderr.removeprefix("interrupted") in ("", "polysight plan: stopped\n")

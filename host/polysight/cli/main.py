@@ -2,8 +2,8 @@
 
 The exit status is 0 only when the command worked, or when the reader of its output has closed the pipe (`| head`).
 
-Only the module of the command is imported, so that every command starts without delay; this module imports what `main`
-needs to be interrupted, and the rest is loaded below it. Errors go to stderr: what happened, why, and what to do.
+Only the module of the command is imported, so that every command starts without delay; and it is imported below `main`,
+where Ctrl-C ends the program without a traceback. Errors go to stderr: what happened, why, and what to do.
 """
 
 from __future__ import annotations
@@ -11,16 +11,11 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING
 
 from polysight_shared import __version__
-from polysight_shared.program import (
-    close_standard_output,
-    expand_home,
-    flush_standard_output,
-    interrupts_between_imports,
-    open_standard_streams,
-)
+
+TYPE_CHECKING = False
+"""True for a type checker, as in the module `typing`, which takes longer to import than all above."""
 
 if TYPE_CHECKING:
     import argparse
@@ -72,8 +67,25 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    if argv is None:
-        argv = sys.argv[1:]
+    handler_before = signal.getsignal(signal.SIGINT)
+    if handler_before is signal.default_int_handler:
+        # Until the modules below are loaded Ctrl-C ends the program immediately, without a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        return _run_safely(sys.argv[1:] if argv is None else argv)
+    finally:
+        signal.signal(signal.SIGINT, handler_before)
+
+
+def _run_safely(argv: Sequence[str]) -> int:
+    """Run one command; return its exit status, also of an error, which is told in words."""
+    from polysight_shared.program import (
+        close_standard_output,
+        expand_home,
+        interrupts_between_imports,
+        open_standard_streams,
+    )
+
     words = expand_home(argv)
     name = " ".join(["polysight", *words[:1]])
     open_standard_streams()
@@ -103,6 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(words: list[str]) -> int:
     """Parse the words and run the command; what it printed is written when this returns."""
     from polysight.cli.options import join_negative_values
+    from polysight_shared.program import flush_standard_output
 
     try:
         parser = build_parser(next(iter(words), None))

@@ -95,3 +95,17 @@ def test_folders_and_places_that_are_not_there_are_refused(root, monkeypatch, co
     args = build_parser().parse_args(command.split())
     with refused(code):
         args.run(args)
+
+
+def test_the_metal_reference_is_called_so_at_a_place(root, capsys):
+    materials = root / "two" / "materials.json"
+    content = json.loads(materials.read_text())
+    content["segments"][0]["outline_mm"] = [[-50.0, -20.0], [-20.0, -20.0], [-20.0, 20.0], [-50.0, 20.0]]
+    materials.write_text(json.dumps(content))
+    assert "in patch 1: the metal reference" in answer(capsys, "probe", root / "two", "-35,0")
+
+
+def test_compare_says_where_its_picture_is(root, capsys, tmp_path):
+    assert main(["compare", str(root / "two"), str(root / "two"), "--png", str(tmp_path / "d.png")]) == 0
+    assert f"picture: {tmp_path / 'd.png'}" in capsys.readouterr().err
+    assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")

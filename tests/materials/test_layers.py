@@ -10,7 +10,7 @@ from tests.support.rigs import published_rig
 
 from polysight.materials.layers import Bands, Layer, LayerFit, Spectrum, check_range, check_stack, fit_layer, predict
 from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import ConfigError, ErrorCode
 
 THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j
@@ -120,8 +120,9 @@ def test_a_stack_that_is_not_the_one_measured_is_noticed():
     ],
 )
 def test_stacks_that_cannot_be_fitted_are_refused(stack, code):
-    with refused(code):
+    with refused(code) as caught:
         fit_layer(measure_bands([GLASS]), stack, THETA)
+    assert isinstance(caught.value, ConfigError)
 
 
 def test_fewer_data_than_unknowns_are_refused():

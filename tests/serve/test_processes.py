@@ -268,3 +268,6 @@ def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
         with refused(ErrorCode.FILE_MISSING, folder, "mkdir -p"):
             serve(folder, Place(), None, control)
         assert not folder.exists()
+    (tmp_path / "scene.toml").touch()
+    with refused(ErrorCode.FILE_FOREIGN, tmp_path / "scene.toml", "is not a folder"):
+        serve(tmp_path / "scene.toml", Place(), None, True)

@@ -139,7 +139,8 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     else:
         lines.append(f"no permittivity: {result.why}")
     if result.patch is not None:
-        lines.append(f"in patch {result.patch.label}: {_format_name(result.patch.name)}")
+        name = "the metal reference" if result.patch.metal_reference else _format_name(result.patch.name)
+        lines.append(f"in patch {result.patch.label}: {name}")
     lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in result.nearest]
     lines.append(result.profile_why or "range profile: --json")
     sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
@@ -154,6 +155,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         from polysight.catalogue import draw_comparison
 
         write_atomically(picture, draw_comparison(comparison, "sigmas").png)
+        sys.stderr.write(f"picture: {picture}\n")
     if as_json:
         print_json(to_plain(values))
         return 0

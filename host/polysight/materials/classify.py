@@ -367,7 +367,10 @@ class Classifier:
     ) -> None:
         if not library.entries:
             raise DataError(
-                "the material library is empty", "nothing was trained", "polysight train", code=ErrorCode.NO_DATA
+                "the material library is empty",
+                "nothing was trained",
+                "polysight train SCAN... --out FILE",
+                code=ErrorCode.NO_DATA,
             )
         if angles_deg is None and len(library.angles_deg) > 1:
             raise DataError(

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from polysight.imaging import Mask
 from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm, box_mask, make_patch
 from polysight.store import TRUTH
-from polysight_shared.errors import DataError, ErrorCode
+from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import read_json
 
 
@@ -223,7 +223,7 @@ def read_labels(path: Path) -> Labels:
     Raises DataError if the file is missing, not JSON, an entry is not four numbers, or the value of `unit`, `metal` or
     `specimens` is invalid.
     """
-    remedy = "correct it, or draw the boxes again: polysight label SCAN"
+    remedy = f"correct it, or remove it and draw the boxes again: rm {quote(path)}; polysight label SCAN"
     try:
         raw: Any = read_json(path)
     except FileNotFoundError:

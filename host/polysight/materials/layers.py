@@ -29,7 +29,7 @@ from polysight.imaging import window_weights
 from polysight.materials.names import format_permittivity
 from polysight.polarimetry import multilayer
 from polysight_shared.config import Chirp
-from polysight_shared.errors import DataError, ErrorCode, PolysightError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, PolysightError
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Real = npt.NDArray[np.float64]
@@ -220,7 +220,7 @@ def check_stack(stack: Sequence[Layer]) -> None:
     """
     open_ended = [layer.name for layer in stack[:-1] if layer.thickness_m is None]
     if not stack or open_ended:
-        raise PolysightError(
+        raise ConfigError(
             f"layers without thickness before the last: {open_ended}" if stack else "an empty stack",
             "only the last layer may be a half space",
             "give each layer its thickness",
@@ -375,10 +375,13 @@ def fit_layer(
     """
     unknown_layers = [i for i, layer in enumerate(stack) if layer.permittivity is None]
     if len(unknown_layers) != 1:
-        raise PolysightError(
+        remedy = "give the permittivity of the others"
+        if not unknown_layers:
+            remedy = "give one layer as NAME,?,MM or NAME,?,?"
+        raise ConfigError(
             f"{len(unknown_layers)} layers of unknown permittivity",
             "one can be fitted",
-            "give the permittivity of the others",
+            remedy,
             code=ErrorCode.VALUES_CONFLICT,
         )
     check_range(thickness_range_m or stack[unknown_layers[0]].thickness_range_m)

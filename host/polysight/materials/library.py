@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.store import open_npz
-from polysight_shared.errors import DataError, ErrorCode
+from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import write_atomically
 
 FORMAT = "polysight-library-1"
@@ -198,7 +198,7 @@ class Library:
             raise DataError(
                 f"{path}: no such library",
                 "none was trained yet, or the path is wrong",
-                "polysight train",
+                f"polysight train SCAN... --out {quote(path)}",
                 code=ErrorCode.FILE_MISSING,
             ) from None
         except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
@@ -436,7 +436,10 @@ class Samples:
             specimens += [e.specimen or ""] * pixels.size
         if not names:
             raise DataError(
-                "the library has no usable pixel", "nothing was trained", "polysight train", code=ErrorCode.NO_DATA
+                "the library has no usable pixel",
+                "nothing was trained",
+                "polysight train SCAN... --out FILE",
+                code=ErrorCode.NO_DATA,
             )
         labels = np.array(names), np.array(groups), np.array(patches), np.array(specimens)
         return cls(np.concatenate(x), *labels, library.angles_deg)

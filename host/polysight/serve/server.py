@@ -147,7 +147,12 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
 
 def _make_folder(root: Path, control: bool) -> None:
     """Make the folder of scans here. Raises ConfigError for one elsewhere, or without control."""
-    if root.exists() or not control or root.absolute().parent != Path.cwd():
+    if root.exists():
+        raise ConfigError(
+            f"{root}: is not a folder", "scans are listed under a folder", "give the folder of the scans",
+            code=ErrorCode.FILE_FOREIGN,
+        )  # fmt: skip
+    if not control or root.absolute().parent != Path.cwd():
         raise ConfigError(
             f"{root}: no such folder",
             "scans are listed under it; one elsewhere may lie on a drive that is not mounted, so it is not made",

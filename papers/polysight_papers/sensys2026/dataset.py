@@ -134,7 +134,8 @@ def read_authors(folder: Path, config: Path, images: Path | None = None, names: 
         raise DataError(
             f"{folder}: neither materials/*.pkl nor labels/<scan> with a known material is in it",
             "; ".join(notices) or "the download is not complete, or this is another folder",
-            "give the folder of the published data set; `polysight reproduce --names FILE` says what its names mean",
+            "give the folder of the published data set; `polysight reproduce --out DIR --authors DATA --names FILE`"
+            " says what its names mean",
         )
     return AuthorsData(folder, base, sources, meaning, tuple(dict.fromkeys(notices)))
 
@@ -248,8 +249,8 @@ def _rename_entries(
     if unknown:
         skipped = ", ".join(sorted(unknown))
         notices.append(
-            f"not judged, names without a row of Table 2: {skipped}; `polysight reproduce --names FILE` says what"
-            " they mean"
+            f"not judged, names without a row of Table 2: {skipped}; `polysight reproduce --out DIR --authors DATA"
+            " --names FILE` says what they mean"
         )
     meaning = {f"{n}, {t:g} mm" if t else n: number for (n, t), number in rows.items()}
     return dict(sorted(meaning.items())), sources

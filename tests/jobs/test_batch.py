@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import make_scene
@@ -206,6 +207,8 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     assert batch.find_scans([tmp_path / "unsynced"]) == scans_found
     assert batch.find_scans([raw, scans_found[1]]) == [raw, scans_found[1]]
     assert batch.find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
+    products = judged_products(tmp_path / "products", "good")
+    assert batch.find_scans([products]) == [products]
     with refused(ErrorCode.NAME_TAKEN, "s1"):
         batch.make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
 

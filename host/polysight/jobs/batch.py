@@ -27,7 +27,7 @@ from polysight.calibration import calibration_of_scan
 from polysight.jobs.output import exit_status
 from polysight.jobs.process import process
 from polysight.process import cores, is_given_images
-from polysight.products import FINISHED, IMAGE, QUALITY, ProcessedScan, write_json
+from polysight.products import FINISHED, IMAGE, QUALITY, SCAN, ProcessedScan, write_json
 from polysight.results import NoResult
 from polysight.settings import Settings
 from polysight.store import (
@@ -109,7 +109,8 @@ def find_scans(paths: Sequence[Path]) -> list[Path]:
     """
     folders: list[Path] = []
     for path in paths:
-        if path.is_dir() and not _is_data(path):
+        # The .npz files of products are no scans of their own.
+        if path.is_dir() and not _is_data(path) and not (path / SCAN).exists():
             scans_inside = sorted(p for p in path.iterdir() if _is_data(p))
         else:
             scans_inside = []

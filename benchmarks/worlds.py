@@ -42,7 +42,7 @@ from polysight.materials.labels import patches_from_labels
 from polysight.materials.result import PatchResult
 from polysight.materials.segment import Segmentation
 from polysight.polarimetry import fresnel
-from polysight.process.quality import scene_reasons
+from polysight.process.judge import scene_reasons
 from polysight.results import join_reasons
 from polysight_shared.config import load_instrument
 

@@ -68,11 +68,10 @@ class Pipeline:
             if from_sums:
                 images = self.builder.current()
             else:
+                self.quality.remove_phase_jumps((self.samples.filled, *self.sub_bands.builders))
                 images = self.samples.filled.finish()
         self.quality.note(**self.synchroniser.recording_facts())
-        if self.source.mirrored:
-            return images.transpose()
-        return images
+        return images.transpose() if self.source.mirrored else images
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
         """Estimate the plane of the plates; return the images on it (unchanged if `move` is False)."""
@@ -94,7 +93,7 @@ class Pipeline:
             axes = images.x_m, images.y_m
             incidence = polarimetry.incidence_choice(rig, *axes, self.settings.incidence, images.raised_m)
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
-            result = materials.analyse(images, optics, known_scene, classifier)
+            result = materials.analyse(images, replace(optics, jump_rad=self.quality.jump_rad), known_scene, classifier)
             metal_plane = None if known_scene is None else known_scene.plane  # of a plate scanned separately
             self.quality.note_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):

@@ -221,6 +221,8 @@ class Board(Section, frozen=True):
     tx_antenna: Annotated[int, msgspec.Meta(ge=0)] = 1
     # Deviation of its chirp's start from `chirp.start_hz`.
     start_offset_hz: float = 0.0
+    # Place in `antennas.rx_mm`, counted from 1, of each recorded RX; empty: in their order.
+    rx_order: tuple[Annotated[int, msgspec.Meta(ge=1)], ...] = ()
 
 
 class Card(Section, frozen=True):
@@ -449,6 +451,12 @@ class Instrument(Section, frozen=True):
             self.transmitter.tx_antenna < len(self.antennas.tx_mm),
             "boards.tx_antenna exceeds the antennas in antennas.tx_mm",
         )
+        places = list(range(1, len(self.antennas.rx_mm) + 1))
+        for board in self.boards:
+            require(
+                not board.rx_order or sorted(board.rx_order) == places,
+                f"boards.rx_order of {board.name} must hold each of {places} once, not {list(board.rx_order)}",
+            )
         misfit = self.stage.misfit(self.grid)
         require(not misfit, misfit)
 

@@ -43,8 +43,14 @@ def tx_position_m(rig: Instrument) -> Vector:
 
 
 def rx_positions_m(rig: Instrument, board: Board) -> tuple[Vector, ...]:
-    """Return the positions of a board's RX antennas at stage offset zero, metres, rig frame; RX1 first."""
-    return tuple(place(p, board.mount) for p in rig.antennas.rx_mm)
+    """Return the positions of a board's RX antennas at stage offset zero, metres, rig frame, as they are recorded.
+
+    RX1 is first, unless the board has an `rx_order`.
+    """
+    positions = [place(p, board.mount) for p in rig.antennas.rx_mm]
+    if not board.rx_order:
+        return tuple(positions)
+    return tuple(positions[number - 1] for number in board.rx_order)
 
 
 def direct_path_m(rig: Instrument, board: Board) -> tuple[float, ...]:
@@ -56,7 +62,7 @@ def direct_path_m(rig: Instrument, board: Board) -> tuple[float, ...]:
 def specular_midpoint_m(rig: Instrument, board: Board) -> Vector:
     """Return the point of the object plane that reflects TX into the board's first RX, stage offset zero, metres."""
     tx = tx_position_m(rig)
-    rx = rx_positions_m(rig, board)[0]
+    rx = place(rig.antennas.rx_mm[0], board.mount)
     z = rig.geometry.object_distance_mm / 1e3
     # Mirror RX in the object plane: the straight path from TX to it crosses the plane at this part of its length.
     t = (z - tx[2]) / ((z - tx[2]) + (z - rx[2]))

@@ -10,7 +10,8 @@ from tests.support.rigs import programmed_rig
 
 from polysight.capture.receiver import RowCapture
 from polysight.doctor.context import CapturedFrames
-from polysight.doctor.rig_checks import check_direct_path, check_level, check_radar, judge_direct_path, judge_skew
+from polysight.doctor.rig_checks import check_radar
+from polysight.doctor.signal_checks import check_direct_path, check_level, judge_direct_path, judge_skew
 from polysight.radar.commands import direct_if_hz
 from polysight.radar.control import BoardState, RadarState
 
@@ -43,6 +44,14 @@ def test_a_missing_direct_path_is_an_error():
     assert findings.level == "error"
     assert "if_hz" not in findings.facts
     assert f"in {FRAMES - findings.facts['heard']} of {FRAMES} chirps" in findings.what
+
+
+@pytest.mark.parametrize(("board", "order"), [("RH", (4, 3, 2, 1)), ("RV", (4, 3, 2, 1)), ("RH", (2, 1, 3, 4))])
+def test_rx_in_another_order_are_an_error_with_that_order(board, order):
+    words = simulate_frames(board)[..., [k - 1 for k in order]]
+    finding = check_direct_path(make_context(captured={board: with_frames(words).captured["RH"]}), RIG.by_name(board))
+    assert finding.level == "error"
+    assert f"rx_order = {list(order)}" in finding.do
 
 
 @pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])

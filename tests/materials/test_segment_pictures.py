@@ -12,6 +12,8 @@ from polysight.materials.copies import find_copies
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.measure import background, background_mean, check_patch, halves_apart
 from polysight.materials.segment import Segmentation, make_patch, segment
+from polysight.results.rules import judge_patches
+from polysight_worlds import METAL, Plate, Stack, World, published_rig, simulate
 
 PIXEL_MM = 2.0
 SIDE = 150
@@ -308,3 +310,16 @@ def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():
     assert background_mean(*noise, segmentation, usable) == pytest.approx((1 / width_px, 1 / width_px), rel=0.35)
     everywhere = segment(np.ones((SIDE, SIDE), complex), np.ones((SIDE, SIDE), complex), AXIS, AXIS)
     assert background_mean(*table, everywhere, usable & False) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("pixels", [50, 90])
+@pytest.mark.parametrize("stack", [METAL, Stack(below=4.69 - 0.7j)], ids=["copper", "dielectric"])
+def test_a_plate_that_fills_the_picture_is_one_region_and_stated(pixels, stack):
+    rig = published_rig()
+    plate = Plate("board", (rig.centre_m[0], rig.centre_m[1]), (0.34, 0.34), stack)
+    pair = simulate(World((plate,)), rig=rig, pixels=pixels)
+    found = segment(pair.h, pair.v, pair.x_m, pair.y_m)
+    assert found.patches == ()
+    share = max(mask.sum() for mask in found.left_out) / pixels**2
+    (told,) = judge_patches({}, 0, len(found.left_out), share)
+    assert "fills" in told.what

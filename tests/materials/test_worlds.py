@@ -7,7 +7,7 @@ import pytest
 from benchmarks.worlds import CHI2_95, analyse_world, draw_calibration, draw_pair, judge_world, pixel_boxes
 
 from polysight.materials import UNKNOWN
-from polysight.process.quality import scene_reasons
+from polysight.process.judge import scene_reasons
 from polysight_worlds import METAL, Plate, Stack, World, published_rig, simulate
 from polysight_worlds.world import nine_places
 

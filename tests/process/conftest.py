@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.support import mangled_scans
 from tests.support.paths import EXAMPLES
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig, rig_with
@@ -28,6 +29,18 @@ class Imaged:
 
 
 Make = Callable[..., Imaged]
+
+
+@pytest.fixture(scope="session")
+def six_plates(tmp_path_factory: pytest.TempPathFactory) -> ScanFolder:
+    """Raw data of the scene of `mangled_scans`."""
+    folder = tmp_path_factory.mktemp("six-plates") / "scan"
+    return ScanFolder.load(simulate(published_rig(), decode_scene(mangled_scans.SCENE, "test"), folder))
+
+
+@pytest.fixture(scope="session")
+def process_six_plates(six_plates: ScanFolder) -> mangled_scans.ProcessMangled:
+    return mangled_scans.processor(six_plates)
 
 
 @pytest.fixture(scope="session")

@@ -1,64 +1,22 @@
 """An RX without a signal is left out of synchronisation and images, and the verdict reports that and nothing wrong."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
+from tests.support.mangled_scans import PLATES, ROWS, SCENE, Mangle, Mangled, ProcessMangled, distances
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig
 
-from polysight.imaging import Images
 from polysight.jobs.process import LiveProcessing
-from polysight.materials import match_truth, truth_plates
-from polysight.pipeline import Pipeline
 from polysight.process import Findings
 from polysight.settings import Settings
-from polysight.store import CubeRow, RowData, ScanFolder, Source
+from polysight.store import CubeRow, RowData, ScanFolder
 from polysight.store.source import split_pieces
-from polysight_simulators.scene import decode_scene, simulate
-from polysight_simulators.scene.simulated_scan import truth
-
-PLATES = {
-    "ceramic": ([-62.0, 32.0], [4.75, 2.43]), "acrylic": ([0.0, 34.0], [4.0, 0.4]), "PET": ([62.0, 32.0], [3.78, 0.7]),
-    "wood": ([-62.0, -32.0], [2.61, 0.01]), "rubber": ([62.0, -32.0], [5.06, 1.11]),
-}  # fmt: skip
-SCENE: dict[str, Any] = {
-    "name": "small", "seed": 5, "burst": {"pulses": 4}, "image": {"columns": 110, "rows": 86},
-    "grid": {"columns": 43, "rows": 41, "step_x_mm": 10.0, "step_y_mm": 6.0},
-    "plates": [
-        {"name": "metal", "centre_mm": [0.0, -34.0], "size_mm": [46.0, 46.0], "metal": True},
-        *({"name": n, "centre_mm": at, "size_mm": [46.0, 46.0], "permittivity": e} for n, (at, e) in PLATES.items()),
-    ],
-}  # fmt: skip
-ROWS = SCENE["grid"]["rows"]
-# Changes the words of a row in place: board, row, int16 [chirp, sample, 2, rx].
-Mangle = Callable[[str, int, np.ndarray], None]
-
-
-class Mangled:
-    """A source whose words or cubes are changed while they are read."""
-
-    def __init__(self, source: Any, mangle: Mangle) -> None:
-        self._source = source
-        self._mangle = mangle
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._source, name)
-
-    def read_row(self, board: str, row: int) -> RowData | CubeRow:
-        recorded = self._source.read_row(board, row)
-        if isinstance(recorded, CubeRow):
-            cube = recorded.cube.copy()
-            self._mangle(board, row, cube.transpose(1, 2, 0)[:, :, None])
-            return replace(recorded, cube=cube)
-        chirp = self.instrument.chirp
-        words = recorded.payload.copy().view(np.int16).reshape(-1, chirp.samples, 2, 4)
-        self._mangle(board, row, words)
-        return replace(recorded, pieces=split_pieces(words.reshape(-1).view(np.uint8)))
+from polysight.sync import RowSynchroniser
+from polysight_simulators.scene import decode_scene
 
 
 def draw_noise(row: int, words: np.ndarray, rms: float) -> np.ndarray:
@@ -68,60 +26,46 @@ def draw_noise(row: int, words: np.ndarray, rms: float) -> np.ndarray:
     return np.rint(rng.normal(0, rms, words.shape[:-1])).astype(np.int16)
 
 
-def kill(board: str, *rx: int, rms: float = 6.0, rows: range = range(1000), value: int | None = None) -> Mangle:
-    """Replace the signal of a board's RX (from 1) in some rows by noise or a constant `value`."""
+def kill(
+    board: str,
+    *rx: int,
+    rms: float = 6.0,
+    rows: range = range(1000),
+    value: int | None = None,
+    positions: slice = slice(None),
+) -> Mangle:
+    """Give RX, counted from 1, of a board noise or a constant `value` instead of their signal in some rows.
+
+    `positions` are those of the row that are changed.
+    """
 
     def mangle(name: str, row: int, words: np.ndarray) -> None:
         if name == board and row in rows:
             for k in rx:
-                words[..., k - 1] = draw_noise(100 * row + k, words, rms) if value is None else value
+                part = words[_chirps_of(positions, words)]
+                part[..., k - 1] = draw_noise(100 * row + k, part, rms) if value is None else value
 
     return mangle
 
 
-@pytest.fixture(scope="module")
-def source(tmp_path_factory) -> ScanFolder:
-    folder = tmp_path_factory.mktemp("rx") / "scan"
-    return ScanFolder.load(simulate(published_rig(), decode_scene(SCENE, "test"), folder))
+def _chirps_of(positions: slice, words: np.ndarray) -> slice:
+    """The chirps of some positions; a row of a cube has one for each."""
+    chirps = len(words) // SCENE["grid"]["columns"]
+    return slice(*(None if end is None else end * chirps for end in (positions.start, positions.stop)))
 
 
-@pytest.fixture(scope="module")
-def process(source) -> Callable[..., tuple[Pipeline, Images, Findings]]:
-    """`process(mangle)`: pipeline, images and findings of the scan with changed words."""
-    done: dict[Any, tuple[Pipeline, Images, Findings]] = {}
+@pytest.fixture
+def source(six_plates: ScanFolder) -> ScanFolder:
+    return six_plates
 
-    def make(mangle: Mangle | None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
-        pipeline = make_pipeline(Mangled(of, mangle) if mangle else of)  # type: ignore[arg-type]
-        images = pipeline.form_images()
-        return pipeline, images, pipeline.examine(images)
 
-    def cached(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
-        if mangle is not None:
-            return make(mangle, of)
-        if of not in done:
-            done[of] = make(None, of)
-        return done[of]
-
-    return cached
+@pytest.fixture
+def process(process_six_plates: ProcessMangled) -> ProcessMangled:
+    return process_six_plates
 
 
 def permittivities(findings: Findings) -> dict[int, complex]:
     return {r.patch.label: r.permittivity.value for r in findings.analysis.patches if r.permittivity.value is not None}
-
-
-def distances(source: Any, findings: Findings) -> list[float]:
-    """Squared distances of the true permittivities in the regions."""
-    scene = decode_scene(SCENE, "test")
-    plates = truth_plates(truth(source.instrument, scene, scene.seed))
-    true = match_truth([r.patch for r in findings.analysis.patches], plates)
-    out = []
-    for r in findings.analysis.patches:
-        e = r.permittivity
-        plate = true.get(r.patch.label)
-        if e.value is not None and plate is not None and plate.permittivity is not None:
-            d = e.value - plate.permittivity
-            out.append(float(np.array([d.real, d.imag]) @ np.linalg.solve(np.array(e.covariance), [d.real, d.imag])))
-    return out
 
 
 def about_rx(findings: Findings) -> list[str]:
@@ -191,6 +135,15 @@ def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
     assert pipeline.quality.result().boards["RV"].dead_rx == {4: list(rows)}
     assert other_reasons(findings) <= other_reasons(process()[2])
     assert max(distances(source, findings)) < 9
+
+
+@pytest.mark.parametrize("positions", [slice(38, None), slice(21, 27), slice(0, 5), slice(24, None)], ids=str)
+@pytest.mark.parametrize("how", [{"rms": 6.0}, {"value": 0}], ids=str)
+def test_an_rx_without_a_signal_in_a_few_positions_of_a_row_is_dead_in_the_row(source, positions, how):
+    mangled = Mangled(source, kill("RV", 2, rows=range(20, 21), positions=positions, **how))
+    synchroniser = RowSynchroniser(mangled, source.instrument, {})  # type: ignore[arg-type]
+    assert synchroniser.synchronise("RV", mangled.read_row("RV", 20))[0].dead_rx == [2]
+    assert synchroniser.synchronise("RV", mangled.read_row("RV", 19))[0].dead_rx == []
 
 
 def test_a_weak_rx_stays(process):

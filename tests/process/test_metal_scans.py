@@ -20,6 +20,7 @@ from polysight.materials.layers import fit_layer
 from polysight.materials.measure import measure_dispersions
 from polysight.materials.sub_bands import bands_of_row
 from polysight.polarimetry import Leakage, PlaneReference, multilayer
+from polysight.results import rules
 from polysight.settings import Settings
 from polysight_shared.config import Instrument
 from polysight_simulators.scene import decode_scene, simulate
@@ -256,3 +257,23 @@ def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytes
         assert abs(error.imag) < 2.5 * fit.std_loss, name
         assert abs(error) < 0.05 * abs(truth), name
         assert not fit.ambiguous, name
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (1.0, 0.0), (0.0, -1.0)])
+def test_a_tilted_metal_plate_is_known_as_such(rig, tmp_path, tilt_deg):
+    raw = {
+        "name": "tilted",
+        "seed": 4,
+        "grid": {"columns": 31, "rows": 21, "step_x_mm": 12.0, "step_y_mm": 10.0},
+        "burst": {"pulses": 4},
+        "image": {"columns": 30, "rows": 30, "pixel_mm": 4.0},
+        "plates": [
+            {"name": "p", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True, "tilt_deg": list(tilt_deg)}
+        ],
+    }
+    reference = load_reference(simulate(rig, decode_scene(raw, "test"), tmp_path / "scan"))
+    # Along the plane of incidence, and across it.
+    found_deg = reference.facts().tilt_deg
+    np.testing.assert_allclose(found_deg, tilt_deg, atol=0.15)
+    told = rules.judge_reference_tilt(found_deg)
+    assert [r.level for r in told] == ([] if tilt_deg == (0.0, 0.0) else ["warning"])

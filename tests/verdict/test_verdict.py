@@ -84,6 +84,7 @@ def test_metal_is_never_judged_by_itself(likely, certain, given, contradicted, o
 
 def test_evidence_without_a_limit_has_its_level():
     assert level(rules.judge_patches({}, 0)) == "none"
+    assert rules.judge_patches({}, 0, 1, 0.9)[0].what != rules.judge_patches({}, 0, 1, 0.1)[0].what
     assert level(rules.judge_patches({1: "noise"}, 1)) == "none"
     assert level(rules.judge_patches({1: "noise"}, 2)) == "care"
     assert level(rules.judge_leakage(True, False, 0.5)) == "good"

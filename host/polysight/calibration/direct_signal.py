@@ -62,6 +62,8 @@ class DirectSignal:
         Change of the IF within a chirp.
     chirps
         Number of chirps received whole.
+    rx_order
+        Places in the rig file of the recorded RX, counted from 1, if they show another order; empty otherwise.
     """
 
     if_hz: NDArray[np.float64]
@@ -70,6 +72,7 @@ class DirectSignal:
     expected_hz: float
     drift_hz_per_s: float
     chirps: int
+    rx_order: tuple[int, ...] = ()
 
     @property
     def found(self) -> bool:
@@ -169,6 +172,9 @@ def find_direct(
         expected_hz=direct_if_hz(rig, board),
         drift_hz_per_s=drift_hz_per_s,
         chirps=int(valid.sum()),
+        rx_order=sync.find_rx_order(
+            without_drift, referenced, setup.path, lambda row, path: sync.reference(row, path, chirp)
+        ),
     )
 
 

@@ -172,6 +172,8 @@ class MetalFile(CalibrationFile, frozen=True, kw_only=True):
     how: str
     imaged_with: ImagedWith | None = None
     bands: list[MetalBand] = []
+    # Rise along the plane of incidence and across it; files of earlier releases do not have it.
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
 
 
 class SphereFile(CalibrationFile, frozen=True, kw_only=True):
@@ -311,6 +313,7 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
         spread=reference.spread,
         how=reference.how,
         imaged_with=reference.made_with,
+        tilt_deg=facts["tilt_deg"],
         bands=[
             MetalBand(band.first_hz, band.last_hz, part.spread, part.how)
             for band, part in zip(bands, reference.bands, strict=True)
@@ -369,6 +372,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         how=file.how,
         made_with=file.imaged_with,
         dispersion=dispersion,
+        rise=(float(np.radians(file.tilt_deg[0])), float(np.radians(file.tilt_deg[1]))),
     )
     band_references = (
         replace(reference, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})

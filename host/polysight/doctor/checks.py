@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.doctor import rig_checks
+from polysight.doctor import rig_checks, signal_checks
 from polysight.doctor.bundle import write_bundle
 from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_to_json, not_checked, verdict
 from polysight_shared.config import Board
@@ -58,9 +58,9 @@ CHECKS = (
     Check("trigger line", rig_checks.check_trigger, needs=("rig is free", "stage")),
     Check("pulses", rig_checks.check_pulses, needs=("pi", "rig is free")),
     Check("radar", rig_checks.check_radar, needs=("buffer", "pulses"), each_board=True),
-    Check("level", rig_checks.check_level, needs=("radar",), each_board=True),
-    Check("direct path", rig_checks.check_direct_path, needs=("level",), each_board=True),
-    Check("trigger skew", rig_checks.check_skew, needs=("direct path",)),
+    Check("level", signal_checks.check_level, needs=("radar",), each_board=True),
+    Check("direct path", signal_checks.check_direct_path, needs=("level",), each_board=True),
+    Check("trigger skew", signal_checks.check_skew, needs=("direct path",)),
 )
 
 

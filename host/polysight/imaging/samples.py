@@ -265,6 +265,8 @@ class BoardSamples:
         self._direct = np.zeros((rx, *shape), np.complex64)
         # Rows in which each RX gave a signal, [rx, row]; where not, its samples are zero in the whole row.
         self.has_rx = np.zeros((rx, shape[0]), bool)
+        # Phase by which the samples of each row are turned in images, complex [row]; 1: as recorded.
+        self._turns = np.ones(shape[0], np.complex64)
         # True for positions with data, [row, column].
         self.valid = np.zeros(shape, bool)
         # Imager of all rows; None if the aperture is irregular, or before it is needed.
@@ -316,7 +318,7 @@ class BoardSamples:
         return self.valid & ~dead[:, None]
 
     def _rx_factors(self) -> NDArray[np.complex64]:
-        """Return 1 / gain of each RX in each row, [rx, row]; 0 if the RX is not used, or the row is not.
+        """Return the turn of each row over the gain of each RX, [rx, row]; 0 if the RX is not used, or the row is not.
 
         If an RX dies within the scan, the others' gains change: samples are referenced to the mean of the live RX.
         """
@@ -329,7 +331,7 @@ class BoardSamples:
             # Samples without any direct path are as they should be.
             gains[gains == 0] = 1
             factors[:, rows] = (self.used_rx / gains)[:, None]
-        return factors
+        return factors * self._turns
 
     def _compute_row_weights(self, index: int) -> NDArray[np.float32]:
         """Return one row of the taper, 0 where not valid, [column]."""
@@ -468,6 +470,13 @@ class BoardSamples:
         self._final = None
         self._invalidate()
 
+    def turn_rows(self, angles_rad: NDArray[np.float64]) -> None:
+        """Turn the phase of all samples of each row, [row], in every image formed from now on; the last call counts."""
+        turns = np.exp(1j * angles_rad).astype(np.complex64)
+        if not np.array_equal(turns, self._turns):
+            self._turns = turns
+            self._invalidate()
+
     def fill(self, samples: NDArray[np.complex64]) -> None:
         """Fill all positions that are not usable with calibrated samples (as of :meth:`calibrate_samples`)."""
         gains = np.where(self.used_rx, self.rx_calibration(), 0).astype(np.complex64)
@@ -475,6 +484,8 @@ class BoardSamples:
         self._cube = filled * gains[:, None, None, None]
         self._direct[:] = (gains / self._antennas.direct_m)[:, None, None]
         self.has_rx[:] = self.used_rx[:, None]
+        # `calibrate_samples` has turned the rows.
+        self._turns[:] = 1
         self.valid[:] = True
         self._invalidate()
 

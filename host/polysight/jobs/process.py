@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
 from polysight.data import find_packaged
-from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, focus_sweep, image_grid
+from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, Rise, focus_sweep, image_grid
 from polysight.jobs.measure_surfaces import add_surfaces, has_steep_patch
 from polysight.jobs.output import count_steps, current_step, name_scan, print_lines, say
 from polysight.materials import WEAK_V_DB, Plates, find_truth, read_labels, read_truth
@@ -186,7 +186,17 @@ def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
             "scan a bare metal plate that covers the plane",
             code=ErrorCode.NO_DATA,
         )
-    return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
+    made_with = pipeline.calibration.imaged_with(pipeline.rig)
+    return replace(reference, made_with=made_with, rise=_measure_rise(images))
+
+
+def _measure_rise(images: Images) -> Rise:
+    """Return the rise of a plate that covers the image, along the plane of incidence and across it; 0 if unknown."""
+    light = images.illumination
+    if light is None:
+        return 0.0, 0.0
+    rise = light.rise(images.h, images.v, images.valid)
+    return rise[1 - light.across], rise[light.across]
 
 
 def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> PlaneReference:
@@ -315,11 +325,16 @@ class LiveProcessing:
             self._pipeline = Pipeline(self._source, self._settings, self._inputs, live=True, samples="keep")
         self._source.reload()
         told = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
+        was_in_order = {name: not board.rx_order for name, board in self._pipeline.quality.boards.items()}
         self._pipeline.add_row(row)
         for name, board in self._pipeline.quality.boards.items():
             # Reported with the row that shows it, not after the scan.
             new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in told[name]}
             for finding in rules.judge_dead_rx(name, new, rows=1):
+                _log.warning("row %d: %s", row, format_one_line(finding))
+            if not was_in_order[name]:
+                continue
+            for finding in rules.judge_rx_order(name, board.rx_order):
                 _log.warning("row %d: %s", row, format_one_line(finding))
         if self._source.complete:
             publish_images(self._pipeline, self._folder / PRODUCTS)

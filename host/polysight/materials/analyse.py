@@ -102,12 +102,15 @@ class Optics:
         inside each patch.
     other_sign
         Probability a priori that all phases of the images have the other sign: 0 for scans of this program.
+    jump_rad
+        Jump of a board's phase between two rows of the scan, which the images are without, radians; 0: none.
     """
 
     theta_rad: npt.ArrayLike
     prior: RigPrior = MEASURED_RIG
     smooth_px: float = 2.0
     other_sign: float = 0.0
+    jump_rad: float = 0.0
 
     @classmethod
     def from_rig(
@@ -375,7 +378,7 @@ class SceneScatter:
             metal = measure_scatter(reference.mask, *channels, images.x_m, images.y_m)
         scatters = [*scatter.values(), *([] if metal is None else [metal])]
         spread = None if plane is None else plane.spread
-        metal_rise = (0.0, 0.0) if reference.label is None else tilts.in_plane(reference.label)
+        metal_rise = tilts.in_plane(reference.label or 0) if plane is None else plane.rise
         evenly = images.illumination is not None and images.illumination.known
         lit = images.usable if plane is None else images.usable & plane.valid
         border = {p.label: border_errors(p, lit, images.x_m) for p in segmentation.patches}
@@ -525,7 +528,8 @@ class _Scene:
         prior = scatter.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
         dispersions = measure_dispersions(images, segmentation, judged, reference.mask, self.plane)
         measured = [
-            scatter.measure(p, (rh, rv), _mean_angle(theta, p), d) for p, d in zip(judged, dispersions, strict=True)
+            scatter.measure(p, (rh, rv), _mean_angle(theta, p), d).widen_by_jump(self.optics.jump_rad)
+            for p, d in zip(judged, dispersions, strict=True)
         ]
         solution = _solve(measured, prior, self.kinds, self.optics.other_sign)
         if self.plane is None:

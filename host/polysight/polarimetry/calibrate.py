@@ -43,7 +43,7 @@ import numpy.typing as npt
 import scipy
 from msgspec import UNSET
 
-from polysight.imaging import Dispersion, Image, ImagedWith, Images, Mask
+from polysight.imaging import Dispersion, Image, ImagedWith, Images, Mask, Rise
 from polysight.results import MetalPlate
 from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
@@ -205,6 +205,8 @@ class PlaneReference:
         Settings that the gains depend on; None if unknown.
     dispersion
         Median change of ln h and ln v of the plate over the sweep; None if unknown.
+    rise
+        Rise of the plate along the plane of incidence and across it, radians, as it was scanned; 0 if unknown.
     """
 
     h: Image
@@ -217,6 +219,7 @@ class PlaneReference:
     bands: tuple[PlaneReference, ...] = ()
     made_with: ImagedWith | None = None
     dispersion: tuple[complex, complex] | None = None
+    rise: Rise = (0.0, 0.0)
 
     def add_dispersion(self, dispersion: Dispersion) -> PlaneReference:
         """Return the reference with the plate's change over the sweep, from the same scan; unchanged if it has none."""
@@ -298,6 +301,7 @@ class PlaneReference:
             ratio_variation_db=_measure_variation_db(h / v),
             ratio_variation_deg=round(float(np.degrees(np.std(phase_from_mean))), 4),
             spread=round(self.spread, 5),
+            tilt_deg=(round(float(np.degrees(self.rise[0])), 3), round(float(np.degrees(self.rise[1])), 3)),
             sub_bands=len(self.bands) or UNSET,
         )
 

@@ -30,7 +30,7 @@ from polysight.polarimetry import (
     specular_incidence_rad,
 )
 from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
-from polysight.process.quality import scene_reasons
+from polysight.process.judge import scene_reasons
 from polysight.process.save import Findings, assemble_result
 from polysight.products import IMAGE, SCAN, ProcessedScan
 from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuality, join_reasons, reason

@@ -1,56 +1,84 @@
-"""Quality of a processed scan: the figures of quality.json, the verdict on it, and the error budget of its results.
+"""Quality of a processed scan: the figures of quality.json, by row, board and scan; `judge.py` has the verdict on them.
 
-`Quality` collects frames received, positions masked, synchronisation residuals and run time. `judge` weighs the
-evidence of recording, rig and scene.
+`Quality` collects frames received, positions masked, synchronisation residuals and run time.
+
+Find jumps of the echo's phase between rows of a scan, such as a cable that was touched makes.
+
+The direct path does not have them if they arise behind it, so that referencing to it leaves them. Echoes of
+neighbouring positions are alike: a linear predictor from the two rows on either side, fitted to the rows around,
+explains an echo but for 15 to 30 % of its amplitude where plates reflect (rows 6 mm apart). If the phase jumps by phi
+between two rows, the parts of the prediction from the other side of the jump have to be turned by phi; least squares
+gives it.
+
+A jump where nothing reflects (gaps between plates, rows at the ends of the scan) is not seen, and one between the last
+row of one plate and the first of the next looks like a difference of the plates.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from polysight.imaging import ImageBuilder, Images, PlaneEstimate, imaging_facts
-from polysight.materials import NOT_PASSIVE, STRONGER_V, Classifier, MaterialsResult, find_copies, permittivity_change
+from polysight.imaging import ImageBuilder, Images, imaging_facts
+from polysight.materials import MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import (
     Backlash,
     BoardQuality,
     CalibrationSource,
     Coverage,
-    ErrorBudget,
     FrequencyRange,
-    IncidenceError,
-    LeakageError,
-    MetalScore,
-    PlaneError,
     ReconstructedPositions,
     Residual,
     ScanQuality,
     Verdict,
-    check_plate,
-    check_reasons,
-    join_reasons,
-    rules,
 )
 from polysight.store import CubeRow, RowData, Source
-from polysight.sync import SyncedRow, block_frequencies_hz, estimate_backlash, object_filter, sample_frequencies_hz
-from polysight_shared.config import Board, CheckPlate, Instrument
-from polysight_shared.findings import Finding
+from polysight.sync import (
+    SyncedRow,
+    block_frequencies_hz,
+    estimate_backlash,
+    judge_rx_order,
+    object_filter,
+    prepare,
+    sample_frequencies_hz,
+)
+from polysight_shared.config import Board, Instrument
 from polysight_shared.raster import plan_raster
 
 # Nothing is calibrated.
 NO_FILES: Mapping[str, CalibrationSource] = {}
+# Least share of a board's rows that tell another order of the RX; chosen.
+OTHER_ORDER = 0.1
 Count = Annotated[int, msgspec.Meta(ge=0)]
+
+
+# Rows on either side that an echo is predicted from, and positions on either side in each of them; chosen.
+_ROWS = (-2, -1, 1, 2)
+_POSITIONS = 1
+# Rows on either side of a jump that the predictor is fitted to, and regularisation relative to its mean power; chosen.
+_FIT_ROWS = 6
+_RIDGE = 1e-3
+# Least jump that is told; the largest that undisturbed scenes show is 8 degrees.
+_LEAST_RAD = np.radians(9)
+# Least ratio of a jump to the error of the prediction: undisturbed scenes reach 0.34, jumps of 30 degrees 0.4 to 3.
+_LEAST_RATIO = 0.42
+# The error of the prediction relative to the part that turns, above which a row tells nothing; chosen.
+_MOST_ERROR = 1.0
+# How far a jump stands out: its ratio over the third largest one's (its neighbours have a share of it); chosen.
+_STANDS_OUT = 1.3
+# Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
+_AT_END = 3
 
 
 class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,6 +101,8 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
         of which all chirps clipped; 0 in files of earlier releases, which did not look for them.
     dead_rx
         RX without a signal, counted from 1.
+    rx_order
+        Places in the rig file of the recorded RX, counted from 1, if the row has a direct path only in this order.
     """
 
     frames_expected: Count
@@ -87,6 +117,7 @@ class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
     chirps_disturbed: Count = 0
     positions_clipped: Count = 0
     dead_rx: list[Count] = []
+    rx_order: list[Count] = []
 
     @property
     def residuals(self) -> dict[str, tuple[float, float, float]]:
@@ -107,12 +138,15 @@ class RowQuality:
         `_compute_direct_snr`.
     echo
         complex64 [rx, position]: echo of the place that mirrors TX into RX, for the estimate of the stage's backlash.
+    direct
+        complex [rx]: mean of the samples, the direct path.
     """
 
     figures: RowFigures
     direct_hz: NDArray[np.float64]
     direct_snr: NDArray[np.float64]
     echo: NDArray[np.complex64]
+    direct: NDArray[np.complexfloating]
 
 
 @dataclass
@@ -127,6 +161,9 @@ class BoardRows:
         """Prepare the filters that single out the object's echo, one for samples and one for blocks of them."""
         sweeps = sample_frequencies_hz(self.rig.chirp), block_frequencies_hz(self.rig.chirp)
         self._filters = {sweep.size: object_filter(self.rig, self.board, sweep) for sweep in sweeps}
+        self._path = prepare(self.rig, self.board)
+        # What each row tells about the order of the RX.
+        self._orders: dict[int, tuple[int, ...]] = {}
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Compute and store the figures of a synchronised row, of which `frames_valid` frames were received whole."""
@@ -145,10 +182,14 @@ class BoardRows:
             chirps_disturbed=synced.chirps_disturbed,
             positions_clipped=synced.positions_clipped,
             dead_rx=synced.dead_rx,
+            rx_order=list(synced.rx_order),
         )
         direct_hz = np.where(synced.valid, synced.direct_hz, np.nan)
         echo = synced.through(self._filters[synced.sweep_hz.size])
-        self.rows[row] = RowQuality(figures, direct_hz, _compute_direct_snr(synced), echo)
+        self.rows[row] = RowQuality(
+            figures, direct_hz, _compute_direct_snr(synced), echo, synced.samples.mean(axis=(1, 2))
+        )
+        self._orders.pop(row, None)
 
     @property
     def figures(self) -> dict[int, RowFigures]:
@@ -181,6 +222,30 @@ class BoardRows:
         figures = self.figures
         numbers = sorted({rx for r in figures.values() for rx in r.dead_rx})
         return {rx: [row for row, r in figures.items() if rx in r.dead_rx] for rx in numbers}
+
+    @property
+    def rx_order(self) -> list[int]:
+        """Places in the rig file of the recorded RX, counted from 1, that most rows show which tell another order.
+
+        Empty if fewer than `OTHER_ORDER` of the rows tell it: rows without an echo cannot.
+        """
+        for row, quality in list(self.rows.items()):
+            if row not in self._orders:
+                self._orders[row] = tuple(quality.figures.rx_order) or judge_rx_order(
+                    quality.direct, quality.echo, self._path
+                )
+        orders = Counter(order for order in list(self._orders.values()) if order)
+        if not orders:
+            return []
+        order, rows = orders.most_common(1)[0]
+        if rows < OTHER_ORDER * len(self.rows):
+            return []
+        return list(order)
+
+    def find_phase_jump(self) -> PhaseJump | None:
+        """Find the clearest jump of the echo's phase between two rows; None if there is none."""
+        plan = plan_raster(self.rig.grid)
+        return find_phase_jump({row: r.echo[:, :: plan.row(row).direction] for row, r in self.rows.items()})
 
     @property
     def direct_snr_db(self) -> float | None:
@@ -225,6 +290,7 @@ class BoardRows:
             chirps_disturbed=sum(r.chirps_disturbed for r in figures.values()),
             positions_clipped=sum(r.positions_clipped for r in figures.values()),
             dead_rx=self.dead_rx,
+            rx_order=self.rx_order,
             direct_path_hz=_find_frequency_range(direct),
             direct_path_snr_db=snr,
             stage_backlash_mm=shift,
@@ -287,6 +353,90 @@ def find_masked_runs(masked: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
+class PhaseJump(NamedTuple):
+    """A jump of the phase of a board's echo: the row that it comes before, and its size in radians."""
+
+    row: int
+    angle_rad: float
+
+
+def find_phase_jump(rows: Mapping[int, NDArray[np.complexfloating]]) -> PhaseJump | None:
+    """Find the clearest jump of the phase from row to row; None if there is none.
+
+    `rows`: number to echoes, complex [rx, position], positions from the smallest x. Numbers that are missing count as
+    rows without echo.
+    """
+    if len(rows) < 2 * _AT_END:
+        return None
+    first = min(rows)
+    shape = next(iter(rows.values())).shape
+    echoes = np.zeros((max(rows) - first + 1, *shape), complex)
+    for number, echo in rows.items():
+        echoes[number - first] = echo
+    angles, errors = _measure_jumps(echoes)
+    is_sound = errors < _MOST_ERROR
+    ratio = np.zeros(len(angles))
+    ratio[is_sound] = np.abs(angles[is_sound]) / errors[is_sound]
+    if np.count_nonzero(is_sound) < _AT_END:
+        return None
+    row = int(np.argmax(ratio))
+    third = float(np.sort(ratio[is_sound])[-_AT_END])
+    is_clear = ratio[row] > _LEAST_RATIO and ratio[row] > _STANDS_OUT * third
+    if not is_clear or abs(angles[row]) < _LEAST_RAD:
+        return None
+    return PhaseJump(first + row, float(angles[row]))
+
+
+def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the jump before each row, radians, and the error of its prediction, [row]; the error is inf if unknown."""
+    count, rx, positions = echoes.shape
+    padded = np.pad(echoes, ((0, 0), (0, 0), (_POSITIONS, _POSITIONS)))
+    taps = 2 * _POSITIONS + 1
+    # [row, rx, position, tap]
+    shifted = np.stack([padded[:, :, k : k + positions] for k in range(taps)], axis=-1)
+    angles = np.zeros(count)
+    errors = np.full(count, np.inf)
+    targets = range(-_ROWS[0], count - _ROWS[-1])
+    # Neighbours [rx * position, tap] of each target by row, and the sums of least squares over each target's row.
+    neighbours = {k: [shifted[k + d].reshape(rx * positions, taps) for d in _ROWS] for k in targets}
+    products = {}
+    for k in targets:
+        together = np.concatenate(neighbours[k], axis=1)
+        products[k] = together.conj().T @ together, together.conj().T @ echoes[k].ravel()
+    for jump in range(_AT_END, count - _ROWS[-1]):
+        fitted = [k for k in range(jump - _FIT_ROWS, jump + _FIT_ROWS) if k in products]
+        normal = np.sum([products[k][0] for k in fitted], axis=0)
+        power = float(np.trace(normal).real) / len(normal)
+        if power == 0:
+            continue
+        right = np.sum([products[k][1] for k in fitted], axis=0)
+        predictor = np.linalg.solve(normal + _RIDGE * power * np.eye(len(normal)), right).reshape(len(_ROWS), taps)
+        turn = 0j
+        turned_power = 0.0
+        residual = 0.0
+        for k in range(jump + _ROWS[0], jump + _ROWS[-1]):
+            if k not in products:
+                continue
+            beyond = np.zeros(rx * positions, complex)
+            rest = echoes[k].ravel().copy()
+            for d, values, weights in zip(_ROWS, neighbours[k], predictor, strict=True):
+                is_beyond = (k + d >= jump) != (k >= jump)
+                if is_beyond:
+                    beyond += values @ weights
+                else:
+                    rest -= values @ weights
+            # Rows before the jump see it turned one way, rows behind it the other way.
+            product = np.vdot(beyond, rest)
+            turn += product.conjugate() if k < jump else product
+            turned_power += float(np.vdot(beyond, beyond).real)
+            residual += float(np.vdot(rest - beyond, rest - beyond).real)
+        if turned_power > 0:
+            angles[jump] = float(np.angle(turn))
+            left = max(residual - 2 * (abs(turn) - turn.real), 0.0)
+            errors[jump] = max(float(np.sqrt(left / turned_power)), 1e-6)
+    return angles, errors
+
+
 class Quality:
     """Collects the quality figures of a scan during processing.
 
@@ -323,6 +473,24 @@ class Quality:
     def boards_masked(self) -> list[str]:
         """Boards with rows of which no position has a direct path."""
         return [name for name, b in self.boards.items() if b.positions and b.positions_masked == b.positions]
+
+    def remove_phase_jumps(self, builders: Iterable[ImageBuilder]) -> None:
+        """Turn the rows on the shorter side of each board's phase jump back, in all images that the builders form."""
+        for name, board in self.boards.items():
+            angles_rad = np.zeros(self.source.plan.rows)
+            jump = board.find_phase_jump()
+            if jump is not None and 2 * jump.row > len(angles_rad):
+                angles_rad[jump.row :] = -jump.angle_rad
+            elif jump is not None:
+                angles_rad[: jump.row] = jump.angle_rad
+            for builder in builders:
+                builder.boards[name].turn_rows(angles_rad)
+
+    @property
+    def jump_rad(self) -> float:
+        """Largest jump of a board's phase between two rows of the scan, radians; 0 if none was found."""
+        jumps = [board.find_phase_jump() for board in self.boards.values()]
+        return max((abs(jump.angle_rad) for jump in jumps if jump is not None), default=0.0)
 
     def coverage(self) -> Coverage:
         """Compare rows, positions and frames with the plan; missing rows count as not received."""
@@ -396,235 +564,3 @@ class Quality:
             verdict=verdict or UNSET,
             pixel_accuracy=pixel_accuracy,
         )
-
-
-def recording_verdict(quality: Quality) -> list[Finding]:
-    """Return reasons from recording and synchronisation: rows, frames, manifest, and the direct path of each board."""
-    coverage = quality.coverage()
-    positions = sum(b.positions for b in quality.boards.values())
-    masked = sum(b.positions_masked for b in quality.boards.values())
-    missing: list[Finding] = []
-    for name, board in quality.boards.items():
-        share_with_path = _divide(board.positions - board.positions_masked, board.positions, default=0.0)
-        received = _divide(board.frames_received, board.frames_expected, default=0.0)
-        # Positions without a whole frame have no direct path either; do not count that loss twice.
-        share_of_received = _divide(share_with_path, received, default=1.0)
-        missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
-        missing += _report_disturbances(name, list(board.figures.values()))
-        missing += rules.judge_dead_rx(name, board.dead_rx, len(board.rows))
-    recorded = rules.judge_recording(coverage, _divide(masked, positions, default=1.0))
-    filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
-    return recorded + missing + rules.judge_reconstruction(filled)
-
-
-def _divide(part: float, whole: float, default: float) -> float:
-    """Return part / whole; `default` if there is no whole."""
-    if not whole:
-        return default
-    return part / whole
-
-
-def _report_disturbances(name: str, rows: list[RowFigures]) -> list[Finding]:
-    """Return reasons from the chirps of a board that were left out."""
-    chirps = sum(r.frames_received for r in rows)
-    positions = sum(r.positions for r in rows)
-    clipped = sum(r.chirps_clipped for r in rows)
-    disturbed = sum(r.chirps_disturbed for r in rows)
-    positions_clipped = sum(r.positions_clipped for r in rows)
-    return rules.judge_left_out_chirps(
-        name,
-        clipped=clipped / max(1, chirps),
-        disturbed=disturbed / max(1, chirps),
-        positions_clipped=positions_clipped / max(1, positions),
-    )
-
-
-def judge(
-    quality: Quality,
-    result: MaterialsResult,
-    plane: PlaneEstimate | None,
-    classifier: Classifier | None,
-    check: CheckPlate,
-) -> Verdict:
-    """Return the verdict on a processed scan.
-
-    Parameters
-    ----------
-    quality
-        Figures of all rows.
-    result
-        Patches, metal reference and joint inversion.
-    plane
-        Plane of the plates; None if it was not estimated.
-    classifier
-        The classifier that named the patches; None without naming.
-    check
-        The rig file's plate of known permittivity.
-    """
-    reasons = recording_verdict(quality) + scene_reasons(result, plane, classifier)
-    if check.name:
-        reasons += check_reasons(check_plate(check, result.rows()))
-    return join_reasons(reasons)
-
-
-def scene_reasons(result: MaterialsResult, plane: PlaneEstimate | None, classifier: Classifier | None) -> list[Finding]:
-    """Return reasons from the scene and its images; parameters are those of :func:`judge`."""
-    reasons: list[Finding] = []
-    refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
-    no_half_spaces = _find_no_half_spaces(result)
-    no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces}
-    # Patches and images.
-    reasons += rules.judge_patches(no_plates, len(result.patches), len(result.segmentation.left_out))
-    pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
-    copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
-    if copies is not None:
-        reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db)
-    reasons += rules.judge_image_shift(result.apart_mm)
-    if result.drift is not None:
-        reasons += rules.judge_drift(*result.drift.largest_drift(), result.drift.drifts)
-        reasons += rules.judge_fringes(result.drift.fringes)
-    reasons += rules.judge_halo(result.halo)
-    reasons += rules.judge_background(result.behind)
-    reasons += rules.judge_flatness(result.ripple, result.relief_rad, is_boxed=bool(result.boxes))
-    reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
-    reasons += rules.judge_passivity(no_half_spaces)
-    # Many plates with more V than H: the channels may be exchanged.
-    plates = len(result.patches) - len(no_plates) - (result.metal.label is not None)
-    reasons += rules.judge_exchange([k for k, v in no_half_spaces.items() if v.what == STRONGER_V], plates)
-    metal = result.metal
-    if result.patches and metal.evidence is not None:
-        evidence = metal.evidence
-        patch = "the given box" if metal.label is None else f"patch {metal.label}"
-        enough = evidence.enough and (metal.given or metal.label not in refused)
-        reasons += rules.judge_metal(
-            patch,
-            likely=enough,
-            certain=enough and evidence.sure,
-            is_given=metal.given,
-            contradicted=evidence.against,
-            only_patch=evidence.others == 0,
-            culprit=evidence.culprit,
-            painted=result.inversion.painted,
-            paint_mm=result.inversion.paint_mm,
-        )
-        if metal.given:
-            reasons += rules.judge_dark_reference(patch, *_find_brightest(result))
-    # Levels of metal relative to the direct path, boards, leakage, and the plane.
-    light = result.calibrated.illumination
-    if result.prior.channels_known and (light is None or light.known):
-        gains = {"H": result.calibrated.metal_h, "V": result.calibrated.metal_v}
-        reasons += rules.judge_levels({channel: _measure_median_level(gain) for channel, gain in gains.items()})
-    reasons += rules.judge_moved_boards(result.inversion.moved)
-    reasons += rules.judge_leakage(
-        result.prior.leakage_measured, result.inversion.leakage_determined, _estimate_leakage_error(result)
-    )
-    if plane is not None:
-        std = float(np.degrees(result.prior.theta_std_rad))
-        tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
-        reasons += rules.judge_plane(plane.known, 1e3 * plane.offset_m, tilt, std)
-    # Plates that have a permittivity: their tilts and brightness, and the angle of the library.
-    judged = {r.patch.label for r in result.patches if r.refused is None}
-    reasons += rules.judge_tilts({k: float(np.degrees(result.tilts.across_rad(k))) for k in judged})
-    reasons += rules.judge_brightness({k: ln for k, ln in result.brightness_off.items() if k in judged})
-    if classifier is not None and len(classifier.angles_deg) == 1:
-        angle = float(np.degrees(np.mean(result.theta_rad)))
-        reasons += rules.judge_incidence(angle, float(classifier.angles_deg[0]))
-    return reasons
-
-
-def _find_no_half_spaces(result: MaterialsResult) -> dict[int, Finding]:
-    """Return patch number to the reason why a patch is a plate but no half space (not noise or several materials)."""
-    return {
-        r.patch.label: r.refused
-        for r in result.patches
-        if r.refused is not None
-        and (r.refused.what == STRONGER_V or (r.refused.what in NOT_PASSIVE and r.permittivity.value is not None))
-    }
-
-
-def _find_brightest(result: MaterialsResult) -> tuple[int, float]:
-    """Return the number of the brightest patch but the metal, and its median |H| relative to metal, dB; 0, 0: none."""
-    levels_db = {}
-    for r in result.patches:
-        h = np.abs(result.h[r.patch.interior])
-        levels = h[np.isfinite(h) & (h > 0)]
-        if levels.size and r.patch.label != result.metal.label:
-            levels_db[r.patch.label] = 20 * float(np.log10(np.median(levels)))
-    brightest = max(levels_db, key=lambda label: levels_db[label], default=0)
-    return brightest, levels_db.get(brightest, 0.0)
-
-
-def _measure_median_level(gain: npt.NDArray[np.complexfloating] | complex | None) -> float | None:
-    """Return the median magnitude of metal's gain where it is known; None if it is known nowhere.
-
-    `gain` is a number, or an image [ny, nx] that a plate need not cover.
-    """
-    if gain is None:
-        return None
-    magnitude = np.abs(np.asarray(gain))
-    magnitude = magnitude[np.isfinite(magnitude)]
-    if magnitude.size == 0:
-        return None
-    return float(np.median(magnitude))
-
-
-def _estimate_leakage_error(result: MaterialsResult) -> float:
-    """Return the median relative error of the permittivities due to leakage; 0 without permittivities."""
-    parts = []
-    for r in result.patches:
-        e = r.permittivity
-        if e.value is not None and e.covariance is not None and e.shares:
-            share = e.shares.get("leakage", 0.0)
-            parts.append(float(np.sqrt(share * np.trace(e.covariance) / 2)) / abs(e.value))
-    if parts:
-        return float(np.median(parts))
-    return 0.0
-
-
-def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorBudget:
-    """Return `error_budget` of materials.json: leakage, incidence angle, plane and evidence for metal."""
-    inversion = result.inversion
-    source = "prior and scene"
-    if result.prior.leakage_measured:
-        source = "measured"
-    elif inversion.leakage_determined:
-        source = "scene"
-    evidence = result.metal.evidence
-    metal = None
-    if evidence is not None:
-        ratio_db = evidence.channel_ratio_db
-        if ratio_db is not None:
-            ratio_db = round(ratio_db, 2)
-        metal = MetalScore(
-            score=round(evidence.score, 2),
-            others=evidence.others,
-            channel_ratio_db=ratio_db,
-            painted=round(inversion.painted, 3),
-            paint_mm=round(inversion.paint_mm, 3),
-        )
-    leakage_h, leakage_v = inversion.leakage
-    removed_h, removed_v = inversion.known_leakage(result.prior)
-    std_h, std_v = inversion.leakage_std
-    angle_deg = float(np.degrees(np.mean(result.theta_rad) + inversion.theta_error_rad))
-    angle_std_deg = float(np.degrees(inversion.theta_std_rad))
-    plane_error = PlaneError()
-    if plane is not None:
-        plane_error = msgspec.convert(plane.to_dict(), PlaneError)
-    return ErrorBudget(
-        leakage=LeakageError(
-            h=_round_complex(leakage_h),
-            v=_round_complex(leakage_v),
-            std=(round(std_h, 5), round(std_v, 5)),
-            source=source,
-            removed_h=_round_complex(removed_h),
-            removed_v=_round_complex(removed_v),
-        ),
-        incidence=IncidenceError(deg=round(angle_deg, 4), std_deg=round(angle_std_deg, 4)),
-        plane=plane_error,
-        metal=metal,
-    )
-
-
-def _round_complex(value: complex) -> tuple[float, float]:
-    """Return real and imaginary part, rounded for the file."""
-    return round(value.real, 5), round(value.imag, 5)

@@ -407,7 +407,8 @@ class KeptSamples:
         direct_hz = np.array(record["direct_hz"][forward])
         direct_snr = np.array(record["direct_snr"][forward])
         echo = np.array(record["echo"][:, forward])
-        self._quality.boards[board].rows[row] = RowQuality(figures, direct_hz, direct_snr, echo)
+        direct = np.array(record["samples_direct"]).mean(axis=1)
+        self._quality.boards[board].rows[row] = RowQuality(figures, direct_hz, direct_snr, echo, direct)
 
     def _open(self) -> int | None:
         """Open and lock rows.jsonl; start new files if those on disk do not fit. None if another program locked it."""

@@ -25,7 +25,8 @@ from polysight.materials import (
     predict_pixel_accuracy,
 )
 from polysight.polarimetry import with_ratio
-from polysight.process.quality import Quality, error_budget, recording_verdict
+from polysight.process.judge import error_budget, recording_verdict
+from polysight.process.quality import Quality
 from polysight.results import MetalSource, NoResult, ScanFacts, ScanMaterials, ScanQuality, Verdict, join_reasons
 from polysight.store import Scan, versions
 from polysight_shared.config import Instrument

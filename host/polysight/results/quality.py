@@ -54,6 +54,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
         Masked positions of which all chirps were clipped.
     dead_rx
         RX that gave no signal, counted from 1, to the rows; they were left out of the images there.
+    rx_order
+        Places in the rig file of the recorded RX, counted from 1, if they were recorded in another order; else empty.
     masked_columns
         Row to half-open ranges [start, stop) of masked columns.
     rows_recorded
@@ -76,6 +78,7 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
     chirps_disturbed: int = 0
     positions_clipped: int = 0
     dead_rx: dict[int, list[int]] = {}
+    rx_order: list[int] = []
     direct_path_hz: FrequencyRange | UnsetType = UNSET
     # In one sample of one chirp; None where the noise is unknown.
     direct_path_snr_db: float | None = None
@@ -166,6 +169,8 @@ class MetalPlate(msgspec.Struct, frozen=True, kw_only=True):
     ratio_variation_deg: float | None = None
     # Standard deviation of each part of V / H over the plate: noise and speckle.
     spread: float | None = None
+    # Rise of the plate along the plane of incidence and across it, as it was scanned.
+    tilt_deg: Pair = (0.0, 0.0)
     sub_bands: int | UnsetType = UNSET
 
 

@@ -14,6 +14,8 @@ import numpy as np
 from polysight.results.verdict import Coverage, is_known, reason
 from polysight_shared.findings import Finding
 
+FILLED = 0.5
+"""Share of the image's pixels in one region that is no patch, above which it fills the image."""
 FEW_POSITIONS = 0.5
 """Share of positions that are absent, masked or without a direct path, above which there is no result."""
 SOME_POSITIONS = 0.005
@@ -167,6 +169,30 @@ def judge_dead_rx(board: str, dead: Mapping[int, Sequence[int]], rows: int) -> l
     return reasons
 
 
+def judge_rx_order(board: str, order: Sequence[int]) -> list[Finding]:
+    """Judge a board's RX: `order` are the places in the rig file, from 1, of those recorded in another order."""
+    if not order:
+        return []
+    moved = [f"RX{k} is RX{place}" for k, place in enumerate(order, 1) if k != place]
+    return [reason(
+        "none", f"the RX of {board} are recorded in another order than the rig file's: {', '.join(moved)}",
+        "the phases of direct path and echo fit these places; lanes are exchanged, or a program lists the RX in its own"
+        " order; the image of the board is wrong",
+        f"write rx_order = {list(order)} for {board} ([[boards]] of the rig file, and of the scan's own copy), or"
+        " correct the order where it is made; process again", 10.5,
+    )]  # fmt: skip
+
+
+def judge_phase_jump(board: str, row: int, angle_rad: float) -> list[Finding]:
+    """Judge a jump of the phase of a board's echo before a row."""
+    return [reason(
+        "care", f"{board}: the phase of the echo jumps by {np.degrees(angle_rad):+.0f} degrees before row {row}",
+        "a cable or connector was touched, or the board was knocked; the direct path does not show it; it was"
+        " removed from the images as measured between the rows, and the errors contain what may be left",
+        "fix cables and boards, and scan again", 4.7,
+    )]  # fmt: skip
+
+
 def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
     """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
     if 1 - found_share > FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
@@ -209,11 +235,22 @@ def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
     return reasons
 
 
-def judge_patches(refused: Mapping[int, str], patches: int, left_out: int = 0) -> list[Finding]:
+def judge_patches(
+    refused: Mapping[int, str], patches: int, left_out: int = 0, filled_share: float = 0.0
+) -> list[Finding]:
     """Judge the patches; `refused` maps numbers of patches that are not plates to why (noise, several materials).
 
-    `left_out` bright regions of a plate's size do not stand out enough to be patches, or touch a larger patch.
+    `left_out` bright regions of a plate's size do not stand out enough to be patches, or touch a larger patch;
+    `filled_share` is the share of the image's pixels in the largest of them.
     """
+    if patches == 0 and filled_share > FILLED:
+        return [reason(
+            "none", f"one region fills {100 * filled_share:.0f} % of the image: no edge of a plate is in it",
+            "a plate as large as the image has nothing beside it from which it could stand out; a table, a wall or"
+            " noise alone look the same, so that it is not taken for a patch",
+            "image a larger area (image.columns, image.rows), lay a smaller plate, or draw a box on it (polysight"
+            " label; process --labels)", 9.0,
+        )]  # fmt: skip
     if patches == 0:
         return [reason(
             "none", "no patch was found", "nothing in the image stands out from its background",
@@ -431,6 +468,18 @@ def judge_disturbed_plates(errors: Mapping[int, float]) -> list[Finding]:
         "care", f"V / H changes within {patches}: an error of up to {100 * max(worst.values()):.0f} % in permittivity",
         "copies of other plates lie there: a second path beside the direct path, clipping, or positions without data",
         "take reflectors away from the line between transmitter and receivers; scan all positions", 2.5,
+    )]  # fmt: skip
+
+
+def judge_reference_tilt(tilt_deg: tuple[float, float]) -> list[Finding]:
+    """Judge the tilt of a metal plate that was scanned separately, along the plane of incidence and across it."""
+    worst = max(tilt_deg, key=abs)
+    if not is_known(worst) or abs(worst) <= PLATE_ACROSS_DEG:
+        return []
+    return [reason(
+        "care", f"the metal plate of the reference scan was tilted by {worst:+.1f} degrees",
+        "the polarisation turns with it, in all plates alike, as if the boards had turned; corrected to a quarter",
+        "lay the metal plate parallel to the stage, and scan it again", 4.1,
     )]  # fmt: skip
 
 

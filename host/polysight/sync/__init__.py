@@ -11,6 +11,7 @@ the echoes.
 from polysight.sync.backlash import estimate_backlash, object_filter
 from polysight.sync.chain import PUBLISHED_STD, STAGES, BoardSetup, RowSynchroniser, synchronise_row
 from polysight.sync.decimate import FOLD, block_frequencies_hz, decimation, sample_frequencies_hz, whole_blocks
+from polysight.sync.direct_path import DirectPath, prepare
 from polysight.sync.high_pass_filter import HighPass, fit_high_pass, high_pass
 from polysight.sync.loops import cis
 from polysight.sync.offsets import (
@@ -19,3 +20,4 @@ from polysight.sync.offsets import (
     align_row,
     reference,
 )
+from polysight.sync.rx_order import find_rx_order, judge_rx_order

@@ -39,6 +39,7 @@ from polysight.sync.offsets import (
     half_scale,
     reference,
 )
+from polysight.sync.rx_order import find_rx_order
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -142,6 +143,10 @@ def synchronise_pieces(
         path = path.without_rx(dead)
         aligned = align(dead)
     synchronised = reference(aligned, path, setup.chirp)
+    order: tuple[int, ...] = ()
+    if 2 * np.count_nonzero(synchronised.found) < np.count_nonzero(aligned.good.any(axis=1)):
+        # RX in another order may be why there is no direct path.
+        order = find_rx_order(aligned, synchronised, path, lambda row, other: reference(row, other, setup.chirp))
     rate = setup.chirp.sample_rate_hz
     return SyncedRow(
         samples=synchronised.samples,
@@ -156,6 +161,7 @@ def synchronise_pieces(
         chirps_clipped=int(aligned.clipped.sum()),
         chirps_disturbed=int((received & ~aligned.clipped & ~aligned.good).sum()),
         positions_clipped=int((aligned.clipped.any(axis=1) & (aligned.clipped == received).all(axis=1)).sum()),
+        rx_order=order,
     )
 
 

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 from polysight.sync.decimate import flatten, fold, sample_frequencies_hz, whole_blocks
 from polysight.sync.direct_path import DirectPath, excess_path_m, prepare
 from polysight.sync.loops import phasor
-from polysight.sync.offsets import AlignedRow, SyncedRow, find_dead_rx, reference
+from polysight.sync.offsets import (
+    JUDGED_ECHOES,
+    JUDGED_POSITIONS,
+    AlignedRow,
+    SyncedRow,
+    find_dead_rx,
+    reference,
+)
+from polysight.sync.rx_order import find_rx_order
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.error_codes import ErrorCode
 from polysight_shared.errors import DataError
@@ -85,13 +93,17 @@ class CubeForm:
         amplitude = hz
         turned = samples
         has_data = valid
+        order: tuple[int, ...] = ()
         if self.path is not None:
-            samples, valid, hz, amplitude = _reference_cube(turned, has_data, self.path, self.chirp)
+            samples, valid, hz, amplitude, order = _reference_cube(turned, has_data, self.path, self.chirp)
         # Neighbouring positions hold nearly the same signals.
-        dead = find_dead_rx(samples[:, :-1], samples[:, 1:])
+        judged = JUDGED_POSITIONS
+        if self.constant.any():
+            judged = JUDGED_ECHOES
+        dead = find_dead_rx(samples[:, :-1], samples[:, 1:], judged)
         if self.path is not None and dead.any():
             path = self.path.without_rx(dead)
-            samples, valid, hz, amplitude = _reference_cube(turned, has_data, path, self.chirp)
+            samples, valid, hz, amplitude, _ = _reference_cube(turned, has_data, path, self.chirp)
         samples += self.constant[:, None, None]
         samples[:, ~valid] = 0
         samples[dead] = 0
@@ -104,6 +116,7 @@ class CubeForm:
             chirps=np.where(valid, pulses, 0),
             direct_hz=hz,
             direct_amplitude=amplitude,
+            rx_order=order,
         )
 
 
@@ -174,8 +187,11 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
             form.append("each RX referenced to its own direct path")
     else:
         direct_path = prepare(rig, board)
-        _, is_found, _, _ = _reference_cube(cube.astype(np.complex64), np.ones(cube.shape[1], bool), direct_path, chirp)
-        if is_found.mean() > _MIN_FOUND and _share(cube[..., a:b], gate) < _ALONE:
+        _, is_found, _, _, order = _reference_cube(
+            cube.astype(np.complex64), np.ones(cube.shape[1], bool), direct_path, chirp
+        )
+        has_direct_path = is_found.mean() > _MIN_FOUND or bool(order)
+        if has_direct_path and _share(cube[..., a:b], gate) < _ALONE:
             path = direct_path
             form.append("not referenced to a direct path; referenced here")
         else:
@@ -254,10 +270,10 @@ def _share(samples: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -
 
 def _reference_cube(
     cube: NDArray[np.complex64], valid: NDArray[np.bool_], path: DirectPath, chirp: Chirp
-) -> tuple[NDArray[np.complex64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.complex64], NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64], tuple[int, ...]]:
     """Reference positions to their direct path; return samples, mask of found positions, IF (Hz) and amplitude.
 
-    Each position of the cube is treated as the average of one chirp.
+    Each position of the cube is treated as the average of one chirp. The last value is that of `find_rx_order`.
     """
     samples = cube.shape[2]
     a, b = whole_blocks(chirp.linear_samples)
@@ -286,13 +302,16 @@ def _reference_cube(
     # sign: it is searched for in the band of complex 2x.
     near_zero = bool(abs(np.median(centre)) < 0.4)
     if near_zero:
-        estimate = reference(aligned, path, msgspec.structs.replace(chirp, if_mode="complex2x"))
-    else:
-        estimate = reference(aligned, path, chirp)
+        chirp = msgspec.structs.replace(chirp, if_mode="complex2x")
+    estimate = reference(aligned, path, chirp)
+    order: tuple[int, ...] = ()
+    if 2 * np.count_nonzero(estimate.found) < np.count_nonzero(valid):
+        # RX in another order may be why there is no direct path.
+        order = find_rx_order(aligned, estimate, path, lambda row, other: reference(row, other, chirp))
     # `reference` found how the IF drifts along a chirp: a phase that grows with the square of time, removed here too.
     time = np.arange(samples) - middle
     steering = path.steering * np.exp(-0.5j * estimate.drift * time**2)
     residual_cycles = (estimate.frequency - centre + 0.5) % 1.0 - 0.5
     turn = phasor(-residual_cycles, -np.angle(estimate.amplitude), samples, middle) * estimate.found[:, None]
     referenced = (mixed * steering[:, None] * turn).astype(np.complex64)
-    return referenced, estimate.found, estimate.frequency * chirp.sample_rate_hz, np.abs(estimate.amplitude)
+    return referenced, estimate.found, estimate.frequency * chirp.sample_rate_hz, np.abs(estimate.amplitude), order

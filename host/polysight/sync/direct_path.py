@@ -6,6 +6,7 @@ The estimators suppress the object with all RX together: one that gives no signa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -72,6 +73,27 @@ class DirectPath(NamedTuple):
     def without_rx(self, dead: NDArray[np.bool_]) -> DirectPath:
         """Return the same without the `dead` RX [rx], for which everything is 0."""
         return _prepare(*self.geometry, tuple(np.flatnonzero(dead).tolist()))
+
+    def reordered(self, order: Sequence[int]) -> DirectPath:
+        """Return the same for RX in another order: recorded RX k is the one at place `order[k]`, from 0."""
+        places = list(order)
+        blocks = self.folded_steering.shape[1]
+
+        def reorder(estimator: NDArray[np.complex128]) -> NDArray[np.complex128]:
+            by_rx = estimator.reshape(*estimator.shape[:-1], len(places), blocks)
+            return by_rx[..., places, :].reshape(estimator.shape)
+
+        chirp, tx_m, rx_m, specular_m = self.geometry
+        return self._replace(
+            steering=self.steering[places],
+            folded_steering=self.folded_steering[places],
+            estimator=reorder(self.estimator),
+            drift_estimator=reorder(self.drift_estimator),
+            half_estimators=reorder(self.half_estimators),
+            beam=self.beam[places],
+            search_weights=self.search_weights[places],
+            geometry=(chirp, tx_m, tuple(rx_m[k] for k in places), specular_m),
+        )
 
 
 def excess_path_m(

@@ -78,9 +78,11 @@ _PRESENT = 30.0
 # An RX is dead if its power is this part (-23 dB, chosen) of the strongest one's, without its noise.
 _DEAD = 0.005
 # The strongest RX says nothing about others if a smaller part of its power is signal, and not noise; chosen.
-_SIGNAL = 0.3
+_SIGNAL = 0.5
 # About so many positions are judged together; chosen.
-_JUDGED = 16
+JUDGED_POSITIONS = 4
+# About so many are, if the direct path is not among the signals: echoes of several plates cancel at single positions.
+JUDGED_ECHOES = 16
 
 Errors = dict[str, NDArray[np.float64]]
 """Error samples after each stage of synchronisation, float64 [3, n]: frequency, phase, relative amplitude."""
@@ -477,6 +479,9 @@ class SyncedRow:
         burst (interference, silence).
     positions_clipped
         Positions without data because all their received chirps were clipped.
+    rx_order
+        Places in the rig file of the recorded RX, counted from 1, if the row has no direct path in the rig file's order
+        but in this one (`rx_order.find_rx_order`); empty otherwise.
     errors
         Error samples of the row after each stage (`errors`), {stage: float64 [3, n]}.
     """
@@ -493,6 +498,7 @@ class SyncedRow:
     chirps_clipped: int = 0
     chirps_disturbed: int = 0
     positions_clipped: int = 0
+    rx_order: tuple[int, ...] = ()
 
     @property
     def dead_rx(self) -> list[int]:
@@ -597,11 +603,14 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     )
 
 
-def find_dead_rx(signal: NDArray[np.complexfloating], again: NDArray[np.complexfloating]) -> NDArray[np.bool_]:
+def find_dead_rx(
+    signal: NDArray[np.complexfloating], again: NDArray[np.complexfloating], judged: int = JUDGED_POSITIONS
+) -> NDArray[np.bool_]:
     """Find the RX that receive noise or nothing in some part of a row while another one receives a signal, bool [rx].
 
     `signal` and `again` [rx, position, sample] hold the same signals, up to a phase of each position, with independent
-    noise. The power of an RX without its noise is the part of their product that is in phase in all RX.
+    noise. The power of an RX without its noise is the part of their product that is in phase in all RX. Any `judged`
+    neighbouring positions are judged together.
     """
     product = np.vecdot(signal, again)
     total = product.sum(axis=0)
@@ -609,11 +618,18 @@ def find_dead_rx(signal: NDArray[np.complexfloating], again: NDArray[np.complexf
         return np.zeros(len(product), bool)
     in_phase = np.real(product * np.exp(-1j * np.angle(total)))
     power = np.sqrt(np.vecdot(signal, signal).real * np.vecdot(again, again).real)
-    parts = np.linspace(0, total.size, max(2, total.size // _JUDGED + 1)).astype(int)[:-1]
-    in_phase, power = (np.add.reduceat(values, parts, axis=1) for values in (in_phase, power))
+    width = min(judged, total.size)
+    in_phase, power = (_sum_neighbours(values, width) for values in (in_phase, power))
     strongest = in_phase.max(axis=0)
-    has_signal = strongest > _SIGNAL * power[in_phase.argmax(axis=0), np.arange(len(parts))]
+    has_signal = strongest > _SIGNAL * power[in_phase.argmax(axis=0), np.arange(power.shape[1])]
     return ((in_phase < _DEAD * strongest) & has_signal).any(axis=1)
+
+
+def _sum_neighbours(values: NDArray[np.floating], width: int) -> NDArray[np.float64]:
+    """Return sums [rx, start] of `width` neighbouring values [rx, position]."""
+    sums = np.cumsum(values, axis=1, dtype=np.float64)
+    before = np.pad(sums, ((0, 0), (1, 0)))[:, :-width]
+    return sums[:, width - 1 :] - before
 
 
 def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:

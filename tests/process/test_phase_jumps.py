@@ -1,0 +1,72 @@
+"""A jump of a channel's phase within a scan is found row by row, told, and counted in the errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.coverage import Cubes
+from tests.support.mangled_scans import PLATES, SCENE, distances
+from tests.support.pipelines import make_pipeline
+from tests.support.rigs import published_rig
+
+from polysight.process.quality import find_phase_jump
+from polysight_simulators.scene import decode_scene
+from polysight_worlds import METAL, Plate, Stack, World, published_rig as independent_rig, record
+from polysight_worlds.world import nine_places
+
+EMPTY: dict[str, Any] = SCENE | {"plates": []}
+
+
+def jumping(board: str, row: int, degrees: float) -> Cubes:
+    """Cubes of the six plates whose echo in one board is turned from a row on; the direct path is not."""
+    cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
+    direct = Cubes(published_rig(), decode_scene(EMPTY, "test"))._cubes[board].mean(axis=(1, 2, 3), keepdims=True)
+    echoes = cubes._cubes[board][:, row:] - direct
+    cubes._cubes[board][:, row:] = direct + echoes * np.exp(1j * np.radians(degrees)).astype(np.complex64)
+    return cubes
+
+
+@pytest.mark.parametrize(("board", "row", "degrees"), [("RV", 14, 30.0), ("RV", 24, -30.0), ("RH", 20, 25.0)])
+def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degrees):
+    cubes = jumping(board, row, degrees)
+    pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
+    findings = pipeline.examine(pipeline.form_images())
+    jump = pipeline.quality.boards[board].find_phase_jump()
+    assert jump is not None
+    assert abs(jump.row - row) <= 1
+    assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=6)
+    assert findings.verdict.level == "care"
+    assert f"{board}: the phase of the echo jumps" in findings.verdict.reasons[0].what
+    inside = distances(cubes, findings)
+    assert len(inside) == len(PLATES)
+    assert max(inside) < 9
+
+
+def test_no_jump_is_found_without_one():
+    for cubes in (jumping("RV", 20, 0.0), jumping("RV", 20, 2.0)):
+        pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
+        assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
+
+
+@pytest.mark.parametrize("degrees", [30.0, -45.0, 15.0])
+@pytest.mark.parametrize("row", [60, 100, 130])
+def test_jumps_of_an_independent_world_are_found(degrees, row):
+    rig = independent_rig()
+    places = nine_places((rig.centre_m[0], rig.centre_m[1]))
+    stacks = [METAL, *(Stack(below=complex(e, -0.4)) for e in (2.2, 3.0, 3.6, 4.2, 5.0, 6.0, 7.0, 2.6))]
+    plates = [Plate(str(i), place, (0.046, 0.046), s) for i, (place, s) in enumerate(zip(places, stacks, strict=True))]
+    echoes = record(rig, rig.v, World(tuple(plates)))
+    direct_m = np.linalg.norm(rig.v.position - rig.tx.position)
+    # One range cell: echoes relative to the direct path, summed over the sweep.
+    middle_m = 0.308
+    turn = np.exp(2j * np.pi * rig.frequencies_hz * (direct_m + middle_m) / 299792458.0)
+    cell = np.tensordot(turn, echoes, 1)
+    rows = {k: cell[k][None] for k in range(len(cell))}
+    assert find_phase_jump(rows) is None
+    turned = {k: v * np.exp(1j * np.radians(degrees) * (k >= row)) for k, v in rows.items()}
+    jump = find_phase_jump(turned)
+    assert jump is not None
+    assert jump.row == row
+    assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=5)

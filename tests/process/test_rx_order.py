@@ -1,0 +1,128 @@
+"""RX that were recorded in another order are told with that order, and nothing false is told beside it."""
+
+from __future__ import annotations
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+from benchmarks.coverage import Cubes
+from tests.support.mangled_scans import PLATES, SCENE, Mangle, Mangled, distances
+from tests.support.pipelines import make_pipeline
+from tests.support.rigs import published_rig, rig_with
+
+from polysight.jobs.process import LiveProcessing
+from polysight.settings import Settings
+from polysight.store import ScanFolder
+from polysight.sync import BoardSetup, rx_order
+from polysight_shared.config import Instrument
+from polysight_shared.errors import ConfigError
+from polysight_simulators.scene import decode_scene
+
+
+def reorder(board: str, *order: int) -> Mangle:
+    """Record the RX of a board in another order: the first recorded one is RX `order[0]`, counted from 1."""
+
+    def mangle(name: str, _: int, words: np.ndarray) -> None:
+        if name == board:
+            words[:] = words[..., [k - 1 for k in order]]
+
+    return mangle
+
+
+def with_order(rig: Instrument, board: str, *order: int) -> Instrument:
+    boards = [msgspec.structs.replace(b, rx_order=order) if b.name == board else b for b in rig.boards]
+    return msgspec.structs.replace(rig, boards=tuple(boards))
+
+
+@pytest.mark.parametrize(
+    ("board", "order"),
+    [("RV", (2, 1, 3, 4)), ("RV", (4, 3, 2, 1)), ("RV", (1, 3, 2, 4)), ("RH", (2, 1, 3, 4)), ("RH", (4, 3, 2, 1))],
+)
+def test_another_order_is_told_and_nothing_else(process_six_plates, board, order):
+    pipeline, _, findings = process_six_plates(reorder(board, *order))
+    assert findings.verdict.level == "none"
+    (told,) = findings.verdict.reasons
+    assert f"the RX of {board} are recorded in another order" in told.what
+    assert f"rx_order = {list(order)}" in told.do
+    assert pipeline.quality.result().boards[board].rx_order == list(order)
+
+
+def test_with_the_order_in_the_rig_file_the_images_are_the_same(six_plates, process_six_plates):
+    class Corrected(Mangled):
+        def __init__(self) -> None:
+            super().__init__(six_plates, reorder("RV", 4, 3, 1, 2))
+            self.instrument = with_order(six_plates.instrument, "RV", 4, 3, 1, 2)
+
+    pipeline = make_pipeline(Corrected())  # type: ignore[arg-type]
+    images = pipeline.form_images()
+    _, expected, _ = process_six_plates()
+    np.testing.assert_allclose(images.v, expected.v, atol=2e-5 * np.abs(expected.v).max())
+    findings = pipeline.examine(images)
+    assert pipeline.quality.result().boards["RV"].rx_order == []
+    assert len(distances(six_plates, findings)) == len(PLATES)
+
+
+def test_the_right_order_and_a_dead_rx_are_no_other_order(process_six_plates):
+    def kill(name: str, _: int, words: np.ndarray) -> None:
+        if name == "RV":
+            words[..., 2] = 0
+
+    for mangle in (None, kill):
+        pipeline, _, _ = process_six_plates(mangle)
+        assert all(not row.figures.rx_order for b in pipeline.quality.boards.values() for row in b.rows.values())
+
+
+@pytest.mark.parametrize(("board", "order"), [("RV", (2, 1, 3, 4)), ("RH", (4, 3, 2, 1))])
+def test_cubes_tell_it_too(process_six_plates, board, order):
+    cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
+    # The phases before synchronisation: only such a cube has the order of its RX in the direct path.
+    setups = {b.name: BoardSetup.from_rig(published_rig(), b) for b in cubes.instrument.receivers}
+
+    def mangle(name: str, row: int, samples: np.ndarray) -> None:
+        path = setups[name].path
+        lags = np.angle(path.steering[:, 96])
+        rng = np.random.default_rng(row)
+        # [position, sample, 1, rx]
+        samples *= np.exp(2j * np.pi * rng.random((len(samples), 1, 1, 1))) * np.exp(-1j * lags)
+        reorder(board, *order)(name, row, samples)
+
+    _, _, findings = process_six_plates(mangle, cubes)
+    assert [r.what for r in findings.verdict.reasons if f"the RX of {board} are recorded" in r.what]
+
+
+def test_the_operator_hears_of_it_with_the_first_rows(six_plates, monkeypatch, caplog):
+    monkeypatch.setattr(ScanFolder, "load", lambda _: Mangled(six_plates, reorder("RH", 4, 3, 2, 1)))
+    processing = LiveProcessing(six_plates.path, Settings())
+    for row in range(3):
+        processing.add_row(row)
+    told = [r.getMessage() for r in caplog.records if "another order" in r.getMessage()]
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("order", [(1, 2, 3), (1, 1, 2, 3), (0, 1, 2, 3), (2, 3, 4, 5)])
+def test_an_order_that_is_none_is_refused(order):
+    def write(table: dict) -> None:
+        table["boards"][1]["rx_order"] = list(order)
+
+    with pytest.raises(ConfigError, match="rx_order"):
+        rig_with(write)
+
+
+@pytest.mark.parametrize("board", [0, 1])
+def test_phases_of_a_place_tell_the_order_in_spite_of_the_channels(board):
+    """Of geometry alone: every order of four RX is found, or one with the same image; none is found without a swap."""
+    rig = published_rig()
+    path = BoardSetup.from_rig(rig, rig.receivers[board]).path
+    expected = rx_order._expect_phases(path)
+    rng = np.random.default_rng(3)
+    for order in itertools.permutations(range(4)):
+        places = list(order)
+        channels = np.exp(1j * np.radians(rng.uniform(-20, 20, 4)))
+        direct = channels * np.exp(1j * expected.direct[places])
+        echo = np.exp(1j * (expected.echo[places] + 0.1 * rng.standard_normal(4)))
+        found = rx_order._choose(rx_order._Vectors(direct, echo), expected)
+        chosen = [k - 1 for k in found] or [0, 1, 2, 3]
+        same = abs(np.exp(1j * (expected.echo[places] - expected.echo[chosen])).mean())
+        assert same > 0.97

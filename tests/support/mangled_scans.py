@@ -1,0 +1,94 @@
+"""A small scan of six plates whose words or cubes are changed while they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from polysight.imaging import Images
+from polysight.materials import match_truth, truth_plates
+from polysight.pipeline import Pipeline
+from polysight.process import Findings
+from polysight.store import CubeRow, RowData, Source
+from polysight.store.source import split_pieces
+from polysight_simulators.scene import decode_scene
+from polysight_simulators.scene.simulated_scan import truth
+from tests.support.pipelines import make_pipeline
+
+PLATES = {
+    "ceramic": ([-62.0, 32.0], [4.75, 2.43]), "acrylic": ([0.0, 34.0], [4.0, 0.4]), "PET": ([62.0, 32.0], [3.78, 0.7]),
+    "wood": ([-62.0, -32.0], [2.61, 0.01]), "rubber": ([62.0, -32.0], [5.06, 1.11]),
+}  # fmt: skip
+SCENE: dict[str, Any] = {
+    "name": "small", "seed": 5, "burst": {"pulses": 4}, "image": {"columns": 110, "rows": 86},
+    "grid": {"columns": 43, "rows": 41, "step_x_mm": 10.0, "step_y_mm": 6.0},
+    "plates": [
+        {"name": "metal", "centre_mm": [0.0, -34.0], "size_mm": [46.0, 46.0], "metal": True},
+        *({"name": n, "centre_mm": at, "size_mm": [46.0, 46.0], "permittivity": e} for n, (at, e) in PLATES.items()),
+    ],
+}  # fmt: skip
+ROWS = SCENE["grid"]["rows"]
+# Changes the words of a row in place: board, row, int16 [chirp, sample, 2, rx].
+Mangle = Callable[[str, int, np.ndarray], None]
+
+
+class Mangled:
+    """A source whose words or cubes are changed while they are read."""
+
+    def __init__(self, source: Any, mangle: Mangle) -> None:
+        self._source = source
+        self._mangle = mangle
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._source, name)
+
+    def read_row(self, board: str, row: int) -> RowData | CubeRow:
+        recorded = self._source.read_row(board, row)
+        if isinstance(recorded, CubeRow):
+            cube = recorded.cube.copy()
+            self._mangle(board, row, cube.transpose(1, 2, 0)[:, :, None])
+            return replace(recorded, cube=cube)
+        chirp = self.instrument.chirp
+        words = recorded.payload.copy().view(np.int16).reshape(-1, chirp.samples, 2, 4)
+        self._mangle(board, row, words)
+        return replace(recorded, pieces=split_pieces(words.reshape(-1).view(np.uint8)))
+
+
+def distances(source: Any, findings: Findings) -> list[float]:
+    """Squared distances of the true permittivities in the regions."""
+    scene = decode_scene(SCENE, "test")
+    plates = truth_plates(truth(source.instrument, scene, scene.seed))
+    true = match_truth([r.patch for r in findings.analysis.patches], plates)
+    out = []
+    for r in findings.analysis.patches:
+        e = r.permittivity
+        plate = true.get(r.patch.label)
+        if e.value is not None and plate is not None and plate.permittivity is not None:
+            d = e.value - plate.permittivity
+            out.append(float(np.array([d.real, d.imag]) @ np.linalg.solve(np.array(e.covariance), [d.real, d.imag])))
+    return out
+
+
+ProcessMangled = Callable[..., tuple[Pipeline, Images, Findings]]
+
+
+def processor(source: Source) -> ProcessMangled:
+    """`process(mangle)`: pipeline, images and findings of the scan with changed words; `of`: of another source."""
+    done: dict[Any, tuple[Pipeline, Images, Findings]] = {}
+
+    def make(mangle: Mangle | None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
+        pipeline = make_pipeline(Mangled(of, mangle) if mangle else of)  # type: ignore[arg-type]
+        images = pipeline.form_images()
+        return pipeline, images, pipeline.examine(images)
+
+    def cached(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
+        if mangle is not None:
+            return make(mangle, of)
+        if of not in done:
+            done[of] = make(None, of)
+        return done[of]
+
+    return cached

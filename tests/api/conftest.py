@@ -45,11 +45,3 @@ def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     products_folder = tmp_path_factory.mktemp("processed")
     command("process", shutil.copytree(folder, products_folder / "scan"), "--out", products_folder / "products")
     return products_folder / "products"
-
-
-@pytest.fixture(scope="session")
-def banded(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same scan processed again, with an angle for each pixel, also by sub-bands."""
-    out = tmp_path_factory.mktemp("banded") / "products"
-    command("process", folder, "--out", out, "--incidence", "pixel", "--bands", "2")
-    return out

@@ -248,8 +248,8 @@ def judge_patches(
             "none", f"one region fills {100 * filled_share:.0f} % of the image: no edge of a plate is in it",
             "a plate as large as the image has nothing beside it from which it could stand out; a table, a wall or"
             " noise alone look the same, so that it is not taken for a patch",
-            "image a larger area (image.columns, image.rows), lay a smaller plate, or draw a box on it (polysight"
-            " label; process --labels)", 9.0,
+            "image a larger area (image.columns, image.rows), lay a smaller plate, or"
+            " draw a box on it (polysight label; process --labels)", 9.0,
         )]  # fmt: skip
     if patches == 0:
         return [reason(

@@ -238,7 +238,7 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
     options = ("--samples", "128", "--lanes", "2", "--q-first", "--json")
     document = json.loads(polysight("other.bin", *options).out)
     assert (document["lanes"], document["samples"], document["q_first"], document["remarks"]) == (2, 128, True, [])
-    assert polysight("rig.bin", "--plot", "absent/x.png").status == 5
+    assert polysight("rig.bin", "--plot", "rig.bin/x.png").status == 5
 
 
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):

@@ -99,8 +99,11 @@ sys.exit(status)
 """
 
 
-def test_an_interrupt_at_any_moment_ends_in_one_line():
-    """A command is interrupted after growing CPU times, until it ends before the interrupt."""
+def test_an_interrupt_at_any_moment_ends_in_one_line_at_most():
+    """A command is interrupted after growing CPU times, until it ends before the interrupt.
+
+    Before its first modules are loaded, the signal ends it without a word, as it ends other programs.
+    """
     ends = []
     for cpu_ms in range(2, 5000, 60):
         command = [sys.executable, "-c", INTERRUPT_AFTER, f"{cpu_ms / 1e3}", "plan", "--config", str(RIG_FILE)]
@@ -108,8 +111,9 @@ def test_an_interrupt_at_any_moment_ends_in_one_line():
         ends.append((process.returncode, process.stderr))
         if process.returncode == 0:
             break
-    assert len(ends) > 1
-    assert set(ends[:-1]) == {(128 + signal.SIGINT, "polysight plan: stopped\n")}
+    stopped = (128 + signal.SIGINT, "polysight plan: stopped\n")
+    assert stopped in ends
+    assert set(ends[:-1]) <= {stopped, (-signal.SIGINT, "")}
 
 
 INTERRUPT_THE_PI = """

@@ -342,6 +342,6 @@ def test_a_standard_deviation_is_not_shown_as_the_value():
 
 def test_a_scene_without_plates_to_name_has_no_count_of_them(scan):
     """Such as a metal plate alone, processed with itself as the reference."""
-    assert scan.plates_named is not None
+    assert scan.named_plates is not None
     metal = [plate for plate in scan.plates if plate.permittivity is None]
-    assert changed(scan, plates=metal).plates_named is None
+    assert changed(scan, plates=metal).named_plates is None

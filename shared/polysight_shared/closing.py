@@ -1,9 +1,10 @@
 """What has to be closed, by `with` or by a call."""
 
+from abc import ABC, abstractmethod
 from typing import Self
 
 
-class Closing:
+class Closing(ABC):
     """Base of what `with` closes at the end of its block, by its method `close`."""
 
     def __enter__(self) -> Self:
@@ -12,6 +13,6 @@ class Closing:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @abstractmethod
     def close(self) -> None:
         """Close it."""
-        raise NotImplementedError

@@ -20,8 +20,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight_shared.config import Board, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.raster import RasterPlan, Row, mean_burst_travel_mm, plan_raster
 

@@ -44,8 +44,7 @@ from polysight.imaging.geometry import Antennas, StageWindow, Window, image_grid
 from polysight.imaging.samples import BoardSamples, reduction
 from polysight.sync import HighPass, SyncedRow, high_pass
 from polysight_shared.config import Board, Chirp, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import ConfigError, DataError
+from polysight_shared.errors import ConfigError, DataError, ErrorCode
 from polysight_shared.geometry import Vector, place
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S

@@ -36,8 +36,7 @@ from polysight.imaging.direct import DirectImager
 from polysight.imaging.spectral import SLACK_M, IncrementalImager, SpectralImager
 from polysight.sync import FOLD, SyncedRow, decimation, sample_frequencies_hz
 from polysight_shared.config import Board, Chirp, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

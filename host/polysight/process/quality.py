@@ -1,14 +1,13 @@
 """Quality of a processed scan: the figures of quality.json, by row, board and scan; `judge.py` has the verdict on them.
 
-`Quality` collects frames received, positions masked, synchronisation residuals and run time.
+`Quality` collects frames received, positions masked, synchronisation residuals and run time, and what only all rows of
+a board show together: the order of its RX, and jumps of its phase.
 
-Find jumps of the echo's phase between rows of a scan, such as a cable that was touched makes.
-
-The direct path does not have them if they arise behind it, so that referencing to it leaves them. Echoes of
-neighbouring positions are alike: a linear predictor from the two rows on either side, fitted to the rows around,
-explains an echo but for 15 to 30 % of its amplitude where plates reflect (rows 6 mm apart). If the phase jumps by phi
-between two rows, the parts of the prediction from the other side of the jump have to be turned by phi; least squares
-gives it.
+A jump of the phase between two rows comes, for example, from a cable that was touched. Referencing to the direct path
+leaves it if only the echo has it. Echoes of neighbouring positions are alike: a linear predictor from the two rows on
+either side, fitted to the rows around, explains an echo but for 15 to 30 % of its amplitude where plates reflect (rows
+6 mm apart). If the phase jumps by phi between two rows, the parts of the prediction from the other side of the jump
+have to be turned by phi; least squares gives it.
 
 A jump where nothing reflects (gaps between plates, rows at the ends of the scan) is not seen, and one between the last
 row of one plate and the first of the next looks like a difference of the plates.
@@ -61,7 +60,6 @@ NO_FILES: Mapping[str, CalibrationSource] = {}
 # Least share of a board's rows that tell another order of the RX; chosen.
 OTHER_ORDER = 0.1
 Count = Annotated[int, msgspec.Meta(ge=0)]
-
 
 # Rows on either side that an echo is predicted from, and positions on either side in each of them; chosen.
 _ROWS = (-2, -1, 1, 2)
@@ -164,6 +162,9 @@ class BoardRows:
         self._path = prepare(self.rig, self.board)
         # What each row tells about the order of the RX.
         self._orders: dict[int, tuple[int, ...]] = {}
+        # The latest jump that was looked for, and the rows in which it was.
+        self._jump: PhaseJump | None = None
+        self._searched_rows: dict[int, RowQuality] = {}
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
         """Compute and store the figures of a synchronised row, of which `frames_valid` frames were received whole."""
@@ -244,8 +245,16 @@ class BoardRows:
 
     def find_phase_jump(self) -> PhaseJump | None:
         """Find the clearest jump of the echo's phase between two rows; None if there is none."""
-        plan = plan_raster(self.rig.grid)
-        return find_phase_jump({row: r.echo[:, :: plan.row(row).direction] for row, r in self.rows.items()})
+        # A copy: threads may add rows meanwhile.
+        rows = dict(self.rows)
+        is_searched = rows.keys() == self._searched_rows.keys() and all(
+            quality is self._searched_rows[row] for row, quality in rows.items()
+        )
+        if not is_searched:
+            plan = plan_raster(self.rig.grid)
+            self._jump = find_phase_jump({row: r.echo[:, :: plan.row(row).direction] for row, r in rows.items()})
+            self._searched_rows = rows
+        return self._jump
 
     @property
     def direct_snr_db(self) -> float | None:

@@ -19,7 +19,7 @@ import select
 import socket
 import struct
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from enum import Enum
@@ -55,7 +55,7 @@ class BoardState(NamedTuple):
     detail: str = ""
 
 
-class RadarControl(Closing, ABC):
+class RadarControl(Closing):
     """The radars of a rig; a context manager that closes the connections."""
 
     @abstractmethod

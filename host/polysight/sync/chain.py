@@ -41,8 +41,7 @@ from polysight.sync.offsets import (
 )
 from polysight.sync.rx_order import find_rx_order
 from polysight_shared.config import Board, Chirp, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 # Stages of `SyncedRow.errors`, and of what each one's errors are.
 STAGES = {

@@ -30,8 +30,7 @@ from polysight.sync.offsets import (
 )
 from polysight.sync.rx_order import find_rx_order
 from polysight_shared.config import Board, Chirp, Instrument
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 

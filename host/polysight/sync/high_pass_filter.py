@@ -15,8 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight_shared.config import Chirp
-from polysight_shared.error_codes import ErrorCode
-from polysight_shared.errors import DataError
+from polysight_shared.errors import DataError, ErrorCode
 
 SMALLEST_GAIN = 0.25
 """Smallest filter gain that is fully compensated (chosen): noise is amplified four times at most."""

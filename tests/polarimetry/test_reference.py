@@ -85,3 +85,21 @@ def test_images_without_a_metal_plate_are_refused():
         plane_reference(make_images(spots, spots), smooth_mm=2.0)
     with refused(ErrorCode.MISMATCH):
         plane_reference(make_images(dark + 1, dark + 1)).check_axes(X + 1e-3, Y)
+
+
+@pytest.mark.parametrize("permittivity", [2.1, 4.75 - 2.43j, 9 - 0.2j])
+def test_a_scene_with_other_plates_beside_the_metal_is_refused(permittivity):
+    """Otherwise all but the metal would be masked without a word."""
+    r = fresnel(permittivity, THETA)
+    is_metal = (X < 0.07)[None, :]
+    h = np.where(is_metal, 1.0, r[0]) * np.ones((Y.size, 1), complex)
+    v = np.where(is_metal, 1.0, r[1]) * np.ones((Y.size, 1), complex)
+    with refused(ErrorCode.MISMATCH):
+        plane_reference(make_images(h, v))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.02, 0.12))
+def test_a_metal_plate_alone_is_taken_however_small_and_unevenly_lit(seed, width_m):
+    light = gains(np.random.default_rng(seed), 0.1)
+    at_plate = np.where((width_m > X)[None, :], 1.0, 0.02)
+    plane_reference(make_images(light[0] * at_plate, light[1] * at_plate), smooth_mm=2.0)

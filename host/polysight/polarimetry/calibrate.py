@@ -181,6 +181,11 @@ SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
 # A smaller area of metal is not a plate that covers the plane; chosen.
 MIN_PIXELS = 100
+# V / H of pixels that are not metal, relative to the brightest ones, and the share of the pixels bright in H that may
+# be so. Dielectrics of up to eps = 9 have -7.4 dB or less. On metal plates gains differ by up to 5 dB; in scenes of
+# copper and other plates 8 to 40 % of the pixels have -7 dB (all simulated).
+OTHER_MATERIAL_DB = -7.0
+OTHER_MATERIAL_SHARE = 0.03
 
 
 @dataclass(frozen=True)
@@ -320,7 +325,7 @@ def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = ""
     The window has the width (standard deviation) `smooth_mm`: the gains vary slowly, speckle does not.
     `name` is the scan, for the report.
 
-    Raises DataError if the image shows no metal.
+    Raises DataError if the image shows no metal, or other materials beside it.
     """
     h = images.h
     v = images.v
@@ -329,9 +334,13 @@ def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = ""
     power_h = smooth(np.where(usable, np.abs(h) ** 2, 0.0).astype(np.float64), smooth_px)
     power_v = smooth(np.where(usable, np.abs(v) ** 2, 0.0).astype(np.float64), smooth_px)
     strong = usable.copy()
+    level_db = []
     for power in (power_h, power_v):
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
-        strong &= power >= max(top * 10 ** (FLOOR_DB / 10), np.finfo(np.float32).tiny)
+        least = float(np.finfo(np.float32).tiny)
+        level_db.append(10 * np.log10(np.maximum(power, least) / max(top, least)))
+        strong &= power >= max(top * 10 ** (FLOOR_DB / 10), least)
+    _check_is_alone(level_db[0][usable], level_db[1][usable])
     # The border of the image does not count as an edge of the plate.
     is_plate = np.asarray(scipy.ndimage.binary_erosion(strong, _make_disk(round(2 * smooth_px)), border_value=1), bool)
     if int(is_plate.sum()) < MIN_PIXELS:
@@ -355,6 +364,20 @@ def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = ""
     return PlaneReference(
         h=metal_h, v=metal_v, valid=is_plate, x_m=images.x_m, y_m=images.y_m, spread=relative_std, how=description
     )
+
+
+def _check_is_alone(h_db: npt.NDArray[np.float64], v_db: npt.NDArray[np.float64]) -> None:
+    """Raise DataError if pixels that are bright in H are not metal: levels [pixel], relative to each channel's top."""
+    is_bright = h_db >= FLOOR_DB
+    share = np.count_nonzero(is_bright & (v_db - h_db < OTHER_MATERIAL_DB)) / max(1, np.count_nonzero(is_bright))
+    if share > OTHER_MATERIAL_SHARE:
+        raise DataError(
+            "the reference scan shows other materials beside metal",
+            f"on {100 * share:.0f} % of its bright area V is {-OTHER_MATERIAL_DB:.0f} dB or more weaker relative to H"
+            " than where it is brightest: so reflect plastics, wood, glass and water",
+            "scan a flat metal plate alone; a scene with metal in it is processed without a reference (--metal)",
+            code=ErrorCode.MISMATCH,
+        )
 
 
 def _make_disk(radius: int) -> npt.NDArray[np.bool_]:

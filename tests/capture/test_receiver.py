@@ -21,7 +21,7 @@ from polysight.acquisition.capture_rig import record_ended
 from polysight.acquisition.control import read_start_ticks
 from polysight.capture import network, receiver_process
 from polysight.capture.dca1000 import Status
-from polysight.capture.network import BatchReceiver, bind_udp, usable_packets
+from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, usable_packets
 from polysight.capture.receiver import BeginRow, EndRow, Open, Progress, ReceiverProcess, RowCapture
 from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
@@ -334,3 +334,9 @@ def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, ca
 def test_address_of_another_machine():
     with refused(ErrorCode.VALUE_INVALID):
         bind_udp("192.0.2.1", 4098, "RH data")
+
+
+def test_a_receive_buffer_that_the_system_allows_is_reported_as_large_as_requested():
+    """Linux itself reports twice the size."""
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sock:
+        assert enlarge_receive_buffer(sock, 1 << 16) == 1 << 16

@@ -19,6 +19,24 @@ def test_memory_is_taken_again_and_clean():
     assert not second.payload[:8000].any()
 
 
+def test_payload_stays_in_its_memory_until_that_is_full():
+    log = PacketLog(1024)
+    memory = log.payload
+    count = memory.size // 1024
+    assert count * 1024 == memory.size
+    packets = np.random.default_rng(0).integers(0, 256, (count + 1, 10 + 1024), dtype=np.uint8)
+    lengths = np.full(count + 1, 10 + 1024)
+    assert log.last_arrival_ns == 0
+    log.add(packets[:-2], lengths[:-2], 3)
+    log.add(packets[-2:-1], lengths[-2:-1], 5)
+    assert log.payload is memory
+    assert log.last_arrival_ns == 5
+    log.add(packets[-1:], lengths[-1:], 7)
+    assert log.payload is not memory
+    assert log.last_arrival_ns == 7
+    assert (log.payload[: packets[:, 10:].size] == packets[:, 10:].ravel()).all()
+
+
 def test_a_segment_holds_the_bytes_given(tmp_path):
     data = np.arange(8000, dtype=np.uint8)
     assert Segment(tmp_path / "b", 8000).finish(data) == zlib.crc32((tmp_path / "b").read_bytes())

@@ -4,7 +4,9 @@ import json
 import os
 import shutil
 import tracemalloc
+from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from msgspec import structs
@@ -149,6 +151,40 @@ def test_a_list_whose_time_is_over_goes_on_with_the_next(root):
     in_parts.read_in_parts()
     assert in_parts.unread == 0
     assert in_parts.list() == whole
+
+
+@pytest.mark.parametrize(("stuck", "threads"), [("", 1), ("out", 2), ("done", 1)])
+def test_another_thread_reads_on_only_when_one_makes_no_progress(root, monkeypatch, stuck, threads):
+    """`done` is the last folder that is read: after it no other one waits."""
+    whole = {s.name for s in Scans(root).list()}
+    begun = []
+
+    class Worker:
+        """A thread that reads one folder while it is waited for, and stays at the one named `stuck`."""
+
+        def __init__(self, target, args, **_) -> None:
+            self._read = target
+            self._waiting, self._until_s = args
+            self._is_stuck = False
+
+        def start(self) -> None:
+            begun.append(self)
+
+        def is_alive(self) -> bool:
+            return self._is_stuck or bool(self._waiting)
+
+        def join(self, _) -> None:
+            if self._is_stuck or not self._waiting:
+                return
+            entry = self._waiting.popleft()
+            self._is_stuck = entry == stuck
+            if not self._is_stuck:
+                self._read(deque([entry]), self._until_s)
+
+    listed = Scans(root)
+    monkeypatch.setattr(scans, "threading", SimpleNamespace(Thread=Worker))
+    assert {s.name for s in listed.list()} == {name for name in whole if name.partition("/")[0] != stuck}
+    assert len(begun) == threads
 
 
 @pytest.mark.parametrize("kept", [0, 1, 0.5, 0.999])

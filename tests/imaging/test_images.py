@@ -414,6 +414,48 @@ def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeyp
     np.testing.assert_array_equal(on_plane.dispersion.h, on_plane.h)
 
 
+class SlopedBoard:
+    """Images of a board on which plates change with range as those at given heights do, with some scatter."""
+
+    # Change of the relative slope of an echo per metre of its height, 1 / m^2; any value would do.
+    SLOPE_PER_M = 40.0
+
+    def __init__(self, masks, heights_m, stds_m) -> None:
+        self._ones = np.ones(masks[0].shape, complex)
+        self._slope = np.zeros(masks[0].shape, complex)
+        for mask, height_m, std_m in zip(masks, heights_m, stds_m, strict=True):
+            is_odd = np.arange(mask.sum()) % 2
+            self._slope[mask] = self.SLOPE_PER_M * (height_m + std_m * (2 * is_odd - 1))
+
+    def image(self):
+        return self._ones, self._ones, None
+
+    def range_slope(self):
+        return self._slope, 0 * self._ones
+
+    def mirror_image(self, _):
+        return self._ones
+
+    def mirror_slope(self, step_m):
+        return step_m * self.SLOPE_PER_M * self._ones
+
+
+def test_only_plates_whose_range_is_known_to_5_cm_have_a_height(monkeypatch):
+    monkeypatch.setattr(plane, "_fit_plane_by_phase", lambda *_: None)
+    masks = np.zeros((3, 12, 30), bool)
+    for k, mask in enumerate(masks):
+        mask[4:8, 10 * k + 3 : 10 * k + 7] = True
+    axes = {"x_m": np.arange(30) * 3e-3, "y_m": np.arange(12) * 3e-3, "pixel_m": 3e-3}
+    heights_m = (0.004, 0.004, 0.07)
+    for stds_m, known in (((1e-3, 0.0499, 0.0501), (0, 1)), ((0.06, 0.0501, 0.0501), ())):
+        boards = {"RH": SlopedBoard(masks, heights_m, stds_m)}
+        estimate = plane.find_plane(SimpleNamespace(grid=SimpleNamespace(**axes), boards=boards), masks)
+        assert np.flatnonzero(np.isfinite(estimate.heights_m)).tolist() == list(known)
+        assert estimate.plates == len(known)
+        assert estimate.known is bool(known)
+        np.testing.assert_allclose(estimate.heights_m[list(known)], 0.004)
+
+
 @pytest.mark.parametrize("level", [0.1, 1.0, 30.0])
 def test_a_plate_ends_where_its_amplitude_falls_to_half_of_that_inside(level):
     pixels = np.arange(60)

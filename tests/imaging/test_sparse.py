@@ -116,6 +116,11 @@ def test_the_image_with_filled_positions_is_nearer_to_that_of_the_whole_scan(sca
     assert error < 2 * errors["RH"].image_error
 
 
+def test_the_first_step_already_reduces_the_residual(scan):
+    _, errors = fill_missing(scan(_kept("a random quarter")[:10]), iterations=1)
+    assert 0 < errors["RH"].residual < 0.9
+
+
 def test_a_whole_scan_does_not_change(scan):
     builder = scan(np.ones((40, 60), bool))
     filled, errors = fill_missing(builder)

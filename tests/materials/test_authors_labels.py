@@ -63,6 +63,9 @@ def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
     np.save(folder / "sar_h.npy", np.ones(3))
     with refused(ErrorCode.TYPE_WRONG, "sar_h.npy", "float64"):
         train.read_labelled_scan(folder)
+    np.save(folder / "sar_h.npy", np.ones((3, 3), complex))
+    with refused(ErrorCode.MISMATCH, (3, 3)):
+        train.read_labelled_scan(folder)
     np.save(folder / "sar_h.npy", np.array([{}], dtype=object), allow_pickle=True)
     with refused(ErrorCode.FILE_UNREADABLE, "sar_h.npy"):
         train.read_labelled_scan(folder)

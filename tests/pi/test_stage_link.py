@@ -129,18 +129,22 @@ def test_only_a_status_answers_a_status_request(dry_stage, connect):
     assert isinstance(stage_lost, StageLost)
 
 
-def test_an_old_sketch_is_named_as_such(dry_stage, instrument, monkeypatch):
+@pytest.mark.parametrize("refused_parameter", [Parameter.BACKLASH, Parameter.PINS])
+def test_a_sketch_that_does_not_know_the_newest_setting_is_named_as_old(
+    dry_stage, instrument, monkeypatch, refused_parameter
+):
     request = StageLink.request
 
     def old(link, verb, *args):
-        if verb == "SET" and args[0] == Parameter.PINS:
+        if verb == "SET" and args[0] == refused_parameter:
             raise StageRefusedError(verb, StageError.OUT_OF_RANGE)
         return request(link, verb, *args)
 
     monkeypatch.setattr(StageLink, "request", old)
     with pytest.raises(StageRefusedError) as e, BenchStage(at_stage_port(instrument, dry_stage.port).stage) as bench:
         bench.home()
-    assert e.value.remedy == "flash the sketch of this release"
+    is_old = e.value.remedy == "flash the sketch of this release"
+    assert is_old is (refused_parameter == Parameter.PINS)
 
 
 def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):

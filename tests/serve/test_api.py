@@ -181,6 +181,35 @@ def test_open_live_views_keep_nobody_from_pausing_and_stopping(view, scans):
         assert stop.now
 
 
+def test_of_two_live_views_that_are_opened_together_one_follows_the_scan(tmp_path, monkeypatch):
+    """The folder is read without a lock, so that another request may open the view meanwhile."""
+    made = []
+    # Views that other requests open while one is being made.
+    others = []
+
+    class Watch:
+        def __init__(self, folder: Path, _control: bool) -> None:
+            self.calls = []
+            made.append(self)
+            if len(made) == 1:
+                others.append(watches.open("one", folder))
+
+        def start(self) -> None:
+            self.calls.append("start")
+
+        def close(self) -> None:
+            self.calls.append("close")
+
+    monkeypatch.setattr(site, "Watch", Watch)
+    watches = site.Watches(control=True)
+    opened = watches.open("one", tmp_path)
+    outer, inner = made
+    assert others == [inner]
+    assert opened is inner
+    assert watches.open("one", tmp_path) is inner
+    assert (outer.calls, inner.calls) == (["close"], ["start"])
+
+
 @pytest.mark.parametrize(
     ("lives", "age_s", "state"), [(True, 0, "running"), (True, 60, "frozen"), (False, 0, "lost"), (False, 1e5, None)]
 )

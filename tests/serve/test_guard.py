@@ -21,7 +21,7 @@ from tests.support.products import judged_products
 from tests.support.refusals import refused
 
 from polysight.serve import Place, guard, server
-from polysight.serve.front import ConnectionLimit
+from polysight.serve.front import ConnectionLimit, CountedConnection
 from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight_shared.errors import ErrorCode
 
@@ -167,6 +167,21 @@ def test_of_too_many_connections_those_without_a_request_are_closed(scans, monke
         assert any(events.readline().startswith(b"event: ") for _ in range(20))
         operator.close()
         stream.close()
+
+
+def test_when_every_connection_has_a_request_the_next_one_is_told_that_the_server_is_busy(scans, monkeypatch):
+    """No connection is closed whose request is there when it is accepted. Some that were closed may still count."""
+    monkeypatch.setattr(server, "MAX_CONNECTIONS", 4)
+    monkeypatch.setattr(server, "ACCEPTED_AT_ONCE", 3)
+    monkeypatch.setattr(CountedConnection, "has_unread_bytes", lambda _: True)
+    answers = []
+    with served_folder(scans, TOKEN) as view, ExitStack() as clients:
+        for _ in range(4 + 2 * 3):
+            stream = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
+            clients.callback(stream.close)
+            stream.request("GET", "/api/events?scan=one")
+            answers.append(stream.getresponse().status)
+    assert answers == [*[200] * 9, 503]
 
 
 def test_a_connection_with_unread_bytes_is_not_closed():

@@ -2,6 +2,7 @@
 
 import gc
 import json
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +23,17 @@ from polysight_shared.errors import ErrorCode
 from polysight_shared.raster import plan_raster
 
 
-def scan_with(folder: Path, lost: int, wrong: bool = False) -> tuple[ScanFolder, bytes]:
-    """One row of each board, with a packet lost and a leftover; `wrong`: all masked, as by an earlier release."""
+def scan_with(folder: Path, lost: int | Collection[int], wrong: bool = False) -> tuple[ScanFolder, bytes]:
+    """One row of each board, with packets lost and a leftover; `wrong`: all masked, as by an earlier release."""
     rig = rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
     size = rig.row_bytes
     frame = rig.frame_bytes
     record = Record.make(size, 5000, 7)
     state_before = Record.make(2000, 3000, 5)
-    packets = [state_before.packets[1], *record.packets[:lost], *record.packets[lost + 1 :], record.packets[4]]
+    lost_packets = {lost} if isinstance(lost, int) else set(lost)
+    received = [packet for k, packet in enumerate(record.packets) if k not in lost_packets]
+    packets = [state_before.packets[1], *received, record.packets[4]]
     boards = {}
     with scan.writer() as writer:
         for board in rig.recorded:
@@ -93,6 +96,15 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     report = json.loads(capsys.readouterr().out)
     assert (report["leftover"], report["duplicates"], report["missing"]) == (1, 1, [[9 * 1456, 10 * 1456]])
     assert [r.changed for r in replace_rows(scan)] == [False, False]
+
+
+def test_of_more_than_eight_missing_ranges_the_first_are_printed(tmp_path, capsys):
+    for count in (1, 8, 9):
+        scan, _ = scan_with(tmp_path / str(count), lost=range(9, 9 + 2 * count, 2))
+        assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 0
+        (line,) = [text for text in capsys.readouterr().out.splitlines() if text.startswith("missing ")]
+        ranges = [f"{k * 1456}..{(k + 1) * 1456}" for k in range(9, 9 + 2 * count, 2)]
+        assert line.split(maxsplit=1)[1].split(", ") == [*ranges[:8], *["..."] * (count > 8)]
 
 
 # A killed program does not close files

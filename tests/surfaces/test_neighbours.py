@@ -1,5 +1,7 @@
 """Objects side by side: the echoes of a window that hardly resolves them are separated, in H and in V."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.surfaces.test_paths import BEHIND, FRONT_M, empty_scan, with_echo
@@ -28,10 +30,19 @@ def find_owner(echoes: Echoes, scan: Samples, fronts: list[np.ndarray]) -> tuple
     return np.abs(away_m).min(axis=0), owner
 
 
+def keep_first_rx(scan: Samples) -> Samples:
+    return replace(scan, cube=scan.cube[:1], rx_m=scan.rx_m[:1])
+
+
 # One resolution cell of a window is 140 mm in x, 48 mm in y and 74 mm in range.
-@pytest.mark.parametrize("apart_m", [(0.15, 0, 0), (0, 0.06, 0), (0, 0, 0.1)])
-def test_each_of_two_objects_has_its_own_place_and_strength(apart_m):
+@pytest.mark.parametrize(
+    ("apart_m", "with_one_rx"),
+    [((0.15, 0, 0), False), ((0, 0.06, 0), False), ((0, 0, 0.1), False), ((0, 0.06, 0), True)],
+)
+def test_each_of_two_objects_has_its_own_place_and_strength(apart_m, with_one_rx):
     scan, fronts = scan_two(apart_m, 0.4j)
+    if with_one_rx:
+        scan = keep_first_rx(scan)
     echoes = find_echoes(scan, GATE_M)
     away_m, owner = find_owner(echoes, scan, fronts)
     windows = len(np.unique(echoes.at_m, axis=0))

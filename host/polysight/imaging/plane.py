@@ -517,7 +517,7 @@ def _estimate_heights_by_range(
         path_std = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
         height = mean / per_metre
         std = float(np.hypot(path_std, from_behind / np.sqrt(power.mean()))) / abs(per_metre)
-        if std < _MAX_RANGE_STD_M and np.isfinite(height):
+        if std < _MAX_RANGE_STD_M:
             heights[i] = height
             stds[i] = max(std, _MIN_STD_M)
     return heights, stds

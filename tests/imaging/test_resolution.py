@@ -83,3 +83,13 @@ def test_without_data_there_is_no_response(make_rig):
     facts = board_facts(ImageBuilder(make_rig(5, 5)).boards["RV"])
     assert facts.masked == 1
     assert facts.loss_db is UNSET
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(2, 41), (41, 2), (1, 41), (41, 1)])
+def test_an_axis_on_which_nothing_is_resolved_has_no_figures(make_rig, columns, rows):
+    """The figures hold for a small part of the plane: a cell wider than the image has none."""
+    board = _full(make_rig(columns, rows, 4.0, 4.0, pixels=(31, 31)))
+    response = point_response(board.aperture, board.weights)
+    for figures in (response.width_mm, response.limit_mm, response.paper_mm, response.sidelobe_db):
+        assert np.isinf(figures).tolist() == [columns < 3, rows < 3]
+    assert [width is None for width in board_facts(board).point_width_mm] == [columns < 3, rows < 3]

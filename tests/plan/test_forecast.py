@@ -18,6 +18,7 @@ from polysight.planning.forecast import (
     predict_burst,
     predict_noise,
 )
+from polysight.planning.plan_command import describe
 from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
@@ -219,3 +220,16 @@ def test_a_burst_of_one_pulse_with_many_chirps_is_kept(rig):
     assert "burst" not in [w.where for w in planned.warnings]
     for proposal in propose(rig, minutes=60.0):
         assert proposal.rig.burst == burst
+
+
+@pytest.mark.parametrize(
+    ("changes", "unresolved"),
+    [(Changes(columns=2, rows=2), "xy"), (Changes(width_mm=5.0, step_x_mm=7.0), "x"), (Changes(), "")],
+)
+def test_an_aperture_that_resolves_nothing_has_a_warning_instead_of_figures(rig, changes, unresolved):
+    planned = forecast(changes.apply(rig))
+    warnings = [warning for warning in planned.warnings if warning.where == "resolution"]
+    assert len(warnings) == len(unresolved)
+    assert all(f"resolves nothing in {axis}" in w.what for axis, w in zip(unresolved, warnings, strict=True))
+    line = next(line for line in describe(planned).splitlines() if line.startswith("resolution"))
+    assert line.count("none") == 2 * len(unresolved)

@@ -6,6 +6,7 @@ entry `imaging` of quality.json. `field_limits` gives the field without ghosts, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -45,6 +46,9 @@ _HALF_POWER = np.sqrt(0.5)
 class PointResponse:
     """Response to a point in the middle of the image, for (x, y).
 
+    All figures of an axis are infinite if `limit_mm` would be wider than the image: nothing is resolved along it, and
+    the figures, which hold for a small part of the plane, would mean nothing.
+
     Attributes
     ----------
     width_mm
@@ -74,19 +78,27 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     """
     grid = aperture.grid
     point = np.array([grid.x_m.mean(), grid.y_m.mean(), float(np.mean(grid.z_m))])
-    limit = [limit_m(aperture, point, axis) for axis in (0, 1)]
-    cuts = [_cut(aperture, weights, point, axis, limit[axis]) for axis in (0, 1)]
     wavelength_m = SPEED_OF_LIGHT_M_S / aperture.frequencies_hz.mean()
     lengths_m = np.ptp(aperture.offsets_m[..., :2], axis=(0, 1))
     distance = point[2] - aperture.offsets_m[..., 2].mean()
-    paper = [1e3 * distance * wavelength_m / length_m if length_m > 0 else np.inf for length_m in lengths_m]
-    widths = [1e3 * _measure_width(cut) * step for cut, step in cuts]
-    sidelobes = [_measure_sidelobe_db(cut) for cut, _ in cuts]
+    width_mm = [math.inf, math.inf]
+    limit_mm = [math.inf, math.inf]
+    paper_mm = [math.inf, math.inf]
+    sidelobe_db = [math.inf, math.inf]
+    for axis, pixels_m in enumerate((grid.x_m, grid.y_m)):
+        cell_m = limit_m(aperture, point, axis)
+        if cell_m > len(pixels_m) * grid.pixel_m:
+            continue
+        cut, step_m = _cut(aperture, weights, point, axis, cell_m)
+        width_mm[axis] = 1e3 * _measure_width(cut) * step_m
+        limit_mm[axis] = 1e3 * cell_m
+        paper_mm[axis] = float(1e3 * distance * wavelength_m / lengths_m[axis])
+        sidelobe_db[axis] = _measure_sidelobe_db(cut)
     return PointResponse(
-        (float(widths[0]), float(widths[1])),
-        (1e3 * limit[0], 1e3 * limit[1]),
-        (float(paper[0]), float(paper[1])),
-        (sidelobes[0], sidelobes[1]),
+        (width_mm[0], width_mm[1]),
+        (limit_mm[0], limit_mm[1]),
+        (paper_mm[0], paper_mm[1]),
+        (sidelobe_db[0], sidelobe_db[1]),
     )
 
 
@@ -134,8 +146,7 @@ def _cut(
 ) -> tuple[NDArray[np.float64], float]:
     """Return the amplitude of a point's image [n] along an axis through the point [3], and the step in metres.
 
-    The amplitude is 1 at the point, which is in the middle. `cell_m` is the resolution cell; if it is infinite, a pixel
-    is taken.
+    The amplitude is 1 at the point, which is in the middle. `cell_m` is the resolution cell.
     """
     # Largest numbers of blocks (rows, columns).
     most = (_BLOCKS_ACROSS, _BLOCKS_ALONG) if axis == 0 else (_BLOCKS_ALONG, _BLOCKS_ACROSS)
@@ -144,8 +155,6 @@ def _cut(
     # The echo of the point alone, [rx, frequency, row, column].
     of_point = DirectImager(replace(blocks, grid=point_grid)).samples(np.ones((1, 1))) * block_weights
     count = int(_CELLS * _POINTS)
-    if not np.isfinite(cell_m):
-        cell_m = aperture.grid.pixel_m
     step = cell_m / _POINTS
     voxels = np.tile(point, (2 * count + 1, 1))
     voxels[:, axis] += np.arange(-count, count + 1) * step

@@ -249,16 +249,17 @@ def forecast(
     """
     noise = noise or Noise()
     aperture, taper = describe_aperture(rig)
+    response = imaging.point_response(aperture, taper)
     return Forecast(
         rig=rig,
         time=scan_time(rig, row_overhead_s),
         raw_bytes=rig.scan_bytes,
         burst=predict_burst(rig),
-        response=imaging.point_response(aperture, taper),
+        response=response,
         field=imaging.field_limits(rig),
         noise=predict_noise(rig, noise),
         noise_source=noise.source,
-        warnings=find_warnings(rig, noise, scene_mm),
+        warnings=(*find_warnings(rig, noise, scene_mm), *_check_resolution(rig, response)),
     )
 
 
@@ -344,6 +345,19 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
     if text := why_unnamed(DEFAULT, rig, will_be=True):
         warnings.append(_note("library", text))
     return tuple(sorted(warnings, key=lambda w: w.level != "error"))
+
+
+def _check_resolution(rig: Instrument, response: imaging.PointResponse) -> Iterator[Finding]:
+    """Yield a finding for each axis along which nothing is resolved."""
+    image_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
+    apertures_mm = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
+    for axis, width_mm, aperture_mm, size_mm in zip("xy", response.width_mm, apertures_mm, image_mm, strict=True):
+        if math.isinf(width_mm):
+            yield _note(
+                "resolution",
+                f"an aperture of {aperture_mm:g} mm resolves nothing in {axis}: a point would fill the image of"
+                f" {size_mm:g} mm; plan a wider one",
+            )
 
 
 def _note(topic: str, text: str) -> Finding:

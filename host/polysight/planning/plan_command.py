@@ -262,9 +262,9 @@ def _format_bytes(count: float) -> str:
     return f"{count / 1e6:.0f} MB"
 
 
-def _format_pair(values: tuple[float, float], digits: int = 1) -> str:
-    """Return two lengths as `x x y`; infinite ones are `unlimited`."""
-    return " x ".join("unlimited" if math.isinf(v) else f"{v:.{digits}f}" for v in values)
+def _format_pair(values: tuple[float, float], digits: int = 1, infinite: str = "none") -> str:
+    """Return two lengths as `x x y`, and `infinite` for infinite ones."""
+    return " x ".join(infinite if math.isinf(v) else f"{v:.{digits}f}" for v in values)
 
 
 def describe(f: Forecast) -> str:
@@ -300,7 +300,7 @@ def describe(f: Forecast) -> str:
             f"the paper's r lambda / L: {_format_pair(response.paper_mm)} mm (docs/decisions/0002-imaging.md explains"
             " the difference)",
         ),
-        ("field", f"without aliases over {_format_pair(f.field.alias_free_mm, 0)} mm"),
+        ("field", f"without aliases over {_format_pair(f.field.alias_free_mm, 0, 'unlimited')} mm"),
         ("", f"flat plates need {_format_pair(f.field.mirror_zone_mm, 0)} mm of aperture beyond them on every side"),
         ("normals", _describe_normals(visible_normals(f.rig))),
         (
@@ -356,7 +356,7 @@ def _format_table(plans: list[Forecast]) -> str:
             f"{i:2d}  {_format_duration(f.time.total_s):9s} {f.rig.stage.speed_mm_s:4g}  {burst.pulses:6d}"
             f"  {burst.period_us:9g}  {f'{grid.step_x_mm:g} x {grid.step_y_mm:g}':11s}"
             f"  {f'{grid.columns} x {grid.rows}':9s}  {f.noise.image_db:8.1f}"
-            f"  {f.burst.travel_wavelengths:4.2f} w  {_format_pair(f.field.alias_free_mm, 0):13s}"
+            f"  {f.burst.travel_wavelengths:4.2f} w  {_format_pair(f.field.alias_free_mm, 0, 'unlimited'):13s}"
             f"  {_format_bytes(f.raw_bytes)}"
         )
     return "\n".join(lines) + "\n"

@@ -8,14 +8,14 @@ const FRESH_MIN = 10; // a rig that was checked longer ago may have changed
 let asked = 0, timer = 0, confirmed = false, rigFile = "", possible = false;
 
 const changes = () => Object.fromEntries(NUMBERS.filter((id) => by(id).value !== "").map((id) => [id, +by(id).value]));
-const pair = ([x, y], digits = 1) => [x, y].map((v) => (v === null ? "unlimited" : v.toFixed(digits))).join(" × ");
+const pair = ([x, y], digits, infinite) => [x, y].map((v) => (v === null ? infinite : v.toFixed(digits))).join(" × ");
 
 function showPlan(p) {
   by("rig").textContent = `${p.rig} · ${p.config}`;
   const { columns, rows, step_x_mm, step_y_mm } = p.begun_with;
   for (const [id, v] of Object.entries({ columns, rows, step_x_mm, step_y_mm, speed_mm_s: p.speed_mm_s, pulses: p.pulses })) by(id).placeholder = v;
   const facts = [["grid", `${p.columns} × ${p.rows} positions, steps of ${p.step_x_mm} × ${p.step_y_mm} mm`], ["raw data", bytes(p.raw_bytes)],
-    ["resolution", `${pair(p.point_width_mm)} mm at half power`], ["free of ghosts", `${pair(p.alias_free_mm, 0)} mm`],
+    ["resolution", `${pair(p.point_width_mm, 1, "none")} mm at half power`], ["free of ghosts", `${pair(p.alias_free_mm, 0, "unlimited")} mm`],
     ["noise", `a point as strong as the direct path stands ${p.image_snr_db.toFixed(0)} dB over it (${p.noise_source})`]];
   const list = make("dl");
   for (const [name, text] of facts) list.append(make("dt", name), make("dd", text));

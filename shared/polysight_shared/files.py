@@ -111,6 +111,21 @@ def _require_file_or_nothing(path: Path) -> None:
         raise OSError(errno.EINVAL, "is a device or a pipe; files are written here", str(path))
 
 
+def require_writable(path: Path) -> None:
+    """Raise OSError if no file can be written at this path: before the work whose result it shall hold."""
+    _require_file_or_nothing(path)
+    require_writable_folder(path.absolute().parent)
+
+
+def require_writable_folder(folder: Path) -> None:
+    """Raise PermissionError or NotADirectoryError if nothing can be made in a folder, which need not exist."""
+    parent = next(place for place in (folder, *folder.parents) if place.exists())
+    if not parent.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(parent))
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(parent))
+
+
 def open_to_write(path: Path, mode: str = "wb", buffering: int = -1) -> IO[Any]:
     """Open a file for writing. Raises OSError, also for a symbolic link, through which nothing is written."""
     refuse_link(path)

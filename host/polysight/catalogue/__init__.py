@@ -29,5 +29,6 @@ from polysight.catalogue.scans import (
     find_program,
     find_programs,
     folder_bytes,
+    is_scan,
     read_generation,
 )

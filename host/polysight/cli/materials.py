@@ -7,9 +7,18 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from polysight.cli.options import Add, add_config_option, add_json_option, add_model_option, count, number
+from polysight.cli.options import (
+    Add,
+    add_config_option,
+    add_json_option,
+    add_model_option,
+    count,
+    number,
+    readable_text,
+)
 from polysight.data import find_packaged
 from polysight_shared.errors import ConfigError, ErrorCode
+from polysight_shared.files import require_writable
 
 if TYPE_CHECKING:
     from polysight.materials import Layer
@@ -205,12 +214,14 @@ def _train(args: argparse.Namespace) -> int:
         require_package("polysight_papers", "papers")
         from polysight_papers.sensys2026.dataset import train_authors
 
+        require_writable(args.out)
         return train_authors(args.authors, args.config, args.out)
     from polysight.jobs.train import train
 
     scenes = None
     if args.simulate is not None:
         scenes = find_packaged(args.simulate)
+    require_writable(args.out)
     return train(scenes, args.data, args.config, args.out, args.times)
 
 
@@ -280,7 +291,7 @@ def _label(args: argparse.Namespace) -> int:
 
 def _parse_box(text: str) -> tuple[str, tuple[float, float, float, float]]:
     """Parse NAME=x0,y0,x1,y1; the name may contain `=`."""
-    name, _, corners = text.rpartition("=")
+    name, _, corners = readable_text(text).rpartition("=")
     try:
         x0, y0, x1, y1 = (float(part) for part in corners.split(","))
     except ValueError:
@@ -292,7 +303,7 @@ def _parse_pair(text: str) -> str:
     """Check that a text has the form NAME=TEXT, neither of them empty, and return it unchanged."""
     if "=" not in text.strip("="):
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form NAME=TEXT")
-    return text
+    return readable_text(text)
 
 
 def _add_label(add: Add) -> None:

@@ -198,6 +198,27 @@ def _parse_four_numbers(text: str, form: str) -> Box:
     return a, b, c, d
 
 
+def file_ending(ending: str) -> Callable[[str], Path]:
+    """Return a `type` for argparse: the path of a file to write, whose name has the ending of its format."""
+
+    def convert(text: str) -> Path:
+        path = Path(text)
+        if path.suffix.lower() != ending:
+            raise argparse.ArgumentTypeError(f"{text!r} does not end in {ending}, the format that is written")
+        return path
+
+    return convert
+
+
+def readable_text(text: str) -> str:
+    """Check a text that is stored: bytes that are not UTF-8 would be lost without a word."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise argparse.ArgumentTypeError(f"{text!a} is not UTF-8: set the terminal to UTF-8, or write ASCII") from None
+    return text
+
+
 def join_negative_values(words: Sequence[str]) -> list[str]:
     """Return the words such that argparse takes `-45,0,40,40` for a value: `--metal-box -45,0,40,40`, `probe -60,0`."""
     out: list[str] = []

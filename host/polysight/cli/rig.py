@@ -20,6 +20,7 @@ from polysight.cli.options import (
     add_material_options,
     count,
     count_from_zero,
+    file_ending,
     material_settings,
     number,
     positive,
@@ -271,7 +272,9 @@ def _add_inspect(add: Add) -> None:
         "inspect", _inspect, "describe a recording of a capture card", "polysight inspect scans/one/raw/RH/0000.bin"
     )
     sub.add_argument("file", type=Path, metavar="FILE", help="payload (.bin), or packets recorded by tcpdump (.pcap)")
-    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the range profile of every antenna")
+    sub.add_argument(
+        "--plot", type=file_ending(".png"), metavar="FILE.png", help="draw the range profile of every antenna"
+    )
     sub.add_argument("--config", type=Path, metavar="RIG", help="rig file of the recording (default: the scan's)")
     sub.add_argument("--placement", action="store_true", help="show how the packets of a scan's row are placed")
     sub.add_argument("--card", default="", metavar="ADDRESS", help="the card, in a recording of several")

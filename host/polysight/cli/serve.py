@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from polysight.cli.options import RIG, Add, add_json_option
+from polysight.cli.options import RIG, Add, add_json_option, file_ending, readable_text
 from polysight_shared.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -142,9 +142,10 @@ def _add_lists(add: Add) -> None:
         "polysight note scans/one --text 'second board' --tag oak",
     )
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder")
-    sub.add_argument("--text", metavar="TEXT", help="replace the notes")
-    sub.add_argument("--tag", dest="add", action="append", default=[], metavar="TAG", help="add a tag")
-    sub.add_argument("--untag", dest="remove", action="append", default=[], metavar="TAG", help="remove a tag")
+    sub.add_argument("--text", type=readable_text, metavar="TEXT", help="replace the notes")
+    tags = {"type": readable_text, "action": "append", "default": [], "metavar": "TAG"}
+    sub.add_argument("--tag", dest="add", help="add a tag", **tags)
+    sub.add_argument("--untag", dest="remove", help="remove a tag", **tags)
     sub = add(
         "ask",
         "scans.ask_scan",
@@ -189,7 +190,11 @@ def _add_results(add: Add) -> None:
     for name in ("first", "second"):
         sub.add_argument(name, type=Path, metavar="DATA", help="scan folder, or a folder of products")
     sub.add_argument(
-        "--png", dest="picture", type=Path, metavar="FILE", help="draw the difference of P in standard deviations"
+        "--png",
+        dest="picture",
+        type=file_ending(".png"),
+        metavar="FILE.png",
+        help="draw the difference of P in standard deviations",
     )
     add_json_option(sub)
     sub = add(
@@ -199,5 +204,5 @@ def _add_results(add: Add) -> None:
         "polysight check scans/today\n  polysight check scans --chart check.png",
     )
     sub.add_argument("folders", type=Path, nargs="+", metavar="DATA", help="processed scan, or a folder of scans")
-    sub.add_argument("--chart", type=Path, metavar="FILE", help="draw the control chart (PNG)")
+    sub.add_argument("--chart", type=file_ending(".png"), metavar="FILE.png", help="draw the control chart")
     add_json_option(sub)

@@ -15,6 +15,7 @@ from polysight.doctor.bundle import write_bundle
 from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_to_json, not_checked, verdict
 from polysight_shared.config import Board
 from polysight_shared.errors import PolysightError, no_such, os_error
+from polysight_shared.files import require_writable
 from polysight_shared.findings import Finding
 from polysight_shared.messages import is_simulated
 
@@ -129,10 +130,14 @@ def run_doctor(
         if the bundle's folder is missing.
     DeviceError
         if the bundle cannot be written.
+    OSError
+        the same, before any check.
     """
     findings: list[Finding] = []
-    if bundle is not None and not bundle.resolve().parent.is_dir():
-        raise no_such(bundle.parent)
+    if bundle is not None:
+        if not bundle.resolve().parent.is_dir():
+            raise no_such(bundle.parent)
+        require_writable(bundle)
     with CheckContext(options, system) as context:
         for finding in run_checks(context):
             findings.append(finding)

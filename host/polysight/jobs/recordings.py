@@ -31,7 +31,7 @@ from polysight.store import (
 )
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError, ErrorCode, PolysightError
-from polysight_shared.files import write_atomically
+from polysight_shared.files import require_writable, write_atomically
 
 # Missing ranges that are printed: they fill about one line of a terminal.
 _MAX_RANGES = 8
@@ -144,8 +144,10 @@ def inspect_file(
 
     `config` is the rig file it was recorded with; a row of a scan folder brings its own. `plot` is the file for a
     picture of the range profile; `card_address` chooses one card's packets of a packet capture; `changes` are fields
-    of `Layout` that replace the rig's. Raises PolysightError.
+    of `Layout` that replace the rig's. Raises PolysightError, and OSError if the picture cannot be written.
     """
+    if plot is not None:
+        require_writable(plot)
     scan = find_scan(file)
     layout = Layout()
     if config is not None:

@@ -50,7 +50,7 @@ from polysight.products import (
 )
 from polysight.settings import Settings
 from polysight.store import TRUTH, open_source, versions
-from polysight_shared.errors import ConfigError, DataError, ScanError, quote
+from polysight_shared.errors import ConfigError, DataError, ScanError, no_such, quote
 
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -264,9 +264,15 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
             "polysight train SCAN... --out FILE; polysight label SCAN names the materials",
         )
     if scenes is not None and not files:
-        raise DataError(f"{scenes}: no scene files", "the folder is wrong", "give a folder of scene files (*.toml)")
+        if not scenes.is_dir():
+            raise no_such(scenes)
+        raise DataError(
+            f"{scenes}: no scene files", "none of its files ends in .toml", "give a folder of scene files (*.toml)"
+        )
     if not out.parent.is_dir():
-        raise ConfigError(f"{out}: no such folder {out.parent}", "the library would be lost", "make it first")
+        raise ConfigError(
+            f"{out}: no such folder {out.parent}", "the library would be lost", f"mkdir -p {quote(out.parent)}"
+        )
     for folder in data:
         check_labelled(folder)
     if files:

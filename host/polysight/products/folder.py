@@ -33,7 +33,7 @@ from polysight.products.processed import (
 from polysight.store import is_source, lock_file
 from polysight.surfaces import POINTS, SURFACE
 from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode
-from polysight_shared.files import sync_folder, write_atomically
+from polysight_shared.files import require_writable_folder, sync_folder, write_atomically
 
 # Picture of the boxes, and the products of surfaces.
 LABELS_PICTURE = "labels.png"
@@ -93,7 +93,7 @@ def check_products_folder(out: Path, scan_id: str) -> None:
     written, and for the only remaining products of another scan, whose raw data was deleted.
     """
     try:
-        _check_writable(out.resolve().parent)
+        require_writable_folder(out.resolve().parent)
         foreign = sorted(p.name for p in out.iterdir() if not (_is_product(p.name) or p.name.startswith(".")))
     except FileNotFoundError:
         return
@@ -206,15 +206,6 @@ def _no_folder_error(out: Path, e: OSError) -> ConfigError:
         "give another --out",
         code=ErrorCode.FILE_UNREADABLE,
     )
-
-
-def _check_writable(folder: Path) -> None:
-    """Raise PermissionError or NotADirectoryError if no folder can be created in `folder`, which need not exist."""
-    parent = next(p for p in (folder, *folder.parents) if p.exists())
-    if not parent.is_dir():
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(parent))
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(parent))
 
 
 def _create_locked(new: Path) -> FolderLock:

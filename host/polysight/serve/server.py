@@ -33,7 +33,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.types import ASGIApp
 
-from polysight.catalogue import Scans
+from polysight.catalogue import NOTES, Scans, is_scan
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
 from polysight.serve.door import PagesServer, close_after_each, open_door
@@ -51,7 +51,7 @@ from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Site, Watches
 from polysight.serve.stage import StageControl
-from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, quote
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, did_you_mean, quote
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Nice value of the reading process, chosen: capture and scan have priority over it.
@@ -166,10 +166,38 @@ def _make_folder(root: Path, control: bool) -> None:
 def preview(folder: Path, place: Place, control: bool) -> int:
     """Serve the live view of one scan folder, which may not exist yet, until Ctrl-C; returns the exit status.
 
-    Raises as :func:`serve`, except for a missing folder.
+    Raises as :func:`serve`; DataError for a folder that holds something else than a scan.
     """
+    _check_scan_folder(folder)
     folder = folder.absolute()
     return _run(Shown(folder.parent, folder.name, control), place, f"live view of {folder}")
+
+
+def _check_scan_folder(folder: Path) -> None:
+    """Say on stderr that there is no scan yet. Raises DataError for a folder in which no scan can begin."""
+    if is_scan(folder):
+        return
+    if not folder.exists():
+        note = f"note: {folder} does not exist yet"
+        try:
+            question = did_you_mean(folder.name, [path.name for path in folder.absolute().parent.iterdir()])
+        except OSError:
+            question = f"{folder.parent} does not exist either"
+        sys.stderr.write(f"{note}; {question or 'the page waits for a scan to begin there'}\n")
+        return
+    other_files = [path.name for path in folder.iterdir() if path.name != NOTES and not path.name.startswith(".")]
+    if not other_files:
+        sys.stderr.write(f"note: no scan is in {folder} yet; the page waits for it to begin\n")
+        return
+    remedy = "give the folder of one scan"
+    scans_below = Scans(folder).list()
+    if scans_below:
+        newest = quote(folder / scans_below[0].name)
+        remedy += f": polysight preview {newest}; polysight serve {quote(folder)} shows them all"
+    raise DataError(
+        f"{folder}: no scan is in it, but {other_files[0]}", "a scan has a folder of its own", remedy,
+        code=ErrorCode.FILE_FOREIGN,
+    )  # fmt: skip
 
 
 def _run(shown: Shown, place: Place, what: str) -> int:

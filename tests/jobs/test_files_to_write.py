@@ -1,0 +1,70 @@
+"""Files that a command is asked to write: a name that cannot be used is refused before the work, not after it."""
+
+from pathlib import Path
+
+import pytest
+
+from polysight.cli.main import main
+from polysight.jobs import recordings, scans, train
+
+
+class WorkedError(Exception):
+    """The command began its work."""
+
+
+COMMANDS = {
+    "train": ["train", "--simulate", "examples/library", "--out"],
+    "train --authors": ["train", "--authors", "authors", "--out"],
+    "compare": ["compare", "one", "two", "--png"],
+    "check": ["check", "one", "--chart"],
+    "inspect": ["inspect", "0000.bin", "--plot"],
+    "doctor": ["doctor", "--config", "none.toml", "--bundle"],
+}
+PICTURES = ("compare", "check", "inspect")
+
+
+@pytest.fixture(autouse=True)
+def work_is_noticed(monkeypatch, tmp_path: Path) -> None:
+    """The work of each command raises WorkedError."""
+
+    def work(*_: object, **__: object) -> None:
+        raise WorkedError
+
+    for module, name in (
+        (train, "check_scenes"),
+        (train, "training_scan"),
+        (scans, "compare"),
+        (scans, "check_scans"),
+        (recordings, "inspect_bin"),
+    ):
+        monkeypatch.setattr(module, name, work)
+    monkeypatch.setattr("polysight_papers.sensys2026.dataset.read_authors", work)
+    monkeypatch.setattr("polysight.doctor.checks.run_checks", work)
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "file").touch()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("name", ["folder.png", "file/x.png"])
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, command, name):
+    assert main([*COMMANDS[command], str(tmp_path / name)]) in (2, 3, 5)
+    assert name.partition("/")[0] in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
+
+
+@pytest.mark.parametrize("command", PICTURES)
+@pytest.mark.parametrize("name", ["x.jpg", "x.pdf", "x", "x.png.txt"])
+def test_a_picture_has_the_ending_of_its_format(tmp_path, capsys, command, name):
+    with pytest.raises(SystemExit) as ended:
+        main([*COMMANDS[command], str(tmp_path / name)])
+    assert ended.value.code == 2
+    assert "does not end in .png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("name", ["new.png", "NEW.PNG", "file.png"])
+def test_a_file_that_can_be_written_lets_the_work_begin(tmp_path, command, name):
+    (tmp_path / "file.png").touch()
+    with pytest.raises(WorkedError):
+        main([*COMMANDS[command], str(tmp_path / name)])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "file.png", "folder.png"]

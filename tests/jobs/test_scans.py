@@ -1,18 +1,22 @@
 """Commands that do the same as the operator's page."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, make_scene
 
-from polysight.catalogue import Notes, read_notes
+from polysight.catalogue import NOTES, Notes, probe, read_notes
 from polysight.cli.main import build_parser, main
+from polysight.jobs import scans
+from polysight.results import ComplexNumber
 from polysight_shared.errors import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -109,3 +113,40 @@ def test_compare_says_where_its_picture_is(root, capsys, tmp_path):
     assert main(["compare", str(root / "two"), str(root / "two"), "--png", str(tmp_path / "d.png")]) == 0
     assert f"picture: {tmp_path / 'd.png'}" in capsys.readouterr().err
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("folder", ["", "empty"])
+def test_notes_are_of_a_scan(root, folder):
+    """A mistyped folder gets no notes that no list would ever show."""
+    (root / "empty").mkdir()
+    args = build_parser().parse_args(["note", str(root / folder), "--text", "oak"])
+    with refused(ErrorCode.FILE_MISSING, root / folder):
+        args.run(args)
+    assert not (root / folder / NOTES).exists()
+
+
+@pytest.mark.parametrize("option", ["--text", "--tag", "--untag"])
+def test_a_text_that_is_not_utf_8_is_refused_and_nothing_is_lost(root, capsys, option):
+    """A terminal of another encoding gives such bytes; they cannot be stored."""
+    options = ("--text", "oak", "--tag", "new")
+    answer(capsys, "note", root / "one", *options)
+    with pytest.raises(SystemExit) as ended:
+        main(["note", str(root / "one"), option, os.fsdecode(b"gr\xfcn")])
+    assert ended.value.code == 2
+    assert "UTF-8" in capsys.readouterr().err
+    assert read_notes(root / "one") == Notes("oak", ("new",))
+
+
+def test_a_rounded_zero_has_no_sign(root, capsys, monkeypatch):
+    result = probe(root / "two", 0, 0)
+    zero = ComplexNumber(-0.0, -0.0)
+    at_zero = replace(result, place_mm=(-0.0, 0.0), h_db=-0.0, v_db=-0.0, p=zero)
+    monkeypatch.setattr(scans, "probe", lambda *_: at_zero)
+    lines = answer(capsys, "probe", root / "two", "0,0").splitlines()
+    assert lines[0].startswith("x 0 mm, y 0 mm")
+    assert lines[1] == "|H| 0 dB, |V| 0 dB"
+    assert lines[2].startswith("P = 0 + 0j ")
+
+
+def test_one_scan_is_counted_as_one(root, capsys):
+    assert "\n1 scan under" in answer(capsys, "scans", root, "--find", "one")

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from polysight.materials.classify import Weights
 from polysight.materials.library import FORMAT, majority, ratio_distance
 from polysight.materials.measure import median_ratio
 from polysight.materials.result import pixel_features
+from polysight.materials.segment import TruthPlate
 from polysight.polarimetry import fresnel
 from polysight.results import to_plain
 from polysight_papers.sensys2026.item import table2
@@ -237,3 +239,12 @@ def test_table2_is_complete():
     assert by_name["Ceramic"].permittivity == 4.75 - 2.43j
     assert by_name["Water (with glass)"].permittivity == 3.66 - 0.43j
     assert "not given" in by_name["Cork"].note
+
+
+def test_of_metal_alone_no_pixel_is_named_right_or_wrong(name_placement):
+    """The reference is metal: there was nothing to name."""
+    result = name_placement(0)
+    metal = TruthPlate("copper", (0.0, 0.0, 1.0, 1.0), None, metal=True)
+    of_metal = replace(result, patches=tuple(replace(r, truth=metal) for r in result.patches))
+    assert materials.pixel_accuracy(of_metal) is None
+    assert materials.predict_pixel_accuracy(of_metal) is None

@@ -18,7 +18,7 @@ from polysight.materials.kinds import (
     layer_odds,
     literature,
 )
-from polysight.materials.names import Odds, may_be_thin, name_patch, summarise_literature, weigh_kinds
+from polysight.materials.names import Odds, add_explanation, may_be_thin, name_patch, summarise_literature, weigh_kinds
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 from polysight_shared.errors import DataError
 
@@ -203,3 +203,10 @@ def test_what_reflects_at_two_faces_gets_no_name_of_the_library_and_no_wrong_val
     # A sheet whose brightness happens to peak in the middle of the sweep looks like a half space.
     assert sum(p.misled for p in pieces) <= 1
     assert sum(p.thin or p.name == LAYER for p in pieces) >= 4
+
+
+def test_each_reason_of_a_name_has_a_subject():
+    """Metal has no permittivity that could be it."""
+    named = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2)
+    for permittivity, subject in ((None, "it is like "), (9.41 - 0.002j, "permittivity 9.41 - j0.00 is like ")):
+        assert add_explanation(named, permittivity, None, LIBRARY).verdict.why.startswith(subject)

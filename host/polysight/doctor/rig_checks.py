@@ -96,7 +96,7 @@ def check_pi_clock(context: CheckContext) -> Finding:
         return not_checked("the Pi does not report its time", "install the same release on both")
     offset_s = (context.hello.t_unix_ns - context.hello_at_ns) * 1e-9
     uncertainty_s = context.hello_took_ns * 0.5e-9
-    observed = f"the Pi's clock minus this machine's: {offset_s:+.3f} s (+- {uncertainty_s:.3f} s)"
+    observed = f"the Pi's clock minus this machine's: {offset_s:+z.3f} s (+- {uncertainty_s:.3f} s)"
     facts = {"offset_s": offset_s, "uncertainty_s": uncertainty_s}
     if abs(offset_s) - uncertainty_s > _CLOCK_LOST_S:
         return error(observed, "one clock is wrong: times in logs and scans cannot be compared", _SET_CLOCK, **facts)

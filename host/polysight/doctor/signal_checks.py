@@ -119,7 +119,7 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     if abs(early_s) > _MAX_DELAY_S:
         start = board.start_offset_hz + early_s * rig.chirp.slope_hz_per_s
         return warning(
-            f"{observed}; {predicted}, {early_s * 1e9:+.1f} ns away",
+            f"{observed}; {predicted}, {early_s * 1e9:+z.1f} ns away",
             "start_offset_hz in the rig file is not the programmed one, the geometry is wrong, or the board is"
             " triggered at another time than the transmitter",
             f"if the board was programmed so: start_offset_hz = {start:.0f} for {board.name}",
@@ -149,8 +149,8 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
     jitter = max(float(unwrap_if(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
     ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
-    observed = f"{v.name} starts {skew * 1e9:+.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
-        f"{name} {mean * 1e9:+.1f} ns after the transmitter, crystal {ppm[name]:+.2f} ppm"
+    observed = f"{v.name} starts {skew * 1e9:+z.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(
+        f"{name} {mean * 1e9:+z.1f} ns after the transmitter, crystal {ppm[name]:+z.2f} ppm"
         for name, (mean, _) in delay.items()
     )
     facts = {

@@ -95,7 +95,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     path = write_calibration(file, out)
     lines = []
     for name, b in file.boards.items():
-        shift = ", ".join(f"{v:+.2f} +- {e:.2f}" for v, e in zip(b.shift_mm, b.standard_error_mm, strict=True))
+        shift = ", ".join(f"{v:+z.2f} +- {e:.2f}" for v, e in zip(b.shift_mm, b.standard_error_mm, strict=True))
         lines += [
             f"{name}: shifted by ({shift}) mm in x, y, z",
             f"{name}: direct path to RX1 {b.direct_path_was_mm:.2f} -> {b.direct_path_mm:.2f}"
@@ -110,8 +110,8 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     lines += [
         f"object plane: {file.object_distance_was_mm:.2f} -> {file.object_distance_mm:.2f}"
         f" +- {file.object_distance_standard_error_mm:.2f} mm",
-        f"the target lay at ({file.target_mm[0]:+.2f}, {file.target_mm[1]:+.2f}) mm, turned by"
-        f" {file.target_turn_deg:+.2f} degrees; its points explain {100 * file.explained:.1f} % of the echoes",
+        f"the target lay at ({file.target_mm[0]:+z.2f}, {file.target_mm[1]:+z.2f}) mm, turned by"
+        f" {file.target_turn_deg:+z.2f} degrees; its points explain {100 * file.explained:.1f} % of the echoes",
     ]
     return print_result(path, file, lines, rig_file_keys("direct_path", path), as_json)
 
@@ -197,7 +197,7 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
             line,
             f"{name}: start_offset_hz {b.start_offset_was_hz:.0f} -> {b.start_offset_hz:.0f} puts it at"
             f" {b.middle_hz / 1e3:.0f} kHz; where mmWave Studio programs the board:"
-            f" {b.start_offset_hz - b.start_offset_was_hz:+.0f} Hz to its start frequency",
+            f" {b.start_offset_hz - b.start_offset_was_hz:+z.0f} Hz to its start frequency",
         ]
         what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
     return print_result(path, file, lines, what_to_set, as_json)
@@ -319,7 +319,7 @@ def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | No
         f"leakage_v = {leakage_v}",
         f"leakage_std = {facts['leakage_std']:.4f}",
     ]
-    gain = f"# H over V in the images: {imbalance_db:+.2f} dB, {imbalance_deg:+.1f} degrees"
+    gain = f"# H over V in the images: {imbalance_db:+z.2f} dB, {imbalance_deg:+z.1f} degrees"
     gain += f"; from {facts['pixels']} pixels"
     # Plate and two strips are as many standards as unknowns, and agree in any case.
     if len(strips) > 2:

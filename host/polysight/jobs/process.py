@@ -433,17 +433,17 @@ def _format_focus(head: str, distance_mm: float, sharpest: Focus, plates: PlaneE
         tilt_std_deg = np.degrees(plates.tilt_std_rad)
         method = "the phase of their echoes" if plates.by_phase else "the range of their echoes"
         lines += [
-            f"{head}: {plates.plates} flat plates lie {offset_mm:+.2f} +- {offset_std_mm:.2f} mm from the rig file's"
+            f"{head}: {plates.plates} flat plates lie {offset_mm:+z.2f} +- {offset_std_mm:.2f} mm from the rig file's"
             f" plane, by {method}: object_distance_mm = {distance_mm + offset_mm:.2f}",
-            f"tilt: {tilt_deg[0]:+.2f} +- {tilt_std_deg[0]:.2f} degrees along x,"
-            f" {tilt_deg[1]:+.2f} +- {tilt_std_deg[1]:.2f} along y",
+            f"tilt: {tilt_deg[0]:+z.2f} +- {tilt_std_deg[0]:.2f} degrees along x,"
+            f" {tilt_deg[1]:+z.2f} +- {tilt_std_deg[1]:.2f} along y",
         ]
     if plates.known and not sharpest.certain:
         return [*lines, "sharpness gives no plane (a narrow scan, or no points and edges in it); use the plates' plane"]
     lines += [
-        f"{head}: the plane is sharpest {sharpest.depth_mm:+.2f} mm from the rig file's:"
+        f"{head}: the plane is sharpest {sharpest.depth_mm:+z.2f} mm from the rig file's:"
         f" object_distance_mm = {distance_mm + sharpest.depth_mm:.2f}",
-        f"tilt: {sharpest.tilt_deg[0]:+.2f} degrees along x, {sharpest.tilt_deg[1]:+.2f} along y;"
+        f"tilt: {sharpest.tilt_deg[0]:+z.2f} degrees along x, {sharpest.tilt_deg[1]:+z.2f} along y;"
         f" sharpness {sharpest.gain:.3f} times the rig file's plane",
     ]
     if not plates.known and not sharpest.certain:

@@ -20,6 +20,7 @@ from polysight.catalogue import (
     Summary,
     compare,
     folder_bytes,
+    is_scan,
     printable,
     probe,
     read_notes,
@@ -30,7 +31,7 @@ from polysight.materials import UNKNOWN
 from polysight.products import QUALITY, REPORT, ProcessedScan, find_products, products_locked, read_products, write_json
 from polysight.results import WARNING_SIGMAS, CheckResult, ComplexNumber, RawDropped, check_plate, read_object, to_plain
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such, quote
-from polysight_shared.files import write_atomically
+from polysight_shared.files import require_writable, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +60,8 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     width = min(max((len(s.name) for s in matching), default=0), _NAME_WIDTH)
     for s in matching:
         sys.stdout.write(f"{s.name:{width}}  {_count_bytes(root, s) / 1e6:8.1f} MB  {printable(_format_summary(s))}\n")
-    sys.stdout.write(f"{len(matching)} scans under {root}{not_listed}\n")
+    noun = "scan" if len(matching) == 1 else "scans"
+    sys.stdout.write(f"{len(matching)} {noun} under {root}{not_listed}\n")
     return 0
 
 
@@ -97,6 +99,12 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     """Change or print the operator's notes and tags of a scan; returns 0. Raises PolysightError."""
     if not folder.is_dir():
         raise no_such(folder)
+    if not (is_scan(folder) or store.is_source(folder)):
+        raise DataError(
+            f"{folder}: no scan is in it", "notes belong to a scan; nothing was recorded or processed in this folder",
+            "give the folder of a scan or of products; polysight scans FOLDER lists those under a folder",
+            code=ErrorCode.FILE_MISSING,
+        )  # fmt: skip
     notes = read_notes(folder)
     if text is not None or add or remove:
         tags = tuple(t for t in dict.fromkeys((*notes.tags, *add)) if t not in remove)
@@ -128,7 +136,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
     if as_json:
         print_json(to_plain(result))
         return 0
-    lines = [f"x {result.place_mm[0]:g} mm, y {result.place_mm[1]:g} mm from the image's centre"]
+    lines = [f"x {result.place_mm[0]:zg} mm, y {result.place_mm[1]:zg} mm from the image's centre"]
     if not result.lit:
         lines.append("the scan does not light this place")
     lines.append(f"|H| {_format_value(result.h_db)} dB, |V| {_format_value(result.v_db)} dB")
@@ -148,7 +156,9 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
 
 
 def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool) -> int:
-    """Print the differences of two processed scans; returns 0. Raises DataError."""
+    """Print the differences of two processed scans; returns 0. Raises DataError, and OSError for the picture."""
+    if picture is not None:
+        require_writable(picture)
     comparison = compare(first, second)
     values = comparison.figures
     if picture is not None:
@@ -165,7 +175,7 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         lines.append(f"P differs by more than {values.significant_sigmas:g} standard deviations in {share} of them")
     for pair in values.patches:
         names = " and ".join(map(_format_name, pair.names))
-        place = f"x {pair.place_mm[0]:g}, y {pair.place_mm[1]:g} mm ({names})"
+        place = f"x {pair.place_mm[0]:zg}, y {pair.place_mm[1]:zg} mm ({names})"
         if pair.difference is None:
             lines.append(f"{place}: no permittivity in one of them")
             continue
@@ -195,7 +205,8 @@ def _format_value(value: float | None) -> str:
     """Format a number with three digits; None as not known."""
     if value is None:
         return "not known"
-    return f"{value:.3g}"
+    # z: no sign before a rounded zero.
+    return f"{value:z.3g}"
 
 
 def _format_complex(number: ComplexNumber | PermittivityDifference) -> str:
@@ -203,7 +214,7 @@ def _format_complex(number: ComplexNumber | PermittivityDifference) -> str:
     if number.real is None or number.imag is None:
         return "not known"
     sign = "-" if number.imag < 0 else "+"
-    return f"{number.real:.3g} {sign} {abs(number.imag):.3g}j"
+    return f"{number.real:z.3g} {sign} {abs(number.imag):.3g}j"
 
 
 # Word that a person types to confirm the removal of raw rows.
@@ -375,8 +386,10 @@ def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
     """Print the check plate of each scan, and draw the control chart into the file `chart`, if given.
 
     Return 1 if a plate is missing or beyond its action limit.
-    Raises PolysightError as :func:`check_scans`.
+    Raises PolysightError as :func:`check_scans`, and OSError if the chart cannot be written.
     """
+    if chart is not None:
+        require_writable(chart)
     checked = check_scans(folders)
     if chart is not None:
         from matplotlib.figure import Figure

@@ -136,7 +136,7 @@ def format_box(box: Box) -> str:
     """Format a box: `x -22.5 to 22.5, y 0.0 to 45.0 mm`."""
     # Negative zero plus zero is zero: no "-0.0".
     x0, y0, x1, y1 = (b + 0.0 for b in box)
-    return f"x {x0:.1f} to {x1:.1f}, y {y0:.1f} to {y1:.1f} mm"
+    return f"x {x0:z.1f} to {x1:z.1f}, y {y0:z.1f} to {y1:z.1f} mm"
 
 
 @dataclass(frozen=True)

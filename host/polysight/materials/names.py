@@ -494,7 +494,9 @@ def add_explanation(
         explanation = f"rather a thin plate{nearest_clause}"
     elif verdict.from_literature:
         values = _list_values(verdict.literature)
-        explanation = f"{estimate} is like {values} of the literature; not measured by this library{nearest_clause}"
+        # Metal has no permittivity to tell.
+        subject = estimate or "it"
+        explanation = f"{subject} is like {values} of the literature; not measured by this library{nearest_clause}"
     elif estimate:
         explanation = f"{estimate} matches the library's {nearest_material}{_list_rivals(verdict)}"
     else:

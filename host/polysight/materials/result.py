@@ -615,7 +615,8 @@ def _find_partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatch
 def pixel_accuracy(result: MaterialsResult) -> float | None:
     """Return the share of interior pixels named right over all patches of known truth; None without such patches.
 
-    Patches rightly called unknown, because the library does not hold their material, do not count.
+    None also if metal is the only material: it is the reference, and there was nothing to name. Patches rightly called
+    unknown, because the library does not hold their material, do not count.
     """
     right = [n.names == truth for n, truth in _select_true_patches(result)]
     return float(np.concatenate(right).mean()) if right else None
@@ -635,6 +636,11 @@ def predict_pixel_accuracy(result: MaterialsResult) -> float | None:
 
 
 def _select_true_patches(result: MaterialsResult) -> list[tuple[NamedPatch, str]]:
-    """Return the named patches of known truth, each with the true name; without those rightly called unknown."""
+    """Return the named patches of known truth, each with the true name; without those rightly called unknown.
+
+    Empty if no patch is of a material with a permittivity.
+    """
+    if not any(r.truth and r.truth.permittivity is not None for r in result.patches):
+        return []
     judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
     return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]

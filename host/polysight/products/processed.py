@@ -490,7 +490,7 @@ def read_products(folder: Path, needs: str = IMAGE) -> ProcessedScan:
     cause = "the folder is wrong, the scan was not processed, or only to images"
     remedy = "give a folder that polysight process wrote"
     if needs == IMAGE:
-        cause = "the folder is wrong, the scan was not processed"
+        cause = "the folder is wrong, or the scan was not processed"
         remedy = "give a folder that polysight process or polysight image wrote"
     raise DataError(f"{folder}: no {needs}", cause, remedy, code=ErrorCode.FILE_MISSING)
 

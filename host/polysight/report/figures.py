@@ -514,13 +514,13 @@ def focus_figure(
     curve, *pictures = fig.subplots(1, 3, width_ratios=[1.1, 1, 1])
     curve.plot(sweep["depths_mm"], sweep["sharpness"], "o-", color="#44AA99", markersize=4)
     curve.axvline(0, color=style.MUTED, linewidth=1, linestyle=":", label="rig file")
-    curve.axvline(sweep["depth_mm"], color="#882255", linewidth=1.4, label=f"found: {sweep['depth_mm']:+.2f} mm")
+    curve.axvline(sweep["depth_mm"], color="#882255", linewidth=1.4, label=f"found: {sweep['depth_mm']:+z.2f} mm")
     curve.set_xlabel("plane, relative to the rig file (mm)", fontsize=9, color=style.MUTED)
     curve.set_ylabel("sharpness of the untilted plane", fontsize=9, color=style.MUTED)
     tilt = sweep["tilt_deg"]
     title = "No clear maximum"
     if sweep["certain"]:
-        title = f"Tilt found: {tilt[0]:+.2f}° in x, {tilt[1]:+.2f}° in y"
+        title = f"Tilt found: {tilt[0]:+z.2f}° in x, {tilt[1]:+z.2f}° in y"
     curve.set_title(title, loc="left", fontsize=10, color=style.INK)
     curve.legend(fontsize=8, frameon=False)
     top = max(float(np.abs(before).max()), float(np.abs(after).max()), 1e-30)

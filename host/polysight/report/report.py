@@ -103,7 +103,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
     rows = [_format_patch_row(patch, colours) for patch in scan.segments]
     plates_found = {row["truth"] for row in rows}
     # The image's centre in the rig frame, mm.
-    centre = [f"{1e3 * (float(axis[0]) + float(axis[-1])) / 2:.1f}" for axis in (scan.x_m, scan.y_m)]
+    centre = [f"{1e3 * (float(axis[0]) + float(axis[-1])) / 2:z.1f}" for axis in (scan.x_m, scan.y_m)]
     metal_how = ""
     library = ""
     if scan.materials is not None and scan.judged:
@@ -245,7 +245,7 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
     row: dict[str, Any] = {
         "label": patch.label,
         "name": name,
-        "where": f"{patch.centre_x_mm:.0f}, {patch.centre_y_mm:.0f}".replace("-", "−"),
+        "where": f"{patch.centre_x_mm:z.0f}, {patch.centre_y_mm:z.0f}".replace("-", "−"),
         "size": f"{patch.width_mm:.0f} × {patch.height_mm:.0f}",
         "colour": patch_colour(patch, colours),
         "metal_reference": patch.metal_reference and bool(patch.name),
@@ -280,17 +280,17 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
         row |= _format_estimate(e)
     if patch.true_permittivity is not None:
         row["true_real"] = f"{patch.true_permittivity.real:.2f}"
-        row["true_loss"] = f"{-patch.true_permittivity.imag:.2f}"
+        row["true_loss"] = f"{-patch.true_permittivity.imag:z.2f}"
         if e is not None:
             row["relative_error"] = e.real / patch.true_permittivity.real - 1
             # Adding zero after rounding removes the sign of a negative zero.
-            row["error"] = f"{round(100 * row['relative_error'], 1) + 0.0:+.1f} %"
+            row["error"] = f"{round(100 * row['relative_error'], 1) + 0.0:+z.1f} %"
     return row
 
 
 def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
     """Format a permittivity with its errors, the 30th and 70th percentile of its pixels, and the main error source."""
-    row = {"real": f"{e.real:.2f}", "loss": f"{e.loss:.2f}"}
+    row = {"real": f"{e.real:z.2f}", "loss": f"{e.loss:z.2f}"}
     if e.spread is not None:
         row["real_error"] = f"± {e.spread.real_std:.2f}"
         row["loss_error"] = f"± {e.spread.loss_std:.2f}"
@@ -353,7 +353,7 @@ def _format_number(value: Any, between: str = " × ") -> str:
     if isinstance(value, list | tuple):
         return between.join(_format_number(v) for v in value)
     if isinstance(value, float):
-        return f"{value:.3g}"
+        return f"{value:z.3g}"
     return str(value)
 
 

@@ -186,7 +186,7 @@ def judge_rx_order(board: str, order: Sequence[int]) -> list[Finding]:
 def judge_phase_jump(board: str, row: int, angle_rad: float) -> list[Finding]:
     """Judge a jump of the phase of a board's echo before a row."""
     return [reason(
-        "care", f"{board}: the phase of the echo jumps by {np.degrees(angle_rad):+.0f} degrees before row {row}",
+        "care", f"{board}: the phase of the echo jumps by {np.degrees(angle_rad):+z.0f} degrees before row {row}",
         "a cable or connector was touched, or the board was knocked; the direct path does not show it; it was"
         " removed from the images as measured between the rows, and the errors contain what may be left",
         "fix cables and boards, and scan again", 4.7,
@@ -223,7 +223,7 @@ def judge_levels(levels: Mapping[str, float | None]) -> list[Finding]:
         if is_known(level) and level > 0 and not DIRECT_LEVELS[0] <= level <= DIRECT_LEVELS[1]:
             weak = level > DIRECT_LEVELS[1]
             state = "weak" if weak else "strong"
-            problem = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+.0f} dB relative to it"
+            problem = f"{channel}: the direct path is {state}: metal is {20 * np.log10(level):+z.0f} dB relative to it"
             if weak:
                 cause = "something in its way weakens the direct path; the object disturbs its estimate"
             else:
@@ -388,7 +388,7 @@ def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], th
         )]  # fmt: skip
     if abs(offset_mm) > PLANE_GATE_MM:
         return [reason(
-            "none", f"the plates lie {offset_mm:+.0f} mm off the rig file's plane",
+            "none", f"the plates lie {offset_mm:+z.0f} mm off the rig file's plane",
             "they are at the edge of the range gate",
             "measure geometry.object_distance_mm and correct the rig file", 7.0,
         )]  # fmt: skip
@@ -396,7 +396,7 @@ def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], th
     tilt = max(abs(t) for t in tilt_deg)
     if abs(offset_mm) > PLANE_FAR_MM:
         reasons.append(reason(
-            "care", f"the plates lie {offset_mm:+.1f} mm off the rig file's plane; the angle was corrected for it",
+            "care", f"the plates lie {offset_mm:+z.1f} mm off the rig file's plane; the angle was corrected for it",
             "the object is at another distance, or object_distance_mm is wrong",
             "correct geometry.object_distance_mm in the rig file", 1.6,
         ))  # fmt: skip
@@ -413,7 +413,7 @@ def judge_copies(labels: Sequence[int], shift_mm: tuple[float, float], level_db:
     """Judge patches that are shifted, weaker copies of the plates; none without `labels`."""
     if not labels:
         return []
-    place = f"x {shift_mm[0]:+.0f}, y {shift_mm[1]:+.0f} mm away and {-level_db:.0f} dB weaker"
+    place = f"x {shift_mm[0]:+z.0f}, y {shift_mm[1]:+z.0f} mm away and {-level_db:.0f} dB weaker"
     return [reason(
         "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place}",
         "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
@@ -428,7 +428,7 @@ def judge_image_shift(apart_mm: tuple[float, float]) -> list[Finding]:
         return []
     return [reason(
         "care",
-        f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+.1f}, y {apart_mm[1]:+.1f} mm)",
+        f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+z.1f}, y {apart_mm[1]:+z.1f} mm)",
         "boards are out of place by a few millimetres, or all plates lie high; the images were laid on each other",
         "measure where the antennas are (`polysight calibrate direct-path`) and correct the rig file", 1.9,
     )]  # fmt: skip
@@ -477,7 +477,7 @@ def judge_reference_tilt(tilt_deg: tuple[float, float]) -> list[Finding]:
     if not is_known(worst) or abs(worst) <= PLATE_ACROSS_DEG:
         return []
     return [reason(
-        "care", f"the metal plate of the reference scan was tilted by {worst:+.1f} degrees",
+        "care", f"the metal plate of the reference scan was tilted by {worst:+z.1f} degrees",
         "the polarisation turns with it, in all plates alike, as if the boards had turned; corrected to a quarter",
         "lay the metal plate parallel to the stage, and scan it again", 4.1,
     )]  # fmt: skip
@@ -552,7 +552,7 @@ def judge_tilts(across_deg: Mapping[int, float]) -> list[Finding]:
     if len(tilted) != 1:
         remark = f" ({len(tilted)} patches in all)"
     return [reason(
-        "care", f"patch {worst} rises by {tilted[worst]:+.1f} degrees across the plane of incidence{remark}",
+        "care", f"patch {worst} rises by {tilted[worst]:+z.1f} degrees across the plane of incidence{remark}",
         "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
         "lay plates and metal flat; shim the tilted one", 1.3,
     )]  # fmt: skip

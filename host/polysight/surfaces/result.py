@@ -585,8 +585,8 @@ def summary_lines(surface: Surface) -> list[str]:
         tilts_deg = [np.degrees(np.arctan2(part, -segment.normal[2])) for part in segment.normal[:2]]
         turned = f", turned by {segment.turned_deg:g} degrees" if segment.turned_deg else ""
         lines.append(
-            f"  {segment.number}: {segment.points} points at ({x_mm:+.0f}, {y_mm:+.0f}, {z_mm:.0f}) mm{turned}, "
-            f"{describe_form(segment)}, tilt {tilts_deg[0]:+.1f}, {tilts_deg[1]:+.1f} degrees, "
+            f"  {segment.number}: {segment.points} points at ({x_mm:+z.0f}, {y_mm:+z.0f}, {z_mm:.0f}) mm{turned}, "
+            f"{describe_form(segment)}, tilt {tilts_deg[0]:+z.1f}, {tilts_deg[1]:+z.1f} degrees, "
             f"incidence {segment.incidence_deg:.1f}: {describe_material(segment)}"
         )
     return lines
@@ -609,7 +609,7 @@ def describe_material(segment: Segment) -> str:
     eps = segment.permittivity
     real_std = segment.covariance[0][0] ** 0.5
     loss_std = segment.covariance[1][1] ** 0.5
-    text = f"{eps.real:.2f} +- {real_std:.2f} - j ({-eps.imag:.2f} +- {loss_std:.2f})"
+    text = f"{eps.real:.2f} +- {real_std:.2f} - j ({-eps.imag:z.2f} +- {loss_std:.2f})"
     text += f", mostly by {segment.dominated_by}"
     if segment.name and segment.confidence is not None:
         text += f"; {segment.name} ({100 * segment.confidence:.0f} %)"

@@ -299,7 +299,7 @@ def _make_fig17_item(
     ax = fig.axes[1]
     ax.legend(fontsize=7.5, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     offsets = ", ".join(
-        f"{n} {data[f'{n} offset'].real:+.2f} in ε′, {-data[f'{n} offset'].imag:+.2f} in ε″" for n in true
+        f"{n} {data[f'{n} offset'].real:+z.2f} in ε′, {-data[f'{n} offset'].imag:+z.2f} in ε″" for n in true
     )
     parts = {"real": "ε′", "loss": "ε″"}
     larger = [

@@ -173,7 +173,8 @@ export function span(seconds) {
 
 export const clock = (seconds) => new Date(seconds * 1000).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit" });
 export const day = (seconds) => new Date(seconds * 1000).toLocaleString([], { year: "numeric", month: "short", day: "numeric", hour: "2-digit", minute: "2-digit" });
-export const signed = (n, digits = 0) => n.toFixed(digits).replace("-", "−");
+/** A number with so many digits and a true minus; a rounded zero has no sign. */
+export const signed = (n, digits = 0) => n.toFixed(digits).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
 export const grouped = (n) => n.toLocaleString("en").replaceAll(",", "\u202f");
 export const bytes = (n) => (n === null || n === undefined ? "…" : n < 1e6 ? `${(n / 1e3).toFixed(0)} kB` : n < 1e9 ? `${(n / 1e6).toFixed(0)} MB` : `${(n / 1e9).toFixed(1)} GB`);
 export const pageOf = (page, scan) => `/${page}?${new URLSearchParams({ scan })}`;

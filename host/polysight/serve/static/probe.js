@@ -1,9 +1,9 @@
 // What a scan says of one place: numbers, nearest materials, and the range profile through it.
-import { by, called, complain, get, make, permittivity, rich } from "./common.js";
+import { by, called, complain, get, make, permittivity, rich, signed } from "./common.js";
 import { plot } from "./plots.js";
 
 const number = (v, digits = 3) => (v === null || v === undefined ? "not known" : v.toPrecision(digits).replace("-", "−"));
-const db = (v) => (v === null ? "nothing" : `${v.toFixed(1).replace("-", "−")} dB`);
+const db = (v) => (v === null ? "nothing" : `${signed(v, 1)} dB`);
 
 function complex({ real, imag }) {
   return `${number(real)} ${imag < 0 ? "−" : "+"} j ${number(Math.abs(imag))}`;
@@ -25,8 +25,8 @@ export async function showProbe(scan, x, y, library, isCurrent) {
     complain("probe-hint");
   } catch (error) { complain("probe-hint", error); return null; }
   by("probe-hint").textContent = told.lit ? "" : "The scan does not illuminate this place.";
-  const facts = [["place", `x ${told.place_mm[0].toFixed(1)}, y ${told.place_mm[1].toFixed(1)} mm`.replaceAll("-", "−")],
-    ["|H|, |V|", `${db(told.h_db)}, ${db(told.v_db)}${told.referenced ? " beside metal" : ""}`],
+  const facts = [["place", `x ${signed(told.place_mm[0], 1)}, y ${signed(told.place_mm[1], 1)} mm`],
+    ["|H|, |V|", `${db(told.h_db)}, ${db(told.v_db)}${told.referenced ? " relative to metal" : ""}`],
     ["P", told.p.real === null ? "nothing" : `${complex(told.p)}${told.p_sigma === null ? "" : ` ± ${number(told.p_sigma, 2)}`}`]];
   if (told.permittivity) {
     const error = { real_std: told.permittivity_real_std, imag_std: told.permittivity_loss_std };

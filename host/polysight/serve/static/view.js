@@ -1,5 +1,5 @@
 // A picture with axes in millimetres: zoom, pan, a place to point at, boxes to draw; by mouse, finger and keyboard.
-import { make } from "./common.js";
+import { make, signed } from "./common.js";
 import { ticks } from "./plots.js";
 
 const LEFT = 46, BOTTOM = 38, TOP = 8, RIGHT = 16;
@@ -242,7 +242,7 @@ export class ImageView {
   }
 }
 
-const placeText = ([x, y]) => `x ${(x + 0).toFixed(1)}, y ${(y + 0).toFixed(1)} mm`.replace("-0.0", "0.0").replaceAll("-", "−");
+const placeText = ([x, y]) => `x ${signed(x, 1)}, y ${signed(y, 1)} mm`;
 
 /** A line that is seen on light and on dark. */
 export function outline(pen, draw, ink) {

@@ -85,6 +85,19 @@ def test_error_bars_are_those_of_repeated_measurements():
         assert np.std(value) == pytest.approx(np.median(claimed), rel=0.35)
 
 
+def test_error_bars_grow_faster_than_the_noise_where_the_posterior_is_bent():
+    """Eq. 3 is nearly linear for errors of some per cent, and not for 20 %."""
+    pet = Layer("pet", 3.78 - 0.7j)
+    stds_over_noise = []
+    for noise in (0.02, 0.04, 0.2):
+        fit = fit_layer(measure_bands([pet], noise), [Layer("pet")], THETA)
+        stds_over_noise.append(np.array([fit.std_real, fit.std_loss]) / noise)
+    small, double, large = stds_over_noise
+    np.testing.assert_allclose(double, small, rtol=1e-3)
+    assert (large > 1.15 * small).all()
+    assert (large < 1.5 * small).all()
+
+
 def test_ambiguity_is_said():
     """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep distinguishes them."""
     eps = 7.0 - 0.1j

@@ -1,6 +1,7 @@
 """Errors that a scene shows: displaced images, a drift, a halo of an overdriven receiver."""
 
 from dataclasses import fields
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -242,6 +243,21 @@ def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
     glow = 0.3 * ndimage.gaussian_filter(by_level[-1].mask.astype(float), 8.0)
     assert find_halo(by_level[-1].interior, patches, images(h, v + glow)).level > 0
     assert find_halo(by_level[0].interior, patches, images(h, v + glow)).level == 0
+
+
+@pytest.mark.parametrize(("left_px", "lies_in_halo"), [(59, True), (61, False)])
+def test_a_plate_within_36_mm_of_the_metal_lies_in_its_halo_even_if_nothing_beside_it_shows_that(left_px, lies_in_halo):
+    metal = np.zeros((SIDE, SIDE), bool)
+    metal[50:73, 20:43] = True
+    plate = np.zeros_like(metal)
+    plate[50:73, left_px : left_px + 23] = True
+    patches = [SimpleNamespace(label=k, mask=mask, interior=mask) for k, mask in enumerate((metal, plate), 1)]
+    h = metal + 0.4 * plate + 0.003
+    v = metal + 0.1 * plate + 0.003 + 0.3 * ndimage.gaussian_filter(metal.astype(float), 8.0)
+    beside_plate = ndimage.binary_dilation(plate, iterations=10) & ~plate
+    halo = find_halo(metal, patches, Images(h, v, AXIS, AXIS, ~beside_plate))
+    assert halo.level > 0.005
+    assert halo.around[2] == (halo.level if lies_in_halo else 0)
 
 
 def _explain_cases(mean: float, std: tuple[float, ...]) -> _Explained:

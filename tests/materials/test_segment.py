@@ -90,8 +90,12 @@ def test_invalid_part_is_left_out(synthetic):
     assert not segmentation.labels[:, :75].any()
     with refused(ErrorCode.NO_DATA):
         segment(scene.h, scene.v, scene.x_m, scene.y_m, np.zeros_like(valid))
+    longer_m = np.append(scene.x_m, 2 * scene.x_m[-1] - scene.x_m[-2])
+    for axes in ((scene.x_m[:-1], scene.y_m), (longer_m, scene.y_m), (scene.x_m, scene.y_m[1:])):
+        with refused(ErrorCode.MISMATCH):
+            segment(scene.h, scene.v, *axes)
     with refused(ErrorCode.MISMATCH):
-        segment(scene.h, scene.v, scene.x_m[:-1], scene.y_m)
+        segment(scene.h, scene.v[1:], scene.x_m, scene.y_m)
 
 
 def test_outline_encloses_the_patch(synthetic):

@@ -94,6 +94,16 @@ def test_a_pause_is_no_time_of_a_row(begun):
     assert history.row_seconds == (60.0, "measured")
 
 
+def test_time_left_after_one_row_is_what_that_row_took(finished):
+    facts = load_facts(finished)
+    first_row, second_row, *_ = (fact for fact in facts if fact["fact"] == "row_committed")
+    history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
+    add_fact(history, first_row | {"committed_utc": UTC.format(1, 30)})
+    assert history.row_seconds == (90.0, "first row")
+    add_fact(history, second_row | {"committed_utc": UTC.format(2, 30)})
+    assert history.row_seconds == (60.0, "measured")
+
+
 def test_time_left_before_the_first_row_is_the_plan_s(finished):
     started = load_facts(finished)[0]
     real = begin_history(started | {"simulated": False})

@@ -68,6 +68,8 @@ def test_a_plan_of_the_page_has_at_most_so_many_positions_after_its_steps():
     """A smaller step makes more positions in the same area of 698 mm."""
     within = PlanRequest(step_x_mm=0.35, speed_mm_s=5.0).apply(RIG_FILE)
     assert within.grid.columns == 1995
+    most = PlanRequest(step_x_mm=0.3491, speed_mm_s=5.0).apply(RIG_FILE)
+    assert most.grid.columns == MAX_POSITIONS
     with refused(ErrorCode.VALUE_INVALID, MAX_POSITIONS):
         PlanRequest(step_x_mm=0.348, speed_mm_s=5.0).apply(RIG_FILE)
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from polysight.surfaces import permittivity
 from polysight.surfaces.gains import Gains, Voltages, learn_gains, number_blocks
 from polysight.surfaces.optics import reflect_flat
 from polysight.surfaces.permittivity import (
@@ -86,6 +87,15 @@ def test_scatter_that_noise_does_not_explain_may_be_common_to_a_block():
     noise = fit_permittivity(make_voltages(ripple, at_m, 0.05), UNIT_GAINS, WAVE_NUMBER)
     edges = fit_permittivity(make_voltages(ripple, at_m, 0.005), UNIT_GAINS, WAVE_NUMBER)
     assert np.trace(edges.covariance) > 1.1 * np.trace(noise.covariance)
+
+
+@pytest.mark.parametrize("away", [-0.8 + 0.3j, 1.5 - 0.8j])
+def test_a_permittivity_does_not_depend_on_where_its_fit_starts(monkeypatch, away):
+    at_m = np.random.default_rng(1).uniform(0, 0.3, (400, 2))
+    voltages = make_voltages(np.full(400, 0.02), at_m, 0.01)
+    usual = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
+    monkeypatch.setattr(permittivity, "point_permittivity", lambda *_: np.full(400, usual.eps + away))
+    assert fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER).eps == pytest.approx(usual.eps, abs=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import pytest
 
 from polysight.sync import loops
 from polysight.sync.cubes import CubeForm
-from polysight.sync.decimate import FOLD, whole_blocks
+from polysight.sync.decimate import FOLD, SEARCH_FFT, whole_blocks
 from polysight.sync.direct_path import prepare
-from polysight.sync.offsets import reference
+from polysight.sync.offsets import half_scale, reference
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -197,8 +197,31 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
     assert error.std() < 1.2 * np.sqrt(10**-1.6 / 2 / (4 * 192))
 
 
-def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(rig, paths, direct_paths, align_single, board):
-    """A far stronger object at some positions hides the direct path there; its amplitude is known from the row."""
+# Tones above and below the direct path by the object's distance, and their strengths relative to it. A stronger peak is
+# taken for the direct path, and so is a comparable one below.
+@pytest.mark.parametrize(("side", "strength"), [(1, 5.0), (-1, 0.6), (0, 0.0)])
+def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(
+    rig, paths, noise, direct_paths, align_single, board, side, strength
+):
+    """At some positions a tone hides the direct path; its amplitude is known from the row."""
+    path = direct_paths[board.name]
+    rng = np.random.default_rng(6)
+    signal, length = paths(board, 40, 0.0, rng)
+    apart = side * np.mean(path.object_bins) / SEARCH_FFT / FOLD
+    tone = strength * signal * np.exp(2j * np.pi * apart * np.arange(256))
+    is_disturbed = np.arange(40) % 8 == 3
+    signal = signal + is_disturbed[:, None, None] * tone + noise(signal.shape, -10, rng)
+    signal *= np.exp(2j * np.pi * 0.25 * np.arange(256))
+    referenced = reference(align_single(signal, np.ones(40, bool)), path, rig.chirp)
+    true = 0.25 + rig.chirp.hz_per_sample * length[0] / SPEED_OF_LIGHT_M_S
+    assert referenced.found.all()
+    # IF bins; the tone is 3.5 away
+    assert np.abs(referenced.frequency - true).max() * 192 < 0.1
+
+
+def test_a_far_stronger_object_at_some_positions_does_not_hide_the_direct_path(
+    rig, paths, direct_paths, align_single, board
+):
     signal, _ = paths(board, 40, 0.5, np.random.default_rng(6), spread_m=0.02)
     pure, length = paths(board, 40, 0.0, np.random.default_rng(6))
     strong = np.arange(40) % 8 == 3
@@ -207,7 +230,14 @@ def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(rig, paths, d
     referenced = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
     true = 0.25 + rig.chirp.hz_per_sample * length[0] / SPEED_OF_LIGHT_M_S
     assert referenced.found.all()
-    assert np.abs(referenced.frequency - true).max() * 192 < 0.1  # IF bins; the object is 3.5 away
+    # IF bins; the object is 3.5 away
+    assert np.abs(referenced.frequency - true).max() * 192 < 0.1
+
+
+def test_halves_are_scaled_to_the_average_of_their_chirps():
+    """Of an odd number of good chirps the first half has one more; both are parts of the average of all."""
+    scale = half_scale(np.arange(6))
+    np.testing.assert_allclose(scale, [(0, 0), (1, 1), (2, 2), (3 / 2, 3), (2, 2), (5 / 3, 5 / 2)], rtol=1e-6)
 
 
 def test_the_lower_of_two_peaks_is_used_if_the_object_is_stronger(run, board):

@@ -8,11 +8,17 @@ import os
 import secrets
 import stat
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, BinaryIO
 
 from polysight_shared.errors import DataError, DeviceError, ErrorCode
+
+try:
+    import fcntl
+except ImportError:
+    # Windows.
+    fcntl = None
 
 # A hundred times the manifest of a scan of ten thousand rows.
 MAX_JSON_BYTES = 256 << 20
@@ -180,6 +186,25 @@ def write_together(files: Mapping[Path, bytes]) -> None:
         raise
     for folder in dict.fromkeys(path.parent for path in files):
         sync_folder(folder)
+
+
+@contextmanager
+def folder_held(folder: Path) -> Iterator[None]:
+    """Let one program, and one thread of it, at a time read and replace a small file of a folder; the others wait.
+
+    The folder itself is locked with flock(2): a kill releases it, and nothing is left on the disk. Where folders cannot
+    be locked (Windows, some network drives) nothing is held. A thread that holds a folder must not hold it again.
+    """
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def sync_folder(path: Path) -> None:

@@ -9,7 +9,7 @@ from tests.support.products import judged_products
 from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser, main
-from polysight.jobs.label import Edits, label
+from polysight.jobs.label import Edits, apply_edits, label
 from polysight.materials import read_labels
 from polysight.products import find_labels, find_products, making_products, write_image, write_json
 from polysight_shared.errors import ErrorCode
@@ -165,3 +165,19 @@ def test_boxes_by_hand_outlive_products_of_the_same_scan_alone(products, scan_id
 def test_the_classifiers_names_are_no_labels(products):
     (products / "labels.json").write_text(json.dumps({"labels": {"metal": [0, 0, 3, 3]}}))
     assert find_labels(products) is None
+
+
+def test_boxes_that_another_command_saved_meanwhile_are_not_overwritten(products, monkeypatch):
+    """Each command would say that its box is saved, and one of them would be gone."""
+
+    def edit_during_another_command(*args):
+        monkeypatch.undo()
+        assert main(["label", str(products), "--box", "oak=20,0,40,20", "--metal", "oak"]) == 0
+        return apply_edits(*args)
+
+    monkeypatch.setattr("polysight.jobs.label.apply_edits", edit_during_another_command)
+    with refused(ErrorCode.MISMATCH, products):
+        label(products, Edits(boxes=[("glass", (-40.0, 0.0, -20.0, 20.0))]))
+    assert list(boxes(products).boxes) == ["oak"]
+    label(products, Edits(boxes=[("glass", (-40.0, 0.0, -20.0, 20.0))]))
+    assert list(boxes(products).boxes) == ["oak", "glass"]

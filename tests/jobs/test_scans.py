@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
@@ -150,3 +151,20 @@ def test_a_rounded_zero_has_no_sign(root, capsys, monkeypatch):
 
 def test_one_scan_is_counted_as_one(root, capsys):
     assert "\n1 scan under" in answer(capsys, "scans", root, "--find", "one")
+
+
+def test_no_tag_of_commands_at_the_same_time_is_lost(root):
+    tags = [[f"{first}{second}" for second in range(4)] for first in "abcd"]
+    together = threading.Barrier(len(tags))
+
+    def add_tags(of_one: list[str]) -> None:
+        together.wait()
+        for tag in of_one:
+            scans.note(root / "one", None, [tag], [])
+
+    threads = [threading.Thread(target=add_tags, args=(of_one,)) for of_one in tags]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(read_notes(root / "one").tags) == sorted(tag for of_one in tags for tag in of_one)

@@ -5,7 +5,7 @@ tags of a scan. Of a processed scan, `read_result` gives the results for a page,
 `probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 
-from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes, write_notes
+from polysight.catalogue.notes import NOTES, Notes, change_notes, is_plain, printable, read_notes, write_notes
 from polysight.catalogue.pictures import AMPLITUDE, PHASE, Picture, Pixels, colour_bar, draw, draw_products, thumbnail
 from polysight.catalogue.results import (
     DIFFERENCE,

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import stat
-import threading
 import unicodedata
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
-from polysight_shared.files import write_atomically
+from polysight_shared.files import folder_held, write_atomically
 
 NOTES = "operator.json"
 # Characters of the notes and of a tag, and tags of a scan: more would make the list of scans unreadable; chosen.
@@ -31,10 +31,6 @@ class Notes(msgspec.Struct, frozen=True):
 
     notes: str = ""
     tags: tuple[str, ...] = ()
-
-
-# Held while notes are compared with the stored ones and replaced, so that no change is overwritten unseen.
-_notes_lock = threading.Lock()
 
 
 def read_notes(folder: Path) -> Notes:
@@ -75,6 +71,37 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
     DataError
         if the present notes are damaged, and `base` is given.
     """
+
+    def check_base(present: Notes) -> Notes:
+        if present != base:
+            raise ScanError(
+                f"the notes of {folder.name} have changed", "somebody saved them after they were read here",
+                "copy your text, load the page again, and add it", code=ErrorCode.MISMATCH,
+            )  # fmt: skip
+        return notes
+
+    if base is not None:
+        return change_notes(folder, check_base)
+    with folder_held(folder):
+        return _write_checked(folder, notes)
+
+
+def change_notes(folder: Path, change: Callable[[Notes], Notes]) -> Notes:
+    """Replace the notes of a scan by `change` of them, while no other program can; return them as written.
+
+    Raises
+    ------
+    ConfigError
+        if a text is too long, or there are too many tags.
+    DataError
+        if the present notes are damaged.
+    """
+    with folder_held(folder):
+        return _write_checked(folder, change(read_notes(folder)))
+
+
+def _write_checked(folder: Path, notes: Notes) -> Notes:
+    """Check and write the notes of a folder that is held; return them as written. Raises ConfigError."""
     text = printable(notes.notes, keep="\n")
     # A dictionary drops tags that are given twice, and keeps the order.
     tags = dict.fromkeys(printable(tag).strip() for tag in notes.tags)
@@ -93,14 +120,8 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     written = Notes(text, tuple(tags))
-    with _notes_lock:
-        if base is not None and read_notes(folder) != base:
-            raise ScanError(
-                f"the notes of {folder.name} have changed", "somebody saved them after they were read here",
-                "copy your text, load the page again, and add it", code=ErrorCode.MISMATCH,
-            )  # fmt: skip
-        content = json.dumps(msgspec.to_builtins(written), indent=1, ensure_ascii=False)
-        write_atomically(folder / NOTES, f"{content}\n".encode())
+    content = json.dumps(msgspec.to_builtins(written), indent=1, ensure_ascii=False)
+    write_atomically(folder / NOTES, f"{content}\n".encode())
     return written
 
 

@@ -34,8 +34,8 @@ from polysight.materials import (
 )
 from polysight.products import IMAGE, LABELS, LABELS_PICTURE, ProcessedScan, find_labels, find_products, label_folder
 from polysight.store import MANIFEST
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, quote
-from polysight_shared.files import write_together
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, quote
+from polysight_shared.files import folder_held, write_together
 
 METAL = "metal"
 MIN_PIXELS = 16
@@ -133,7 +133,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         labels = ask_for_names(patches, ask)
         left_out = []
     labels_folder = label_folder(products.folder)
-    checked, notes = save_labels(labels_folder, products, labels)
+    checked, notes = save_labels(labels_folder, products, labels, lambda: _check_unchanged(folder, saved_labels))
     print_lines(_format_table(checked))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
@@ -142,8 +142,21 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     return 0
 
 
-def save_labels(folder: Path, products: ProcessedScan, labels: Labels) -> tuple[Labels, list[str]]:
+def _check_unchanged(folder: Path, saved_labels: tuple[Path, Labels] | None) -> None:
+    """Raise ScanError if the boxes of a scan are not those that were read."""
+    if find_labels(folder) != saved_labels:
+        raise ScanError(
+            f"the boxes of {folder} have changed", "another program saved boxes after they were read here",
+            "look at them (--list), and give the command again", code=ErrorCode.MISMATCH,
+        )  # fmt: skip
+
+
+def save_labels(
+    folder: Path, products: ProcessedScan, labels: Labels, check_present: Callable[[], None] = lambda: None
+) -> tuple[Labels, list[str]]:
     """Check boxes drawn on products, and write them with their picture into a folder; return them with notes on them.
+
+    `check_present` is called just before, when no other program can change them; it raises to keep the present boxes.
 
     Raises
     ------
@@ -166,7 +179,9 @@ def save_labels(folder: Path, products: ProcessedScan, labels: Labels) -> tuple[
 
     picture = label_figure(products, checked.boxes, checked.metal)
     # The boxes are written last, so that saved boxes always have a picture.
-    write_together({folder / LABELS_PICTURE: picture, folder / LABELS: pack_labels(checked)})
+    with folder_held(folder):
+        check_present()
+        write_together({folder / LABELS_PICTURE: picture, folder / LABELS: pack_labels(checked)})
     masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
     notes = []
     if small_boxes := [name for name, mask in masks.items() if (mask & products.valid).sum() < MIN_PIXELS]:

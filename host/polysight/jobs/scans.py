@@ -18,13 +18,13 @@ from polysight.catalogue import (
     PermittivityDifference,
     Scans,
     Summary,
+    change_notes,
     compare,
     folder_bytes,
     is_scan,
     printable,
     probe,
     read_notes,
-    write_notes,
 )
 from polysight.jobs.output import confirm, print_json, print_lines
 from polysight.materials import UNKNOWN
@@ -105,12 +105,15 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
             "give the folder of a scan or of products; polysight scans FOLDER lists those under a folder",
             code=ErrorCode.FILE_MISSING,
         )  # fmt: skip
-    notes = read_notes(folder)
+
+    def change(present: Notes) -> Notes:
+        tags = tuple(t for t in dict.fromkeys((*present.tags, *add)) if t not in remove)
+        return Notes(present.notes if text is None else text, tags)
+
     if text is not None or add or remove:
-        tags = tuple(t for t in dict.fromkeys((*notes.tags, *add)) if t not in remove)
-        if text is None:
-            text = notes.notes
-        notes = write_notes(folder, Notes(text, tags))
+        notes = change_notes(folder, change)
+    else:
+        notes = read_notes(folder)
     lines = [f"tags: {', '.join(notes.tags) or 'none'}"]
     if notes.notes:
         lines.insert(0, notes.notes)

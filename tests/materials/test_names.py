@@ -210,3 +210,12 @@ def test_each_reason_of_a_name_has_a_subject():
     named = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2)
     for permittivity, subject in ((None, "it is like "), (9.41 - 0.002j, "permittivity 9.41 - j0.00 is like ")):
         assert add_explanation(named, permittivity, None, LIBRARY).verdict.why.startswith(subject)
+
+
+@pytest.mark.parametrize(("unknown", "rival"), [(0.5, "a material that the library lacks 50 %"), (0.001, "no other")])
+def test_a_likely_unknown_material_is_told_as_a_rival(unknown, rival):
+    """Half of the probability without a name is another likely material."""
+    named = name_ratios(complex(inverse_ratio(LIBRARY["acrylic"], ANGLES[0])))
+    verdict = replace(named.verdict, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})
+    reason = add_explanation(replace(named, verdict=verdict), LIBRARY["acrylic"], None, LIBRARY).verdict.why
+    assert reason.partition("; ")[2].removeprefix("it could also be ").startswith(rival)

@@ -55,6 +55,12 @@ def test_synchronisation_undoes_every_disturbance(image_scene):
         assert correlation(on, ideal_values) > 0.995, channel
 
 
+def test_a_scene_without_disturbances_has_no_jump_of_the_phase(image_scene):
+    """Its rows are as far apart as its image allows, so that a row is predicted badly from its neighbours."""
+    scan = image_scene("nine-materials")
+    assert [board.find_phase_jump() for board in scan.pipeline.quality.boards.values()] == [None, None]
+
+
 def test_metal_gives_one_at_every_pixel_within_noise(image_scene):
     """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
     scan = image_scene("metal-plate")

@@ -173,9 +173,10 @@ def _format_finding(finding: Finding) -> str:
 def _count_verdicts(findings: list[Finding], failed: list[str]) -> str:
     """Return the counts of the verdicts as a line; it names the first failed check, where to begin."""
     verdicts = [verdict(finding) for finding in findings]
+    warnings = verdicts.count("warning")
     counts = (
-        f"{verdicts.count('ok')} ok, {verdicts.count('warning')} warnings, {len(failed)} errors,"
-        f" {verdicts.count('not checked')} not checked"
+        f"{verdicts.count('ok')} ok, {warnings} warning{'s' * (warnings != 1)}, {len(failed)}"
+        f" error{'s' * (len(failed) != 1)}, {verdicts.count('not checked')} not checked"
     )
     if not failed:
         return counts

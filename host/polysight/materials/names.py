@@ -47,6 +47,9 @@ UNKNOWN_BUDGET = 0.03
 """Relative error of V / H, in addition to its pixels' spread, if the scan's error budget is not known; chosen."""
 LIKELY = 0.005
 """Materials of less probability are not listed; chosen."""
+LIKELY_UNKNOWN = 0.05
+"""A material that the library lacks is not told as a rival with less probability: a few percent are always left for it;
+chosen."""
 LAYER = "possible layer"
 """Name of a patch that is rather a thin plate or a stack of layers than a half space."""
 POSSIBLY_THIN = 0.2
@@ -506,9 +509,13 @@ def add_explanation(
 
 def _list_rivals(verdict: PatchName) -> str:
     """Return a clause on the other likely names; empty for the KNN, which has no probabilities."""
-    rivals = [
-        f"{name} {100 * p:.0f} %" for name, p in verdict.probabilities.items() if name not in (verdict.name, UNKNOWN)
-    ]
+    rivals = []
+    for name, probability in verdict.probabilities.items():
+        least = LIKELY_UNKNOWN if name == UNKNOWN else LIKELY
+        if name == verdict.name or probability < least:
+            continue
+        rival = "a material that the library lacks" if name == UNKNOWN else name
+        rivals.append(f"{rival} {100 * probability:.0f} %")
     if rivals:
         return f"; it could also be {' or '.join(rivals[:2])}"
     if verdict.probabilities:

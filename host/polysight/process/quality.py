@@ -73,8 +73,9 @@ _LEAST_RAD = np.radians(9)
 _LEAST_RATIO = 0.42
 # The error of the prediction relative to the part that turns, above which a row tells nothing; chosen.
 _MOST_ERROR = 1.0
-# How far a jump stands out: its ratio over the third largest one's (its neighbours have a share of it); chosen.
-_STANDS_OUT = 1.3
+# How far a jump stands out: its ratio over the third largest one's (its neighbours have a share of it). The nine plates
+# of the examples, whose rows are 6 mm apart, reach 1.4 without a jump; jumps of 30 degrees reach 2.6 and more.
+_STANDS_OUT = 1.6
 # Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
 _AT_END = 3
 

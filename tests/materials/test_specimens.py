@@ -57,22 +57,6 @@ def test_the_spread_is_found():
     assert np.mean([f[:, 1].mean() for f in spreads]) == pytest.approx(0.2, rel=0.2)
 
 
-def test_the_spread_settles_within_fewer_rounds_than_the_limit(monkeypatch):
-    rounds = []
-    average_channels = specimens.average_channels
-
-    def count(covariance):
-        rounds.append(covariance)
-        return average_channels(covariance)
-
-    monkeypatch.setattr(specimens, "average_channels", count)
-    # More and less than the published spread, from which the rounds begin.
-    for spread in ((0.2, 0.6), (0.01, 0.05)):
-        rounds.clear()
-        MODELS[DISCRIMINANT]("H+V+P").fit(drawn(spread, 40))
-        assert 3 < len(rounds) < 100
-
-
 def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
     """Its patch is its mean: a residual of zero does not count."""
     samples = drawn((0.03, 0.2), 6)

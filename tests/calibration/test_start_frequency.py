@@ -1,10 +1,13 @@
 """The estimated start frequencies move the direct path to the middle of the IF band, from anywhere."""
 
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
 import pytest
 from tests.support.refusals import refused
 
+from polysight.calibration import files
 from polysight.calibration.direct_signal import choose_start_offset, fit_start, predict_by_geometry, unwrap_if
 from polysight.calibration.files import StartFile, open_raw, read_calibration
 from polysight.cli.main import main
@@ -91,3 +94,11 @@ def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, make_
     folder = make_scan(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
     with refused(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
         fit_start(open_raw(folder), "RH")
+
+
+def test_of_many_rows_as_many_as_asked_for_are_read_evenly_spaced(make_rig, monkeypatch):
+    monkeypatch.setattr(files, "row_words", lambda *_: (None, None))
+    recorded = SimpleNamespace(payload=None, missing=(), frames_expected=0)
+    source = SimpleNamespace(instrument=make_rig(), rows=lambda: iter((0, 1, 3, 4, 5, 8)), read_row=lambda *_: recorded)
+    for limit, rows in ((None, [0, 1, 3, 4, 5, 8]), (6, [0, 1, 3, 4, 5, 8]), (3, [0, 3, 8]), (1, [0])):
+        assert [row for row, _, _ in files.board_rows(source, "RH", limit)] == rows

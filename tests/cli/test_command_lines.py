@@ -138,7 +138,17 @@ def test_the_earlier_form_of_a_box_is_read_with_a_notice(capsys):
     assert build_parser().parse_args(["permittivity", "out", "--segment", "3"]).patch == 3
 
 
-@pytest.mark.parametrize("text", ["20,0,-20,10", "0,20,10,20", "1,2,3", "a,b,c,d"])
+@pytest.mark.parametrize(("text", "strips"), [("-180=a", (-180, Path("a"))), ("180=a=b", (180, Path("a=b")))])
+def test_the_orientation_of_strips_is_an_angle_and_their_scan(text, strips):
+    assert build_parser().parse_args(["leakage", "plate", f"--strips={text}"]).strips == [strips]
+
+
+@pytest.mark.parametrize("text", ["-180.5=a", "180.5=a", "nan=a", "a=b", "90", "90="])
+def test_strips_without_an_orientation_or_scan_are_refused(text):
+    assert text in refusal("leakage", "plate", f"--strips={text}")
+
+
+@pytest.mark.parametrize("text", ["20,0,-20,10", "20,0,20,10", "0,20,10,20", "0,20,10,-20", "1,2,3", "a,b,c,d"])
 def test_a_box_has_a_lower_left_and_an_upper_right_corner(text):
     assert text in refusal("process", "s", "--out", "o", f"--metal-box={text}")
 

@@ -220,8 +220,7 @@ def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], f
     for receiver in receivers:
         card = (receiver.board.card_address, CARD_SOURCE_PORT)
         host = (receiver.board.host_address, receiver.board.data_port)
-        first_packet = 0
-        words = map(str, (*card, *host, first_packet, packets, rate, MAX_PAYLOAD_BYTES))
+        words = map(str, (*card, *host, packets, rate, MAX_PAYLOAD_BYTES))
         command = [sys.executable, "-I", str(_SENDER), *words]
         senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
     # A sender prints the seconds that it took; one that failed prints nothing.

@@ -1,4 +1,4 @@
-"""Send packets as a capture card does: `python -I send_packets.py CARD CARD_PORT HOST PORT FIRST PACKETS RATE BYTES`.
+"""Send packets as a capture card does: `python -I send_packets.py CARD CARD_PORT HOST PORT PACKETS RATE BYTES`.
 
 Prints the seconds it took. A program without imports from this package, so that it starts without delay on a busy
 machine.
@@ -13,13 +13,13 @@ import time
 _MAX_LAG_S = 0.005
 
 
-def main(card: str, card_port: int, host: str, port: int, first: int, packets: int, rate: float, size: int) -> None:
-    """Send packets of `size` payload bytes with consecutive counters from packet `first` on, at `rate` packets/s."""
+def main(card: str, card_port: int, host: str, port: int, packets: int, rate: float, size: int) -> None:
+    """Send packets of `size` payload bytes with the counters of a card that was reset, at `rate` packets/s."""
     period_s = 1 / rate
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((card, card_port))
         began = due = time.perf_counter()
-        for k in range(first, first + packets):
+        for k in range(packets):
             count = k * size
             # Header: sequence number, which begins with 1, and bytes sent before, 48 bits; little-endian.
             sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
@@ -31,13 +31,12 @@ def main(card: str, card_port: int, host: str, port: int, first: int, packets: i
 
 
 if __name__ == "__main__":
-    _, card, card_port, host, port, first, packets, rate, size = sys.argv
+    _, card, card_port, host, port, packets, rate, size = sys.argv
     main(
         card=card,
         card_port=int(card_port),
         host=host,
         port=int(port),
-        first=int(first),
         packets=int(packets),
         rate=float(rate),
         size=int(size),

@@ -3,6 +3,7 @@
 import io
 import re
 import statistics
+from typing import Literal
 
 import msgspec
 import pytest
@@ -110,11 +111,13 @@ def test_the_page_has_the_same_time_left(rig, tmp_path):
 ROWS = 20
 
 
-def show_progress(*steps: ScanProgress, terminal: bool) -> str:
+def show_progress(*steps: ScanProgress, terminal: bool, colours: Literal["standard"] | None = None) -> str:
     out = io.StringIO()
-    with ScanBar(Console(file=out, width=200, force_terminal=terminal, color_system=None)) as bar:
+    with ScanBar(Console(file=out, width=200, force_terminal=terminal, color_system=colours)) as bar:
         for step in steps:
             bar.update(step)
+    if colours:
+        return out.getvalue()
     return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue())
 
 
@@ -137,3 +140,12 @@ def test_notices_are_shown_and_steps_are_not():
         *(ScanProgress(phase, f"so {phase}", **step) for phase in (*answer, "row", "state")), terminal=False
     )
     assert progress_text.splitlines() == [f"{phase}: so {phase}" for phase in answer]
+
+
+@pytest.mark.parametrize("phase", ["warning", "end"])
+def test_messages_are_shown_as_they_are(phase):
+    """Brackets and colons are no markup, and numbers have no colours."""
+    message = "the Pi's [stage] differs in 'travel_x_mm' = 12.5: see [/tmp/rig] :x:"
+    step = ScanProgress(phase, message, ROWS, committed=3, row=4, take=1)
+    assert f"{phase}: {message}\n" in show_progress(step, terminal=True, colours="standard")
+    assert show_progress(step, terminal=False) == f"{phase}: {message}\n"

@@ -22,6 +22,7 @@ from urllib.request import Request, urlopen
 from msgspec.structs import replace
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.text import Text
 
 from polysight.acquisition import (
     ControlFolder,
@@ -106,15 +107,19 @@ class ScanBar:
                 row_text += f" take {p.take}"
             self._bars.update(self._points, description=row_text, total=p.row_points, completed=p.points, visible=True)
         if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
-            self._console.print(f"{p.phase}: {p.message}", highlight=False)
+            self._print(f"{p.phase}: {p.message}")
         # Print now why the rows ended early: the error message itself follows only after the processing.
         if p.phase == "end" and p.committed < p.rows:
-            self._console.print(f"{p.phase}: {p.message}", highlight=False)
+            self._print(f"{p.phase}: {p.message}")
         if not self._console.is_terminal and p.phase == "committed":
             tenth = 10 * p.committed // max(1, p.rows)
             if tenth != self._printed_tenth:
                 self._printed_tenth = tenth
-                self._console.print(f"{p.committed} of {p.rows} rows, {_format_clock(p.remaining_s)}", highlight=False)
+                self._print(f"{p.committed} of {p.rows} rows, {_format_clock(p.remaining_s)}")
+
+    def _print(self, text: str) -> None:
+        """Print a line as it is: rich would take brackets, as of `[stage]`, for its markup, and colour numbers."""
+        self._console.print(Text(text))
 
 
 def _run_and_notify(folder: Path, processing: LiveProcessing | None, run_rows: RunScan, notifier: Notify) -> int:

@@ -1,12 +1,14 @@
 """Point response: measured widths and sidelobes agree with formulas, and so does the loss by missing positions."""
 
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
 import pytest
 from msgspec import UNSET
 
 from polysight.imaging import ImageBuilder
-from polysight.imaging.resolution import board_facts, point_response
+from polysight.imaging.resolution import board_facts, imaging_facts, point_response
 from polysight_shared.geometry import specular_midpoint_m
 
 
@@ -77,6 +79,13 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
     assert -20 * np.log10(summed / peak) == pytest.approx(facts.loss_db, abs=1e-3)
     # Image amplitudes do not change
     assert peak == pytest.approx(1, abs=0.03)
+
+
+def test_notices_of_images_are_told_if_there_are_any(make_rig):
+    builder = ImageBuilder(make_rig(5, 5))
+    notice = "the direct sum is slower"
+    assert imaging_facts(builder, SimpleNamespace(notices=(notice,)))["notices"] == [notice]
+    assert list(imaging_facts(builder, SimpleNamespace(notices=()))) == ["RH", "RV"]
 
 
 def test_without_data_there_is_no_response(make_rig):

@@ -9,12 +9,13 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.paths import REPO
-from tests.support.pi.machine_bench import Bench
+from tests.support.pi.machine_bench import ROW, Bench
 from tests.support.rigs import published_rig
 
 from polysight.planning.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
 from polysight_pi.machine import RefusedError
+from polysight_pi.motions import estimate_row_duration_s
 from polysight_pi.rules import RULES, TIMEOUTS_S, WIRE_STATE, State
 from polysight_pi.stage import IDLE_STATUS_S, SILENT_AT_REST_S, STATUS_PER_HEARTBEAT, StatusWatch
 from polysight_pi.trigger import LOOK_UP_S, LoopFault, TriggerWatch
@@ -47,6 +48,18 @@ def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
         bench.status(0, state="idle")
     assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
     assert not bench.machine.homed
+
+
+def test_a_row_that_does_not_end_is_given_up_after_half_a_minute_and_three_times_its_duration():
+    long_row = msgspec.structs.replace(ROW, points=400)
+    for row in (ROW, long_row):
+        bench = Bench().begin_and_home()
+        limit_s = 30 + 3 * estimate_row_duration_s(row, bench.stage.config, 20.0)
+        bench.start(row)
+        bench.later(limit_s - 0.1)
+        assert bench.machine.state == "running"
+        bench.later(0.2)
+        assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
 
 
 @pytest.mark.parametrize("place", [(500, 0), (0, -1)])

@@ -2,12 +2,22 @@
 
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from polysight.jobs.surface import check_is_metal
-from polysight.surfaces import Seen, Segment, Uncertainty, analyse_surface, find_shape, find_voltages, learn_gains
+from polysight.surfaces import (
+    Seen,
+    Segment,
+    Uncertainty,
+    analyse_surface,
+    find_shape,
+    find_voltages,
+    learn_gains,
+    result,
+)
 from polysight.surfaces.gains import receive, reflect_points
 from polysight.surfaces.measure import group_echoes
 from polysight.surfaces.paths import STRIDE_M
@@ -284,6 +294,49 @@ def test_points_of_a_wall_say_how_far_they_may_lie_off(least, most):
     # The more both faces cancel, the rarer are thick walls, whose errors count for all.
     assert np.mean(inside) > 0.9
     assert least < 0.4 or np.mean(inside) < 0.99
+
+
+@pytest.mark.parametrize(
+    ("reason", "name", "radius_mm", "depth_m", "judged_as"),
+    [
+        (NO_SINGLE_MEDIUM, "", 80.0, None, "wall"),
+        (NO_SINGLE_MEDIUM, "metal", 80.0, None, "surface"),
+        (NO_SINGLE_MEDIUM, "", 80.0, 0.03, "behind"),
+        ("", "", 39.9, 0.03, "behind"),
+        ("", "", 40.1, 0.03, "surface"),
+        ("", "", 39.9, None, "surface"),
+        ("z: a reason of another kind", "", 39.9, None, "surface"),
+    ],
+)
+def test_a_place_is_doubted_for_a_wall_and_for_an_echo_behind_another_surface(
+    monkeypatch, reason, name, radius_mm, depth_m, judged_as
+):
+    """A small radius alone is no reason to doubt a place: only with another surface in front of it."""
+
+    class ThreePoints(list):
+        segment = np.array([1, 1, 2])
+
+    monkeypatch.setattr(result, "find_reflection", lambda *_: np.full(3, 0.3))
+    monkeypatch.setattr(result, "find_depth_behind", lambda *_: depth_m)
+    segment = Segment(
+        number=1,
+        points=2,
+        centre_m=CENTRE_M,
+        normal=(0.0, 0.0, -1.0),
+        radius_mm=radius_mm,
+        radius_std_mm=1.0,
+        incidence_deg=50.0,
+        reason=reason,
+        name=name,
+    )
+    voltages = SimpleNamespace(band_rise=np.full((3, 2), 0.1))
+    (judged,), unknown_m = doubt_places(
+        [segment], ThreePoints([0, 0, 0]), None, voltages, SimpleNamespace(band_rise=np.zeros(2))
+    )
+    expected_m = {"surface": 0.0, "wall": estimate_wall_std(0.3, 0.1), "behind": 0.03 / np.sqrt(3)}[judged_as]
+    np.testing.assert_allclose(unknown_m, [expected_m, expected_m, 0])
+    assert judged.reason == (BEHIND_ANOTHER if judged_as == "behind" else reason)
+    assert (judged.radius_std_mm > 1) is (judged_as != "surface")
 
 
 def test_a_radius_says_where_curvatures_and_normals_disagree(metal, optics):

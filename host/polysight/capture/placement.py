@@ -268,12 +268,12 @@ class _Record:
     # Payload of a full packet, bytes.
     full: int
     # Bytes from the start to the end of the furthest packet.
-    length: int = 0
+    length: int
     # True if the furthest packet is short, as only a record's last one is.
-    ended: bool = False
+    ended: bool
     # True if the record ends at the row's last byte (with a short packet, unless full ones fill the row), and no
     # packet continues it.
-    ends_as_planned: bool = False
+    ends_as_planned: bool
 
 
 def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:

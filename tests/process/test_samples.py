@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -19,6 +20,7 @@ from polysight.imaging import PLANE_REACH_M, Images
 from polysight.jobs.process import image, process
 from polysight.pipeline import Pipeline
 from polysight.process import Use, map_rows
+from polysight.process.rows import KeptSamples
 from polysight.store import RowData, ScanFolder
 from polysight.store.manifest import encode_line
 from polysight.store.source import split_pieces
@@ -215,6 +217,17 @@ def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, kept:
     assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
     assert [line["row"] for line in lines] == list(range(17))
     np.testing.assert_array_equal(np.moveaxis(cube, 0, 2), from_raw.builder.boards["RH"]._cube)
+
+
+@pytest.mark.parametrize(
+    ("needed_m", "covered"),
+    [((0.1, 1.0), True), ((0.2, 0.9), True), ((0.099, 0.9), False), ((0.2, 1.001), False), ((0.0, 2.0), False)],
+)
+def test_samples_are_kept_only_if_their_paths_are_those_of_every_other_image(needed_m, covered) -> None:
+    samples = SimpleNamespace(_head={}, _keep=True)
+    usual_m = (0.1, 1.0)
+    assert KeptSamples._gate_m(samples, None, needed_m, usual_m) == (usual_m if covered else needed_m)
+    assert samples._keep is covered
 
 
 @pytest.mark.parametrize(

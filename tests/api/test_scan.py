@@ -208,7 +208,7 @@ def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
 
 
 def test_the_published_layout_has_surfaces_with_the_rig_that_it_was_opened_with(tmp_path, monkeypatch):
-    data = simulate_plates(tmp_path / "data", COPPER, PET, layout="authors")
+    data = simulate_plates(tmp_path / "data", COPPER, layout="authors")
     rig_file = (data / "instrument.toml").rename(tmp_path / "rig.toml")
     rig = replace(load_instrument(rig_file), name="rig of this test")
     used_rigs = []

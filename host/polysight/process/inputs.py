@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy.typing as npt
@@ -62,7 +63,7 @@ def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> s
     path = library_path(settings)
     # That of H; V's is nearly the same.
     angle = incidence_deg(rig, rig.receivers[0])
-    known_angles = Library.load(path).angles_deg
+    known_angles = _load_library(path, _find_stamp(path)).angles_deg
     # Classifier refuses an empty library.
     if not known_angles or any(abs(library_angle - angle) <= SAME_ANGLE_DEG for library_angle in known_angles):
         return ""
@@ -77,8 +78,32 @@ def load_classifier(settings: Settings, rig: Instrument) -> Classifier | None:
     """Return the classifier for scans of a rig; None without naming, see :func:`why_unnamed`. Raises DataError."""
     if why_unnamed(settings, rig):
         return None
-    angle = incidence_deg(rig, rig.receivers[0])
-    return Classifier(Library.load(library_path(settings)), model=settings.model, angles_deg=[angle])
+    path = library_path(settings)
+    return _fit_classifier(path, _find_stamp(path), settings.model, incidence_deg(rig, rig.receivers[0]))
+
+
+# A scan's settings are checked with the classifier before its rows are read, and its patches are named with it after
+# that: it is fitted once. Two, as scans of two angles may be processed in turn.
+@lru_cache(2)
+def _fit_classifier(path: Path, stamp: tuple[int, int], model: str | None, angle_deg: float) -> Classifier:
+    """Return the classifier of the library that the file `path` held at `stamp`."""
+    return Classifier(_load_library(path, stamp), model=model, angles_deg=[angle_deg])
+
+
+@lru_cache(1)
+def _load_library(path: Path, stamp: tuple[int, int]) -> Library:  # noqa: ARG001 (a changed file has another stamp)
+    """Return the library that the file `path` held at `stamp`."""
+    return Library.load(path)
+
+
+def _find_stamp(path: Path) -> tuple[int, int]:
+    """Return what changes when a file is replaced: time of its last change in ns, and size; zeros if it is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        # Loading says what is wrong.
+        return (0, 0)
+    return (status.st_mtime_ns, status.st_size)
 
 
 def library_path(settings: Settings) -> Path:

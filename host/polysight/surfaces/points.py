@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 # rest are for starts from which the first steps are cut to LONGEST_STEP_M.
 NEWTON_STEPS = 12
 LONGEST_STEP_M = 0.15
+# A step below this was the last that changed anything: the next would be its square.
+SHORTEST_STEP_M = 1e-9
 # Newton's method starts this far in front of the antennas, and never comes closer than NEAREST_M (both chosen): behind
 # them a mirror image of each point has nearly the same path and slope.
 START_RANGE_M = 0.5
@@ -64,6 +66,8 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
         points = points - step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-30))
         # A point that a step moved behind the antennas is put back in front of them.
         points[:, 2] = np.maximum(points[:, 2], NEAREST_M)
+        if (length < SHORTEST_STEP_M).all():
+            break
     return points
 
 

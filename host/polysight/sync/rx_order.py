@@ -186,27 +186,30 @@ def _normalise(phasors: NDArray[np.complexfloating]) -> NDArray[np.complex128]:
     return np.divide(phasors, size, out=np.zeros(phasors.shape, complex), where=size > 0)
 
 
+@lru_cache(_MOST_RX)
+def _list_orders(count: int) -> NDArray[np.intp]:
+    """Return all orders of `count` RX, [order, rx]; the first is that of the rig file."""
+    return np.array(list(itertools.permutations(range(count))))
+
+
 def _choose(vectors: _Vectors, expected: RxPhases) -> tuple[int, ...]:
     """Return the order that fits, from 1; empty if that of the rig file does, or none."""
-    count = vectors.direct.size
-    costs = {}
-    for order in itertools.permutations(range(count)):
-        places = list(order)
-        cost = _misfit(vectors.direct, expected.direct[places], _CHANNEL_RAD)
-        if vectors.echo is not None:
-            cost += _misfit(vectors.echo, expected.echo[places], _ECHO_RAD)
-        costs[order] = cost + _MOVED * sum(place != k for k, place in enumerate(order))
-    best = min(costs, key=lambda order: costs[order])
-    is_better = costs[tuple(range(count))] - costs[best] > _BETTER_BY
+    orders = _list_orders(vectors.direct.size)
+    costs = _misfit(vectors.direct, expected.direct[orders], _CHANNEL_RAD)
+    if vectors.echo is not None:
+        costs += _misfit(vectors.echo, expected.echo[orders], _ECHO_RAD)
+    costs += _MOVED * np.count_nonzero(orders != orders[0], axis=1)
+    best = int(np.argmin(costs))
+    is_better = costs[0] - costs[best] > _BETTER_BY
     if not is_better or costs[best] > _LEFT_OVER:
         return ()
-    return tuple(place + 1 for place in best)
+    return tuple((orders[best] + 1).tolist())
 
 
-def _misfit(phasors: NDArray[np.complexfloating], phases: NDArray[np.float64], std_rad: float) -> float:
-    """Return the sum of squared deviations of phasors [rx] from phases [rx] of any common phase, over their variance.
+def _misfit(phasors: NDArray[np.complexfloating], phases: NDArray[np.float64], std_rad: float) -> NDArray[np.float64]:
+    """Return the sum of squared deviations of phasors [rx] from phases [order, rx] of any common phase, [order].
 
-    Deviations count as 2 - 2 cos, which is their square where they are small.
+    It is in units of the variance. Deviations count as 2 - 2 cos, which is their square where they are small.
     """
-    coherence = abs((_normalise(phasors) * np.exp(-1j * phases)).mean())
-    return float(2 * phases.size * (1 - coherence) / std_rad**2)
+    coherence = np.abs(np.exp(-1j * phases) @ _normalise(phasors)) / phasors.size
+    return 2 * phasors.size * (1 - coherence) / std_rad**2

@@ -35,6 +35,16 @@ def test_who_applies_the_changes_has_the_list():
         assert pages[page] == {scan.name: scan for scan in listed}
 
 
+def test_the_stamp_of_every_earlier_state_is_understood_and_nothing_else():
+    changing = ChangingList()
+    stamps = [changing.update([make_scan("a", size)], "").stamp for size in range(11)]
+    newest = [make_scan("a", 10)]
+    assert not any(changing.update(newest, stamp).whole for stamp in stamps)
+    origin = stamps[0].partition("-")[0]
+    for number in ("", "-1", "1e1", "\u0663", 5000 * "9"):
+        assert changing.update(newest, f"{origin}-{number}").whole
+
+
 def test_a_list_that_is_unchanged_is_not_sent_again(tmp_path):
     for name in ("one", "two"):
         judged_products(tmp_path / name / "products", "care")

@@ -1,7 +1,8 @@
 """Checks before a row begins: homed stage, free disk space, and a Pi with the same `[stage]` as the rig file.
 
-`make_ready` waits for the stage and homes it if that is safe. `check_same_stage` compares the Pi's own `[stage]` with
-the rig file's. A *run* is what the Pi calls a scan: it has the scan's id.
+`make_begin_run` makes the command that begins a run, `make_ready` waits for the stage and homes it if that is safe.
+`check_same_stage` compares the Pi's own `[stage]` with the rig file's. A *run* is what the Pi calls a scan: it has the
+scan's id.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from polysight.store import PiDescription
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ErrorCode, ScanError, quote
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.messages import HelloReply, StatusReply
-from polysight_shared.raster import Stage
+from polysight_shared.messages import BeginRun, HelloReply, StatusReply
+from polysight_shared.raster import RasterPlan, Stage
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 # Timeout of homing: longer than the Pi's own, so that the Pi reports the exact reason first.
@@ -29,6 +30,21 @@ STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)
 STAGE_NOT_REPORTED = (
     "the Pi does not report its [stage], so it cannot be compared with the rig file's: install this release on the Pi"
 )
+
+
+def make_begin_run(rig: Instrument, scan_id: str, plan: RasterPlan, last_seq: int = 0) -> BeginRun:
+    """Return the command that begins or resumes a run; `last_seq` is the last event that this host has."""
+    burst = rig.burst
+    return BeginRun(
+        scan_id=scan_id,
+        plan=plan,
+        pulses=burst.pulses,
+        period_us=burst.period_us,
+        width_us=burst.width_us,
+        speed_mm_s=rig.stage.speed_mm_s,
+        last_seq=last_seq,
+        heartbeat_ms=rig.pi.host_heartbeat_ms,
+    )
 
 
 def make_ready(

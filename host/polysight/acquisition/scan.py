@@ -33,6 +33,7 @@ from polysight.acquisition.ready import (
     check_disk,
     check_same_stage,
     describe_pi,
+    make_begin_run,
     make_ready,
     measure_lost_steps,
     stage_differences,
@@ -70,7 +71,7 @@ from polysight.store import (
 )
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ErrorCode, PolysightError, ScanError, advice, quote
-from polysight_shared.messages import AnyEvent, BeginRun, HelloReply, RowStarted, RunStarted, is_simulated
+from polysight_shared.messages import AnyEvent, HelloReply, RowStarted, RunStarted, is_simulated
 from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster
 from polysight_shared.tables import to_builtins
@@ -137,7 +138,7 @@ class RunningScan:
         try:
             with stop_on_interrupt(self._stop):
                 self._pi.follow(self._scan.scan_id, events.last_seq, events.append)
-                self._pi.begin_run(self._make_begin_run(events.last_seq))
+                self._pi.begin_run(make_begin_run(self._instrument, self._scan.scan_id, self._plan, events.last_seq))
                 begun = True
                 # Fetch the events of takes that an earlier program recorded.
                 self._pi.drain()
@@ -181,20 +182,6 @@ class RunningScan:
             # If `_end` failed itself, the manifest gets a second `scan_ended`, with its error: the last one counts.
             with suppress(PolysightError):
                 self._end(begun)
-
-    def _make_begin_run(self, last_seq: int) -> BeginRun:
-        """Return the command that begins or resumes the run; `last_seq` is the last event that this host has."""
-        burst = self._instrument.burst
-        return BeginRun(
-            scan_id=self._scan.scan_id,
-            plan=self._plan,
-            pulses=burst.pulses,
-            period_us=burst.period_us,
-            width_us=burst.width_us,
-            speed_mm_s=self._instrument.stage.speed_mm_s,
-            last_seq=last_seq,
-            heartbeat_ms=self._instrument.pi.host_heartbeat_ms,
-        )
 
     def _warn_of_lost_events(self, events: list[AnyEvent]) -> None:
         """Warn if the Pi's journal is shorter than the scan's event log."""

@@ -17,10 +17,8 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.acquisition import RefusedError, StopRequest, make_ready, stage_differences
-from polysight.calibration import (
-    load_checked_calibration,
-)
+from polysight.acquisition import RefusedError, StopRequest, make_begin_run, make_ready, stage_differences
+from polysight.calibration import load_checked_calibration
 from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
     CheckContext,
@@ -46,7 +44,7 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.findings import LEVELS, Finding
 from polysight_shared.geometry import incidence_deg
-from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S, BeginRun, RowFinished, is_simulated
+from polysight_shared.messages import MAX_PULSES_AT_REST, MAX_PULSES_AT_REST_S, RowFinished, is_simulated
 from polysight_shared.raster import RasterPlan, check_burst_fits
 from polysight_shared.sockets import HOST_KEYS, is_loopback
 
@@ -318,19 +316,8 @@ def _run_row(context: CheckContext) -> RowFinished:
     pi = context.pi
     plan = RasterPlan(_POINTS, 1, rig.grid.step_x_mm, rig.grid.step_y_mm)
     scan_id = f"doctor-{new_scan_id()}"
-    burst = rig.burst
     pi.follow(scan_id, last_seq=0, on_event=lambda _event: None)
-    pi.begin_run(
-        BeginRun(
-            scan_id=scan_id,
-            plan=plan,
-            pulses=burst.pulses,
-            period_us=burst.period_us,
-            width_us=burst.width_us,
-            speed_mm_s=rig.stage.speed_mm_s,
-            heartbeat_ms=rig.pi.host_heartbeat_ms,
-        )
-    )
+    pi.begin_run(make_begin_run(rig, scan_id, plan))
     try:
         make_ready(pi, StopRequest(), lambda _phase, _message: None)
         pi.run_row(scan_id, row_index=0, take=1)

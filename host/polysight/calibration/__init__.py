@@ -23,6 +23,7 @@ from polysight.calibration.files import (
     MetalFile,
     SphereFile,
     StartFile,
+    board_rows,
     calibration_of_rig,
     calibration_of_scan,
     copy_into_scan,

@@ -456,7 +456,7 @@ def _format_focus(head: str, distance_mm: float, sharpest: Focus, plates: PlaneE
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
     """Write figures, JSON and text of the residual errors of synchronisation; return 0. Raises PolysightError."""
-    from polysight.capture import row_words
+    from polysight.calibration import board_rows
     from polysight.report import SyncReport, write_sync_report
     from polysight.sync import BoardSetup, synchronise_row
 
@@ -471,9 +471,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
         rx = len(setup.path.beam)
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx)
         say(f"rows of {board.name}")
-        for row in source.rows():
-            recorded = source.read_row(board.name, row)
-            words, valid = row_words(recorded.payload, recorded.missing, recorded.frames_expected, chirp.samples, rx)
+        for _, words, valid in board_rows(source, board.name):
             report.add(synchronise_row(words, valid, setup))
     sys.stdout.write(write_sync_report(out, reports, source.scan_id, source.simulated))
     return 0

@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.capture import row_words
+from polysight.calibration import board_rows
 from polysight.planning.forecast import (
     MAX_STEPS_PER_S,
     ROW_OVERHEAD_S,
@@ -426,15 +426,11 @@ def measure_noise(source: RawSource) -> Noise:
 
     rig = source.instrument
     rx = len(rig.antennas.rx_mm)
-    rows = list(source.rows())
-    spaced = np.linspace(0, len(rows) - 1, min(_NOISE_ROWS, len(rows))).astype(int)
     ratios = []
     for board in rig.receivers:
         setup = BoardSetup.from_rig(rig, board)
         report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, rx)
-        for row in (rows[i] for i in spaced):
-            data = source.read_row(board.name, row)
-            words, valid = row_words(data.payload, data.missing, data.frames_expected, rig.chirp.samples, rx)
+        for _, words, valid in board_rows(source, board.name, _NOISE_ROWS):
             report.add(synchronise_row(words, valid, setup))
         ratios.append(report.snr)
     if not np.isfinite(ratios).all():

@@ -468,7 +468,7 @@ def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: f
             if survey.ok and board.record:
                 findings += _check_reception(card, instrument, core, listen_s)
     except DeviceError as e:
-        findings.append(_wrong("host", e))
+        findings.append(Finding.of_error(e, where="host"))
     hops = {hop.where for hop in findings}
     findings += [Finding("note", "", where=hop) for hop in HOPS if hop not in hops]
     return survey
@@ -477,11 +477,6 @@ def _survey(board: Board, instrument: Instrument, core: Core | None, listen_s: f
 def _ok(hop: str, what: str) -> Finding:
     """Return the finding that a hop works."""
     return Finding("ok", what, where=hop)
-
-
-def _wrong(hop: str, e: DeviceError) -> Finding:
-    """Return the finding that a hop does not work."""
-    return Finding.of_error(e, where=hop)
 
 
 def _check_way(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
@@ -505,7 +500,7 @@ def _check_way(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
         interface = route_interface(address) or "unknown interface"
     for hop, text in (("route", interface), ("link", interface), ("card", f"replies, FPGA {survey.version}")):
         if error is not None and hop == faulty:
-            yield _wrong(hop, error)
+            yield Finding.of_error(error, where=hop)
             return
         yield _ok(hop, text)
 
@@ -517,7 +512,7 @@ def _check_reception(card: CardClient, instrument: Instrument, core: Core | None
     try:
         receiver = ReceiverProcess(board, requested, core)
     except DeviceError as e:
-        yield _wrong("receiver", e)
+        yield Finding.of_error(e, where="receiver")
         return
     with receiver:
         if receiver.warnings:
@@ -529,7 +524,7 @@ def _check_reception(card: CardClient, instrument: Instrument, core: Core | None
         try:
             warning = check_receive_buffer(board.name, receiver.granted_bytes, requested, burst_bytes)
         except DeviceError as e:
-            yield _wrong("buffer", e)
+            yield Finding.of_error(e, where="buffer")
             return
         if warning:
             yield Finding("warning", warning.removeprefix(f"{board.name}: "), where="buffer")
@@ -561,9 +556,9 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             card.record_stop()
             row_capture = receiver.end_row(card.take_status())
     except DeviceError as e:
-        return _wrong("radar", e)
+        return Finding.of_error(e, where="radar")
     if row_capture.packets == 0:
-        return _wrong("radar", silent_radar(card.board, row_capture))
+        return Finding.of_error(silent_radar(card.board, row_capture), where="radar")
     return _report_stream(row_capture)
 
 

@@ -128,6 +128,11 @@ def add_action(
     return sub
 
 
+def shipped(text: str) -> Path:
+    """Parse the path of a scene or rig file, which may be one that comes with the program."""
+    return find_packaged(Path(text))
+
+
 def add_json_option(sub: argparse.ArgumentParser) -> None:
     """Add `--json`."""
     sub.add_argument("--json", dest="as_json", action="store_true", help="print JSON, for programs")

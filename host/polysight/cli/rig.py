@@ -24,6 +24,7 @@ from polysight.cli.options import (
     material_settings,
     number,
     positive,
+    shipped,
 )
 from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
@@ -74,9 +75,6 @@ def _plan(args: argparse.Namespace) -> int:
     from polysight.planning import Changes, PlanOptions, run_plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
-    scene = None
-    if args.scene is not None:
-        scene = find_packaged(args.scene)
     options = PlanOptions(
         minutes=args.minutes,
         count=args.count,
@@ -84,7 +82,7 @@ def _plan(args: argparse.Namespace) -> int:
         snr_db=args.snr_db,
         row_overhead_s=args.row_overhead_s,
         scene_mm=args.scene_mm,
-        scene=scene,
+        scene=args.scene,
         as_json=args.as_json,
     )
     return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
@@ -113,7 +111,7 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--minutes", type=_minutes, metavar="M", help="propose the best plans within this time")
     sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
-    sub.add_argument("--scene", type=Path, metavar="FILE", help="scene file whose plates are checked, with its grid")
+    sub.add_argument("--scene", type=shipped, metavar="FILE", help="scene file whose plates are checked, with its grid")
     sub.add_argument("--scene-mm", type=_parse_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
         "--snr-db",
@@ -182,13 +180,6 @@ def _add_doctor(add: Add) -> None:
 # --- card ---
 
 
-def _run_card(args: argparse.Namespace) -> int:
-    """`polysight card` without an action."""
-    from polysight.jobs.devices import show_cards
-
-    return show_cards(args.config, args.listen, args.as_json)
-
-
 def _program_card(args: argparse.Namespace) -> int:
     from polysight.jobs.devices import program_card
 
@@ -213,11 +204,15 @@ def _add_own_config(sub: argparse.ArgumentParser) -> None:
 def _add_card(add: Add) -> None:
     """Add `polysight card` and its actions."""
     card = add(
-        "card", _run_card, "check the network path to each capture card; program or reset a card", "polysight card"
+        "card",
+        "devices.show_cards",
+        "check the network path to each capture card; program or reset a card",
+        "polysight card",
     )
     add_config_option(card)
     card.add_argument(
         "--listen",
+        dest="listen_s",
         type=_seconds,
         default=0.0,
         metavar="S",
@@ -451,20 +446,14 @@ def _add_scans(add: Add) -> None:
     sub.add_argument("--yes", action="store_true", help="do not ask for confirmation")
 
 
-def _run_demo(args: argparse.Namespace) -> int:
-    from polysight.jobs.demo import run_demo
-
-    return run_demo(find_packaged(args.scene), args.config, args.out, args.time_scale)
-
-
 def _simulate(args: argparse.Namespace) -> int:
     """Run `polysight simulate`, after warnings about the scene on stderr."""
     from polysight.jobs.demo import run_simulator
     from polysight.planning import find_scene_warnings
 
-    for warning in find_scene_warnings(find_packaged(args.scene), args.config):
+    for warning in find_scene_warnings(args.scene, args.config):
         sys.stderr.write(f"note, {warning.where}: {warning.what}\n")
-    command = ["simulate", str(find_packaged(args.scene)), "--config", str(args.config), "--out", str(args.out)]
+    command = ["simulate", str(args.scene), "--config", str(args.config), "--out", str(args.out)]
     command += ["--layout", args.layout]
     if args.seed is not None:
         command += ["--seed", str(args.seed)]
@@ -501,7 +490,7 @@ def _add_simulated(add: Add) -> None:
     """Add `polysight demo`, `simulate` and `reproduce`."""
     sub = add(
         "demo",
-        _run_demo,
+        "demo.run_demo",
         "scan a scene with a simulated rig and write the report; needs no hardware",
         "polysight demo --out out/demo",
         ("--out", "--scene"),
@@ -515,7 +504,7 @@ def _add_simulated(add: Add) -> None:
     )
     sub.add_argument(
         "--scene",
-        type=Path,
+        type=shipped,
         default=find_packaged(Path("examples/demo.toml")),
         metavar="FILE",
         help="scene file (default: nine plates on a table, as in a lab)",
@@ -529,7 +518,7 @@ def _add_simulated(add: Add) -> None:
         "write the raw data of a scene, with truth.json",
         "polysight simulate examples/point-targets.toml --out out/points",
     )
-    sub.add_argument("scene", type=Path, metavar="SCENE.toml", help="scene file, e.g. examples/metal-plate.toml")
+    sub.add_argument("scene", type=shipped, metavar="SCENE.toml", help="scene file, e.g. examples/metal-plate.toml")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     sub.add_argument(
         "--layout",

@@ -35,13 +35,13 @@ def echoes(rig):
 def test_backlash_is_recovered_with_everything_else_disturbed(echoes, backlash_mm):
     estimate = estimate_backlash(*echoes(backlash_mm))
     assert estimate is not None
-    assert estimate.shift_mm == pytest.approx(backlash_mm, abs=0.05)
-    assert estimate.std_mm < 0.05
+    assert estimate.shift == pytest.approx(backlash_mm, abs=0.05)
+    assert estimate.std < 0.05
 
 
 def test_an_empty_plane_gives_no_backlash(echoes):
     estimate = estimate_backlash(*echoes(0.3, points=[]))
-    assert estimate is None or estimate.std_mm > 0.1
+    assert estimate is None or estimate.std > 0.1
 
 
 def test_too_few_rows_give_no_backlash(echoes):

@@ -75,16 +75,13 @@ def test_without_corners_the_taps_are_the_identity(rig):
     np.testing.assert_allclose(taps, [[0, 1, 0]] * 2, atol=1e-12)
 
 
-@pytest.mark.parametrize("with_phase", [True, False])
 @pytest.mark.parametrize("corners", [(175e3, 350e3), (235e3, 700e3), (350e3, 1.4e6), (161e3, 372e3)])
-def test_a_fit_recovers_the_corners_of_a_sweep(corners, with_phase):
+def test_a_fit_recovers_the_corners_of_a_sweep(corners):
     rng = np.random.default_rng(2)
     f = np.linspace(100e3, 1.9e6, 60)
     h = 37 * HighPass(corners).response(f)
     amplitude = np.abs(h) * (1 + 0.01 * rng.standard_normal(60))
-    phase = np.angle(h) + 1.0 + 0.01 * rng.standard_normal(60)
-    fit = fit_high_pass(f, amplitude, phase if with_phase else None)
-    np.testing.assert_allclose(fit.corners_hz, corners, rtol=0.02 if with_phase else 0.06)
+    np.testing.assert_allclose(fit_high_pass(f, amplitude).corners_hz, corners, rtol=0.06)
 
 
 def test_an_insufficient_sweep_is_refused():

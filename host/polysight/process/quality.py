@@ -315,7 +315,7 @@ class BoardRows:
         estimate = estimate_backlash({row: quality.echo for row, quality in self.rows.items()}, self.rig)
         if estimate is None:
             return None
-        return Backlash(shift=round(estimate.shift_mm, 4), std=round(estimate.std_mm, 4))
+        return Backlash(shift=round(estimate.shift, 4), std=round(estimate.std, 4))
 
 
 def _find_frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange | UnsetType:

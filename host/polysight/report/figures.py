@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
@@ -408,7 +407,6 @@ def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]
     extent = (-width / 2, width / 2, -height / 2, height / 2)
     size = (9.0, 0.9 + 4.2 * min(1.2, max(0.3, height / width)))
     fig = Figure(figsize=size, dpi=130, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
     for ax, (name, mask) in zip(fig.subplots(1, len(masks), squeeze=False)[0], masks.items(), strict=True):
         colours = ListedColormap(_POSITION_COLOURS)
         ax.imshow(mask, origin="lower", extent=extent, cmap=colours, vmin=0, vmax=1, interpolation="nearest")
@@ -510,7 +508,6 @@ def focus_figure(
     are relative to the rig file's plane.
     """
     fig = Figure(figsize=(13.0, 4.2), dpi=140, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
     curve, *pictures = fig.subplots(1, 3, width_ratios=[1.1, 1, 1])
     curve.plot(sweep["depths_mm"], sweep["sharpness"], "o-", color="#44AA99", markersize=4)
     curve.axvline(0, color=style.MUTED, linewidth=1, linestyle=":", label="rig file")
@@ -545,7 +542,6 @@ def focus_figure(
 def surface_figure(surface: Surface) -> bytes:
     """Return a PNG of a surface from three sides."""
     fig = Figure(figsize=(11.5, 4.9), dpi=150, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
     panels = fig.subplots(1, 3)
     points_mm = 1e3 * surface.points_m
     colour = surface_colours(surface)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -135,7 +134,6 @@ class SyncReport:
 def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
     """Return a PNG: histograms of errors after each stage, the bounds as normal distributions, the paper's values."""
     fig = Figure(figsize=(11, 9), dpi=110, layout="constrained", facecolor="white")
-    FigureCanvasAgg(fig)
     if simulated:
         fig.suptitle(f"{title}   SIMULATED", color=STAMP, fontsize=12)
     else:

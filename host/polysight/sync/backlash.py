@@ -7,11 +7,10 @@ over groups of rows its standard deviation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from polysight.results import Backlash
 from polysight.sync.decimate import sample_frequencies_hz
 from polysight.sync.direct_path import excess_path_m
 from polysight_shared.config import Board, Instrument
@@ -42,14 +41,6 @@ def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) 
     weights[linear] = np.hanning(linear.size + 2)[1:-1] / linear.size
     weights[linear] *= np.exp(-2j * np.pi * (sweep_hz[linear] - first) * excess / SPEED_OF_LIGHT_M_S)
     return weights
-
-
-@dataclass(frozen=True)
-class Backlash:
-    """Shift of odd rows along +x relative to even ones, and the standard deviation of its estimate."""
-
-    shift_mm: float
-    std_mm: float
 
 
 def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -> Backlash | None:

@@ -121,21 +121,15 @@ def high_pass(chirp: Chirp) -> HighPass:
     return HighPass(tuple(khz * 1e3 for khz in (chirp.hpf1_khz, chirp.hpf2_khz) if khz))
 
 
-def fit_high_pass(
-    if_hz: NDArray[np.float64],
-    amplitude: NDArray[np.float64],
-    phase_rad: NDArray[np.float64] | None = None,
-) -> HighPass:
+def fit_high_pass(if_hz: NDArray[np.float64], amplitude: NDArray[np.float64]) -> HighPass:
     """Fit two first-order sections to one reflector, measured at several IF by changing the start frequency.
 
-    Least squares of log amplitude, and of phase if known, over the corners and a common gain (paper, Fig. 9).
+    Least squares of log amplitude over the corners and a common gain (paper, Fig. 9).
 
     Parameters
     ----------
     if_hz, amplitude
         float64 [point]: IF and linear amplitude, in any unit.
-    phase_rad
-        float64 [point], up to a constant; None if the phases of the measurements are unrelated.
 
     Raises
     ------
@@ -152,17 +146,11 @@ def fit_high_pass(
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     measured = np.log(amplitude)
-    phasors = None if phase_rad is None else np.exp(1j * np.asarray(phase_rad))
 
     def misfit(log_corners: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the deviations [value] of log amplitudes, then of phases if known, from those of a filter."""
-        h = HighPass(tuple(np.exp(log_corners))).response(if_hz)
-        gain = measured - np.log(np.abs(h))
-        deviation = gain - gain.mean()
-        if phasors is None:
-            return deviation
-        difference = phasors * np.conj(h) / np.abs(h)
-        return np.concatenate([deviation, np.angle(difference * np.conj(difference.mean()))])
+        """Return the deviations [point] of log amplitudes from those of a filter."""
+        gain = measured - np.log(np.abs(HighPass(tuple(np.exp(log_corners))).response(if_hz)))
+        return gain - gain.mean()
 
     # Limits, starts and the loss are chosen.
     limits = np.log(if_hz.min() / 10), np.log(if_hz.max() * 3)

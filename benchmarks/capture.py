@@ -8,7 +8,7 @@ import tempfile
 import time
 import zlib
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -88,25 +88,25 @@ class Trial:
 
     # Requested rate, and the rate that the senders reached.
     wanted: float
-    rate: float
+    rate: float = 0.0
     # Time of sending.
-    seconds: float
+    seconds: float = 0.0
     # Packets sent; those not received; those that the kernel counted as dropped.
-    packets: int
-    lost: int
-    kernel_drops: int
+    packets: int = 0
+    lost: int = 0
+    kernel_drops: int = 0
     # True if all complete rows have the right checksum.
-    exact: bool
+    exact: bool = True
     # Share of a core, each receiver.
-    cpu: list[float]
+    cpu: list[float] = field(default_factory=list)
     # Worst fill of a receive buffer, as a share.
-    queue: float
+    queue: float = 0.0
     # Worst time to make a row durable and begin the next.
-    turn_s: float
+    turn_s: float = 0.0
     # Rows processed a second meanwhile.
-    rows_beside: float
+    rows_beside: float = 0.0
     # The machine's load average over a minute.
-    load: float
+    load: float = 0.0
 
     @property
     def good(self) -> bool:
@@ -170,20 +170,7 @@ class Receivers:
         packets = blocks * PACKETS
         state_before = ask(beside)
         cpu = [cpu_s(r.pid) for r in self._receivers]
-        trial = Trial(
-            wanted=rate,
-            rate=0,
-            seconds=0,
-            packets=0,
-            lost=0,
-            kernel_drops=0,
-            exact=True,
-            cpu=[],
-            queue=0,
-            turn_s=0,
-            rows_beside=0,
-            load=0,
-        )
+        trial = Trial(rate)
         began = time.perf_counter()
         ended = 0.0
         for _ in range(rows):
@@ -275,10 +262,7 @@ class PlainLoops:
             packets=total,
             lost=total - sum(a["received"] for a in answers),
             kernel_drops=sum(a["drops"] for a in answers),
-            exact=True,
             cpu=[a["cpu_s"] / took for a in answers],
-            queue=0.0,
-            turn_s=0.0,
             rows_beside=(ask(beside)["rows"] - state_before["rows"]) / wall,
             load=os.getloadavg()[0],
         )

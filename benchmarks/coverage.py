@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -224,22 +225,26 @@ def _draw_materials(rng: np.random.Generator) -> dict[str, tuple[float, float]]:
     return {f"drawn {i}": (float(real[i]), float(real[i] * tangent[i])) for i in range(len(PLACES))}
 
 
-def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
-    """Simulate a metal plate on the rig file's plane with the scene's rig: the same leakage and gains."""
+def lay_metal_plate(scene: Scene) -> Scene:
+    """Return the scene with a metal plate on the rig file's plane instead of all else: the same leakage and gains."""
     # It fills the image of 232 mm by 180 mm, and ends far from it.
     plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
     plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
-    alone = msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
-    pipeline = _image_scan(Cubes(rig, alone))
+    return msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0, plane_tilt_deg=(0.0, 0.0))
+
+
+def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
+    """Simulate a metal plate alone with the scene's rig."""
+    pipeline = image_scan(Cubes(rig, lay_metal_plate(scene)), Settings(model="none"))
     images = pipeline.form_images()
     reference = plane_reference(images.level(images.valid))
     # A reference is refused for a scan with other settings or calibration files than its own.
     return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
 
 
-def _image_scan(source: Any, model: str | None = "none", inputs: Inputs = NO_INPUTS) -> Pipeline:
-    """Return a pipeline with all rows of a source; `model`: "none" names nothing, None is the default classifier."""
-    pipeline = Pipeline(source, Settings(model=model), inputs)
+def image_scan(source: Any, settings: Settings, inputs: Inputs = NO_INPUTS) -> Pipeline:
+    """Return a pipeline with all rows of a source."""
+    pipeline = Pipeline(source, settings, inputs)
     for row in source.rows():
         pipeline.add_row(row)
     return pipeline
@@ -252,19 +257,18 @@ def judge_scan(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene,
     """
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     scene = draw_scene(seed, kind)
-    model = "none"
-    if kind == "named":
-        model = None
+    # "none" names nothing, None is the default classifier.
+    settings = Settings(model=None if kind == "named" else "none")
     inputs = NO_INPUTS
     if kind in WHOLE and not any(p.metal for p in scene.plates):
         inputs = Inputs(reference=metal_scan(rig, scene))
     if raw or kind in ("no direct path", "noise"):
         with tempfile.TemporaryDirectory(prefix="polysight-coverage-") as folder:
             simulate(rig, scene, Path(folder) / "scan")
-            pipeline = _image_scan(open_source(Path(folder) / "scan", None), model, inputs)
+            pipeline = image_scan(open_source(Path(folder) / "scan", None), settings, inputs)
             findings = pipeline.examine(pipeline.form_images())
     else:
-        pipeline = _image_scan(Cubes(rig, scene), model, inputs)
+        pipeline = image_scan(Cubes(rig, scene), settings, inputs)
         findings = pipeline.examine(pipeline.form_images())
     return scene, apply_scene(rig, scene), findings, pipeline.plane
 
@@ -365,11 +369,6 @@ def print_pulls(rows: list[PatchFigures]) -> dict[str, Any]:
     return out
 
 
-def _measure_scene(job: tuple[int, str, bool]) -> list[PatchFigures]:
-    """Return `figures` of a job (seed, kind, raw): a pool passes one argument."""
-    return figures(*job)
-
-
 def _read_names(seed: int) -> list[tuple[float, bool]]:
     """Return the probability of each name of one scene of kind "named", and whether the name is right."""
     scene, rig, findings, _ = judge_scan(seed, "named")
@@ -408,9 +407,8 @@ class WithoutResult(NamedTuple):
     reason: str
 
 
-def _judge_without_result(job: tuple[int, str]) -> WithoutResult:
-    """Judge a scene (seed, kind) that must give no result."""
-    seed, kind = job
+def _judge_without_result(seed: int, kind: str) -> WithoutResult:
+    """Judge a scene that must give no result."""
     _, _, findings, _ = judge_scan(seed, kind)
     rows = findings.analysis.rows()
     said = sum(r.name is not None or r.permittivity is not None for r in rows)
@@ -438,24 +436,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the tables; return 1 if a scene without anything to name got a name or a permittivity."""
     seeds = range(args.first, args.first + args.scenes)
-    jobs = [(i, "full", False) for i in seeds] + [(args.first + i, "full", True) for i in range(args.raw)]
+    nothing_kinds = [NOTHING[i % len(NOTHING)] for i in range(args.without)]
     print("simulated scenes; regions of the permittivity (real and imaginary part together)")
+    flatten = itertools.chain.from_iterable
     with ProcessPoolExecutor(args.jobs) as pool:
-        results = list(pool.map(_measure_scene, jobs))
-        thin = [
-            r
-            for result in pool.map(figures, [*range(args.first, args.first + args.sheets)], ["sheet"] * args.sheets)
-            for r in result
-        ]
-        wide_jobs = [(args.first + i, "wide", False) for i in range(args.wide)]
-        wide = [r for result in pool.map(_measure_scene, wide_jobs) for r in result]
-        nothing_jobs = [(args.first + i, NOTHING[i % len(NOTHING)]) for i in range(args.without)]
-        without = list(pool.map(_judge_without_result, nothing_jobs))
-        named = [
-            pair for result in pool.map(_read_names, range(args.first, args.first + args.named)) for pair in result
-        ]
-    rows = [r for result in results[: args.scenes] for r in result]
-    raw = [r for result in results[args.scenes :] for r in result]
+        rows = [*flatten(pool.map(figures, seeds))]
+        raw = [*flatten(pool.map(partial(figures, raw=True), range(args.first, args.first + args.raw)))]
+        thin = [*flatten(pool.map(partial(figures, kind="sheet"), range(args.first, args.first + args.sheets)))]
+        wide = [*flatten(pool.map(partial(figures, kind="wide"), range(args.first, args.first + args.wide)))]
+        without = list(pool.map(_judge_without_result, itertools.count(args.first), nothing_kinds))
+        named = [*flatten(pool.map(_read_names, range(args.first, args.first + args.named)))]
     out: dict[str, Any] = {"all": _print_coverage(rows, "all, from samples")}
     out["raw"] = _print_coverage(raw, "all, from raw data")
     for name in CLASSES:

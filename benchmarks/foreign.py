@@ -13,6 +13,7 @@ import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -139,11 +140,6 @@ def _is_alike(name: str, true: complex) -> bool:
     return material is not None and abs(material.permittivity - true) < ALIKE * abs(true)
 
 
-def _judge(job: tuple[str, int, str]) -> list[Piece]:
-    """Judge a scene by the arguments of `judge_scene`, as one value for a pool."""
-    return judge_scene(*job)
-
-
 def format_line(title: str, pieces: Sequence[Piece]) -> str:
     """Return one line of the table; its columns are those that the module's docstring lists."""
     library = [p.confidence for p in pieces if p.source == "library"]
@@ -174,7 +170,8 @@ def run(args: argparse.Namespace) -> int:
     with ProcessPoolExecutor(args.jobs) as pool:
         for nuisance in args.nuisances.split(","):
             for kind in KINDS:
-                pieces = [p for scene in pool.map(_judge, [(kind, seed, nuisance) for seed in seeds]) for p in scene]
+                scenes = pool.map(partial(judge_scene, kind, nuisance=nuisance), seeds)
+                pieces = [p for scene in scenes for p in scene]
                 print(format_line(f"{kind}, {nuisance}", pieces), flush=True)
                 for p in pieces:
                     if (p.source == "library" and p.confidence >= 0.8) or p.misled:

@@ -86,10 +86,10 @@ class Bench:
         spectral.forget()
         return self.ours()
 
-    def theirs(self, points: int = SETTINGS[0], tuned: bool = False) -> Image:
-        """Form the image by the published method, from disk; arguments as of `form_image`: `points` of a range FFT."""
+    def theirs(self, points: int = SETTINGS[0]) -> Image:
+        """Form the image by the published method, from disk; `points` are those of its range FFT."""
         cube = np.load(self.path, mmap_mode="r")
-        return form_image(cube, self.rig, self.board, image_grid(self.rig), points, tuned)
+        return form_image(cube, self.rig, self.board, image_grid(self.rig), points)
 
 
 def time_alternately(jobs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Seconds]:
@@ -116,12 +116,7 @@ def rms(image: Image, true: Image) -> float:
 def compare_with_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]]:
     """Compare with the published method, from the cube on disk; return lines of the table and figures for the file."""
     bench.ours()
-    jobs = {
-        "cold": bench.ours_cold,
-        "warm": bench.ours,
-        "published": bench.theirs,
-        "published, tuned": lambda: bench.theirs(tuned=True),
-    }
+    jobs = {"cold": bench.ours_cold, "warm": bench.ours, "published": bench.theirs}
     took = time_alternately(jobs, min(rounds, ROUNDS))
     aperture, samples = bench.reduce_cube("boxcar")
     # Our sum over all samples, without a window, as the published method has none. It stands for the exact one; its own
@@ -135,19 +130,11 @@ def compare_with_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[
             image = bench.theirs(points)
         settings[points] = {"cpu_s": once.cpu[0], "rms_error": rms(image, exact)}
     theirs = took["published"].median
-    tuned = took["published, tuned"].median
     finer = (f"{n} points {s['cpu_s']:.1f} s, {100 * s['rms_error']:.2g} %" for n, s in settings.items())
+    note = f"published method's settings, seconds and rms distance from our image: {'; '.join(finer)}"
     lines = []
     for name, at_least, aim in (("warm", 18, 30), ("cold", 9, 13)):
         ours = took[name].median
-        # Tuned: in single precision, and padded to sizes whose transforms are fast.
-        if name == "cold":
-            note = f"against the published method in single precision, padded ({tuned:.2f} s): {tuned / ours:.1f}x"
-        else:
-            note = (
-                f"against the tuned method {tuned / ours:.1f}x; published method's settings, seconds and rms"
-                f" distance from our image: {'; '.join(finer)}"
-            )
         lines.append(
             Line(
                 f"image from the cube on disk, {name} kernels",
@@ -156,7 +143,7 @@ def compare_with_published(bench: Bench, rounds: int) -> tuple[list[Line], dict[
                 theirs / ours,
                 at_least,
                 aim,
-                note=note,
+                note=note if name == "warm" else "",
             )
         )
     return lines, {"settings": settings, "cpu_s": {name: t.cpu for name, t in took.items()}}

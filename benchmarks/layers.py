@@ -18,15 +18,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes
+from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes, image_scan, lay_metal_plate
 from polysight.data import find_packaged
 from polysight.jobs.process import make_plane_reference
 from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
-from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference
 from polysight.process import Inputs
 from polysight.results import PatchFigures
@@ -40,6 +38,7 @@ RANGE_M = (0.3e-3, 6e-3)
 """Where the thickness of a sheet is looked for; chosen."""
 # Sub-bands of the sweep, in which a scene is imaged; chosen.
 BANDS = 4
+IN_BANDS = Settings(model="none", bands=BANDS)
 SCENES_PER_RIG = 5
 # Side of the plates (chosen).
 SIDE_MM = 46.0
@@ -146,20 +145,9 @@ def draw_scene(seed: int) -> Scene:
     )
 
 
-def _image_scan(rig: Instrument, scene: Scene) -> Pipeline:
-    """Return a pipeline with all rows of a simulated scene, in sub-bands."""
-    source = Cubes(rig, scene)
-    pipeline = Pipeline(source, Settings(model="none", bands=BANDS))
-    for row in source.rows():
-        pipeline.add_row(row)
-    return pipeline
-
-
 def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     """Simulate a metal plate over the rig file's plane with the same rig, in the same sub-bands."""
-    plate = {"name": "plate", "centre_mm": [0.0, 0.0], "size_mm": [420.0, 340.0], "metal": True}
-    plates = decode_scene({"name": "plate", "plates": [plate]}, "plate").plates
-    pipeline = _image_scan(rig, msgspec.structs.replace(scene, plates=plates, plane_shift_mm=0.0))
+    pipeline = image_scan(Cubes(rig, lay_metal_plate(scene)), IN_BANDS)
     parts = tuple(make_plane_reference(pipeline, part) for part in pipeline.sub_bands.finish(pipeline.source.mirrored))
     return replace(make_plane_reference(pipeline, pipeline.form_images()), bands=parts)
 
@@ -171,8 +159,7 @@ def process_scene(
 
     Rows are by the plate's name; the error is a standard deviation, radians.
     """
-    pipeline = _image_scan(rig, scene)
-    pipeline.inputs = Inputs(reference=metal)
+    pipeline = image_scan(Cubes(rig, scene), IN_BANDS, Inputs(reference=metal))
     findings = pipeline.examine(pipeline.form_images())
     result = findings.analysis
     plates = match_truth([r.patch for r in result.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))

@@ -15,18 +15,16 @@ import tomli_w
 import zmq
 
 from benchmarks.data import temporary
-from benchmarks.measure import add_arguments as add_common, machine, write
-from polysight.acquisition.pi_client import PiClient
+from benchmarks.measure import add_arguments as add_common, cpu_s, machine, write
+from polysight.acquisition import PiClient, make_begin_run
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.messages import BeginRun, Capture, RowFinished
+from polysight_shared.messages import Capture, RowFinished
 from polysight_shared.raster import plan_raster
 from polysight_shared.tables import to_builtins
 from polysight_shared.wires import WireClient, WireEdge
 from polysight_simulators import gpio
 
 RIG = Path(__file__).parents[1] / "instrument.toml"
-# Unit of the processor times in /proc/PID/stat.
-TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 # Limits (chosen): share of a core, and resident memory.
 CPU_AT_MOST = 0.15
 MEMORY_AT_MOST_MB = 60.0
@@ -141,13 +139,7 @@ class _Rows:
         # Complete bursts, each with its edges on SYNC_IN.
         self.bursts: list[tuple[Capture, list[WireEdge]]] = []
         client.follow("benchmark", 0, lambda _: None)
-        client.begin_run(
-            BeginRun(
-                scan_id="benchmark", plan=plan_raster(rig.grid), pulses=rig.burst.pulses,
-                period_us=rig.burst.period_us, width_us=rig.burst.width_us, speed_mm_s=rig.stage.speed_mm_s,
-                heartbeat_ms=rig.pi.host_heartbeat_ms,
-            )
-        )  # fmt: skip
+        client.begin_run(make_begin_run(rig, "benchmark", plan_raster(rig.grid)))
 
     def take_row(self) -> None:
         """Run one row to its end and add its bursts; processor time counts from its first capture on.
@@ -175,13 +167,13 @@ class _Rows:
             for event in self._client.events():
                 if isinstance(event, Capture):
                     if not captures:
-                        cpu_at_start_s = _read_cpu_s(self._pid)
+                        cpu_at_start_s = cpu_s(self._pid)
                         start_s = time.monotonic()
                     captures.append(event)
                 if isinstance(event, RowFinished):
                     finished = event
         if captures:
-            self.cpu_s += _read_cpu_s(self._pid) - cpu_at_start_s
+            self.cpu_s += cpu_s(self._pid) - cpu_at_start_s
             self.wall_s += time.monotonic() - start_s
         # The last edges may come after the event: until half a second brings none (chosen).
         while isinstance(message := self._wires.receive(0.5), WireEdge):
@@ -197,13 +189,6 @@ class _Rows:
             if not finished.fault or capture is not captures[-1]:
                 self.bursts.append((capture, edges[first_edge:next_edge]))
             first_edge = next_edge
-
-
-def _read_cpu_s(pid: int) -> float:
-    """Return the CPU seconds of a process so far."""
-    # After the name, which is in brackets, from the state on: utime and stime (proc(5)).
-    user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
-    return (int(user) + int(system)) * TICK_S
 
 
 def _compute_quantiles(values: list[float]) -> list[float]:

@@ -25,32 +25,22 @@ from polysight.products import ProcessedScan
 from polysight.results import PatchFigures
 from polysight.settings import Settings, path_text
 from polysight_shared.config import load_instrument
+from polysight_worlds import TABLE_2
 
 # Environment variable with the folder of the picture.
 FOLDER = "POLYSIGHT_PUBLISHED_IMAGES"
 ANGLE_DEG = 55.0
-TABLE_2 = {
-    "rubber": ("rubber", 5.06, 1.11),
-    "cardboard_rough": ("cardboard (rough)", 4.54, 0.56),
-    "silicone_rubber": ("silicone rubber", 3.52, 0.82),
-    "PET_0.5mm": ("PET (0.5 mm)", 3.78, 0.70),
-    "ceramic": ("ceramic", 4.75, 2.43),
-    "acrylic_3mm": ("acrylic (3 mm)", 4.00, 0.40),
-    "PCB": ("glass fiber", 4.69, 0.70),
-    "wood_thin": ("wood (thin, smooth)", 2.61, 0.01),
+PLATES = {
+    "rubber": ("rubber", "rubber"),
+    "cardboard_rough": ("cardboard (rough)", "cardboard_rough"),
+    "silicone_rubber": ("silicone rubber", "silicone_rubber"),
+    "PET_0.5mm": ("PET (0.5 mm)", "pet_0.5mm"),
+    "ceramic": ("ceramic", "ceramic"),
+    "acrylic_3mm": ("acrylic (3 mm)", "acrylic_3mm"),
+    "PCB": ("glass fiber", "glass_fibre"),
+    "wood_thin": ("wood (thin, smooth)", "wood_thin"),
 }
-"""Name of a box to the material's name in the paper, eps' and loss eps''."""
-WORLD_NAMES = {
-    "rubber": "rubber",
-    "cardboard_rough": "cardboard_rough",
-    "silicone_rubber": "silicone_rubber",
-    "PET_0.5mm": "pet_0.5mm",
-    "ceramic": "ceramic",
-    "acrylic_3mm": "acrylic_3mm",
-    "PCB": "glass_fibre",
-    "wood_thin": "wood_thin",
-}
-"""Name of a box to the name in Table 2 of the independent generator (`benchmarks.worlds`)."""
+"""Name of a box to the material's name in the paper, and to that in Table 2 of the independent generator."""
 # Box of the metal reference.
 METAL_BOX = "copper"
 RATIO_STD = 0.08
@@ -142,7 +132,9 @@ class PlateFigures:
 
 def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
     """Compare a plate with Table 2; `patch` is None if none was found in its box."""
-    name, real, loss = TABLE_2[box]
+    name, world_name = PLATES[box]
+    real = TABLE_2[world_name].real
+    loss = -TABLE_2[world_name].imag
     if patch is None:
         return PlateFigures(f"  {box:16} not found")
     if patch.refused is not None:
@@ -170,7 +162,7 @@ def judge_plate(box: str, patch: PatchFigures | None) -> PlateFigures:
 def table_2_library(extent: str) -> Library:
     """Return a library of the paper's Table 2 as half spaces under the picture's angle: "all" or these "plates"."""
     library = table_2_classifier(float(np.radians(ANGLE_DEG))).library
-    paper_names = {world_name: TABLE_2[box][0] for box, world_name in WORLD_NAMES.items()}
+    paper_names = {world_name: name for name, world_name in PLATES.values()}
     entries = []
     for entry in library.entries:
         is_of_picture = entry.name in paper_names or entry.name == METAL_BOX
@@ -214,7 +206,7 @@ def print_names_of_ratio_alone(ratios: dict[str, complex], library: Library) -> 
     """Print the likeliest name of each plate by `weigh_ratio_alone`, and how many are right."""
     names = []
     right_count = 0
-    for box, (true_name, _, _) in TABLE_2.items():
+    for box, (true_name, _) in PLATES.items():
         probability = weigh_ratio_alone(ratios[box], library)
         name = max(probability, key=lambda key: probability[key])
         right_count += name == true_name
@@ -257,7 +249,7 @@ def run(args: argparse.Namespace) -> int:
         for form in write_forms(sources[0], boxes, Path(scratch)):
             scan, patch_of = process(form, boxes, library)
             by_number = {patch.label: patch for patch in scan.segments}
-            plates = [judge_plate(box, by_number.get(patch_of[box])) for box in TABLE_2]
+            plates = [judge_plate(box, by_number.get(patch_of[box])) for box in PLATES]
             widths = [plate.half_width for plate in plates if plate.half_width is not None]
             metal = by_number.get(patch_of[METAL_BOX])
             # Patches that are not the main one of any box.

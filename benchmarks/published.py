@@ -37,15 +37,10 @@ class Synchroniser:
     ----------
     rig, board
         Rig file and one of its receiving boards: the linear samples, and where the direct path comes from.
-    tuned
-        The same numbers without repeated or too precise steps: single precision throughout, I and Q copied
-        instead of multiplied, transforms without their reordering, one transform of the RX's sum instead of one of
-        each, and the closer look as a product with a matrix that is made once.
     """
 
-    def __init__(self, rig: Instrument, board: Board, tuned: bool = False) -> None:
+    def __init__(self, rig: Instrument, board: Board) -> None:
         chirp = rig.chirp
-        self._tuned = tuned
         self._samples = chirp.samples
         self._a, self._b = chirp.linear_samples
         middle = chirp.first_sample_hz + chirp.hz_per_sample * chirp.samples / 2
@@ -55,20 +50,13 @@ class Synchroniser:
         # [rx]: bring the direct path of every RX to the phase of RX1's.
         self._beam = np.exp(-2j * np.pi * middle / SPEED_OF_LIGHT_M_S * (path - path[0])).astype(np.complex64)
         self._n = np.arange(chirp.samples)
-        self._n_single = self._n.astype(np.float32)
-        # Spectrum of the linear samples at all range bins; and, as a matrix, at points within a bin of zero.
+        # Spectrum of the linear samples at all range bins.
         self._to_bins = scipy.signal.ZoomFFT(self._b - self._a, [0, RANGE_BINS], RANGE_BINS, fs=RANGE_BINS)
-        near_zero = (2 * np.arange(ZOOM) / ZOOM - 1) / RANGE_BINS
-        self._zoom = np.exp(-2j * np.pi * np.outer(np.arange(self._b - self._a), near_zero)).astype(np.complex64)
 
     def decode(self, payload: NDArray[np.uint8], chirps: int) -> Complex:
         """Convert one position's bytes to complex64 [rx, chirp, sample]: I of RX1..RX4, then Q, for every sample."""
         words = payload.view("<i2").reshape(chirps, self._samples, 2, -1)
-        if not self._tuned:
-            return (words[:, :, 0] + 1j * words[:, :, 1]).astype(np.complex64).transpose(2, 0, 1)
-        out = np.empty((words.shape[-1], chirps, self._samples), np.complex64)
-        out.real, out.imag = words.transpose(2, 3, 0, 1)
-        return out
+        return (words[:, :, 0] + 1j * words[:, :, 1]).astype(np.complex64).transpose(2, 0, 1)
 
     def align(self, chirps: Complex) -> Complex:
         """Align every chirp with the strongest one in frequency and phase; return the mean, complex64 [rx, sample].
@@ -82,12 +70,6 @@ class Synchroniser:
             complex64 [rx, chirp, sample].
         """
         frequency, phase = (part[:, None] for part in self.offsets(chirps))
-        if self._tuned:
-            angle = np.float32(2 * np.pi) * frequency.astype(np.float32) * self._n_single + phase.astype(np.float32)
-            turn = np.empty(angle.shape, np.complex64)
-            turn.real = np.cos(angle)
-            turn.imag = -np.sin(angle)
-            return (chirps * turn).mean(axis=1)
         out = np.empty_like(chirps)
         # As published: each RX makes the same factors again, in double precision.
         for rx, channel in enumerate(chirps):
@@ -104,15 +86,9 @@ class Synchroniser:
         # As published: samples near zero are replaced before the division.
         reference[np.abs(reference) < 0.1] = 0.1
         points = UPSCALE * self._samples
-        spectra: NDArray[np.complexfloating]
-        if self._tuned:
-            spectra = np.asarray(scipy.fft.fft(channel / reference, points))
-            peaks = (spectra.real**2 + spectra.imag**2).argmax(axis=1)
-            frequency = np.where(peaks < points // 2, peaks, peaks - points) / points
-        else:
-            spectra = np.asarray(np.fft.fftshift(np.fft.fft(channel / reference, points), -1))
-            peaks = np.abs(spectra).argmax(axis=1)
-            frequency = (peaks - points / 2) / points
+        spectra = np.asarray(np.fft.fftshift(np.fft.fft(channel / reference, points), -1))
+        peaks = np.abs(spectra).argmax(axis=1)
+        frequency = (peaks - points / 2) / points
         return frequency, np.angle(spectra[np.arange(len(peaks)), peaks])
 
     def reference(self, mean: Complex) -> tuple[Complex, float]:
@@ -131,25 +107,10 @@ class Synchroniser:
         complex [rx, sample], and the direct path's phase (rad) at the first linear sample.
         """
         linear = mean[:, self._a : self._b]
-        # The RX's sum, steered to the direct path; None in the plain form, which transforms each RX and sums spectra.
-        beam = None
-        if self._tuned:
-            beam = self._beam @ linear
-        if beam is None:
-            spectrum = self._beam @ self._to_bins(linear)
-        else:
-            spectrum = np.asarray(scipy.fft.fft(beam, RANGE_BINS))
-        power = np.abs(spectrum)
+        power = np.abs(self._beam @ self._to_bins(linear))
         # As published: the first of the peaks of at least half the maximum, two bins apart or more.
         peaks, _ = scipy.signal.find_peaks(power, height=power.max() / 2, distance=2)
         best = int(peaks[0] if len(peaks) else power.argmax())
-        if beam is not None:
-            # Tuned: the sum, mixed down by the peak's bin, is looked at within a bin of zero.
-            turned = beam * np.exp(np.float32(-2 * np.pi * best / RANGE_BINS) * 1j * self._n_single[: len(beam)])
-            frequency = (best + 2 * int(np.abs(turned @ self._zoom).argmax()) / ZOOM - 1) / RANGE_BINS
-            turn = np.exp(np.float32(-2 * np.pi * frequency) * 1j * (self._n_single - self._a))
-            phase = float(np.angle(beam @ turn[self._a : self._b]))
-            return mean * turn * (self._beam * np.exp(-1j * phase)).astype(np.complex64)[:, None], phase
         # As published: each RX within a bin of the peak, then once more the whole spectrum, of which bin 0 is read.
         near = scipy.signal.ZoomFFT(linear.shape[1], [best - 1, best + 1], ZOOM, fs=RANGE_BINS)
         frequency = (best + 2 * int(np.abs(self._beam @ near(linear)).argmax()) / ZOOM - 1) / RANGE_BINS
@@ -176,7 +137,6 @@ def form_image(
     board: Board,
     grid: ImageGrid,
     points: int = SETTINGS[0],
-    tuned: bool = False,
 ) -> NDArray[np.complexfloating]:
     """Form the image of one board.
 
@@ -190,9 +150,6 @@ def form_image(
         Geometry.
     points
         Points of the range FFT.
-    tuned
-        The same convolutions padded to sizes whose transforms are fast, with a kernel's phases made once and not for
-        every bin, and one inverse transform for all RX.
 
     Returns
     -------
@@ -206,11 +163,7 @@ def form_image(
     x = _make_lattice(grid.x_m, columns)
     excess = Antennas.from_rig(rig, board).excess_m(x[None, :], y[:, None], grid.z_m)
     start_hz = chirp.first_sample_hz + chirp.hz_per_sample * a
-    full = rows + y.size - 1, columns + x.size - 1
-    if tuned:
-        shape = tuple(int(scipy.fft.next_fast_len(n) or n) for n in full)
-    else:
-        shape = full
+    shape = rows + y.size - 1, columns + x.size - 1
     # The part of the convolution in which every position counts: one entry for each pixel.
     pixels = slice(rows - 1, rows - 1 + ny), slice(columns - 1, columns - 1 + nx)
     image = np.zeros((ny, nx), np.complex64)
@@ -219,21 +172,11 @@ def form_image(
         spectrum = np.asarray(scipy.fft.fft(cube[rx, :, :, a:b], points))
         bins = np.round(excess[rx] / SPEED_OF_LIGHT_M_S * chirp.hz_per_sample * points).astype(int)
         angle = (-2 * np.pi * start_hz / SPEED_OF_LIGHT_M_S * excess[rx]).astype(np.float32)
-        wave = None
-        if tuned:
-            wave = np.exp(1j * angle)
         for n in range(int(bins.min()), int(bins.max()) + 1):
-            if wave is not None:
-                kernel = np.where(bins == n, wave, 0)
-            else:
-                kernel = np.exp(1j * angle) * (bins == n)
-            kernel = np.asarray(scipy.fft.fft2(kernel, shape))
+            kernel = np.asarray(scipy.fft.fft2(np.exp(1j * angle) * (bins == n), shape))
             total += kernel * np.asarray(scipy.fft.fft2(spectrum[:, :, n % points], shape))
-        if not tuned:
-            image += np.asarray(scipy.fft.ifft2(total))[pixels]
-            total[:] = 0
-    if tuned:
-        return np.asarray(scipy.fft.ifft2(total))[pixels]
+        image += np.asarray(scipy.fft.ifft2(total))[pixels]
+        total[:] = 0
     return image
 
 

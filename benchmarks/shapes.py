@@ -287,10 +287,6 @@ def angles_deg(first: NDArray, second: NDArray) -> NDArray:
     return np.degrees(2 * np.arcsin(np.clip(np.linalg.norm(first - second, axis=1) / 2, 0, 1)))
 
 
-def _judge(job: tuple[str, int, str, ScanKind]) -> ObjectFigures:
-    return judge_object(*job)
-
-
 def _percentile_68(values: Iterable[float | None]) -> str:
     """Return the 68th percentile of the figures that are known, as a cell of the table."""
     numbers = [value for value in values if value is not None]
@@ -422,7 +418,8 @@ def run(args: argparse.Namespace) -> int:
         for seed in seeds:
             jobs += [(kind, seed, name, scan) for kind in kinds if (kind, seed, name) not in judged_before]
     with ProcessPoolExecutor(args.jobs) as pool:
-        for judged in pool.map(_judge, jobs):
+        # Each job is a tuple of arguments.
+        for judged in pool.map(judge_object, *zip(*jobs, strict=True)):
             figures.append(judged)
             if args.campaign is not None:
                 with args.campaign.open("a", encoding="utf-8") as campaign:

@@ -70,13 +70,10 @@ class Ours:
 
 
 class Theirs:
-    """The published method on some positions of the same files, its time scaled to the row.
+    """The published method on some positions of the same files, its time scaled to the row."""
 
-    `tuned`: in single precision, and without steps that repeat or are too precise (`Synchroniser`).
-    """
-
-    def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool, positions: int = POSITIONS) -> None:
-        self._boards = [(Synchroniser(rig, rig.by_name(name), tuned), path) for name, path in files.items()]
+    def __init__(self, rig: Instrument, files: dict[str, Path], positions: int = POSITIONS) -> None:
+        self._boards = [(Synchroniser(rig, rig.by_name(name)), path) for name, path in files.items()]
         self._rig = rig
         self._chosen = np.linspace(0, rig.grid.columns - 1, min(positions, rig.grid.columns)).astype(int)
 
@@ -103,11 +100,7 @@ class Theirs:
 
 def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, np.ndarray]:
     """Measure seconds a position of one board, [round, stage] by method, in turn; the first round is not counted."""
-    jobs = {
-        "ours": Ours(rig, files),
-        "published": Theirs(rig, files, tuned=False),
-        "published, tuned": Theirs(rig, files, tuned=True),
-    }
+    jobs = {"ours": Ours(rig, files), "published": Theirs(rig, files)}
     rounds: dict[str, list[tuple[float, float]]] = {name: [] for name in jobs}
     for turn in range(repeats + 1):
         for name, job in jobs.items():
@@ -118,7 +111,7 @@ def measure(rig: Instrument, files: dict[str, Path], repeats: int) -> dict[str, 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure all methods on one core and print the table; return 0."""
+    """Measure both methods on one core and print the table; return 0."""
     rig, scene = published_scene(args.quick)
     with temporary(args.folder) as folder, keep_on_one_core():
         files = {}
@@ -130,12 +123,8 @@ def run(args: argparse.Namespace) -> int:
     lines = []
     for k, stage in enumerate(STAGES):
         ours = float(medians["ours"][k])
-        plain = float(medians["published"][k])
-        tuned = float(medians["published, tuned"][k])
-        note = f"against the published method in single precision ({1e6 * tuned:.0f} us): {tuned / ours:.1f}x"
-        lines.append(
-            Line(stage, f"{1e6 * ours:.0f} us", f"{1e6 * plain:.0f} us", plain / ours, *LIMITS[stage], note=note)
-        )
+        theirs = float(medians["published"][k])
+        lines.append(Line(stage, f"{1e6 * ours:.0f} us", f"{1e6 * theirs:.0f} us", theirs / ours, *LIMITS[stage]))
     show("synchronisation, a position of one board, one core, published method beside it", lines, args.quick)
     write(args.json, "sync", lines, seconds_a_position={m: t.tolist() for m, t in times.items()})
     return 0

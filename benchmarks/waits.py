@@ -156,11 +156,8 @@ def small_products(folder: Path) -> Path:
     scan = folder / "small"
     products = folder / "made"
     rig = ["--config", str(ROOT / "instrument.toml")]
-    # A scene smaller than the published one, if the examples have it.
-    if (SCENE.parent / "own-scene.toml").exists():
-        small = SCENE.parent / "own-scene.toml"
-    else:
-        small = SCENE
+    # A scene smaller than the published one.
+    small = SCENE.parent / "own-scene.toml"
     subprocess.run(
         [sys.executable, "-m", "polysight_simulators", "simulate", str(small), *rig, "--out", str(scan)],
         cwd=ROOT,

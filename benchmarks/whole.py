@@ -51,14 +51,13 @@ def rows_that_fit(rig: Instrument, rows: int, folder: Path) -> int:
 class Published:
     """The published method on a part of a scan, its time scaled to the whole: positions and boards cost the same.
 
-    `files`: raw data of one row by board; `tuned`: in single precision (`_make_time_line`).
+    `files`: raw data of one row by board.
     """
 
-    def __init__(self, rig: Instrument, files: dict[str, Path], tuned: bool) -> None:
+    def __init__(self, rig: Instrument, files: dict[str, Path]) -> None:
         self._rig = rig
-        self._tuned = tuned
         self._grid = image_grid(rig)
-        self._row = sync.Theirs(rig, files, tuned, POSITIONS)
+        self._row = sync.Theirs(rig, files, POSITIONS)
         # [rx, row, column, sample]
         shape = len(rig.antennas.rx_mm), rig.grid.rows, rig.grid.columns, rig.chirp.samples
         # The time does not depend on the samples.
@@ -70,7 +69,7 @@ class Published:
         positions_s = sum(self._row.row()) * self._rig.grid.rows
         image = Seconds()
         with image.time_block():
-            form_image(self._cube, self._rig, self._rig.receivers[0], self._grid, tuned=self._tuned)
+            form_image(self._cube, self._rig, self._rig.receivers[0], self._grid)
         return positions_s + image.cpu[0] * len(self._rig.receivers)
 
 
@@ -89,18 +88,15 @@ def run(args: argparse.Namespace) -> int:
         # Row 0 of each board is enough for the published method.
         files = {name: scan / "raw" / name / "0000.bin" for name in rows}
         del rows
-        plain = Published(rig, files, False)
-        tuned = Published(rig, files, True)
+        published = Published(rig, files)
         # Our processing, each in a process of its own: of a whole scan, and as during a running one.
         batch = Chain(folder, "batch", {"scan": str(scan)})
         live = Chain(folder, "live", {"scan": str(scan)})
         ours = []
         theirs = []
-        theirs_tuned = []
         for _ in range(count_repeats(args.quick, args.repeats)):
             ours.append(batch.run())
-            theirs.append(plain.run())
-            theirs_tuned.append(tuned.run())
+            theirs.append(published.run())
         beside_scan = live.run()
         memory = max(batch.end(), live.end())
     scale = rig.grid.rows / count
@@ -114,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
     seconds = statistics.median((r["cpu_s"] - r["once_cpu_s"]) * scale + r["once_cpu_s"] for r in ours)
     quantity = f"raw to image, two boards, {whole_bytes / 1e9:.1f} GB"
     lines = [
-        _make_time_line(quantity, seconds, statistics.median(theirs), statistics.median(theirs_tuned), part),
+        _make_time_line(quantity, seconds, statistics.median(theirs), part),
         _make_last_row_line(beside_scan),
         line_at_most(
             "anonymous memory of a full scan, GB",
@@ -125,15 +121,12 @@ def run(args: argparse.Namespace) -> int:
         ),
     ]
     show("a whole scan, one core, simulated rows repeated", lines, args.quick)
-    write(args.json, "whole", lines, ours=ours, live=beside_scan, published_s=theirs, published_tuned_s=theirs_tuned)
+    write(args.json, "whole", lines, ours=ours, live=beside_scan, published_s=theirs)
     return 0
 
 
-def _make_time_line(quantity: str, seconds: float, published_s: float, tuned_s: float, part: str) -> Line:
-    """Return the line about CPU seconds: ours, the published method's, and its tuned form's.
-
-    The tuned form is in single precision, without steps that repeat or are too precise (`Synchroniser`, `form_image`).
-    """
+def _make_time_line(quantity: str, seconds: float, published_s: float, part: str) -> Line:
+    """Return the line about CPU seconds: ours, and the published method's."""
     return Line(
         quantity,
         f"{seconds:.1f} s",
@@ -141,8 +134,7 @@ def _make_time_line(quantity: str, seconds: float, published_s: float, tuned_s: 
         published_s / seconds,
         at_least=80,
         aim=120,
-        note=f"ours from {part}; published method from {2 * POSITIONS} positions and one board's image, scaled;"
-        f" in single precision {tuned_s:.0f} s: {tuned_s / seconds:.0f}x",
+        note=f"ours from {part}; published method from {2 * POSITIONS} positions and one board's image, scaled",
     )
 
 

@@ -9,13 +9,14 @@ hold under those, and in how many scenes a reason names the nuisance, among the 
 """
 
 import argparse
+import itertools
 import json
 import re
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -379,10 +380,7 @@ def judge_world(nuisance: str, seed: int, searched: bool = False, mixed: bool = 
 def compare_with_plate(nuisance: str, patch: PatchResult, plate: generator.Plate) -> PatchFigures:
     """Compare one patch with its plate, whose true permittivity is that of its half space."""
     e = patch.permittivity
-    if patch.refused is None:
-        refused = ""
-    else:
-        refused = patch.refused.what
+    refused = "" if patch.refused is None else patch.refused.what
     distance2 = None
     half_width = None
     error = None
@@ -392,13 +390,10 @@ def compare_with_plate(nuisance: str, patch: PatchResult, plate: generator.Plate
         distance2 = float(parts @ np.linalg.solve(e.covariance, parts))
         half_width = 1.96 * float(np.sqrt(np.trace(e.covariance) / 2)) / abs(e.value)
         error = abs(deviation) / abs(plate.stack.below)
-    if patch.verdict is None:
-        name = UNKNOWN
-    else:
+    name = UNKNOWN
+    confidence = 0.0
+    if patch.verdict is not None:
         name = patch.verdict.name
-    if patch.verdict is None:
-        confidence = 0.0
-    else:
         confidence = patch.verdict.confidence
     return PatchFigures(
         nuisance=nuisance,
@@ -470,11 +465,6 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
     return MetalFigures(kind, seed, verdict.level, withdrawn, tuple(name for name in names if name != UNKNOWN))
 
 
-def _judge_metal(job: tuple[str, int, bool]) -> MetalFigures:
-    """Judge a scene by the arguments of `judge_metal`, as one value for a pool."""
-    return judge_metal(*job)
-
-
 def print_metal(scenes: Sequence[MetalFigures]) -> None:
     """Print for each kind: how often the metal is withdrawn, the verdicts, and in how many scenes there are names."""
     for kind in METAL_KINDS:
@@ -486,11 +476,6 @@ def print_metal(scenes: Sequence[MetalFigures]) -> None:
             with_names = sum(bool(scene.names) for scene in scenes_of_kind)
             print(f"{kind}: {len(scenes_of_kind)} scenes, withdrawn {withdrawn}, verdicts {levels},", end="")
             print(f" scenes with names {with_names}")
-
-
-def _judge(job: tuple[str, int, bool, bool]) -> SceneFigures:
-    """Judge a world by the arguments of `judge_world`, as one value for a pool."""
-    return judge_world(*job)
 
 
 def format_line(title: str, scenes: Sequence[SceneFigures]) -> str:
@@ -568,14 +553,15 @@ def run(args: argparse.Namespace) -> int:
     """Judge worlds of each nuisance, or with `--metal` scenes of `METAL_KINDS`; print the tables. Return 0."""
     if args.metal:
         seeds = range(args.first, args.first + args.metal)
-        of_metal = [(kind, seed, args.searched) for kind in METAL_KINDS for seed in seeds]
+        kinds, numbers = zip(*itertools.product(METAL_KINDS, seeds), strict=True)
         with ProcessPoolExecutor(args.jobs) as pool:
-            print_metal(list(pool.map(_judge_metal, of_metal)))
+            print_metal(list(pool.map(partial(judge_metal, searched=args.searched), kinds, numbers)))
         return 0
     seeds = range(args.first, args.first + args.scenes)
-    jobs = [(name, seed, args.searched, args.mixed) for name in args.nuisances.split(",") for seed in seeds]
+    names, numbers = zip(*itertools.product(args.nuisances.split(","), seeds), strict=True)
+    judge = partial(judge_world, searched=args.searched, mixed=args.mixed)
     with ProcessPoolExecutor(args.jobs) as pool:
-        scenes = list(pool.map(_judge, jobs))
+        scenes = list(pool.map(judge, names, numbers))
     print(__doc__)
     print_tables(scenes)
     if args.json is not None:

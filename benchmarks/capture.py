@@ -189,7 +189,7 @@ class Receivers:
             captures = [r.end_row() for r in self._receivers]
             for k, capture in enumerate(captures):
                 trial.packets += packets
-                trial.lost += packets - capture.packets
+                trial.lost += packets - capture.counts.placed
                 trial.kernel_drops += capture.kernel_drops
                 trial.exact &= capture.missing_bytes > 0 or capture.crc32 == self._expected_checksum(k, blocks)
             for r in self._receivers:

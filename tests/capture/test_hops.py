@@ -12,6 +12,7 @@ from tests.support.paths import REPO
 
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import Hop, neighbour_mac, route_interface, silent_card, silent_hop, silent_radar
+from polysight.capture.placement import Losses, PacketCounts
 from polysight.capture.receiver import RowCapture
 from polysight_shared.config import Board
 
@@ -81,6 +82,7 @@ def test_unknown_hops_are_not_guessed(tmp_path):
 
 def row(**given) -> RowCapture:
     fields = dict.fromkeys((f.name for f in msgspec.structs.fields(RowCapture)), 0)
+    fields |= {"counts": PacketCounts(), "losses": Losses()}
     return RowCapture(**(fields | {"missing": [(0, 9)], "located": False, "reason": "no packet came"} | given))
 
 

@@ -79,11 +79,11 @@ def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
             if k == 1:
                 assert row.missing == [(0, 2 * FULL)]
                 assert facts["missing"] == [[0, 2 * FULL]]
-                assert (row.late, row.duplicates, row.malformed) == (1, 1, 1)
+                assert (row.counts.late, row.counts.duplicates, row.counts.malformed) == (1, 1, 1)
                 assert path.read_bytes() == bytes(2 * FULL) + data[2 * FULL :]
             else:
                 assert row.complete
-                assert (row.late, row.duplicates, row.packets, row.short) == (0, 0, n, 1)
+                assert (row.counts.late, row.counts.duplicates, row.counts.placed, row.counts.short) == (0, 0, n, 1)
                 assert path.read_bytes() == data
 
 
@@ -165,7 +165,7 @@ def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
         receiver.begin_row(0, 2, 4096, 4096, tmp_path / "b.part")
         assert not (tmp_path / "a.part").exists()
         row = receiver.end_row()
-    assert (row.packets, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
+    assert (row.counts.placed, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
 
 
 def test_errors_come_back_to_the_host(board, tmp_path):
@@ -236,9 +236,9 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         wait_for(lambda: quiet.report().received == 20 * FULL, "packets")
         hit = swamped.end_row()
         spared = quiet.end_row()
-        assert hit.kernel_drops == 2000 - hit.packets > 0
+        assert hit.kernel_drops == 2000 - hit.counts.placed > 0
         assert spared.kernel_drops == 0
-        assert hit.tail_bytes == 2000 * FULL - hit.bytes
+        assert hit.losses.tail_bytes == 2000 * FULL - hit.bytes
         swamped.begin_row(1, 1, 4096, 4096, tmp_path / "next.part")
         assert swamped.end_row().kernel_drops == 0
 

@@ -8,6 +8,7 @@ import pytest
 from tests.support.doctor.case import FRAMES, RIG, direct_signal, make_context, simulate_frames
 from tests.support.rigs import programmed_rig
 
+from polysight.capture.placement import Losses, PacketCounts
 from polysight.capture.receiver import RowCapture
 from polysight.doctor.context import CapturedFrames
 from polysight.doctor.rig_checks import check_radar
@@ -28,7 +29,8 @@ def with_frames(words, **row):
         "holes": [],
         "slipped": False,
     }
-    counts |= {"located": True, "expected": words.nbytes, "bytes": words.nbytes, "packets": 9, **row}
+    counts |= {"located": True, "expected": words.nbytes, "bytes": words.nbytes}
+    counts |= {"counts": PacketCounts(placed=9), "losses": Losses(), **row}
     return make_context(captured={"RH": CapturedFrames(words, np.ones(len(words), bool), RowCapture(**counts))})
 
 
@@ -132,10 +134,10 @@ def test_an_rx_without_a_signal_is_an_error(rms):
     ("row", "verdict"),
     [
         ({}, "ok"),
-        ({"packets": 0, "bytes": 0}, "error"),
-        ({"packets": 0, "bytes": 0, "strangers": 5}, "error"),
+        ({"counts": PacketCounts(), "bytes": 0}, "error"),
+        ({"counts": PacketCounts(), "bytes": 0, "strangers": 5}, "error"),
         ({"bytes": 4096, "slipped": True, "reason": "missed"}, "error"),
-        ({"missing": [(0, 1456)], "gap_bytes": 1456, "bytes": 9}, "warning"),
+        ({"missing": [(0, 1456)], "losses": Losses(gaps=1, gap_bytes=1456), "bytes": 9}, "warning"),
         ({"card_status": 1 << 7}, "error"),
         ({"strangers": 3}, "warning"),
     ],

@@ -15,6 +15,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import zmq
 
 from polysight.acquisition import pulse_times
@@ -185,7 +186,7 @@ class Take:
             held_text = "; the row was held, and a card ends its record after 2 s without data"
         else:
             held_text = ""
-        if capture.packets == 0:
+        if capture.counts.placed == 0:
             if radar.detail:
                 detail = f"; its radar was {radar.detail}, and may not have obeyed"
             else:
@@ -216,8 +217,8 @@ class Take:
             else:
                 kind = _classify_unlocated(capture)
             return TakeFault(kind, capture.reason + unplaced + waits_text + held_text, name)
-        if capture.conflicting and capture.missing:
-            text = f"{capture.conflicting} packets have other bytes than packets with equal counters"
+        if capture.counts.conflicting and capture.missing:
+            text = f"{capture.counts.conflicting} packets have other bytes than packets with equal counters"
             return TakeFault(FaultKind.CONFLICTING, f"{text}; {capture.missing_bytes} bytes are masked", name)
         if capture.missing:
             text = (
@@ -248,7 +249,7 @@ class Take:
     @property
     def silent_boards(self) -> list[str]:
         """Boards without any data although bursts were sent."""
-        return [n for n, c in self.captures.items() if c.packets == 0 and (self.events or self.all_pulses_sent)]
+        return [n for n, c in self.captures.items() if c.counts.placed == 0 and (self.events or self.all_pulses_sent)]
 
 
 def _classify_unlocated(capture: RowCapture) -> FaultKind:
@@ -344,9 +345,10 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
 
 
 def _describe_reception(capture: RowCapture) -> dict[str, Any]:
-    """Return the counts of `capture` under the names of the manifest, which differ only for the bytes."""
-    counts = {kind: getattr(capture, kind) for kind in Reception.__struct_fields__ if hasattr(capture, kind)}
-    return {**counts, "received_bytes": capture.bytes}
+    """Return the counts of `capture` under the names of the manifest, which differ for placed packets and bytes."""
+    counts = {**msgspec.structs.asdict(capture), **vars(capture.counts), **vars(capture.losses)}
+    known_counts = {kind: counts[kind] for kind in Reception.__struct_fields__ if kind in counts}
+    return {**known_counts, "packets": capture.counts.placed, "received_bytes": capture.bytes}
 
 
 def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder, takes: int) -> ScanError:

@@ -557,14 +557,14 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
             row_capture = receiver.end_row(card.take_status())
     except DeviceError as e:
         return Finding.of_error(e, where="radar")
-    if row_capture.packets == 0:
+    if row_capture.counts.placed == 0:
         return Finding.of_error(silent_radar(card.board, row_capture), where="radar")
     return _report_stream(row_capture)
 
 
 def _report_stream(row_capture: RowCapture) -> Finding:
     """Report a radar's data. Only gaps between packets count as lost: the record is stopped before its end."""
-    text = f"{row_capture.packets} packets, {row_capture.bytes} bytes came"
+    text = f"{row_capture.counts.placed} packets, {row_capture.bytes} bytes came"
     if row_capture.lost_before_packets:
         return Finding(
             "warning",
@@ -573,12 +573,12 @@ def _report_stream(row_capture: RowCapture) -> Finding:
             "a shorter card.packet_delay_us in instrument.toml lets the card send faster",
             "radar",
         )
-    if row_capture.gap_bytes or row_capture.strangers:
+    if row_capture.losses.gap_bytes or row_capture.strangers:
         return Finding(
             "warning",
             text,
-            f"{row_capture.gap_bytes} bytes are lost in {row_capture.gaps} gaps, {row_capture.kernel_drops} packets"
-            f" dropped by this machine, {row_capture.strangers} came from elsewhere",
+            f"{row_capture.losses.gap_bytes} bytes are lost in {row_capture.losses.gaps} gaps,"
+            f" {row_capture.kernel_drops} packets dropped by this machine, {row_capture.strangers} came from elsewhere",
             "check cable and switch, the receive buffer above, and that no two cards have the same ports",
             "radar",
         )

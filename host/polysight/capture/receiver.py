@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 import msgspec
 
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, Status
+from polysight.capture.placement import Losses, PacketCounts
 from polysight_shared.closing import Closing
 from polysight_shared.config import Board
 from polysight_shared.errors import DeviceError, ErrorCode
@@ -192,17 +193,12 @@ class RowCapture(_Message, frozen=True):
     """Reception of one row of one board.
 
     `expected` are the bytes of the whole row, `bytes` counts placed ones, `missing` are the other byte ranges (the
-    whole row if `located` is False, for which `reason` says why): `head_bytes` before the first packet, `gap_bytes` in
-    `gaps` gaps, `tail_bytes` after the last one. `holes` are the missing ranges before the furthest byte that came;
-    `slipped` if nothing but missing whole frames keeps the row from being located. Arrival times are of the host's
-    monotonic clock, 0 without packets.
+    whole row if `located` is False, for which `reason` says why), `losses` their sizes by place. `holes` are the
+    missing ranges before the furthest byte that came; `slipped` if nothing but missing whole frames keeps the row from
+    being located. Arrival times are of the host's monotonic clock, 0 without packets.
 
-    `packets` were placed, some of them `late` (after a packet of a later place, by at most `late_by_bytes`) or `short`
-    (not full). Not placed were `duplicates`, `conflicting` (equal counters, other bytes), `leftover` (of an earlier
-    record; `before_pulses` of them came before the first pulse), `restarted` (the card restarted within the row),
-    `outside` (beyond the row's end), `disagreeing` (their counters contradict each other) and `malformed` packets. Not
-    of the row are `strangers` (packets from another address than the card's), `stale` (packets from between rows) and
-    `kernel_drops` (dropped by the kernel during the row).
+    `counts` are the packets by result. Not of the row are `strangers` (packets from another address than the card's),
+    `stale` (packets from between rows) and `kernel_drops` (dropped by the kernel during the row).
 
     `card_status` are the bits the card reported during the row. The three CRC-32 are of the row's files: payload,
     index, packets.
@@ -215,13 +211,8 @@ class RowCapture(_Message, frozen=True):
     missing: list[tuple[int, int]]
     located: bool
     reason: str
-    packets: int
-    duplicates: int
-    late: int
-    outside: int
-    disagreeing: int
-    malformed: int
-    short: int
+    counts: PacketCounts
+    losses: Losses
     strangers: int
     stale: int
     kernel_drops: int
@@ -229,18 +220,9 @@ class RowCapture(_Message, frozen=True):
     last_arrival_ns: int
     crc32: int
     index_crc32: int
-    leftover: int = 0
-    late_by_bytes: int = 0
-    head_bytes: int = 0
-    gaps: int = 0
-    gap_bytes: int = 0
-    tail_bytes: int = 0
     card_status: int = 0
     holes: list[tuple[int, int]] = []
     slipped: bool = False
-    conflicting: int = 0
-    restarted: int = 0
-    before_pulses: int = 0
     packets_crc32: int = 0
     # It is unknown where the card's next record begins: the card must be reset.
     start_lost: bool = False

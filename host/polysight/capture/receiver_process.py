@@ -241,11 +241,7 @@ class Receiver:
         crc = row.segment.finish(payload)
         facts = {"row": begun.row, "take": begun.take, **placed.facts(), "card_status": request.card_status}
         index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
-        counts = vars(placed.counts).copy()
-        losses = vars(placed.losses)
         arrivals = placed.arrivals
-        # The other counts and losses have the names that `RowCapture` gives them.
-        counts["packets"] = counts.pop("placed")
         first_arrival_ns = 0
         last_arrival_ns = 0
         if arrivals.size:
@@ -259,6 +255,8 @@ class Receiver:
             missing=placed.missing,
             located=placed.located,
             reason=placed.reason,
+            counts=placed.counts,
+            losses=placed.losses,
             strangers=self._batches.strangers - row.strangers,
             stale=row.stale,
             kernel_drops=kernel_drops(self._socket) - row.drops,
@@ -271,8 +269,6 @@ class Receiver:
             holes=placed.holes,
             slipped=placed.slipped,
             start_lost=placed.past.lost,
-            **counts,
-            **losses,
         )
 
 

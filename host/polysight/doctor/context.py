@@ -232,7 +232,7 @@ def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], f
         time.sleep(0.2)
         if [r.report().received for r in receivers] == received_before:
             break
-    lost_packets = sum(packets - r.end_row().packets for r in receivers)
+    lost_packets = sum(packets - r.end_row().counts.placed for r in receivers)
     return LoadResult(rate, packets / max(sending_s), packets * len(receivers), lost_packets)
 
 

@@ -486,20 +486,20 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
     is_complete = captured.valid.reshape(-1, context.rig.burst.chirps).all(axis=1)
     complete = int(is_complete.sum())
     row = captured.row
-    facts = {"frames_expected": is_complete.size, "frames": complete, "bytes": row.bytes, "packets": row.packets}
+    facts = {"frames_expected": is_complete.size, "frames": complete, "bytes": row.bytes, "packets": row.counts.placed}
     if captured.radar is not None and captured.radar.state is RadarState.FAULT:
         observed = f"the radar stopped: {captured.radar.detail}"
         return error(observed, "the radar reported a fault", "`polysight radar check BOARD`", **facts)
-    text = f"{complete} of {is_complete.size} frames, {row.packets} packets"
+    text = f"{complete} of {is_complete.size} frames, {row.counts.placed} packets"
     return msgspec.structs.replace(_judge_frames(board, row, text), facts=facts)
 
 
 def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
     """Judge if a row's frames came to this machine, by the first fault; `slipped`: only whole frames are missing."""
-    if row.packets == 0:
+    if row.counts.placed == 0:
         e = silent_radar(board, row)
         return error(e.what, e.why, e.remedy)
-    if row.slipped or (row.bytes < row.expected and not row.gap_bytes):
+    if row.slipped or (row.bytes < row.expected and not row.losses.gap_bytes):
         return error(
             f"{observed}: {row.reason or 'the record ended early'}",
             "the radar missed pulses: wrong level or width of SYNC_IN, or it was armed for fewer frames",

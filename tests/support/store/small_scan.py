@@ -18,7 +18,7 @@ from polysight.acquisition import scan as host_run
 from polysight.acquisition.progress import ScanProgress, ScanResult
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.capture.dca1000 import PacketLog
-from polysight.capture.placement import Evidence, Past, place_record
+from polysight.capture.placement import Evidence, Losses, PacketCounts, Past, place_record
 from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
 from polysight.store import manifest
@@ -200,11 +200,10 @@ class SmallRig:
         crc = segment.finish(out)
         index = write_index(segment.path.with_suffix(".idx"), placed.facts(), placed.arrivals)
         packets = write_packets(segment.path.with_suffix(PACKETS), log, evidence, placed)
-        zero = dict.fromkeys(("duplicates", "late", "outside", "disagreeing", "malformed", "short", "strangers"), 0)
         return RowCapture(
-            row=row, take=take, expected=len(data), bytes=len(data), missing=[], located=True, reason="", packets=1,
-            **zero, stale=0, kernel_drops=0, first_arrival_ns=0, last_arrival_ns=0, crc32=crc, index_crc32=index,
-            packets_crc32=packets,
+            row=row, take=take, expected=len(data), bytes=len(data), missing=[], located=True, reason="",
+            counts=PacketCounts(placed=1), losses=Losses(), strangers=0, stale=0, kernel_drops=0,
+            first_arrival_ns=0, last_arrival_ns=0, crc32=crc, index_crc32=index, packets_crc32=packets,
         )  # fmt: skip
 
     def close(self) -> None:

@@ -89,7 +89,9 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     assert errors(scan.path) == []
     holds(scan, data, [(9 * 1456, 10 * 1456)])
     board = scan.committed_rows()[0].boards["RH"]
-    assert (board.leftover, board.duplicates) == (1, 1), "the manifest counts as the new index does"
+    placed = -(-len(data) // 1456) - 1
+    counts = (board.packets, board.leftover, board.duplicates)
+    assert counts == (placed, 1, 1), "the manifest counts as the new index does"
     names = {p.name for p in scan.path.rglob("raw/RH/*")}
     assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS}"}
     assert inspect_placement(scan.path / "raw/RH/0000-1.idx", as_json=True) == 0

@@ -303,6 +303,7 @@ def _write_new_files(scan: ScanFolder, board: BoardRow, placed_again: PlacedAgai
         packets_crc32=f"{packets_crc:08x}",
         located=placed.located,
         received_bytes=placed.received,
+        packets=placed.counts.placed,
         **counts,
         **vars(placed.losses),
     )

@@ -45,6 +45,10 @@ def block_faults(block: Block) -> list[tuple[int, str]]:
         ]
         return marks + [(n, fault) for n, command in block.commands() for fault in command_faults(command)]
     if block.language == "":
+        # In a list, a line left of its block ends list and block: the closing fence then opens another one.
+        headings = [n for n, text in enumerate(block.text.splitlines(), block.line) if text.startswith("## ")]
+        if headings:
+            return [(headings[0], "a heading in a code block: indent every line of the block above it as its fences")]
         # What a program prints, or an indented example: a command may have a remark after two spaces.
         return [
             (n, f)

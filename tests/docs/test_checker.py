@@ -141,3 +141,10 @@ def test_the_commands_of_a_page_end_with_the_check(tmp_path):
     # Orphans of a killed program stay until the system's first process has awaited them.
     commands = int(pid.read_text())
     wait_for(lambda: not runs(commands), "the page's commands end with the check")
+
+
+def test_a_block_that_a_line_left_of_it_ends_is_found(tmp_path):
+    """What follows would be shown as code."""
+    faults = page_faults(page(tmp_path, "# Page\n\n1. a\n\n   ```toml\n   x = 1\ny = 2\n   ```\n\n## Next\n"))
+    assert len(faults) == 1
+    assert ":10: a heading in a code block" in faults[0]

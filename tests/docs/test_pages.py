@@ -6,6 +6,8 @@ import tomllib
 import numpy as np
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
+from tests.support.rigs import published_rig
+from tests.support.scenes import COPPER, make_scene
 
 from polysight.acquisition import ScanCommand
 from polysight.cli.serve import SCAN_COMMANDS
@@ -14,6 +16,7 @@ from polysight.radar.usb import PRODUCT, VENDOR
 from polysight.results import NoResult
 from polysight_shared.errors import PolysightError
 from polysight_shared.faults import EXPLANATIONS, PiFault
+from polysight_simulators.scene import decode_scene, simulate
 
 
 def test_links_and_commands():
@@ -78,3 +81,15 @@ def test_the_label_file_that_is_shown_can_be_learnt_from(tmp_path):
     boxes = check_labels(read_labels(tmp_path / "labels.json"), axis_m, axis_m)
     assert [boxes.specimen(name) for name in boxes.boxes] == [None, "board 7", "2"]
     assert (boxes.metal, boxes.by_hand) == ("copper", True)
+
+
+def test_the_python_blocks_about_imaging_run(tmp_path, monkeypatch):
+    """They use rooms behind the public interface, whose names change."""
+    simulate(
+        published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "test"), tmp_path / "scans" / "points"
+    )
+    monkeypatch.chdir(tmp_path)
+    blocks = [block for block in read_page(ROOT / "docs/how-to/imaging.md").blocks if block.info == ("python", "run")]
+    assert len(blocks) > 1
+    for block in blocks:
+        exec(compile(block.text, f"imaging.md:{block.line}", "exec"), {})

@@ -10,9 +10,10 @@ from polysight.jobs.output import count_steps, steps
 def test_every_step_is_named_before_it_begins(capsys):
     answer = [(thing, capsys.readouterr().err) for thing in steps(["a", "b"], ["first", "second"])]
     assert [thing for thing, _ in answer] == ["a", "b"]
-    assert answer[0][1] == "[1/2] first ..."
-    assert "[2/2] second ..." in answer[1][1]
-    assert capsys.readouterr().err.endswith("s\n")
+    # What the step prints begins on a line of its own.
+    assert answer[0][1] == "[1/2] first ...\n"
+    assert answer[1][1] == "[1/2] first: 0 s\n[2/2] second ...\n"
+    assert capsys.readouterr().err == "[2/2] second: 0 s\n"
 
 
 def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):

@@ -18,6 +18,7 @@ from polysight.catalogue import NOTES, Notes, probe, read_notes
 from polysight.cli.main import build_parser, main
 from polysight.jobs import scans
 from polysight.results import ComplexNumber
+from polysight.store import MANIFEST, manifest
 from polysight_shared.errors import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -168,3 +169,17 @@ def test_no_tag_of_commands_at_the_same_time_is_lost(root):
     for thread in threads:
         thread.join()
     assert sorted(read_notes(root / "one").tags) == sorted(tag for of_one in tags for tag in of_one)
+
+
+@pytest.mark.parametrize(
+    "command", ["report one", "process one --out one/products", "process one --out ./one/products/"]
+)
+def test_products_of_a_running_scan_are_left_to_it(root, monkeypatch, command):
+    """Its own processing would find the folder in use at its end, and fail."""
+    monkeypatch.chdir(root)
+    args = build_parser().parse_args(command.split())
+    with (root / "one" / MANIFEST).open("rb") as recorded:
+        manifest.lock_file(recorded)
+        with refused(ErrorCode.BUSY, "polysight preview one"):
+            args.run(args)
+    assert not (root / "one" / "products").exists()

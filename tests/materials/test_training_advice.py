@@ -26,7 +26,7 @@ def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_s
     text = advise(fit_samples(drawn((0.12, 0.6), 6, seed=1, labelled=False)))
     assert "underconfident" in text
     assert "no second specimen" in text
-    assert f"{FREEDOM_NEEDED} more are needed" in text
+    assert f"scan {FREEDOM_NEEDED} more" in text
 
 
 @pytest.mark.parametrize(

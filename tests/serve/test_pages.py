@@ -334,6 +334,16 @@ def test_a_scan_that_is_not_there_shows_the_error_alone(page):
     page.browser.wait("document.getElementById('told').innerText.includes('nowhere')", "the error")
     sections = "[...document.querySelectorAll('main section, #side')].filter(s => s.checkVisibility()).map(s => s.id)"
     assert page.browser.value(sections) == ["head"]
+    assert not page.browser.value("[...document.querySelectorAll('#links > *')].some(link => link.checkVisibility())")
+    assert "choose a scan from the list" in page.browser.text("told")
+
+
+def test_a_scan_that_is_not_there_is_not_taken_for_a_server_that_is_not_there(page):
+    page.open("/watch?scan=nowhere")
+    page.browser.wait("document.title.length > 9 && document.body.classList.contains('lost')", "the status")
+    assert page.browser.text("headline") == "No scan of this name"
+    assert "nowhere" in page.browser.text("detail")
+    assert "choose a scan from the list" in page.browser.text("do")
 
 
 def test_the_list_is_searched_and_two_are_compared(page):

@@ -26,7 +26,7 @@ from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_no
 from polysight.products import IMAGE, LABELS, MATERIALS, QUALITY, SCAN, ProcessedScan, find_labels
 from polysight.results import NoResult
 from polysight.store import MANIFEST, Manifest, manifest
-from polysight_shared.errors import DataError, ErrorCode, PolysightError, no_such
+from polysight_shared.errors import DataError, ErrorCode, PolysightError
 from polysight_shared.files import write_atomically
 from polysight_shared.findings import Finding
 
@@ -596,10 +596,12 @@ class Scans:
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
         if not exists:
-            if not path.exists():
-                raise no_such(path)
+            problem = f"{path}: not a scan"
             cause = "nothing was recorded there"
-            raise DataError(f"{path}: not a scan", cause, "choose a name from the list", code=ErrorCode.FILE_MISSING)
+            if not path.exists():
+                problem = f"{path}: does not exist"
+                cause = "its name is mistyped, or it was moved, renamed or deleted"
+            raise DataError(problem, cause, "choose a scan from the list", code=ErrorCode.FILE_MISSING)
         return path
 
     def _summarise(self, name: str) -> Summary:

@@ -167,6 +167,8 @@ def _format_half_space_line(patch: PatchFigures, layer: Mapping[str, Any] | None
     if patch.refused is not None:
         text = f"{head} not judged: {patch.refused_text}"
     elif patch.permittivity is None:
+        if patch.metal_reference:
+            head = f"{patch.label:>3}  {_pad_name('metal reference')}"
         text = f"{head} metal-like: no permittivity"
     else:
         text = f"{head} one interface {_format_estimate(patch.permittivity)}"

@@ -60,13 +60,15 @@ def say(step: str) -> None:
 
 
 def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
-    """Yield the things, one a step; print the name of each before it begins, and its wall time when it is done."""
+    """Yield the things, one a step; print the name of each before it begins, and its wall time when it is done.
+
+    Each is a line of its own, because a step may print lines, too.
+    """
     for k, (thing, name) in enumerate(zip(things, names, strict=True), 1):
-        sys.stderr.write(f"[{k}/{len(things)}] {name} ...")
-        sys.stderr.flush()
+        say(f"[{k}/{len(things)}] {name}")
         started_s = monotonic()
         yield thing
-        sys.stderr.write(f" {monotonic() - started_s:.0f} s\n")
+        sys.stderr.write(f"[{k}/{len(things)}] {name}: {monotonic() - started_s:.0f} s\n")
 
 
 def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:

@@ -41,9 +41,9 @@ from polysight.process import (
 from polysight.products import IMAGE, REPORT, check_products_folder, making_products, raw_dropped, write_json
 from polysight.results import format_one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
-from polysight.store import ScanFolder, Source, dropped_rows, open_source, raw_source, require_raw
+from polysight.store import MANIFEST, ScanFolder, Source, dropped_rows, manifest, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, advice, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, advice, quote
 
 _log = logging.getLogger(__name__)
 
@@ -249,6 +249,7 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
     source = open_source(data, settings.path("config"), dropped=True)
     plates = find_plates(data)
     check_products_folder(out, source.scan_id)
+    _check_not_recorded(data, out)
     pipeline = Pipeline(source, settings, inputs, samples="keep")
     check_inputs(settings, inputs, pipeline.calibration, pipeline.rig, pixel_axes(pipeline))
     add_rows(pipeline, data, threads)
@@ -257,6 +258,18 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
     products = make_products(pipeline, out, plates)
     sys.stdout.write(products.summary())
     return products.exit_status
+
+
+def _check_not_recorded(data: Path, out: Path) -> None:
+    """Raise ScanError if products would go where a running scan puts its own."""
+    if out.resolve() != (data / PRODUCTS).resolve() or not (data / MANIFEST).is_file():
+        return
+    if manifest.is_being_written(data / MANIFEST):
+        raise ScanError(
+            f"{data} is being scanned", f"the scan makes {out} when its rows have ended, and would find it in use",
+            f"wait for its end (polysight preview {quote(data)} shows it); polysight process {quote(data)} --out DIR"
+            " processes its present rows", code=ErrorCode.BUSY,
+        )  # fmt: skip
 
 
 def rig_of_images(config: Path | None) -> Instrument:

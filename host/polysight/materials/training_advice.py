@@ -61,10 +61,14 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
         return []
     missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
     # Scans of one and the same piece cannot show how often names are right on another piece.
-    need = (
-        f"{fit['specimen_freedom']} specimens beyond the first of a material tell how far specimens differ;"
-        f" {missing} more are needed to know it to 25 % (scan other pieces: polysight label --specimen NAME=WHICH)"
-    )
+    freedom = fit["specimen_freedom"]
+    if freedom == 0:
+        known = "how far specimens of a material differ is not known: no second one of any is named"
+    elif freedom == 1:
+        known = "how far specimens of a material differ is known from one beyond the first"
+    else:
+        known = f"how far specimens of a material differ is known from {freedom} beyond the first ones"
+    need = f"{known}; to know it to 25 %, scan {missing} more (polysight label SCAN --specimen NAME=WHICH names them)"
     lines = []
     # Standard deviation of a share of so many names by chance, at least that of a share of about 95 %.
     chance = np.sqrt(max(fit["right"] * (1 - fit["right"]), 0.05) / max(fit["named"], 1))

@@ -99,7 +99,7 @@ function showImages() {
   if (!by("h_amplitude")) buildChannels();
   const waiting = p.waiting ? `, ${p.waiting} more on their way` : "";
   const early = p.rows && p.rows < state.scan.rows / 3 ? "; sharp when more rows are in" : "";
-  by("images-note").textContent = `${p.rows} rows in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
+  by("images-note").textContent = `${p.rows} ${p.rows === 1 ? "row" : "rows"} in${waiting}; ${p.width_mm} × ${p.height_mm} mm${early}`;
   const notes = { finished: "not referenced to metal: not processed", unprocessed: "not referenced to metal: not processed" };
   by("p_note").textContent = state.verdict ? "as received; relative to metal under Result"
     : notes[state.status.key] ?? "not referenced to metal yet";
@@ -239,7 +239,18 @@ function connect() {
     if (state) showStatus();
     if (state?.scan) showStage();
   }));
-  source.onerror = () => lost(server.states.offline);
+  source.onerror = sayWhyLost;
+}
+
+/** The server ends a stream that it refuses as it ends one that breaks: only another question tells which. */
+async function sayWhyLost() {
+  try { await get("scan", { scan: name }); } catch (error) {
+    if (error.code === "file-missing") {
+      lost({ level: "bad", headline: "No scan of this name", detail: error.what, why: error.why, do: error.do });
+      return;
+    }
+  }
+  lost(server.states.offline);
 }
 
 /** The page is alone: its own words, from the same table as the server's. */

@@ -7,12 +7,14 @@ from tests.support.paths import REPO
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.row import ON_REQUEST, FaultKind, TakeFault
+from polysight.acquisition.row import ON_REQUEST, FaultKind, Take, TakeFault
 from polysight.acquisition.scan import run_scan
 from polysight.capture.dca1000 import Status
 from polysight.page.history import CAUSES, notice_of_rejection
 from polysight.store import RowFault
 from polysight_shared.faults import PiFault, explain
+from polysight_shared.messages import RowFinished
+from polysight_shared.raster import Row
 
 SPEC = REPO / "docs/spec/scan-folder.md"
 HELD = "held on the way: some positions were passed below full speed"
@@ -43,6 +45,20 @@ def make_unlocated(rig) -> None:
 
 def pi_fault(rig) -> None:
     rig.pi.fail_rows[0, 1] = int(PiFault.EDGE_LOST)
+
+
+@pytest.mark.parametrize(("status", "all_sent"), [(None, False), ("done", True), ("fault", False), ("aborted", False)])
+def test_only_a_row_that_is_done_has_all_its_pulses_and_a_remark(status, all_sent):
+    finished = None
+    if status is not None:
+        counts = {"points": 3, "edges": 3, "bursts": 3, "pulses": 6}
+        finished = RowFinished(
+            scan_id="s", seq=1, t_mono_ns=1, row_index=0, take=1, status=status, reason=HELD, **counts
+        )
+    row = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
+    take = Take(row, number=1, finished=finished)
+    assert take.all_pulses_sent is all_sent
+    assert take.note == (HELD if all_sent else "")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The report is one file, loads no other files, and marks simulated data."""
 
 import base64
+import json
 import re
 from html.parser import HTMLParser
 
@@ -331,6 +332,26 @@ def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
     words = re.findall(r"[\w.]+", Page(html).words.lower())
     assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]
     assert format_value(value) == "–"
+
+
+@pytest.mark.parametrize(
+    ("name", "in_library", "shown"),
+    [
+        ("unknown", False, "acrylic"), ("unknown", True, "✗ acrylic"),
+        ("PET", False, "✗ acrylic"), ("acrylic", True, "✓ acrylic"),
+    ],
+)  # fmt: skip
+def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(scan, name, in_library, shown):
+    foreign = MATERIALS[1] | {"name": name, "truth": MATERIALS[1]["truth"] | {"in_library": in_library}}
+    # As read from a file.
+    figures = json.loads(json.dumps({"segments": [MATERIALS[0], foreign], "library": "", "model": "knn"}))
+    figures |= {"pixel_accuracy": 0.5, "metal_reference": {"how": "given"}}
+    with skip_rendering():
+        words = Page(render(changed(scan, materials=ScanMaterials.decode(figures)), {})).words
+    assert shown in words
+    assert ("✗ acrylic" in words) is (shown == "✗ acrylic")
+    assert ("✓ acrylic" in words) is (shown == "✓ acrylic")
+    assert ("not in the library" in words) is (shown == "acrylic")
 
 
 def test_a_standard_deviation_is_not_shown_as_the_value():

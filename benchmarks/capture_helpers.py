@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture.dca1000 import CARD_SOURCE_PORT, MAX_PAYLOAD_BYTES, PACKET_HEADER_BYTES, decode_row
-from polysight.capture.network import _Header, _IoVec, _Message, bind_udp, enlarge_receive_buffer, kernel_drops
+from polysight.capture.network import _Header, _IoVec, _Message, bind_udp, count_kernel_drops, enlarge_receive_buffer
 from polysight.capture.receiver import take_priority
 from polysight.sync.chain import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument
@@ -157,7 +157,7 @@ def count(host: str, port: str, buffer_bytes: str) -> None:
         expected = int(line)
         received = 0
         idle = 0
-        drops = kernel_drops(sock)
+        drops = count_kernel_drops(sock)
         cpu = time.process_time()
         while received < expected and idle < 3:
             try:
@@ -166,7 +166,7 @@ def count(host: str, port: str, buffer_bytes: str) -> None:
                 idle += 1
                 continue
             received += 1
-        return {"received": received, "drops": kernel_drops(sock) - drops, "cpu_s": time.process_time() - cpu}
+        return {"received": received, "drops": count_kernel_drops(sock) - drops, "cpu_s": time.process_time() - cpu}
 
     say("ready")
     answer_lines(answer)

@@ -239,7 +239,7 @@ def metal_scan(rig: Instrument, scene: Scene) -> PlaneReference:
     images = pipeline.form_images()
     reference = plane_reference(images.level(images.valid))
     # A reference is refused for a scan with other settings or calibration files than its own.
-    return replace(reference, made_with=pipeline.calibration.imaged_with(pipeline.rig))
+    return replace(reference, made_with=pipeline.calibration.describe_imaging(pipeline.rig))
 
 
 def image_scan(source: Any, settings: Settings, inputs: Inputs = NO_INPUTS) -> Pipeline:

@@ -22,7 +22,7 @@ from polysight_pi.lines import (
     request_output,
 )
 from polysight_pi.stage import BenchStage
-from polysight_pi.trigger import MIN_PART, BurstSpec, spi_burst
+from polysight_pi.trigger import MIN_PART, BurstSpec, make_spi_burst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, os_error
 from polysight_shared.findings import Finding
@@ -228,7 +228,7 @@ def measure_clock(instrument: Instrument) -> str | Finding:
     """Time transfers of zeros as long as a burst; the shortest gives the SPI clock. Raises DeviceError."""
     device = SpiDevice(instrument.pi.spi_device)
     try:
-        burst = spi_burst(BurstSpec.from_burst(instrument.burst), device.bufsiz)
+        burst = make_spi_burst(BurstSpec.from_burst(instrument.burst), device.bufsiz)
         zeros = bytes(len(burst.data))
         times_ns = [device.transfer(zeros, burst.clock_hz) for _ in range(TRANSFERS)]
     finally:

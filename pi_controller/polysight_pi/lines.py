@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from polysight_pi.trigger import DEFAULT_BUFSIZ, Edge, Lines, Seen, SpiBurst
+from polysight_pi.trigger import DEFAULT_BUFSIZ, Edge, Lines, ReturnedPulses, SpiBurst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_shared.faults import PiFault
@@ -260,7 +260,7 @@ class GpiodLines(TriggerInput):
             self._output.release()
             raise
 
-    def look_back(self, sent: int) -> Seen | None:
+    def count_returned(self, sent: int) -> ReturnedPulses | None:
         """Count the rising edges of the return wire since the last call; wait for as many as were sent.
 
         None without a return wire. Raises DeviceError when the line is lost.
@@ -274,7 +274,7 @@ class GpiodLines(TriggerInput):
                 pulses += len(self._return.read_edge_events())
         except OSError as e:
             raise _line_lost_error(e) from None
-        return Seen(pulses)
+        return ReturnedPulses(pulses)
 
     def sleep_until(self, t_ns: int) -> None:
         """Return at `t_ns`, never before it.
@@ -396,7 +396,7 @@ class SpiLines(TriggerInput):
         self._device = SpiDevice(pi.spi_device)
         self.bufsiz = self._device.bufsiz
         self._has_return = pi.pulses_in is not None
-        self._seen = Seen(0)
+        self._seen = ReturnedPulses(0)
         try:
             super().__init__(pi)
         except DeviceError:
@@ -416,13 +416,13 @@ class SpiLines(TriggerInput):
         while high:
             high &= high >> 1
             longest += 1
-        self._seen = Seen(pulses, max(self._seen.width_max_ns, round(longest * burst.bit_ns)))
+        self._seen = ReturnedPulses(pulses, max(self._seen.width_max_ns, round(longest * burst.bit_ns)))
         return times
 
-    def look_back(self, sent: int) -> Seen | None:  # noqa: ARG002 - MISO was read with the transfers
+    def count_returned(self, sent: int) -> ReturnedPulses | None:  # noqa: ARG002 - MISO was read with the transfers
         """Return the pulses that MISO has received since the last call; None without the wire."""
         returned = self._seen
-        self._seen = Seen(0)
+        self._seen = ReturnedPulses(0)
         if not self._has_return:
             return None
         return returned
@@ -497,7 +497,7 @@ class WireLines:
         self._seqno += 1
         return Edge(edge.t_ns, self._seqno)
 
-    def look_back(self, sent: int) -> Seen | None:
+    def count_returned(self, sent: int) -> ReturnedPulses | None:
         """Count the pulses that came back since the last call, and measure their widths on the wire; None: no wire."""
         if self._return is None:
             return None
@@ -515,7 +515,7 @@ class WireLines:
                 rose_ns.append(message.t_ns)
             elif message.line == self._return and rose_ns:
                 widths_ns.append(message.t_ns - rose_ns[-1])
-        return Seen(len(rose_ns), max(widths_ns, default=0))
+        return ReturnedPulses(len(rose_ns), max(widths_ns, default=0))
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
         """Send a pulse, starting now; return its times."""

@@ -106,7 +106,7 @@ class BurstRecord(NamedTuple):
     fault: int = 0
 
 
-class Seen(NamedTuple):
+class ReturnedPulses(NamedTuple):
     """Pulses seen at the connector, by the return wire."""
 
     pulses: int
@@ -133,8 +133,9 @@ class _Lines(Protocol):
     # The next rising edge of the trigger line, or None after `timeout_s` of wall time.
     def wait_edge(self, timeout_s: float) -> Edge | None: ...
 
-    # The pulses seen since the last call, waiting a moment for as many as were sent; None without a return wire.
-    def look_back(self, sent: int) -> Seen | None: ...
+    # The pulses that the return wire has seen since the last call; it waits briefly until all that were sent have come.
+    # None without a return wire.
+    def count_returned(self, sent: int) -> ReturnedPulses | None: ...
 
     # Sets SYNC_IN low and releases the lines.
     def close(self) -> None: ...
@@ -163,7 +164,7 @@ Lines = PulseLines | BitLines
 
 
 @lru_cache(maxsize=16)
-def spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
+def make_spi_burst(spec: BurstSpec, bufsiz: int = DEFAULT_BUFSIZ) -> SpiBurst:
     """Return the SPI transfer of a burst, for a spidev buffer of `bufsiz` bytes.
 
     One bit lasts one pulse width. Raises ConfigError if the controller cannot make that width, or, with the `bufsiz` to
@@ -248,7 +249,7 @@ def _send_bits(
     The duration of the system call gives an upper bound of the bit length, so every transfer checks the SPI clock: a
     wrong clock (a Pi whose core clock changes) is a fault before it spoils a scan.
     """
-    burst = spi_burst(spec, lines.bufsiz)
+    burst = make_spi_burst(spec, lines.bufsiz)
     lead_ns = round(burst.bits[0] * burst.bit_ns)
     begin_ns = max(start_ns - lead_ns, lines.now_ns())
     nothing_sent = BurstRecord(0, start_ns, start_ns, start_ns)
@@ -284,7 +285,7 @@ def _send_bits(
     )
 
 
-def send_bench(
+def send_untriggered_burst(
     lines: Lines, spec: BurstSpec, start_ns: int, previous_rise_ns: int | None, stop: Callable[[], bool]
 ) -> BurstRecord:
     """Send a burst without a trigger edge, in several transfers if the SPI buffer is too small for one.
@@ -294,7 +295,7 @@ def send_bench(
     part = spec
     while isinstance(lines, BitLines) and part.pulses > 1:
         try:
-            spi_burst(part, lines.bufsiz)
+            make_spi_burst(part, lines.bufsiz)
             break
         except ConfigError:
             part = part._replace(pulses=-(-part.pulses // 2))
@@ -370,7 +371,7 @@ class TriggerLoop:
         The lines; after :meth:`start` only the loop's thread uses them, and closes them at its end.
     post
         Called with :class:`BurstSent`, :class:`Pulsed` (a burst without an edge) and :class:`LoopFault`; must return
-        at once.
+        immediately.
     prepare
         Called first in the thread, for example to request real-time scheduling.
     """
@@ -387,7 +388,7 @@ class TriggerLoop:
         # The armed row; None: edges are not answered.
         self._job: Job | None = None
         # A burst to be sent without an edge.
-        self._bench: BurstSpec | None = None
+        self._untriggered: BurstSpec | None = None
         self._last_seqno: int | None = None
         # Last rising edge of SYNC_IN, from which the shortest period is checked.
         self._last_rise_ns: int | None = None
@@ -433,12 +434,12 @@ class TriggerLoop:
 
     def send(self, spec: BurstSpec) -> None:
         """Send one burst without an edge, within LOOK_UP_S; `post` gets the result. Only while no row is armed."""
-        self._bench = spec
+        self._untriggered = spec
 
     def check(self, spec: BurstSpec) -> None:
         """Raise ConfigError if the lines cannot send this burst in one piece."""
         if isinstance(self._lines, BitLines):
-            spi_burst(spec, self._lines.bufsiz)
+            make_spi_burst(spec, self._lines.bufsiz)
 
     @property
     def alive(self) -> bool:
@@ -463,9 +464,9 @@ class TriggerLoop:
                 edge = self._lines.wait_edge(LOOK_UP_S)
                 with self._lock:
                     if edge is not None:
-                        self._take(edge)
-                    if self._bench is not None:
-                        self._send_without_edge(self._bench)
+                        self._answer_edge(edge)
+                    if self._untriggered is not None:
+                        self._send_without_edge(self._untriggered)
         except DeviceError as e:
             self._fail(None, PiFault.TRIGGER_LINE_LOST, e.what)
         except Exception as e:
@@ -476,7 +477,7 @@ class TriggerLoop:
             with contextlib.suppress(DeviceError):
                 self._lines.close()
 
-    def _take(self, edge: Edge) -> None:
+    def _answer_edge(self, edge: Edge) -> None:
         """Answer one edge with a burst and post the result, or post why the row has failed. Stray edges are counted."""
         edges_lost = 0
         if self._last_seqno is not None:
@@ -499,7 +500,7 @@ class TriggerLoop:
         start_ns = edge.t_ns + FIRST_PULSE_DELAY_NS
         record = send_burst(self._lines, job.spec, start_ns, self._last_rise_ns, lambda: self._is_over(job))
         self._note_sent(record)
-        record, unseen = self._look_back(record)
+        record, unseen = self._count_returned(record)
         self.counts = Counts(point + 1, bursts + (record.pulses > 0), pulses + record.pulses)
         self._post(BurstSent(job, point, edge.t_ns, record))
         if record.fault:
@@ -510,12 +511,12 @@ class TriggerLoop:
         elif unseen:
             self._fail(job, PiFault.PULSES_UNSEEN, f"point {point}: {unseen}")
 
-    def _look_back(self, record: BurstRecord) -> tuple[BurstRecord, str]:
+    def _count_returned(self, record: BurstRecord) -> tuple[BurstRecord, str]:
         """Return the record with the pulses seen by the return wire, and how they differ from those sent, or "".
 
         Without a return wire the record is not changed.
         """
-        returned = self._lines.look_back(record.pulses)
+        returned = self._lines.count_returned(record.pulses)
         self.sees_pulses = returned is not None
         if returned is None:
             return record, ""
@@ -530,13 +531,13 @@ class TriggerLoop:
 
     def _send_without_edge(self, spec: BurstSpec) -> None:
         """Send a burst that `send` has requested, and post its result."""
-        self._bench = None
+        self._untriggered = None
         start_ns = self._lines.now_ns()
         if self._last_rise_ns is not None:
             start_ns = max(start_ns, self._last_rise_ns + spec.period_ns)
-        r = send_bench(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
+        r = send_untriggered_burst(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
         self._note_sent(r)
-        r, unseen = self._look_back(r)
+        r, unseen = self._count_returned(r)
         result = Pulsed(
             pulses=r.pulses,
             width_max_ns=r.width_max_ns,

@@ -1,11 +1,11 @@
-"""What has to be closed, by `with` or by a call."""
+"""Base class of objects that have to be closed, by `with` or by a call of `close`."""
 
 from abc import ABC, abstractmethod
 from typing import Self
 
 
 class Closing(ABC):
-    """Base of what `with` closes at the end of its block, by its method `close`."""
+    """An object that `with` closes at the end of its block: it calls the method `close`."""
 
     def __enter__(self) -> Self:
         return self
@@ -15,4 +15,4 @@ class Closing(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close it."""
+        """Release what the object holds; a subclass says what."""

@@ -11,7 +11,7 @@ from typing import Any
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DeviceError
 from polysight_shared.tables import decode, to_builtins
-from polysight_simulators.cards import SOURCE_PORT, bound_udp
+from polysight_simulators.cards import SOURCE_PORT, bind_udp
 
 # Subnets that are tried, because other programs may hold ports of some. Chosen.
 _TRIES = 50
@@ -57,7 +57,7 @@ def is_free(rig: Instrument) -> bool:
     with ExitStack() as stack:
         try:
             for address, port in udp:
-                stack.enter_context(bound_udp(address, port))
+                stack.enter_context(bind_udp(address, port))
             for address, port in tcp:
                 s = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
                 # Addresses of a rig that has just ended count as free.

@@ -20,7 +20,7 @@ from tests.support.store.plain_scan import errors
 from polysight.acquisition import capture_rig
 from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.scan import resume_scan, run_scan, takes_so_far
+from polysight.acquisition.scan import find_last_takes, resume_scan, run_scan
 from polysight.capture import card
 from polysight.capture.dca1000 import Code
 from polysight.store.logs import read_events
@@ -158,7 +158,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     assert {k: state_after[k] for k in state_before} == state_before
     assert result.folder.read_row("RV", 3).payload.tobytes() == payload("RV", 3, rig.instrument.row_bytes)
     assert errors(tmp_path / "s") == []
-    assert set(takes_so_far(result.folder)) == {0, 1, 2, 3}
+    assert set(find_last_takes(result.folder)) == {0, 1, 2, 3}
 
 
 def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_path):

@@ -20,7 +20,7 @@ SPEC = REPO / "docs/spec/scan-folder.md"
 HELD = "held on the way: some positions were passed below full speed"
 
 
-def lost_on_the_way(rig) -> None:
+def lose_a_packet_on_the_way(rig) -> None:
     rig.cards["RV"].drop[0, 1] = {3}
 
 
@@ -32,7 +32,7 @@ def frames_missing(rig) -> None:
     rig.cards["RV"].short[0, 1] = rig.instrument.frame_bytes
 
 
-def held(rig) -> None:
+def hold_row(rig) -> None:
     frames_missing(rig)
     rig.pi.notes[0, 1] = HELD
 
@@ -64,10 +64,10 @@ def test_only_a_row_that_is_done_has_all_its_pulses_and_a_remark(status, all_sen
 @pytest.mark.parametrize(
     ("spoil", "fault"),
     [
-        (lost_on_the_way, {"kind": "lost_on_the_way", "board": "RV"}),
+        (lose_a_packet_on_the_way, {"kind": "lost_on_the_way", "board": "RV"}),
         (no_data, {"kind": "no_data", "board": "RV"}),
         (frames_missing, {"kind": "frames_missing", "board": "RV"}),
-        (held, {"kind": "held", "board": "RV"}),
+        (hold_row, {"kind": "held", "board": "RV"}),
         (make_unlocated, {"kind": "unlocated", "board": "RV"}),
         (pi_fault, {"kind": "pi_fault", "number": 103}),
     ],

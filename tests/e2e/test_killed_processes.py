@@ -122,7 +122,7 @@ class Killed:
 
     def scan(self, folder: Path, places: Sequence[Place] = (), *more: str) -> Any:
         """Start a scan, or resume it if its manifest has a first line."""
-        if begun(folder):
+        if has_begun(folder):
             command = ("resume", folder)
         else:
             command = ("scan", "--config", self.rig.config, "--out", folder)
@@ -201,7 +201,7 @@ def list_kinds(places: Sequence[Place]) -> list[Place]:
     return [(operation, suffix, 0) for operation, suffix in dict.fromkeys(place[:2] for place in places)]
 
 
-def begun(folder: Path) -> bool:
+def has_begun(folder: Path) -> bool:
     path = folder / "manifest.jsonl"
     return path.exists() and manifest.read(path).length > 0
 
@@ -214,7 +214,7 @@ def rows(folder: Path) -> dict[str, str]:
 
 def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
     """SHA-256 of the committed rows of an interrupted scan; all must be good. Empty if the scan is not begun."""
-    if not begun(folder):
+    if not has_begun(folder):
         return {}
     assert [f for f in validate(folder) if f.level == "error"] == []
     row_states = rows(folder)
@@ -224,7 +224,7 @@ def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
 
 def retaken(folder: Path) -> set[int]:
     """Rows that the last resume has retaken, by the manifest, without those that it rejected itself."""
-    if not begun(folder):
+    if not has_begun(folder):
         return set()
     facts = load_facts(folder)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
@@ -325,4 +325,4 @@ def test_pi_is_lost_with_its_journal(killed_rig: Killed):
 
 def list_committed(folder: Path) -> list[int]:
     """Committed rows of a scan; none if it is not begun."""
-    return list(ScanFolder.load(folder).committed_rows()) if begun(folder) else []
+    return list(ScanFolder.load(folder).committed_rows()) if has_begun(folder) else []

@@ -205,11 +205,11 @@ def _sag(offsets):
     offsets[2, :, 1] += np.linspace(0, 1e-4, offsets.shape[1])
 
 
-def _lost_row(offsets):
+def _lose_rows(offsets):
     offsets[3:, :, 1] += 1e-3
 
 
-@pytest.mark.parametrize("change", [_jitter_x, _jitter_z, _sag, _lost_row])
+@pytest.mark.parametrize("change", [_jitter_x, _jitter_z, _sag, _lose_rows])
 def test_irregular_positions_are_imaged_directly_with_a_notice(aperture, change):
     a = aperture(9, 6, 4.0, 4.0, (8, 8), 2.0)
     assert isinstance(choose_imager(a)[0], SpectralImager)

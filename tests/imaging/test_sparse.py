@@ -29,7 +29,7 @@ def board(make_rig, points_rows):
     return make
 
 
-def _kept(name):
+def _select_kept(name):
     is_kept = np.zeros((40, 60), bool)
     if name == "every second row":
         is_kept[::2] = True
@@ -42,7 +42,7 @@ def _kept(name):
 
 @pytest.mark.parametrize("name", ["every second row", "every second column", "a random quarter"])
 def test_points_of_a_sparse_scan_are_reconstructed_without_aliases(board, name):
-    samples = board(_kept(name))
+    samples = board(_select_kept(name))
     reconstruction = reconstruct(samples, iterations=40, strength=0.03)
     truth = np.zeros((40, 40), complex)
     truth[tuple(np.transpose(AT))] = AMPLITUDES
@@ -65,7 +65,7 @@ def test_points_of_a_sparse_scan_are_reconstructed_without_aliases(board, name):
 def test_weak_reflectors_beside_a_strong_one_are_kept(board):
     """Thin wood has 0.42 of the amplitude of metal in H and 0.035 in V."""
     amplitudes = np.array([1.0, 0.035j, -0.42])
-    reconstruction = reconstruct(board(_kept("every second column"), amplitudes), iterations=25)
+    reconstruction = reconstruct(board(_select_kept("every second column"), amplitudes), iterations=25)
     sums = np.array([reconstruction.image[j - 1 : j + 2, i - 1 : i + 2].sum() for j, i in AT])
     np.testing.assert_allclose(sums / amplitudes, 1, atol=0.2)
 
@@ -108,16 +108,16 @@ def image_error(found, whole):
 )
 def test_the_image_with_filled_positions_is_nearer_to_that_of_the_whole_scan(scan, name, factor):
     full_image = scan(np.ones((40, 60), bool)).finish()
-    thin = scan(_kept(name))
+    thin = scan(_select_kept(name))
     filled, errors = fill_missing(thin)
     error = image_error(filled.finish(), full_image)
     assert error < image_error(thin.finish(), full_image) / factor
-    assert errors["RH"].missing_share == pytest.approx(1 - _kept(name).mean())
+    assert errors["RH"].missing_share == pytest.approx(1 - _select_kept(name).mean())
     assert error < 2 * errors["RH"].image_error
 
 
 def test_the_first_step_already_reduces_the_residual(scan):
-    _, errors = fill_missing(scan(_kept("a random quarter")[:10]), iterations=1)
+    _, errors = fill_missing(scan(_select_kept("a random quarter")[:10]), iterations=1)
     assert 0 < errors["RH"].residual < 0.9
 
 

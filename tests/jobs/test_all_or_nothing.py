@@ -64,7 +64,7 @@ def quick(monkeypatch) -> None:
         monkeypatch.setattr(exports, pack, lambda _: b"packed")
 
 
-def written(folder: Path) -> dict[str, bytes]:
+def read_visible_files(folder: Path) -> dict[str, bytes]:
     """Files that a person sees."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
@@ -77,8 +77,8 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_b
     whole_scan = Path(shutil.copytree(scan_before, tmp_path / "whole"))
     with FaultyDisk(whole_scan)() as disk:
         assert command(whole_scan) == 0
-    old = written(scan_before)
-    new = written(whole_scan)
+    old = read_visible_files(scan_before)
+    new = read_visible_files(whole_scan)
     assert old.keys() != new.keys() or old != new
     (last_rename,) = [step.split()[1] for step in disk.done if step.startswith("rename")][-1:]
     (committing,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]
@@ -89,7 +89,7 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_b
                 status = command(folder)
         except (Killed, OSError, PolysightError):
             status = 1
-        remaining = written(folder)
+        remaining = read_visible_files(folder)
         committed = remaining == new
         if status == 0:
             assert committed, (position, disk.done[position - 1])
@@ -99,4 +99,4 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_b
             # A picture may be new already, but it does not count until its file is replaced.
             assert remaining.get(committing) == old.get(committing), (position, disk.done[position - 1])
         assert command(folder) == 0, (position, disk.done[position - 1])
-        assert written(folder) == new
+        assert read_visible_files(folder) == new

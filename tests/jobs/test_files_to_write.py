@@ -32,7 +32,7 @@ def work_is_noticed(monkeypatch, tmp_path: Path) -> None:
 
     for module, name in (
         (train, "check_scenes"),
-        (train, "training_scan"),
+        (train, "load_training_scan"),
         (scans, "compare"),
         (scans, "check_scans"),
         (recordings, "inspect_bin"),

@@ -11,7 +11,7 @@ from tests.support.rigs import published_rig
 from tests.support.scenes import make_scene
 
 from polysight.cli.main import main
-from polysight.jobs.train import training_scan
+from polysight.jobs.train import load_training_scan
 from polysight.materials import Library
 from polysight.materials.train import make_entries
 from polysight.products import IMAGE
@@ -41,7 +41,7 @@ def scans(tmp_path_factory) -> list[Path]:
     return simulated_scans
 
 
-def drawn() -> list[str]:
+def list_box_options() -> list[str]:
     return [word for box in BOXES for word in ("--box", box)]
 
 
@@ -56,7 +56,7 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
         assert main(["image", str(scan), "--out", str(images)]) == 0
     # A scan folder, and products without their rows
     for folder in (first, elsewhere):
-        assert main(["label", str(folder), *drawn(), "--specimen", f"{MINE}=board 7"]) == 0
+        assert main(["label", str(folder), *list_box_options(), "--specimen", f"{MINE}=board 7"]) == 0
     assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
     answer = capsys.readouterr().out
     assert f"  {MINE}: 2 patches in 2 scans" in answer
@@ -91,10 +91,10 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
     labels.write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "reference"}), encoding="utf-8")
     assert main(["process", str(scan), "--out", str(out), "--labels", str(labels)]) == 0
     assert f"drawn as {MINE}" in (out / "report.html").read_text(encoding="utf-8")
-    assert main(["label", str(out), *drawn()]) == 0
+    assert main(["label", str(out), *list_box_options()]) == 0
     (scan / "labels.json").write_bytes((out / "labels.json").read_bytes())
-    rows = make_entries(training_scan(scan, RIG_FILE))
-    images = make_entries(training_scan(out, RIG_FILE))
+    rows = make_entries(load_training_scan(scan, RIG_FILE))
+    images = make_entries(load_training_scan(out, RIG_FILE))
     assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
     for first_item, second_item in zip(rows, images, strict=True):
         assert first_item.incidence_deg == pytest.approx(second_item.incidence_deg, abs=0.05)
@@ -105,27 +105,27 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
 def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
     spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
     scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
-    answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(training_scan(scan, RIG_FILE))]
+    answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(load_training_scan(scan, RIG_FILE))]
     assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
     assert len({specimen for _, specimen, _ in answer}) == 2
     again = simulate(published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
-    redrawn = {e.specimen for e in make_entries(training_scan(again, RIG_FILE))}
+    redrawn = {e.specimen for e in make_entries(load_training_scan(again, RIG_FILE))}
     assert not redrawn & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
-    answer = [(e.name, e.specimen) for e in make_entries(training_scan(scan, RIG_FILE))]
+    answer = [(e.name, e.specimen) for e in make_entries(load_training_scan(scan, RIG_FILE))]
     assert answer == [("tin", None), (MINE, "left")]
     boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
     with pytest.raises(DataError) as caught:
-        training_scan(scan, RIG_FILE)
+        load_training_scan(scan, RIG_FILE)
     assert all(value in str(caught.value) for value in ("labels.json", "tin", MINE, "10.0 x 20.0 mm"))
 
 
 def test_a_box_without_a_finite_ratio_is_noted(scans, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["image", str(scans[0]), "--out", str(out)]) == 0
-    assert main(["label", str(out), *drawn()]) == 0
+    assert main(["label", str(out), *list_box_options()]) == 0
     with np.load(out / IMAGE) as saved:
         arrays = dict(saved)
     # The board's half of both images is not a number.
@@ -133,6 +133,6 @@ def test_a_box_without_a_finite_ratio_is_noted(scans, tmp_path, capsys):
         arrays[channel][:, arrays["x_m"] > arrays["x_m"].mean()] = np.nan
     np.savez(out / IMAGE, **arrays)
     capsys.readouterr()
-    scan = training_scan(out, RIG_FILE)
+    scan = load_training_scan(out, RIG_FILE)
     assert [e.name for e in make_entries(scan)] == ["copper"]
     assert f"the box of {MINE} holds no pixel that can be used" in capsys.readouterr().err

@@ -14,7 +14,7 @@ MEANS = np.array([[-0.6, -2.0, 0.1], [-0.55, -1.9, 0.2], [-0.5, -2.2, 3.1], [-0.
 """ln|H|, ln|V| and arg P of five materials; two of them lie on either side of 180 degrees."""
 
 
-def drawn(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, means=MEANS):
+def draw_pixels(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, means=MEANS):
     """Pixels of every material in every scan with errors of three sources, in all three features alike."""
     rng = np.random.default_rng(seed)
     shape = (scans, len(means), pixels, 3)
@@ -36,7 +36,7 @@ def together(one, other):
 
 
 def test_the_sizes_of_the_errors_are_found():
-    models = [ErrorDiscriminant().fit(drawn(seed, scans=40)) for seed in range(6)]
+    models = [ErrorDiscriminant().fit(draw_pixels(seed, scans=40)) for seed in range(6)]
     for covariances, size in (
         ([f.within for f in models], 0.03),
         ([f.between for f in models], 0.01),
@@ -49,8 +49,8 @@ def test_the_sizes_of_the_errors_are_found():
 
 def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
     near = [[-0.6 + 0.08 * i, -2.0, 0.1] for i in range(5)]
-    model = ErrorDiscriminant().fit(drawn(0, means=near))
-    test = drawn(1, scans=1, scan=0.0, means=near)
+    model = ErrorDiscriminant().fit(draw_pixels(0, means=near))
+    test = draw_pixels(1, scans=1, scan=0.0, means=near)
     gains = np.array([1.03, 0.96]), np.exp(0.04j)
     h = test.x[:, 0] * gains[0][0]
     v = test.x[:, 1] * gains[0][1]
@@ -64,12 +64,12 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
 
 
 def test_a_phase_of_180_degrees_is_no_edge():
-    assert score(drawn(2), DISCRIMINANT).patches == 1.0
+    assert score(draw_pixels(2), DISCRIMINANT).patches == 1.0
 
 
 def test_a_patch_alone_is_named_as_before_and_scans_do_not_touch_each_other():
-    model = ErrorDiscriminant().fit(drawn(0))
-    test = drawn(3, scans=1)
+    model = ErrorDiscriminant().fit(draw_pixels(0))
+    test = draw_pixels(3, scans=1)
     for patch in np.unique(test.patches):
         of_patch = test.patches == patch
         alone = model.by_scan(test.x[of_patch], test.patches[of_patch])
@@ -79,18 +79,18 @@ def test_a_patch_alone_is_named_as_before_and_scans_do_not_touch_each_other():
 
 
 def test_known_patches_are_called_unknown_at_the_stated_rate():
-    rates = [score(drawn(seed, pixels=6), DISCRIMINANT).unknown for seed in range(12)]
+    rates = [score(draw_pixels(seed, pixels=6), DISCRIMINANT).unknown for seed in range(12)]
     assert np.mean(rates) == pytest.approx(REJECTED, abs=0.015)
 
 
 def test_probabilities_mean_what_they_say():
     """Of the patches named with confidence c, a share c is named right: five materials close to each other in |H|."""
     near = [[-0.6 + 0.02 * i, -2.0, 0.1] for i in range(5)]
-    model = ErrorDiscriminant().fit(drawn(0, scans=60, means=near))
+    model = ErrorDiscriminant().fit(draw_pixels(0, scans=60, means=near))
     sure = []
     right = []
     for seed in range(60):
-        test = drawn(100 + seed, scans=1, means=near)
+        test = draw_pixels(100 + seed, scans=1, means=near)
         verdicts = model.by_scan(test.x, test.patches)
         sure += verdicts.confidence.tolist()
         right += [name == f"m{i}" for i, name in enumerate(verdicts.names)]
@@ -99,15 +99,15 @@ def test_probabilities_mean_what_they_say():
 
 
 def test_a_material_that_was_never_learnt_is_unknown():
-    missed = score_unseen_materials(drawn(4), DISCRIMINANT)
+    missed = score_unseen_materials(draw_pixels(4), DISCRIMINANT)
     assert set(missed) == {f"m{i}" for i in range(5)}
     assert min(missed.values()) > 0.9
 
 
 def test_a_stranger_does_not_shift_the_others():
-    model = ErrorDiscriminant().fit(drawn(0))
-    test = drawn(5, scans=1)
-    strange = drawn(6, scans=1, means=[[-1.5, -3.5, 1.5]] * 3)
+    model = ErrorDiscriminant().fit(draw_pixels(0))
+    test = draw_pixels(5, scans=1)
+    strange = draw_pixels(6, scans=1, means=[[-1.5, -3.5, 1.5]] * 3)
     alone = model.by_scan(test.x, test.patches)
     joint = model.by_scan(np.concatenate([test.x, strange.x]), np.concatenate([test.patches, strange.patches + 100]))
     assert joint.names[:5].tolist() == alone.names.tolist()
@@ -132,7 +132,7 @@ def with_metal(samples, stray):
 
 
 def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
-    samples = with_metal(drawn(8), 0)
+    samples = with_metal(draw_pixels(8), 0)
     turned = samples.take(np.arange(len(samples.x))[::-1])
     model = ErrorDiscriminant().fit(samples)
     turned_model = ErrorDiscriminant().fit(turned)
@@ -144,8 +144,8 @@ def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
 @pytest.mark.parametrize("stray", [0, 5])
 def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
     """The reference has no error of its own, so its patch does not change the results of others."""
-    model = ErrorDiscriminant().fit(with_metal(drawn(8), 0))
-    test = with_metal(drawn(9, scans=1), stray)
+    model = ErrorDiscriminant().fit(with_metal(draw_pixels(8), 0))
+    test = with_metal(draw_pixels(9, scans=1), stray)
     without_metal = test.take(test.names != "metal")
     alone = model.by_scan(without_metal.x, without_metal.patches)
     beside = model.by_scan(test.x, test.patches)
@@ -154,8 +154,8 @@ def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
 
 
 def test_two_angles_are_independent_and_tell_more():
-    first_angle = drawn(0, pixel=0.1, patch=0.05)
-    two = drawn(1, pixel=0.1, patch=0.05)
+    first_angle = draw_pixels(0, pixel=0.1, patch=0.05)
+    two = draw_pixels(1, pixel=0.1, patch=0.05)
     both_angles = first_angle.join(two)
     model = ErrorDiscriminant().fit(both_angles)
     for covariance in (model.scan, model.between, model.within):
@@ -165,7 +165,7 @@ def test_two_angles_are_independent_and_tell_more():
 
 def add_lonely_material(samples, scans=1):
     """The same scans; the first few have an additional material that is unlike all others."""
-    only = drawn(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
+    only = draw_pixels(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
     names = np.full(len(only.x), "lonely")
     lonely_samples = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)
     return together(samples, lonely_samples)
@@ -174,7 +174,7 @@ def add_lonely_material(samples, scans=1):
 @pytest.mark.parametrize("model", [DISCRIMINANT, PAPER])
 def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
     """The material cannot be learnt from other scans: the accuracy is that of the others, and a note names it."""
-    some = drawn(12, scans=4, pixels=4)
+    some = draw_pixels(12, scans=4, pixels=4)
     without = score(some, model)
     beside = score(add_lonely_material(some), model)
     assert (without.not_judged, beside.not_judged) == ((), ("lonely",))
@@ -186,14 +186,14 @@ def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
 
 
 def test_a_library_says_which_materials_could_not_be_judged():
-    few = drawn(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
+    few = draw_pixels(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
     fit = fit_samples(add_lonely_material(few))
     assert (fit["materials"], fit["not_judged"]) == (4, ["lonely"])
     assert fit["pixel_accuracy"] == fit["patch_accuracy"] == 1.0
 
 
 def test_the_channels_alone_are_judged_on_the_same_materials():
-    some = drawn(0, scans=4, pixels=6)
+    some = draw_pixels(0, scans=4, pixels=6)
     without = fit_weights(some).by_channel
     beside = fit_weights(add_lonely_material(some)).by_channel
     assert [beside[c] for c in "hv"] == pytest.approx([without[c] for c in "hv"])
@@ -201,11 +201,11 @@ def test_the_channels_alone_are_judged_on_the_same_materials():
 
 def test_a_material_of_two_scans_among_many_is_judged():
     """This holds for any split of the scans into folds."""
-    assert score(add_lonely_material(drawn(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
+    assert score(add_lonely_material(draw_pixels(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
 
 
 def test_scans_without_a_common_material_are_refused():
-    samples = drawn(14, scans=5)
+    samples = draw_pixels(14, scans=5)
     disjoint = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
         score(disjoint, DISCRIMINANT)

@@ -7,13 +7,20 @@ import pytest
 from hypothesis import given, strategies as st
 
 from polysight.materials.inversion import SOURCES, RigPrior, SceneLikelihood, invert, sample_posterior, true_ratio
-from polysight.materials.kinds import Kind, Kinds, PatchMeasurement, literature, permittivity_slope, probability_of_same
+from polysight.materials.kinds import (
+    Kind,
+    Kinds,
+    PatchMeasurement,
+    compute_probability_of_same_material,
+    list_literature_kinds,
+    permittivity_slope,
+)
 from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.materials.result import ratio_error
 from polysight.polarimetry import permittivity_from_ratio
 
 THETA = np.radians(55.0)
-KINDS = Kinds(literature(), float(THETA))
+KINDS = Kinds(list_literature_kinds(), float(THETA))
 PUBLISHED = np.array([
     5.24 - 0.01j, 4.15 - 0.81j, 3.56 - 0.18j, 3.52 - 0.82j, 4.26 - 0.21j, 3.79 - 0.34j, 3.65 - 0.7j, 2.61 - 0.01j,
     4.0 - 0.4j, 3.78 - 0.7j, 4.21 - 0.3j, 4.75 - 2.43j, 5.06 - 1.11j, 7.26 - 0.85j, 4.69 - 0.7j, 4.63 - 0.31j,
@@ -230,7 +237,7 @@ def test_paint_is_an_error_of_the_reference_from_a_probability_of_a_fifth():
 def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     # The patches are of the library, which with the leakage that was measured before the turn none of them fits.
     plates = [Kind(f"plate {i}", complex(e), spread=(0.02, 0.1)) for i, e in enumerate(PUBLISHED)]
-    kinds = Kinds([*literature(), *plates], float(THETA))
+    kinds = Kinds([*list_literature_kinds(), *plates], float(THETA))
     # With 0.05 one draw of four has 0.89: two of the plates have nearly the same V / H, and count for less than two.
     prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
     turned = world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
@@ -319,7 +326,7 @@ def test_plates_of_one_foreign_material_do_not_turn_the_boards(eps):
     As six independent plates they turned the boards until they agreed with the library: 0, 67 and 0 % of regions held.
     """
     library = [Kind(f"material {i}", complex(value)) for i, value in enumerate(PUBLISHED)]
-    kinds = Kinds([*library, *literature()], float(THETA), with_sheets=True)
+    kinds = Kinds([*library, *list_literature_kinds()], float(THETA), with_sheets=True)
     plates = np.full(6, eps)
     inside = []
     for seed in range(3):
@@ -335,12 +342,12 @@ def test_plates_are_of_one_material_if_their_ratios_agree_within_their_errors():
     rng = np.random.default_rng(0)
     alike = world(rng, (0j, 0j), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
     others = world(rng, (0j, 0j), noise=0.002, eps=np.array([2.6 - 0.01j, 7.5 - 0.3j]))
-    same = probability_of_same([*alike, *others])
+    same = compute_probability_of_same_material([*alike, *others])
     assert np.diag(same) == pytest.approx(1)
     assert same == pytest.approx(same.T)
     assert same[:5, :5].min() > 0.5
     assert same[:5, 5:].max() < 1e-6
     # Leakage is common to all plates: it hardly changes which of them agree.
     leaking = world(np.random.default_rng(0), (0.05j, 0.04), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
-    assert probability_of_same(leaking) == pytest.approx(same[:5, :5], abs=0.05)
-    assert probability_of_same([]).shape == (0, 0)
+    assert compute_probability_of_same_material(leaking) == pytest.approx(same[:5, :5], abs=0.05)
+    assert compute_probability_of_same_material([]).shape == (0, 0)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from polysight.materials.kinds import HalfSpaces, Kinds, inverse_ratio, literature, permittivity_slope
+from polysight.materials.kinds import HalfSpaces, Kinds, inverse_ratio, list_literature_kinds, permittivity_slope
 from polysight.polarimetry import fresnel
 
 THETA = np.radians(55.0)
-KINDS = Kinds(literature(), float(THETA))
+KINDS = Kinds(list_literature_kinds(), float(THETA))
 
 
 @pytest.mark.parametrize("std", [0.005, 0.02, 0.06])

@@ -7,11 +7,11 @@ import pytest
 
 from polysight.materials.analyse import most_like_metal
 from polysight.materials.inversion import RigPrior
-from polysight.materials.kinds import Kinds, PatchMeasurement, literature
+from polysight.materials.kinds import Kinds, PatchMeasurement, list_literature_kinds
 from polysight.materials.metal import MetalEvidence, log_evidence_of_dielectric, metal_evidence
 
 THETA = np.radians(55.0)
-KINDS = Kinds(literature(), float(THETA))
+KINDS = Kinds(list_literature_kinds(), float(THETA))
 EPS = [
     2.6 - 0.01j, 2.05 - 0.01j, 3.78 - 0.7j, 4.0 - 0.4j, 4.54 - 0.56j, 4.69 - 0.7j, 5.06 - 1.11j, 3.52 - 0.82j,
     4.75 - 2.43j, 3.66 - 0.43j, 6.3 - 0.2j, 7.5 - 0.3j, 9.4 - 0.1j, 9.37 - 18.0j, 1.3 - 0.01j,

@@ -16,7 +16,7 @@ from polysight.materials.kinds import (
     draw_sheets,
     inverse_ratio,
     layer_odds,
-    literature,
+    list_literature_kinds,
 )
 from polysight.materials.names import Odds, add_explanation, may_be_thin, name_patch, summarise_literature, weigh_kinds
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
@@ -24,7 +24,7 @@ from polysight_shared.errors import DataError
 
 ANGLES = tuple(np.radians([55.0, 65.0]))
 LIBRARY = {"acrylic": 4.0 - 0.4j, "rubber": 5.06 - 1.11j, "wood": 2.61 - 0.01j, "glass": 7.26 - 0.85j}
-KINDS = (*(Kind(name, eps) for name, eps in LIBRARY.items()), *literature(tuple(LIBRARY)))
+KINDS = (*(Kind(name, eps) for name, eps in LIBRARY.items()), *list_literature_kinds(tuple(LIBRARY)))
 AT_ANGLES = tuple(Kinds(KINDS, angle, with_sheets=True) for angle in ANGLES)
 
 
@@ -184,7 +184,7 @@ def test_a_change_of_any_size_has_finite_odds():
 
 def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
     wood = Kind("wood", 2.6 - 0.1j)
-    kinds = Kinds([wood, *literature()], ANGLES[0], with_sheets=True)
+    kinds = Kinds([wood, *list_literature_kinds()], ANGLES[0], with_sheets=True)
     t = complex(inverse_ratio(2.6 - 0.1j, ANGLES[0]))
     evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5)
     still = name_patch((kinds,), (replace(evidence, dispersion=dispersion(np.zeros(3))),), np.array([[t]])).verdict

@@ -12,7 +12,7 @@ from polysight.materials import UNKNOWN, Classifier, match_patches, pack_patches
 from polysight_shared.errors import ErrorCode
 
 
-def named_again(found, scene, classifier, path):
+def name_from_file(found, scene, classifier, path):
     """Names of a result's patches, by number, from its file."""
     path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
     patches = read_patches(path)
@@ -25,7 +25,7 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placemen
     scene = synthetic(3)
     classifier = Classifier(library)
     analysis = name_placement(3)
-    renamed = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
+    renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
     for r in analysis.patches:
         if r.named is not None:
             assert renamed[r.patch.label].name == r.named.verdict.name
@@ -44,7 +44,7 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(
     factor = np.where(metal, 1.0, gain)
     pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
     analysis = scene.analyse(classifier=classifier, pair=pair)
-    renamed = named_again(analysis, scene, classifier, tmp_path / "patches.npz")
+    renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
     names = {r.patch.label: r.named.verdict.name for r in plain.patches if r.named is not None}
     wrong = {n: (names[n], v.name) for n, v in renamed.items() if n in names and v.name not in (names[n], UNKNOWN)}
     assert not wrong

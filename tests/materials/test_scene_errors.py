@@ -41,7 +41,7 @@ def images(h, v):
     return Images(h, v, AXIS, AXIS, np.ones(h.shape, bool))
 
 
-def dimmed(h, v):
+def dim_copper(h, v):
     """The same with copper at the end of the scan, which lights V less than H, and less towards the edge."""
     light = np.linspace(0.3, 1.0, 23)[:, None]
     h = h.copy()
@@ -53,7 +53,7 @@ def dimmed(h, v):
 
 def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
     """By the median of V / H, which differs from the root mean square by some per cent."""
-    scene = dimmed(*plates())
+    scene = dim_copper(*plates())
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     metal = metal_by_label(int(found.labels[30, 30]), found)
     relative = to_metal(scene, metal, None)
@@ -65,7 +65,7 @@ def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
 
 def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
     errors = []
-    for scene in (images(*plates()), dimmed(*plates())):
+    for scene in (images(*plates()), dim_copper(*plates())):
         found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
         known = KnownScene(segmentation=found, metal=int(found.labels[30, 30]))
         result = analyse(scene, Optics(np.radians(55.0)), known)

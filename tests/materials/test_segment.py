@@ -40,7 +40,7 @@ WEAK_AND_STRONG = {
 }
 
 
-def found_right(synthetic, seeds, **scene_facts):
+def count_right_plates(synthetic, seeds, **scene_facts):
     """Plates whose box is found within 6 mm, of all, and patches that are not plates."""
     right = extra = plates = 0
     for seed in seeds:
@@ -57,14 +57,14 @@ def found_right(synthetic, seeds, **scene_facts):
 
 def test_speckle_does_not_hide_the_plates(synthetic):
     """Noise of a fifth of metal's amplitude in each channel: two fifths of a dielectric's in H, more than all in V."""
-    right, plates, extra = found_right(synthetic, range(4), noise=0.2)
+    right, plates, extra = count_right_plates(synthetic, range(4), noise=0.2)
     assert right >= 0.85 * plates
     assert extra <= 2
 
 
 def test_weak_plates_are_found_beside_strong_ones(synthetic):
     """From metal to foam, 16 dB below it and 8 dB above the noise."""
-    right, plates, extra = found_right(synthetic, range(4), materials=WEAK_AND_STRONG, noise=0.06)
+    right, plates, extra = count_right_plates(synthetic, range(4), materials=WEAK_AND_STRONG, noise=0.06)
     assert right >= plates - 1
     assert extra <= 1
 

@@ -15,7 +15,7 @@ ANGLE = np.radians(60.0)
 KINDS = {"a": 2.2 - 0.02j, "b": 3.0 - 0.6j, "c": 4.0 - 0.3j, "d": 5.0 - 1.2j, "e": 6.5 - 0.2j, "f": 4.7 - 2.4j}
 
 
-def drawn(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True):
+def draw_pixels(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelled=True):
     """Pixels of every material in every scan, a specimen of its own in each, errors of the patch's gains and phase."""
     rng = np.random.default_rng(seed)
     eps = np.array(list(kinds.values()))
@@ -52,14 +52,16 @@ def test_the_effect_of_a_specimen_is_what_eq_2_says():
 
 
 def test_the_spread_is_found():
-    spreads = [np.sqrt(MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.2), 40, seed)).spread) for seed in range(4)]
+    spreads = [
+        np.sqrt(MODELS[DISCRIMINANT]("H+V+P").fit(draw_pixels((0.03, 0.2), 40, seed)).spread) for seed in range(4)
+    ]
     assert np.mean([f[:, 0].mean() for f in spreads]) == pytest.approx(0.03, rel=0.15)
     assert np.mean([f[:, 1].mean() for f in spreads]) == pytest.approx(0.2, rel=0.2)
 
 
 def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
     """Its patch is its mean: a residual of zero does not count."""
-    samples = drawn((0.03, 0.2), 6)
+    samples = draw_pixels((0.03, 0.2), 6)
     repeated = np.isin(samples.names, ["a", "b", "c"])
     once = ~repeated & (samples.groups == samples.groups[0])
     alone = MODELS[DISCRIMINANT]("H+V+P").fit(samples.take(repeated))
@@ -69,7 +71,7 @@ def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
 
 
 def test_without_specimens_apart_the_published_spread_stands():
-    samples = drawn((0.0, 0.0), 6, labelled=False)
+    samples = draw_pixels((0.0, 0.0), 6, labelled=False)
     np.testing.assert_allclose(
         MODELS[DISCRIMINANT]("H+V+P").fit(samples).spread, [np.square(PUBLISHED_SPREAD)] * len(KINDS)
     )
@@ -92,11 +94,11 @@ def test_the_order_of_patches_does_not_matter_to_the_spread():
 
 def test_probabilities_mean_what_they_say_of_specimens_never_seen():
     close = {"a": 4.0 - 0.4j, "b": 4.2 - 0.45j, "c": 4.45 - 0.6j, "d": 4.7 - 0.7j}
-    model = MODELS[DISCRIMINANT]("H+V+P").fit(drawn((0.03, 0.15), 40, 1, kinds=close))
+    model = MODELS[DISCRIMINANT]("H+V+P").fit(draw_pixels((0.03, 0.15), 40, 1, kinds=close))
     sure = []
     right = []
     for seed in range(40):
-        test = drawn((0.03, 0.15), 1, 100 + seed, kinds=close)
+        test = draw_pixels((0.03, 0.15), 1, 100 + seed, kinds=close)
         verdicts = model.by_scan(test.x, test.patches)
         sure += verdicts.confidence.tolist()
         right += (verdicts.names == list(close)).tolist()
@@ -130,9 +132,9 @@ def entries(samples):
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_what_the_library_lacks_gets_no_name_from_any_model(model):
-    classifier = Classifier(entries(drawn((0.01, 0.05), 12, 3)), model=model, angles_deg=[60.0])
+    classifier = Classifier(entries(draw_pixels((0.01, 0.05), 12, 3)), model=model, angles_deg=[60.0])
     strange = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
-    test = drawn((0.01, 0.05), 1, 9, kinds=strange)
+    test = draw_pixels((0.01, 0.05), 1, 9, kinds=strange)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
     assert not [n.verdict.name for n in named if n.verdict.source == "library"]
 
@@ -158,9 +160,9 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
-    samples = drawn((0.01, 0.05), 12, 3)
+    samples = draw_pixels((0.01, 0.05), 12, 3)
     classifier = Classifier(entries(samples), model=model, angles_deg=[60.0])
-    test = drawn((0.0, 0.0), 1, 4)
+    test = draw_pixels((0.0, 0.0), 1, 4)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
     whys = [
         add_explanation(n, eps, None, classifier.permittivities).verdict.why
@@ -172,8 +174,8 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
 
 def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
     """It is named for any distance, so that a person knows where to begin."""
-    classifier = Classifier(entries(drawn((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
-    x = drawn((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})
+    classifier = Classifier(entries(draw_pixels((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
+    x = draw_pixels((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})
     named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])
     permittivities = classifier.permittivities
     for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):

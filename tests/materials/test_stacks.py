@@ -4,7 +4,7 @@ import numpy as np
 from tests.support.rigs import published_rig
 
 from polysight.materials.inversion import RigPrior, invert
-from polysight.materials.kinds import Kinds, PatchMeasurement, literature
+from polysight.materials.kinds import Kinds, PatchMeasurement, list_literature_kinds
 from polysight.materials.layers import Layer, Spectrum, predict
 
 THETA_RAD = np.radians(55.0)
@@ -27,7 +27,7 @@ def test_cups_behind_glass_keep_their_ratio_and_the_measured_leakage():
         for (ratio, brightness), scatter in zip(MEASURED, SCATTER, strict=True)
     ]
     prior = RigPrior(0.003, leakage=LEAKAGE, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
-    inversion = invert(seen, prior, Kinds(literature(), THETA_RAD, with_sheets=True))
+    inversion = invert(seen, prior, Kinds(list_literature_kinds(), THETA_RAD, with_sheets=True))
     assert np.abs(np.array(inversion.leakage) - LEAKAGE).max() < 0.02
     for t, patch in zip(true, inversion.patches, strict=True):
         assert abs(patch.inverse_ratio - t) < 0.12 * abs(t)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.materials.test_specimens import KINDS, drawn
+from tests.materials.test_specimens import KINDS, draw_pixels
 
 from polysight.materials import Library, accuracy_lines
 from polysight.materials.train import fit_samples
@@ -14,7 +14,7 @@ CLOSE = {"acrylic": 4.0 - 0.4j, "resin": 4.03 - 0.405j, "rubber": 5.06 - 1.11j}
 
 @pytest.fixture(scope="module")
 def fit_of_many_specimens():
-    return fit_samples(drawn((0.03, 0.2), MANY_SCANS, seed=2))
+    return fit_samples(draw_pixels((0.03, 0.2), MANY_SCANS, seed=2))
 
 
 def advise(fit) -> str:
@@ -23,7 +23,7 @@ def advise(fit) -> str:
 
 def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_specimens():
     """They differ by 12 %, which counts as an error of placement for all materials alike."""
-    text = advise(fit_samples(drawn((0.12, 0.6), 6, seed=1, labelled=False)))
+    text = advise(fit_samples(draw_pixels((0.12, 0.6), 6, seed=1, labelled=False)))
     assert "underconfident" in text
     assert "no second specimen" in text
     assert f"scan {FREEDOM_NEEDED} more" in text
@@ -50,14 +50,14 @@ def test_a_library_of_many_specimens_needs_none_and_is_neither_over_nor_undercon
 
 
 def test_materials_that_no_number_of_specimens_separates_are_told():
-    text = advise(fit_samples(drawn((0.03, 0.2), 8, seed=3, kinds=CLOSE)))
+    text = advise(fit_samples(draw_pixels((0.03, 0.2), 8, seed=3, kinds=CLOSE)))
     assert "acrylic and resin lie" in text
     assert "rubber" not in text.split("lie")[0].splitlines()[-1]
 
 
 def test_the_freedom_of_specimens_is_counted_over_the_materials(fit_of_many_specimens):
     few_scans = 3
-    fit_of_few = fit_samples(drawn((0.03, 0.2), few_scans, seed=4))
+    fit_of_few = fit_samples(draw_pixels((0.03, 0.2), few_scans, seed=4))
     for scans, fit in ((few_scans, fit_of_few), (MANY_SCANS, fit_of_many_specimens)):
         assert fit["specimen_freedom"] == len(KINDS) * (scans - 1)
         assert np.isfinite([fit["said"], fit["right"]]).all()

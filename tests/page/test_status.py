@@ -12,7 +12,7 @@ from polysight.acquisition import STATES
 from polysight.acquisition.control import Life
 from polysight.catalogue import Program
 from polysight.page.history import PiState, notice_of_fault
-from polysight.page.status import Inputs, LifeSigns, RowSync, Shown, judge, make_snapshot
+from polysight.page.status import Inputs, LifeSigns, RowSync, ShownResults, judge, make_snapshot
 from polysight.results import Verdict
 from polysight_shared.faults import EXPLANATIONS, PiFault
 from polysight_shared.findings import Finding
@@ -35,7 +35,7 @@ def history(finished):
     return history
 
 
-def status(history, signs=LIVELY, heard=RUNNING, shown=Shown(), **more):  # noqa: B008
+def status(history, signs=LIVELY, heard=RUNNING, shown=ShownResults(), **more):  # noqa: B008
     return judge(Inputs(FOLDER, history, signs, heard, shown, **more))
 
 
@@ -133,14 +133,14 @@ def test_a_row_taken_again_is_a_warning_for_a_while(history):
 
 
 def test_an_rx_without_a_signal_is_told(history):
-    s = status(history, shown=Shown(sync={"RH": {0: RowSync(0.02, 0.004, 0, dead_rx=(3,))}}))
+    s = status(history, shown=ShownResults(sync={"RH": {0: RowSync(0.02, 0.004, 0, dead_rx=(3,))}}))
     assert s.level == "warn"
     assert "RX3 of RH gives no signal" in s.headline + s.detail
 
 
 @pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
 def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, level):
-    pictures = Shown(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})
+    pictures = ShownResults(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})
     s = status(history, shown=pictures)
     assert s.level == level
     assert bool(s.do) == (level == "warn")

@@ -230,7 +230,7 @@ def list_set_bits(data: bytes) -> list[int]:
 @given(bursts)
 def test_one_set_bit_a_pulse_at_its_place(burst):
     pulses, period_ns, width_ns = burst
-    made_burst = trigger.spi_burst(trigger.BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
+    made_burst = trigger.make_spi_burst(trigger.BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
     assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
     set_bits = list_set_bits(made_burst.data)
     assert tuple(set_bits) == made_burst.bits
@@ -245,26 +245,26 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
 
 @given(bursts, st.integers(trigger.MIN_BYTES, 65_536))
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
-    needed_bytes = len(trigger.spi_burst(trigger.BurstSpec(*burst), LARGE_BUFFER).data)
+    needed_bytes = len(trigger.make_spi_burst(trigger.BurstSpec(*burst), LARGE_BUFFER).data)
     if needed_bytes > bufsiz:
         with refused(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
-            trigger.spi_burst(trigger.BurstSpec(*burst), bufsiz)
+            trigger.make_spi_burst(trigger.BurstSpec(*burst), bufsiz)
         advised_bytes = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
         assert needed_bytes <= advised_bytes
-        trigger.spi_burst(trigger.BurstSpec(*burst), advised_bytes)
+        trigger.make_spi_burst(trigger.BurstSpec(*burst), advised_bytes)
     else:
-        assert len(trigger.spi_burst(trigger.BurstSpec(*burst), bufsiz).data) == needed_bytes
+        assert len(trigger.make_spi_burst(trigger.BurstSpec(*burst), bufsiz).data) == needed_bytes
 
 
 @pytest.mark.parametrize("width_ns", [MIN_WIDTH_NS, 499, 2001, MAX_WIDTH_NS])
 def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
     with refused(ErrorCode.VALUES_CONFLICT, "0.5..2 us"):
-        trigger.spi_burst(trigger.BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
+        trigger.make_spi_burst(trigger.BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
 
 
 def test_the_published_burst_fits_every_pi_as_it_comes():
     b = published_rig().burst
-    burst = trigger.spi_burst(trigger.BurstSpec.from_burst(b))
+    burst = trigger.make_spi_burst(trigger.BurstSpec.from_burst(b))
     assert SpiWireLines.bufsiz == trigger.DEFAULT_BUFSIZ == 4096
     assert (burst.clock_hz, len(burst.data)) == (1_000_000, 2815)
     assert [y - x for x, y in itertools.pairwise(burst.bits)] == [1500] * 15
@@ -291,7 +291,7 @@ class Controller:
         self.t = max(self.t, t_ns)
 
     def wait_edge(self, timeout_s: float) -> None: ...
-    def look_back(self, sent: int) -> None: ...
+    def count_returned(self, sent: int) -> None: ...
     def close(self) -> None: ...
 
     def transfer(self, burst: trigger.SpiBurst) -> tuple[int, int]:
@@ -412,7 +412,7 @@ def test_pulses_that_are_not_seen_are_a_fault(seen):
     posted = []
     loop = trigger.TriggerLoop(lines, posted.append, lambda: None)
     loop.arm(2, SPEC)
-    loop._take(trigger.Edge(100_000_000, 1))
+    loop._answer_edge(trigger.Edge(100_000_000, 1))
     sent, fault = posted
     assert (sent.record.pulses, fault.number) == (seen(16), PiFault.PULSES_UNSEEN)
     assert f"16 pulses sent, {seen(16)} seen" in fault.detail

@@ -227,7 +227,7 @@ def spi_rig(instrument, tmp_path):
 def start_homed(spi_rig, start):
     """Starts the program with these settings of the controller, begins a run and homes; gives both ends."""
 
-    def homed(hub=None, wire_time=True, **settings):
+    def start_and_home(hub=None, wire_time=True, **settings):
         environment = gpio.environment(
             spi_rig.pi.gpio_chip, hub, wire_time=wire_time, spi=spi_rig.pi.spi_device, **settings
         )
@@ -236,7 +236,7 @@ def start_homed(spi_rig, start):
         host.home()
         return program, host
 
-    return homed
+    return start_and_home
 
 
 @pytest.mark.slow

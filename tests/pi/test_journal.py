@@ -297,7 +297,7 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
     host = pi.host
     stop = m.EndRun(scan_id="scan", exit_status="success")
 
-    def refused_when_full(command):
+    def check_is_refused_when_full(command):
         monkeypatch.setattr(journal_module.os, "pwrite", full)
         assert host.must_refuse(command) == PiFault.JOURNAL_FULL
         monkeypatch.undo()
@@ -305,12 +305,12 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
 
     host.must_accept(host.begin())
     host.must_accept(stop)
-    refused_when_full(host.begin(last_seq=2))
+    check_is_refused_when_full(host.begin(last_seq=2))
     assert not host.ask(m.Hello()).in_run
     host.must_accept(m.Home())
     host.until_state("homed")
     host.must_accept(host.begin())
-    refused_when_full(stop)
+    check_is_refused_when_full(stop)
     assert host.ask(m.Hello()).in_run
     host.must_accept(stop)
     assert [type(e) for e in host.replay()] == [m.RunStarted, m.RunStopped] * 2

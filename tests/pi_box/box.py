@@ -130,10 +130,10 @@ class Box:
         """Wait until a login is possible; return the duration."""
         begun = time.monotonic()
 
-        def logged_in() -> bool:
+        def can_log_in() -> bool:
             return self.try_run("true", limit_s=600).returncode == 0
 
-        self.wait(logged_in, "ssh answers", BOOT_LIMIT_S)
+        self.wait(can_log_in, "ssh answers", BOOT_LIMIT_S)
         return time.monotonic() - begun
 
     def wait(self, condition: Callable[[], bool], what: str, limit_s: float = COMMAND_LIMIT_S) -> None:

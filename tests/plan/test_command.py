@@ -139,7 +139,7 @@ def scan(rig, tmp_path_factory):
     return simulate(Changes(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig), scene, folder)
 
 
-def taken_by_a_pi(scan, rig, gap_s: float) -> None:
+def add_events_of_a_pi(scan, rig, gap_s: float) -> None:
     """Add events of a Pi to the scan, with `gap_s` seconds from a row's last trigger to the next one's first."""
     facts = load_facts(scan)
     facts[0]["pi"] = {"release": "test"}
@@ -187,7 +187,7 @@ def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, read_plan):
     stage = small.stage
     ramps_s = row_motion_s(grid, stage) - (COLUMNS - 1) * grid.step_x_mm / stage.speed_mm_s
     motion_s = ramps_s + turn_s(grid, stage) + tail_s(small)
-    taken_by_a_pi(scan, rig, GAP_S)
+    add_events_of_a_pi(scan, rig, GAP_S)
     assert read_plan("--like", scan)["time_s"]["standstill"] == pytest.approx(30 * (GAP_S - motion_s))
 
 
@@ -206,7 +206,7 @@ def test_noise_is_measured_in_a_scan_with_two_antennas(tmp_path):
 
 
 def test_options_override_the_scan(scan, rig, read_plan):
-    taken_by_a_pi(scan, rig, GAP_S)
+    add_events_of_a_pi(scan, rig, GAP_S)
     values = read_plan("--like", scan, "--snr-db", "3", "--row-overhead-s", "0.5")
     assert values["position_snr_db"] == pytest.approx(3 + 12.04, abs=0.01)
     assert values["time_s"]["standstill"] == pytest.approx(15.0)

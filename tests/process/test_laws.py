@@ -15,7 +15,7 @@ def plate_mask(scan, name, rim_mm=11.0):
     return box_mask(box, scan.images.x_m, scan.images.y_m) & scan.images.valid
 
 
-def named_materials(scan):
+def name_materials(scan):
     return scan.pipeline.find_materials(
         scan.images, known_scene=KnownScene(plates=scan.plates), classifier=Classifier(Library.load(SIMULATED_LIBRARY))
     )
@@ -108,7 +108,7 @@ def test_the_set_leakage_is_recovered_from_a_known_material(image_scene, disturb
 
 def test_the_demo_scene_is_named_right_and_its_permittivities_found(image_scene):
     scan = image_scene("nine-materials")
-    names = named_materials(scan)
+    names = name_materials(scan)
     assert len(names.patches) == 9
     named = [p for p in names.patches if p.verdict is not None]
     assert [p.truth.name for p in names.patches if p.verdict is None] == ["copper"]  # the reference

@@ -270,7 +270,7 @@ def test_a_row_with_invalid_figures_is_made_again(expected: Images, kept: Path, 
     assert same(process_scan(without_raw(kept)).form_images(), expected)
 
 
-def damaged_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarray], None]) -> None:
+def damage_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarray], None]) -> None:
     """Change the words int16 [chirp and sample, 2 x RX] of every row that is read."""
     read_row = ScanFolder.read_row
 
@@ -291,7 +291,7 @@ def test_an_image_without_a_valid_pixel_is_an_error_that_names_the_board(
     def silent(board: str, words: np.ndarray) -> None:
         words *= board not in dead
 
-    damaged_raw(monkeypatch, silent)
+    damage_raw(monkeypatch, silent)
     with refused(ErrorCode.NO_DATA, " and ".join(dead)):
         if command == "image":
             image(scan, tmp_path / "out")
@@ -307,7 +307,7 @@ def test_rows_of_dead_receivers_are_kept(
     def one_rx(_: str, words: np.ndarray) -> None:
         words[:, [1, 2, 3, 5, 6, 7]] = 0
 
-    damaged_raw(monkeypatch, one_rx)
+    damage_raw(monkeypatch, one_rx)
     first = process_scan(scan)
     assert not caplog.text
     processed_again = process_scan(without_raw(scan))

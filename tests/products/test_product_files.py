@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
-from polysight.products.exports import export_folder
+from polysight.products.exports import create_export_folder
 from polysight.products.processed import read_image
 from polysight.results import to_plain
 from polysight_shared.errors import DataError, ErrorCode
@@ -67,9 +67,9 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_exports_lie_beside_their_products_by_default(tmp_path):
-    assert export_folder(tmp_path / "products", None) == tmp_path / "products-export"
-    assert export_folder(tmp_path / "products", tmp_path / "other") == tmp_path / "other"
+    assert create_export_folder(tmp_path / "products", None) == tmp_path / "products-export"
+    assert create_export_folder(tmp_path / "products", tmp_path / "other") == tmp_path / "other"
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "linked-export").symlink_to(tmp_path / "elsewhere")
     with refused(ErrorCode.PATH_OUTSIDE, "linked-export"):
-        export_folder(tmp_path / "linked", None)
+        create_export_folder(tmp_path / "linked", None)

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
-from polysight.radar.usb import UsbWords, read_words, set_up_spi, write_words
+from polysight.radar.usb import UsbWords, encode_reads, encode_spi_setup, encode_writes
 from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars import UsbChip, board as simulated
 
@@ -20,13 +20,13 @@ def usb(chip, clock) -> UsbWords:
 
 
 def test_a_word_is_selected_swapped_and_deselected():
-    assert write_words([0x1234]).hex(" ") == "80 c0 4b 80 c0 4b 11 01 00 12 34 80 c8 4b 80 c8 4b 80 c8 4b 87"
-    assert read_words(1).hex(" ") == "80 c2 4b 80 c2 4b 20 01 00 80 c8 4b 80 c8 4b 80 c8 4b 87"
+    assert encode_writes([0x1234]).hex(" ") == "80 c0 4b 80 c0 4b 11 01 00 12 34 80 c8 4b 80 c8 4b 80 c8 4b 87"
+    assert encode_reads(1).hex(" ") == "80 c2 4b 80 c2 4b 20 01 00 80 c8 4b 80 c8 4b 80 c8 4b 87"
 
 
 def test_the_clock_is_10_mhz_and_rests_low(chip, usb):
     assert chip.spi_hz == 10e6
-    assert set_up_spi().hex(" ") == "8a 97 8d 86 02 00 80 c8 4b 85"
+    assert encode_spi_setup().hex(" ") == "8a 97 8d 86 02 00 80 c8 4b 85"
     assert chip.errors == []
     usb.close()
 
@@ -43,7 +43,7 @@ def test_words_arrive_unchanged(words):
 @given(st.lists(st.integers(0, 0xFFFF), max_size=20), st.data())
 def test_a_stream_may_be_split_anywhere(words, data):
     chip = UsbChip(simulated.RadarBoard(lambda: 0.0))
-    stream = write_words(words)
+    stream = encode_writes(words)
     cut = data.draw(st.integers(0, len(stream)))
     chip.take("A", stream[:cut])
     chip.take("A", stream[cut:])
@@ -53,7 +53,7 @@ def test_a_stream_may_be_split_anywhere(words, data):
 @pytest.mark.parametrize("byte", [0, 1, 3, 4, 8])
 def test_an_invalid_stream_is_detected(chip, byte):
     """The simulated chip detects violations of the SPI protocol, so that its silence above counts."""
-    stream = bytearray(write_words([0x1234, 0x5678]))
+    stream = bytearray(encode_writes([0x1234, 0x5678]))
     stream[byte] ^= 0x09
     chip.take("A", bytes(stream))
     assert chip.errors or chip.words_written != [0x1234, 0x5678]

@@ -54,7 +54,7 @@ def write_products(folder, rows=None) -> ProcessedScan:
     )
 
 
-def drawn_text(make) -> str:
+def collect_texts(make) -> str:
     """All texts of a figure."""
     collected: list[str] = []
     plain = Axes.text
@@ -108,8 +108,8 @@ def test_reasons_of_less_weight_are_folded(tmp_path):
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
     folder = judged_products(tmp_path, "none", careless)
     with skip_rendering():
-        text = drawn_text(lambda: write_report(folder, write_products(folder)))
-    text += drawn_text(lambda: open_scan(folder).plot())
+        text = collect_texts(lambda: write_report(folder, write_products(folder)))
+    text += collect_texts(lambda: open_scan(folder).plot())
     page = unescape((folder / "report.html").read_text(encoding="utf-8"))
     for part in (text, page[page.index("<main>") :]):
         assert [word for word in RESULTS if word in part] == []

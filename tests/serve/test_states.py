@@ -17,7 +17,7 @@ from polysight.acquisition import STATES
 from polysight.acquisition.control import Life
 from polysight.catalogue import Scans
 from polysight.page.history import ScanHistory
-from polysight.page.status import Inputs, LifeSigns, Motion, Shown, make_snapshot, say
+from polysight.page.status import Inputs, LifeSigns, Motion, ShownResults, make_snapshot, make_status
 from polysight.page.watch import Versioned
 from polysight.results import Verdict
 from polysight.results.verdict import LEVELS, reason
@@ -40,7 +40,7 @@ class StillWatch:
 
     def __init__(self, folder: Path, history: ScanHistory) -> None:
         self.folder = folder
-        self.shown = Shown()
+        self.shown = ShownResults()
         self.state = Versioned(0, b"{}")
         self.motion = Versioned(0, b"{}").publish(Motion(now_s=1_800_000_000))
         self._history = history
@@ -55,7 +55,7 @@ class StillWatch:
         verdict = None
         if key.startswith("result_"):
             verdict = Verdict(key.removeprefix("result_"), (reason("care", **REASON),))  # type: ignore[arg-type]
-        status = replace(say(key, **(WORDS | words)), since_s=1.79e9)
+        status = replace(make_status(key, **(WORDS | words)), since_s=1.79e9)
         self.state = self.state.publish(replace(snapshot, status=status, verdict=verdict))
 
     def close(self) -> None:

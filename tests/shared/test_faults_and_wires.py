@@ -11,7 +11,7 @@ from tests.support.processes import HANG_S
 from tests.support.refusals import refused
 
 from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError
-from polysight_shared.faults import EXPLANATIONS, PiFault, StageError, c_header, explain
+from polysight_shared.faults import EXPLANATIONS, PiFault, StageError, explain, format_c_header
 from polysight_shared.wires import WireClient, WireEdge, WireMotion, encode, parse
 
 
@@ -23,7 +23,7 @@ def test_every_number_is_explained_and_unique():
 
 
 def test_the_firmware_header_is_the_table():
-    assert (REPO / "arduino_stage" / "stage_errors.h").read_text() == c_header()
+    assert (REPO / "arduino_stage" / "stage_errors.h").read_text() == format_c_header()
 
 
 big = st.integers(-(2**60), 2**60)

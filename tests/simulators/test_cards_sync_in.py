@@ -25,7 +25,7 @@ def pulses(times: list[int]) -> list[Pulse]:
 def test_frames_never_start_closer_than_the_radar_can_and_every_other_pulse_is_counted(gaps: list[int]) -> None:
     times = list(np.cumsum(gaps, dtype=int))
     sync = SyncInput(RIG)
-    started = sync.frames(pulses(times))
+    started = sync.select_starting(pulses(times))
     assert all(b.t_ns - a.t_ns >= DEAD_NS for a, b in pairwise(started))
     assert len(started) + sync.too_soon == len(times)
 
@@ -70,7 +70,7 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
         for answer, true in zip(offsets_mm, row_offsets_mm(radar, row), strict=True):
             np.testing.assert_allclose(answer, true, atol=1e-3)
         first = index * row.points * RIG.burst.pulses
-        assert [p.number for p in track.places(sent)] == list(range(first, first + len(sent)))
+        assert [p.number for p in track.number_by_plan(sent)] == list(range(first, first + len(sent)))
 
 
 def make_burst_at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
@@ -90,5 +90,5 @@ def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column:
     first = (row * RIG.grid.columns + point) * RIG.burst.pulses
     track = StageTrack(RIG)
     for base_ns in (0, 10**11):
-        numbered = track.places(make_burst_at_point(track, row, column, t_ns + base_ns))
+        numbered = track.number_by_plan(make_burst_at_point(track, row, column, t_ns + base_ns))
         assert [p.number for p in numbered] == list(range(first, first + RIG.burst.pulses))

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from polysight_simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, message
+from polysight_simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, make_message
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
 ENDS = {Status.RECORD_COMPLETED, Status.NO_LVDS_DATA}
@@ -56,7 +56,7 @@ class AnyUse(RuleBasedStateMachine):
         if ends:
             assert self.received == self.given, "bytes lost or invented"
             assert statuses
-            assert outputs[-1] in [Message(message(0x0A, s).payload) for s in ENDS]
+            assert outputs[-1] in [Message(make_message(0x0A, s).payload) for s in ENDS]
             assert sum(s < self.payload for s in self.sizes) <= 1, "more than one short packet in a record"
             assert all(s == self.payload for s in self.sizes[:-1])
             self.recording = False
@@ -80,14 +80,14 @@ class AnyUse(RuleBasedStateMachine):
     @rule()
     def stop(self) -> None:
         outputs = self.card.command(request(0x06), self.now)
-        assert outputs[0] == message(0x06, 0)
+        assert outputs[0] == make_message(0x06, 0)
         self.compare(outputs[1:], self.recording)
 
     @rule(n=st.integers(0, 9000))
     def data(self, n: int) -> None:
         fresh = ((np.arange(n) + self.next_byte) % 251).astype(np.uint8)
         self.next_byte += n
-        outputs = self.card.lvds(fresh, self.now)
+        outputs = self.card.process_lvds(fresh, self.now)
         if self.recording and self.suits:
             self.given += fresh.tobytes()
             self.last_data = self.now
@@ -109,7 +109,7 @@ class AnyUse(RuleBasedStateMachine):
     @rule(body=st.sampled_from(["01010102031e", "01020102031e", "c005350c0000", "0101", ""]))
     @precondition(lambda self: not self.recording)
     def configure(self, body: str) -> None:
-        assert self.card.command(request(0x03, bytes.fromhex(body)), self.now) == [message(0x03, 0)]
+        assert self.card.command(request(0x03, bytes.fromhex(body)), self.now) == [make_message(0x03, 0)]
         if body == "01010102031e":
             self.suits = True
         elif body == "01020102031e":
@@ -118,7 +118,9 @@ class AnyUse(RuleBasedStateMachine):
     @rule(size=st.sampled_from([48, 1000, 1470, 1472]), ticks=st.integers(0, 5000))
     @precondition(lambda self: not self.recording)
     def pace(self, size: int, ticks: int) -> None:
-        assert self.card.command(request(0x0B, struct.pack("<HHH", size, ticks, 0)), self.now) == [message(0x0B, 0)]
+        assert self.card.command(request(0x0B, struct.pack("<HHH", size, ticks, 0)), self.now) == [
+            make_message(0x0B, 0)
+        ]
         self.payload = min(size, 1470) - 14
         assert self.card.packet_delay_s == ticks * 8e-9
 
@@ -127,7 +129,7 @@ class AnyUse(RuleBasedStateMachine):
         if power:
             self.card.power_cycle()
         else:
-            assert self.card.command(request(0x01), self.now) == [message(0x01, 0)]
+            assert self.card.command(request(0x01), self.now) == [make_message(0x01, 0)]
         self.recording = False
         self.suits = True
         self.payload = 1456

@@ -24,11 +24,11 @@ from polysight.jobs.scans import drop_raw, find_processed_digests
 from polysight.products import REPORT, making_products, write_json
 from polysight.results import NoResult
 from polysight.settings import DEFAULT
-from polysight.store import locked_samples
+from polysight.store import lock_samples
 from polysight.store.logs import AppendFile
 from polysight.store.raw import drop, find_droppable, require_raw
 from polysight.store.scan_folder import MANIFEST, ScanFolder, dropped_files
-from polysight.store.validation import damaged_rows
+from polysight.store.validation import find_damaged_rows
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 
 ROWS = 4
@@ -124,7 +124,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
         elif what == "being made":
             other_items.enter_context(making_products(scan / "products", ScanFolder.load(scan).scan_id))
         elif what == "being processed":
-            other_items.enter_context(locked_samples(ScanFolder.load(scan)))
+            other_items.enter_context(lock_samples(ScanFolder.load(scan)))
             named = "rows.jsonl"
         elif what == "sample":
             flip(samples / "RH.npy", row=2)
@@ -257,7 +257,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
     }
     assert missing_files <= set(dropped_files(remaining))
     assert errors(scan) == []
-    assert damaged_rows(remaining) == {}
+    assert find_damaged_rows(remaining) == {}
     drop(ScanFolder.load(scan), digests, scan / "products")
     assert not payloads(scan)
     assert errors(scan) == []

@@ -9,7 +9,7 @@ from tests.support.rigs import published_rig
 from polysight.store.open import open_source
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
-from polysight_simulators.scene import SimulatedRig, decode_scene, lost_bytes, simulate
+from polysight_simulators.scene import SimulatedRig, decode_scene, find_lost_bytes, simulate
 
 RIG = published_rig()
 RAW = {
@@ -32,7 +32,7 @@ def test_a_simulated_scan_folder_is_whole(tmp_path: Path, loss: float) -> None:
     for row in scan.plan:
         for board in ("RH", "RV"):
             data = scan.read_row(board, row.index)
-            assert data.missing == lost_bytes(radar, board, row)
+            assert data.missing == find_lost_bytes(radar, board, row)
             assert data.payload.size == data.frames_expected * 4096
 
 

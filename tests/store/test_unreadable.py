@@ -48,7 +48,7 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypa
     )
     monkeypatch.setattr(Path, "read_bytes", lambda path: raise_for_bad(path) or path_read(path))
     with refused(ErrorCode.FILE_UNREADABLE, os.strerror(error_number)) as e:
-        validation.damaged_rows(scan)
+        validation.find_damaged_rows(scan)
     assert f"polysight resume {undisturbed_scan.path}" in e.value.remedy
     assert [f.where for f in validation.validate(undisturbed_scan.path)] == [
         str(bad.relative_to(undisturbed_scan.path))
@@ -66,7 +66,7 @@ def test_row_whose_file_is_gone_is_taken_again(undisturbed_scan, monkeypatch):
         return path_open(path, *arguments, **options)
 
     monkeypatch.setattr(Path, "open", open_unless_missing)
-    assert list(validation.damaged_rows(scan)) == [1]
+    assert list(validation.find_damaged_rows(scan)) == [1]
 
 
 def list_operations_that_need_space(samples: Samples, folder: Path, disk_of: str) -> list[int]:

@@ -44,7 +44,7 @@ def scan(undisturbed_scan, tmp_path) -> ScanFolder:
     return ScanFolder.load(undisturbed_scan.copy(tmp_path / "copy").path)
 
 
-def committed_as(scan: ScanFolder, file: str) -> None:
+def commit_first_row_as(scan: ScanFolder, file: str) -> None:
     """Commit the first row once more, with its first board's payload in this file."""
     fact = next(f for f in load_facts(scan, "row_committed") if f["row"] == 0)
     name = next(iter(fact["boards"]))
@@ -58,7 +58,7 @@ def committed_as(scan: ScanFolder, file: str) -> None:
 def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
     victim = scan.path.parent / "victim.bin"
     victim.write_bytes(b"mine")
-    committed_as(scan, file)
+    commit_first_row_as(scan, file)
     for use in (scan.committed_rows, lambda: list(scan.rows()), lambda: find_droppable(scan, {})):
         with refused(ErrorCode.PATH_OUTSIDE):
             use()
@@ -207,7 +207,7 @@ def test_nothing_is_written_through_a_link(write, tmp_path):
     assert victim.read_bytes() == b"mine"
 
 
-def begun_with(scan: ScanFolder, **answer: object) -> Path:
+def rewrite_first_line(scan: ScanFolder, **answer: object) -> Path:
     """The scan's folder, with a changed first line of its manifest."""
     first, *rest = (scan.path / "manifest.jsonl").read_bytes().splitlines(keepends=True)
     fact = {**manifest.decode_line(first.rstrip()), **answer}
@@ -219,7 +219,7 @@ def begun_with(scan: ScanFolder, **answer: object) -> Path:
 def test_calibration_outside_the_scan_is_not_read(scan, file):
     answer = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
     with refused(ErrorCode.PATH_OUTSIDE):
-        calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=answer)))
+        calibration_of_scan(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
@@ -227,7 +227,7 @@ def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
     with refused(ErrorCode.PATH_OUTSIDE):
         calibration_of_scan(
             ScanFolder.load(
-                begun_with(scan, instrument={**rig, "calibration": {"hpf": "/etc/passwd"}}, calibration=None)
+                rewrite_first_line(scan, instrument={**rig, "calibration": {"hpf": "/etc/passwd"}}, calibration=None)
             )
         )
 
@@ -235,7 +235,7 @@ def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
 @pytest.mark.parametrize("answer", ["text", ["a"], {"hpf": "a"}, {"hpf": {"file": 3}}])
 def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
     with refused(ErrorCode.FILE_DAMAGED, "manifest.jsonl"):
-        calibration_of_scan(ScanFolder.load(begun_with(scan, calibration=answer)))
+        calibration_of_scan(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
 
 
 def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):

@@ -84,11 +84,11 @@ def processor(source: Source) -> ProcessMangled:
         images = pipeline.form_images()
         return pipeline, images, pipeline.examine(images)
 
-    def cached(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
+    def process_once(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
         if mangle is not None:
             return make(mangle, of)
         if of not in done:
             done[of] = make(None, of)
         return done[of]
 
-    return cached
+    return process_once

@@ -40,7 +40,7 @@ def _errors(aligned, df, phase):
     return f - f.mean(axis=1, keepdims=True), np.angle(turns / turns.mean(axis=1, keepdims=True))
 
 
-def _bound(signal, snr_db):
+def _compute_bounds(signal, snr_db):
     """Cramer-Rao bounds of frequency and phase offset of a known waveform in white noise."""
     inside = signal[..., slice(*LINEAR)]
     n = np.arange(inside.shape[-1]) - CENTRE
@@ -60,7 +60,7 @@ def test_offsets_are_at_the_cramer_rao_bound(burst, snr_db, echo):
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
     assert aligned.good.all()
     mean_factor = np.sqrt(CHIRPS / (CHIRPS - 1))  # the mean was taken out of the errors
-    for error, bound in zip(_errors(aligned, df, phase), _bound(signal, snr_db), strict=True):
+    for error, bound in zip(_errors(aligned, df, phase), _compute_bounds(signal, snr_db), strict=True):
         assert error.std() * mean_factor < 1.1 * bound
         assert error.std() * mean_factor > 0.9 * bound
 
@@ -80,7 +80,7 @@ def test_at_low_snr_there_are_no_gross_errors_and_half_the_error_of_division(bur
     f, _ = _errors(align_row(frames, np.ones(df.shape, bool), LINEAR), df, phase)
     bin_ = 1 / 192
     assert np.abs(f).max() < bin_ / 2
-    assert np.abs(f).max() < 8 * _bound(signal, snr_db)[0]
+    assert np.abs(f).max() < 8 * _compute_bounds(signal, snr_db)[0]
     divided = _divide_by_first(frames) - df
     divided -= np.median(divided, axis=1, keepdims=True)
     small = np.abs(divided) < bin_ / 2  # without its gross errors

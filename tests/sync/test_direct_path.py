@@ -364,11 +364,11 @@ def test_the_compiled_search_is_never_given_more_blocks_than_it_has_room_for(rig
     blocks_searched = []
     find = type(compiled).find
 
-    def watched(self, halves, **arguments):
+    def find_and_note(self, halves, **arguments):
         blocks_searched.append(halves.shape[-1])
         return find(self, halves, **arguments)
 
-    monkeypatch.setattr(type(compiled), "find", watched)
+    monkeypatch.setattr(type(compiled), "find", find_and_note)
     rng = np.random.default_rng(0)
     for linear in ((0, 192), (0, 1024), (0, 1200)):
         chirp = msgspec.structs.replace(

@@ -21,7 +21,7 @@ from polysight.acquisition.control import (
 )
 from polysight.acquisition.pi_client import PiClient, RefusedError
 from polysight.acquisition.progress import OnProgress, OnRow, ScanProgress, ScanResult, time_left, typical_row_s
-from polysight.acquisition.ready import make_begin_run, make_ready, stage_differences
+from polysight.acquisition.ready import list_stage_differences, make_begin_run, make_ready
 from polysight.acquisition.row import FaultKind
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.acquisition.states import BADGES, STATES, Button, StateLevel

@@ -1,4 +1,4 @@
-"""At which pulse each frame of a row was taken, by the times at which its packets came (docs/spec/row.md).
+"""Find the pulse of each frame of a row, from the times at which its packets came (docs/spec/row.md).
 
 A record says how many frames a radar sent, not at which pulses: a missed SYNC_IN pulse, a spurious edge and bytes that
 the card dropped unnoticed leave no other trace. Arrival times do. The packets of one frame come together, as a *train*
@@ -400,7 +400,7 @@ def _predict_arrivals(
     widths = residual[sharing - 1 :] - residual[: residual.size - sharing + 1]
     narrowest = int(np.argmin(widths))
     if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
-        raise _DisturbedError("the delays of the bursts differ too much to tell their pulses apart")
+        raise _DisturbedError("the delays of the bursts differ too much to distinguish their pulses")
     # Of the bursts that agree, the quickest one counts: slower ones were delayed.
     pulses = pulses_ns.reshape(-1)
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]

@@ -165,7 +165,7 @@ def describe_pi(hello: HelloReply) -> PiDescription:
     return PiDescription(hello.pi_release, hello.firmware, hello.backend, hello.stage)
 
 
-def stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
+def list_stage_differences(stage: Stage, hello: HelloReply) -> list[str]:
     """List the keys of `[stage]` that place rows and differ on the Pi, with both values; [] if it reports none."""
     settings = stage.placement_settings
     return [
@@ -181,7 +181,7 @@ def check_same_stage(stage: Stage, hello: HelloReply, source: str) -> list[str]:
     Returns a warning if the Pi's release does not report its `[stage]`. Raises ScanError with both values of each key
     that differs.
     """
-    if differing := stage_differences(stage, hello):
+    if differing := list_stage_differences(stage, hello):
         raise ScanError(
             f"host and Pi place rows differently: {'; '.join(differing)}",
             f"the rig file of the Pi is not that of {source}; rows of both would be two coordinate systems in one scan",

@@ -33,10 +33,10 @@ from polysight.acquisition.ready import (
     check_disk,
     check_same_stage,
     describe_pi,
+    list_stage_differences,
     make_begin_run,
     make_ready,
     measure_lost_steps,
-    stage_differences,
 )
 from polysight.acquisition.row import (
     ON_REQUEST,
@@ -63,8 +63,8 @@ from polysight.store import (
     ScanPaused,
     ScanResumed,
     check_same_scan,
-    damaged_rows,
     extract_connection,
+    find_damaged_rows,
     new_scan_id,
     read_events,
     utc_now,
@@ -148,7 +148,7 @@ class RunningScan:
                 self._write_radar_report({})
                 self._record_rows(events)
                 self._check_lost_steps()
-                self._end(begun)
+                self._end_scan(begun)
                 events.sync()
         except BaseException as e:
             self._fail(e, begun)
@@ -179,9 +179,10 @@ class RunningScan:
                 # The first error is the one to report.
                 with suppress(PolysightError):
                     self._pi.come_to_rest(self.result.reason)
-            # If `_end` failed itself, the manifest gets a second `scan_ended`, with its error: the last one counts.
+            # If `_end_scan` failed itself, the manifest gets a second `scan_ended`, with its error; readers use the
+            # last one.
             with suppress(PolysightError):
-                self._end(begun)
+                self._end_scan(begun)
 
     def _warn_of_lost_events(self, events: list[AnyEvent]) -> None:
         """Warn if the Pi's journal is shorter than the scan's event log."""
@@ -197,7 +198,7 @@ class RunningScan:
         """Record every missing row, in order."""
         todo = [row for row in self._plan if row.index not in self._committed]
         check_disk(self._scan.path, self._instrument, len(todo))
-        takes = takes_so_far(self._scan)
+        takes = find_last_takes(self._scan)
         taker = RowTaker(
             instrument=self._instrument,
             rig=self._rig,
@@ -249,7 +250,7 @@ class RunningScan:
         for number in range(first_take, last_take + 1):
             transaction = RowTransaction(self._follow_state)
             try:
-                take = self._take(row, number, taker, transaction)
+                take = self._take_row(row, number, taker, transaction)
                 if take is None:
                     transaction.change_state(RowState.STOPPED)
                     return
@@ -270,7 +271,7 @@ class RunningScan:
             self.result.retakes += 1
             self._notify("retake", f"row {row.index} is taken again: {join_faults(faults)}")
 
-    def _take(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
+    def _take_row(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
         """Wait until the row may begin, and record it; return None if asked to stop before it began."""
         check_disk(self._scan.path, self._instrument, 1)
         if not self._wait_while_paused() or not self._wait_for_processing():
@@ -360,7 +361,7 @@ class RunningScan:
             self._notify("warning", f"row {row} is kept incomplete: {join_faults(faults)}")
         return True
 
-    def _end(self, begun: bool) -> None:
+    def _end_scan(self, begun: bool) -> None:
         """Add `scan_ended` to the manifest and end the Pi's run."""
         status = self.result.exit_status
         reason = self.result.reason
@@ -451,7 +452,7 @@ class RunningScan:
         self._notify("state", "")
 
 
-def takes_so_far(scan: ScanFolder) -> dict[int, int]:
+def find_last_takes(scan: ScanFolder) -> dict[int, int]:
     """Return the highest take number of every row that was begun, so that none is used twice."""
     begun = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
     events = read_events(scan.path / EVENTS).events
@@ -571,7 +572,7 @@ def resume_scan(
             warnings = check_same_stage(scan.instrument.stage, hello, f"{folder}")
         else:
             # The scan began without the Pi's stage settings, which placed its rows: a difference is only a warning.
-            differences = stage_differences(scan.instrument.stage, hello)
+            differences = list_stage_differences(scan.instrument.stage, hello)
             warnings = [f"not compared when the scan began: {d}" for d in differences]
         # Addresses and limits, for the manifest; with `scan.reload` they are in `scan.instrument`.
         connection = None
@@ -610,7 +611,7 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
     rows = scan.committed_rows()
     if progress is not None:
         progress(ScanProgress("check", f"comparing {len(rows)} committed rows with their digests", scan.plan.rows, 0))
-    damaged = damaged_rows(scan)
+    damaged = find_damaged_rows(scan)
     for row, faults in damaged.items():
         writer.append(RowWithdrawn(row=row, take=rows[row].take, reasons=faults, withdrawn_utc=utc_now()))
     scan.reload()

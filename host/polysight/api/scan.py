@@ -38,7 +38,7 @@ from polysight.products import (
     surface_dataset,
     write_netcdf,
 )
-from polysight.results import PatchFigures, Verdict, declared_figures
+from polysight.results import PatchFigures, Verdict, list_declared_figures
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder, Source, open_source
 from polysight_shared.config import Instrument, load_instrument
@@ -678,7 +678,7 @@ class Processing:
 
 def patch_table(scan: ProcessedScan) -> str:
     """Return the patches as an HTML table: the figures that reports show."""
-    figures = [figure for figure in declared_figures(PatchFigures) if figure.column.title]
+    figures = [figure for figure in list_declared_figures(PatchFigures) if figure.column.title]
     lines = ["<tr><th>patch</th><th>name</th><th>permittivity</th>"]
     lines += [f"<th>{escape(figure.column.title)}</th>" for figure in figures]
     for patch in scan.segments:

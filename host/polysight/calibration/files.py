@@ -472,11 +472,11 @@ class Calibration:
             plane = self.reference()
             name = str(self.path("metal"))
         if plane is not None:
-            plane.check_rig(self.imaged_with(rig), name)
+            plane.check_rig(self.describe_imaging(rig), name)
             plane.check_bands(bands, name)
         return plane
 
-    def imaged_with(self, placed: Instrument) -> ImagedWith:
+    def describe_imaging(self, placed: Instrument) -> ImagedWith:
         """Return the settings that the gains of images depend on; `placed` is a rig that :meth:`rig` returned."""
         return ImagedWith.from_rig(placed, self.high_passes(placed))
 
@@ -575,7 +575,7 @@ def load_checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
     placed = calibration.rig(rig)
     reference = calibration.reference()
     if reference is not None:
-        reference.check_rig(calibration.imaged_with(placed), str(calibration.path("metal")))
+        reference.check_rig(calibration.describe_imaging(placed), str(calibration.path("metal")))
         grid = image_grid(placed)
         reference.check_axes(grid.x_m, grid.y_m)
     for kind, file in calibration.files().items():

@@ -327,7 +327,7 @@ def read_pcap(path: Path) -> Iterator[Datagram]:
     DataError
         if the file is not a packet capture of an Ethernet interface, or ends within a packet.
     """
-    # Here, because it loads a hundred protocols.
+    # Imported here, because dpkt loads a hundred protocols.
     import dpkt
 
     try:
@@ -422,7 +422,7 @@ def _select_from_card(path: Path, card_address: str) -> tuple[CardReport, list[D
         if card.address not in ("", datagram.source[0]):
             raise DataError(
                 f"{path}: holds packets of {card.address} and {datagram.source[0]}",
-                "several cards were recorded at once",
+                "several cards were recorded together",
                 f"choose one: --card {card.address}",
                 code=ErrorCode.VALUES_CONFLICT,
             )

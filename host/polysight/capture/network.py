@@ -140,7 +140,7 @@ def read_granted_bytes(sock: socket.socket) -> int:
     return size
 
 
-def kernel_drops(sock: socket.socket) -> int:
+def count_kernel_drops(sock: socket.socket) -> int:
     """Return the number of packets that the kernel dropped at this socket; 0 if the system does not report it."""
     try:
         return struct.unpack("9I", sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 36))[_MEMINFO_DROPS]

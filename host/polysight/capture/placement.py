@@ -1,13 +1,13 @@
-"""Which packets are a row, and where each byte belongs: the whole decision (docs/spec/placement.md).
+"""Decide which packets are a row, and where each byte belongs (docs/spec/placement.md).
 
 A *record* is one recording of a card, normally that of one row of the scan. A card numbers every byte that it sends:
 each packet has a byte count and a sequence number, its *counters*. If the counters of the row's first byte, the
 *start*, are known, each packet's place follows from its counters alone. Packets with earlier counters are left over
-from an earlier record, packets elsewhere are of another record.
+from an earlier record; packets whose counters do not fit the start belong to another record.
 
 A card may drop bytes before it numbers them, and a radar may miss or add a frame. Only the length of the record shows
 that. So a row is *located* if its start is known and its record ends where it must. A row that is not located is masked
-as a whole; data is original or masked, never guessed.
+as a whole. Every byte of a row is original or masked, never guessed.
 
 The start of a record is known after one whose start and end are certain, and after a reset by the host (`Past`). After
 any other record the host has to reset the card.
@@ -201,10 +201,10 @@ def place_record(
     holes = _merge([*_find_gaps(row.covered, row.extent), *row.conflicts])
     missing = _merge([*holes, (row.extent, log.expected)])
     if cause.text:
-        out = row.bytes(holes)
+        out = row.fill_row(holes)
         masked = _merge([(0, log.expected)])
     else:
-        out = row.bytes(missing)
+        out = row.fill_row(missing)
         masked = missing
     placed = Placed(
         expected=log.expected,
@@ -308,9 +308,9 @@ def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
     # only if the row began far from there. They come after the row's first packet.
     after_restart = np.zeros_like(is_of_row)
     if start.byte_count > 2 * expected and is_of_row.any():
-        counts_anew = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
-        is_behind = np.arange(log.count) > int(np.argmax(is_of_row))
-        after_restart = counts_anew & is_behind & ~is_early & ~is_of_row
+        counts_again = (log.byte_counts == full_payload * (log.sequences - 1)) & (log.byte_counts < expected)
+        is_after_first = np.arange(log.count) > int(np.argmax(is_of_row))
+        after_restart = counts_again & is_after_first & ~is_early & ~is_of_row
     return _Record(
         start=start,
         offsets=offsets,
@@ -378,8 +378,8 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
     # A card that restarts within the row begins with its first counters again, and never counts to the row's end. If
     # the row began with them, too, the same counters come twice.
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
-    counted_anew = row.counts.restarted > 0 and not record.ends_as_planned
-    if counted_anew or (record.start == SWITCHED_ON and counted_twice):
+    counted_again = row.counts.restarted > 0 and not record.ends_as_planned
+    if counted_again or (record.start == SWITCHED_ON and counted_twice):
         return _Doubt("the card restarted within it")
     # A second card may also send packets at places that are missing of the first, so no packet is certain.
     if row.counts.conflicting >= MIN_PACKETS_OF_A_RECORD:
@@ -425,8 +425,8 @@ def _count_packets(
     leftover = is_unplaced & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.after_restart))
     restarted = is_unplaced & record.after_restart & ~leftover
     is_unplaced &= ~(leftover | restarted)
-    behind_the_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
-    is_outside = is_unplaced & (record.of_row | record.beyond | behind_the_row)
+    after_the_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
+    is_outside = is_unplaced & (record.of_row | record.beyond | after_the_row)
     return PacketCounts(
         placed=int(placed.sum()),
         duplicates=int(duplicate.sum()),
@@ -541,8 +541,8 @@ class _Row:
         is_new = np.diff(reached, prepend=0) > 0
         return np.column_stack([self._log.arrivals_ns[is_new], reached[is_new]])
 
-    def bytes(self, holes: list[Gap]) -> Bytes:
-        """Return the row, zero at the `holes`: a view of the log if it came whole and in order, otherwise a copy.
+    def fill_row(self, holes: list[Gap]) -> Bytes:
+        """Return the row, zero at the `holes`: a view of the log if it came completely and in order, otherwise a copy.
 
         In a copy the holes are zeroed, never in the log's payload, which is stored as evidence.
         """

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from polysight.capture import receiver as messages
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, PacketLog, Status
-from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, kernel_drops
+from polysight.capture.network import BatchReceiver, bind_udp, count_kernel_drops, enlarge_receive_buffer
 from polysight.capture.placement import Evidence, Past, Preview, place_record, preview
 from polysight.capture.receiver import take_core, take_priority
 from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
@@ -192,7 +192,7 @@ class Receiver:
         self._row = row = _Row(request, segment, log, self._past)
         row.stale = strays.count + strays.malformed
         row.strangers = self._batches.strangers
-        row.drops = kernel_drops(self._socket)
+        row.drops = count_kernel_drops(self._socket)
         return messages.Began(row.stale)
 
     def _discard(self) -> None:
@@ -228,18 +228,23 @@ class Receiver:
         for n in self._batches.receive_all():
             self._log(row, self._batches, n)
         self._row = None
-        begun = row.request
+        begin_request = row.request
         log = row.log
         path = Path(row.request.path)
         # Names of the status bits by which the card reports data lost before its packets were numbered.
         loss_bits = (Status(request.card_status) & LOST_BEFORE_PACKETS).name or ""
         not_before_ns = max(request.not_before_ns, row.not_before_ns)
-        evidence = Evidence(begun.expected_bytes, begun.frame_bytes, not_before_ns, loss_bits, row.past)
-        placed, payload = place_record(log, begun.frame_bytes, row.past, not_before_ns, loss_bits)
+        evidence = Evidence(begin_request.expected_bytes, begin_request.frame_bytes, not_before_ns, loss_bits, row.past)
+        placed, payload = place_record(log, begin_request.frame_bytes, row.past, not_before_ns, loss_bits)
         self._past = placed.past
         self._memory = log.payload
         crc = row.segment.finish(payload)
-        facts = {"row": begun.row, "take": begun.take, **placed.facts(), "card_status": request.card_status}
+        facts = {
+            "row": begin_request.row,
+            "take": begin_request.take,
+            **placed.facts(),
+            "card_status": request.card_status,
+        }
         index_crc = write_index(path.with_suffix(".idx"), facts, placed.arrivals)
         arrivals = placed.arrivals
         first_arrival_ns = 0
@@ -248,8 +253,8 @@ class Receiver:
             first_arrival_ns = int(arrivals[0, 0])
             last_arrival_ns = int(arrivals[-1, 0])
         return messages.RowCapture(
-            row=begun.row,
-            take=begun.take,
+            row=begin_request.row,
+            take=begin_request.take,
             expected=placed.expected,
             bytes=placed.received,
             missing=placed.missing,
@@ -259,7 +264,7 @@ class Receiver:
             losses=placed.losses,
             strangers=self._batches.strangers - row.strangers,
             stale=row.stale,
-            kernel_drops=kernel_drops(self._socket) - row.drops,
+            kernel_drops=count_kernel_drops(self._socket) - row.drops,
             first_arrival_ns=first_arrival_ns,
             last_arrival_ns=last_arrival_ns,
             crc32=crc,

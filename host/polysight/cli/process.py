@@ -22,12 +22,12 @@ from polysight.cli.options import (
 from polysight.settings import Settings, path_text
 from polysight_shared.config import MAX_IMAGE_MM, MAX_PIXEL_MM, MAX_PIXELS, MIN_PIXEL_MM
 
-_shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <= 1000)
+_parse_shift = number(float, "a shift of at most 1000 mm", lambda value: abs(value) <= 1000)
 _search_range = number(float, "a length of 0.5 to 100 mm", lambda value: 0.5 <= value <= 100)
 _millimetres = number(float, "a length above 0, at most 50 mm", lambda value: 0 < value <= 50)
 _radius = number(float, "a radius of 50 to 500 mm", lambda value: 50 <= value <= 500)
 _turn = number(float, "angles of at most 360 degrees, as 0,30,60", lambda value: abs(value) <= 360)
-_degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
+_parse_degrees = number(float, "`one`, `pixel` or an angle of 5 to 80 degrees", lambda value: 5 <= value <= 80)
 
 
 def _parse_angles(text: str) -> tuple[float, ...]:
@@ -38,14 +38,14 @@ def _parse_angles(text: str) -> tuple[float, ...]:
 def _parse_axis(text: str) -> tuple[float, float]:
     """Parse x and z of a turntable's axis, millimetres, separated by a comma."""
     x, _, z = text.partition(",")
-    return _shift(x), _shift(z)
+    return _parse_shift(x), _parse_shift(z)
 
 
 def _parse_incidence(text: str) -> str | float:
     """Parse `one`, `pixel`, or degrees."""
     if text in ("one", "pixel"):
         return text
-    return _degrees(text)
+    return _parse_degrees(text)
 
 
 def process_settings(args: argparse.Namespace, data: Path) -> Settings:
@@ -177,7 +177,7 @@ def add_commands(add: Add) -> None:
     _add_data(sub)
     sub.add_argument(
         "--depth",
-        type=_shift,
+        type=_parse_shift,
         default=0.0,
         metavar="MM",
         help="shift of the imaged plane, away from the rig (default: 0)",

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.acquisition import RefusedError, StopRequest, make_begin_run, make_ready, stage_differences
+from polysight.acquisition import RefusedError, StopRequest, list_stage_differences, make_begin_run, make_ready
 from polysight.calibration import load_checked_calibration
 from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
 from polysight.doctor.context import (
@@ -254,7 +254,7 @@ def check_pi(context: CheckContext) -> Finding:
             "install the same release on both: `make pi-install HOST=...`",
             **facts,
         )
-    if differing := stage_differences(context.rig.stage, hello):
+    if differing := list_stage_differences(context.rig.stage, hello):
         return error(
             f"{observed}; {'; '.join(differing)}",
             "host and Pi have different rig files, so the Pi would refuse a scan",
@@ -321,13 +321,13 @@ def _run_row(context: CheckContext) -> RowFinished:
     try:
         make_ready(pi, StopRequest(), lambda _phase, _message: None)
         pi.run_row(scan_id, row_index=0, take=1)
-        return _take_row_end(context)
+        return _wait_for_row_end(context)
     finally:
         pi.come_to_rest("end of polysight doctor")
         pi.end_run(scan_id, "success", "polysight doctor --move")
 
 
-def _take_row_end(context: CheckContext) -> RowFinished:
+def _wait_for_row_end(context: CheckContext) -> RowFinished:
     """Wait for the event that ends the row. Raises DeviceError after `_ROW_TIMEOUT_S`."""
     deadline = time.monotonic() + _ROW_TIMEOUT_S
     while time.monotonic() < deadline:

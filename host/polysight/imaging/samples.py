@@ -561,7 +561,7 @@ class BoardSamples:
             # All rows together, unless an RX dies within the scan.
             for column in np.unique(factors[:, factors.any(axis=0)], axis=1).T:
                 rows = (factors == column[:, None]).all(axis=0)
-                image += imager.weighted_image(self._cube, self.weights * rows[:, None], column)
+                image += imager.form_weighted_image(self._cube, self.weights * rows[:, None], column)
         return (image / self.count).astype(np.complex64), self._image_constant(imager, self._mirror(grid)), notice
 
     def range_profile(self, point_m: NDArray[np.float64], shifts_m: NDArray[np.float64]) -> NDArray[np.complex64]:

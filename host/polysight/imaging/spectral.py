@@ -394,9 +394,9 @@ class SpectralImager(RowSpectra):
 
     def image(self, samples: Any) -> Any:
         """Return the matched filter of samples [rx, frequency, row, column], complex64 [ny, nx]."""
-        return self.weighted_image(samples, 1.0, [1.0] * self.aperture.shape[0])
+        return self.form_weighted_image(samples, 1.0, [1.0] * self.aperture.shape[0])
 
-    def weighted_image(self, samples: Any, weights: Any, factors: Any) -> Any:
+    def form_weighted_image(self, samples: Any, weights: Any, factors: Any) -> Any:
         """Return :meth:`image` of samples times weights [row, column] (or one number) and a factor per RX."""
         xp = self.xp
         rows, columns = self.aperture.shape[2:]

@@ -62,8 +62,8 @@ _POLL_S = 0.2
 class Job(msgspec.Struct, frozen=True):
     """One scan to process, as plain data.
 
-    `data` and `products` are absolute folders, `made_with` the dependencies that :func:`made_with` returns, `threads`
-    the number of rows processed at a time.
+    `data` and `products` are absolute folders, `made_with` the dependencies that :func:`describe_dependencies` returns,
+    `threads` the number of rows processed at a time.
     """
 
     data: str
@@ -145,7 +145,9 @@ def make_jobs(scans: Sequence[tuple[Path, Settings]], out: Path) -> list[Job]:
         # A scan folder brings its own rig file.
         if (data / MANIFEST).exists():
             settings = msgspec.structs.replace(settings, config=None)
-        jobs[data.name] = Job(str(data), str(out.absolute() / data.name), settings, made_with(data, settings))
+        jobs[data.name] = Job(
+            str(data), str(out.absolute() / data.name), settings, describe_dependencies(data, settings)
+        )
     return list(jobs.values())
 
 
@@ -156,7 +158,7 @@ _OWN_FILES = (MANIFEST, TRUTH, "raw/*/*.bin", "raw/*/*.idx")
 _PUBLISHED_FILES = ("*_cfg.json", TRUTH, "*/*.bin", "*/*_log.csv", "*_synced.npy")
 
 
-def made_with(data: Path, settings: Settings) -> dict[str, Any]:
+def describe_dependencies(data: Path, settings: Settings) -> dict[str, Any]:
     """Return the dependencies of products: releases, options, and a digest of the data files' sizes and times.
 
     An option that names a file counts by the digest of its content, one that names a folder as the data do.

@@ -239,7 +239,7 @@ def leakage_of_scans(
     simulated = pipeline.source.simulated
     for degrees, folder in strips:
         strips_pipeline, strip_images = form_scan_images(folder, settings)
-        plate_reference.check_rig(strips_pipeline.calibration.imaged_with(strips_pipeline.rig), str(plate))
+        plate_reference.check_rig(strips_pipeline.calibration.describe_imaging(strips_pipeline.rig), str(plate))
         plate_reference.check_axes(strip_images.x_m, strip_images.y_m)
         mask = mask & strip_images.valid
         strips_by_angle.append((float(np.radians(degrees)), strip_images.h, strip_images.v))

@@ -83,7 +83,7 @@ def make_rig_optics(rig: Instrument) -> surfaces.Optics:
     return surfaces.make_optics(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
 
 
-def see_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
+def find_points_in_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
     """Find the specular points in the rows that a pipeline holds."""
     h, v = take_samples(pipeline)
     # The range gate of the images counts from the direct path, that of `see_points` from zero path.
@@ -196,7 +196,7 @@ def add_surfaces(pipeline: Pipeline, products: Path) -> None:
 
     with pipeline.quality.measure_time("surfaces"):
         optics = make_rig_optics(pipeline.rig)
-        seen_rows = see_rows(pipeline, optics)
+        seen_rows = find_points_in_rows(pipeline, optics)
         if len(seen_rows):
             save_surface(products, analyse_points(pipeline, optics, seen_rows))
     quality = read_products(products).quality

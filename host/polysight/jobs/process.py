@@ -186,7 +186,7 @@ def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
             "scan a bare metal plate that covers the plane",
             code=ErrorCode.NO_DATA,
         )
-    made_with = pipeline.calibration.imaged_with(pipeline.rig)
+    made_with = pipeline.calibration.describe_imaging(pipeline.rig)
     return replace(reference, made_with=made_with, rise=_measure_rise(images))
 
 

@@ -142,7 +142,7 @@ def inspect_file(
 ) -> int:
     """Describe a capture; return the exit status, that of DataError if all samples are 0.
 
-    `config` is the rig file it was recorded with; a row of a scan folder brings its own. `plot` is the file for a
+    `config` is the rig file it was recorded with; for a row of a scan folder it is the scan's. `plot` is the file for a
     picture of the range profile; `card_address` chooses one card's packets of a packet capture; `changes` are fields
     of `Layout` that replace the rig's. Raises PolysightError, and OSError if the picture cannot be written.
     """
@@ -242,16 +242,16 @@ def inspect_placement(file: Path, as_json: bool) -> int:
             )
     result = place_again(row)
     # This placement is by byte counts: frames that were placed by their pulses lie elsewhere, with other ranges.
-    same = result.by_pulses or result.missing_before == result.placed.missing
+    is_same = result.by_pulses or result.missing_before == result.placed.missing
     if as_json:
-        print_json({**result.placed.facts(), "committed_missing": result.missing_before, "same": same})
+        print_json({**result.placed.facts(), "committed_missing": result.missing_before, "same": is_same})
     else:
-        sys.stdout.write("\n".join(_format_placement(file, result, same)) + "\n")
-    return exit_status(same)
+        sys.stdout.write("\n".join(_format_placement(file, result, is_same)) + "\n")
+    return exit_status(is_same)
 
 
-def _format_placement(file: Path, result: PlacedAgain, same: bool) -> list[str]:
-    """Return lines about the placement of a row's packets; `same` says that it was committed like this.
+def _format_placement(file: Path, result: PlacedAgain, is_same: bool) -> list[str]:
+    """Return lines about the placement of a row's packets; `is_same`: it was committed like this.
 
     `start`: the card's packet and byte counts at the row's first byte; `located`: the place of each byte is certain.
     """
@@ -279,7 +279,7 @@ def _format_placement(file: Path, result: PlacedAgain, same: bool) -> list[str]:
         lines.append(f"card       dropped data before numbering it ({evidence.dropped_by_card})")
     if result.by_pulses:
         lines.append("committed  with its frames at their pulses")
-    elif same:
+    elif is_same:
         lines.append("committed  the same")
     else:
         lines.append("committed  differently: `polysight validate SCAN --replace` commits it as it is here")

@@ -244,7 +244,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0
     products = read_products(products or folder, REPORT).folder
-    with products_locked(products), store.locked_samples(scan):
+    with products_locked(products), store.lock_samples(scan):
         return _confirm_and_drop(scan, folder, products, yes)
 
 
@@ -288,7 +288,7 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
 
 def _check_samples(scan: store.ScanFolder, rows: set[int]) -> None:
     """Check that images can be made without the raw data of these rows. Raises DataError."""
-    damaged = {row: names for row, names in store.damaged_samples(scan).items() if row in rows}
+    damaged = {row: names for row, names in store.find_damaged_samples(scan).items() if row in rows}
     if not damaged:
         from polysight.pipeline import Pipeline
 

@@ -46,14 +46,14 @@ RADIUS_TOLERANCE = 0.15
 def process_to_points(data: Path, rig: Path | Instrument | None) -> tuple[Pipeline, Optics, Seen]:
     """Process the rows of a scan, and find the specular points in it. Raises PolysightError.
 
-    `rig`: rig, or rig file, of published data; scan folders bring their own.
+    `rig`: rig, or rig file, of published data; a scan folder has its own.
     """
     # Where the raw data was deleted, the samples that the scan folder keeps are used.
     source = open_source(data, rig, dropped=True)
     pipeline = process_rows(source, data, Settings(depth_range_mm=1e3 * DEPTH_M))
     optics = measure_surfaces.make_rig_optics(pipeline.rig)
     say("specular points")
-    points = measure_surfaces.see_rows(pipeline, optics)
+    points = measure_surfaces.find_points_in_rows(pipeline, optics)
     if not len(points):
         raise DataError(
             f"{data}: no surface shows a specular point",
@@ -80,20 +80,20 @@ def surface(
     """
     check_turns(len(scans), turned_deg)
     surfaces = [make_surface(scan, config, reference) for scan in scans]
-    surface = surfaces[0]
+    joined = surfaces[0]
     if len(surfaces) > 1:
         rig = open_source(scans[0], config, dropped=True).instrument
-        surface = join_turned(surfaces, turned_deg, find_axis(rig, axis_mm or (0.0, 0.0)))
-    measure_surfaces.save_surface(out, surface)
+        joined = join_turned(surfaces, turned_deg, find_axis(rig, axis_mm or (0.0, 0.0)))
+    measure_surfaces.save_surface(out, joined)
     if as_json:
         row = {
-            "scan_id": surface.scan_id,
-            "simulated": surface.simulated,
-            "segments": [plain_segment(segment) for segment in surface.segments],
+            "scan_id": joined.scan_id,
+            "simulated": joined.simulated,
+            "segments": [plain_segment(segment) for segment in joined.segments],
         }
         print_json(row)
     else:
-        lines = summary_lines(surface)
+        lines = summary_lines(joined)
         rig = open_source(scans[0], config, dropped=True).instrument
         if rig.polarimetry.leakage_std is None:
             lines.append("the rig's leakage was never measured, and widens all errors: measure it (polysight leakage)")

@@ -56,7 +56,7 @@ EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
 
 
-def training_scan(data: Path, config: Path) -> TrainingScan:
+def load_training_scan(data: Path, config: Path) -> TrainingScan:
     """Return a scan for the library, its patches named by labels or truth.
 
     `data` is a scan folder of any layout, or a folder of products; `config` the rig file of layouts without one.
@@ -92,7 +92,7 @@ def check_labelled(data: Path) -> None:
     Raises
     ------
     DataError
-        as :func:`training_scan`, as far as the saved image shows it.
+        as :func:`load_training_scan`, as far as the saved image shows it.
     """
     scan = find_scan_folder(data) or data
     if not data.is_dir():
@@ -169,8 +169,10 @@ def _read_optics(saved: ProcessedScan) -> Optics:
         raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
     # "one": the same incidence angle for all pixels.
     optics = Optics.from_rig(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
-    budget = (saved.materials and saved.materials.error_budget) or None
-    if budget is None or budget.incidence is None or budget.leakage is None:
+    budget = None
+    if saved.materials is not None:
+        budget = saved.materials.error_budget
+    if not budget or budget.incidence is None or budget.leakage is None:
         return optics
     angle_deg = budget.incidence.deg
     angle_std_deg = budget.incidence.std_deg
@@ -236,11 +238,11 @@ def train_from_scans(data: Sequence[Path], config: Path, note: str = "") -> Libr
     Raises
     ------
     PolysightError
-        as :func:`training_scan`; with fewer than two scans.
+        as :func:`load_training_scan`; with fewer than two scans.
     """
     for folder in data:
         check_labelled(folder)
-    return make_library(number_equal_names([training_scan(folder, config) for folder in data]), note)
+    return make_library(number_equal_names([load_training_scan(folder, config) for folder in data]), note)
 
 
 def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, times: int = 1) -> int:
@@ -278,17 +280,17 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
     if files:
         check_scenes(files, config)
     # `steps` prints each text before the work on it, and its duration.
-    scans = [training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
+    scans = [load_training_scan(folder, config) for folder in steps(data, [str(folder) for folder in data])]
     if files:
         with tempfile.TemporaryDirectory(prefix="polysight-train-") as temporary:
             scenes_drawn = list(product(files, range(times)))
-            texts = [f"simulating and imaging {file.name}, specimens {again}" for file, again in scenes_drawn]
-            for file, again in steps(scenes_drawn, texts):
-                folder = Path(temporary) / f"{file.stem}-{again}"
+            texts = [f"simulating and imaging {file.name}, specimens {repetition}" for file, repetition in scenes_drawn]
+            for file, repetition in steps(scenes_drawn, texts):
+                folder = Path(temporary) / f"{file.stem}-{repetition}"
                 command = ["simulate", str(file), "--config", str(config), "--out", str(folder)]
-                if run_simulator([*command, "--specimens", str(again)]):
+                if run_simulator([*command, "--specimens", str(repetition)]):
                     raise ScanError(f"{file}: simulation failed", "the lines above say why", "correct the scene file")
-                scans.append(training_scan(folder, config))
+                scans.append(load_training_scan(folder, config))
                 shutil.rmtree(folder)
     note = ""
     if all(s.simulated for s in scans):
@@ -322,7 +324,7 @@ def number_equal_names(scans: Sequence[TrainingScan]) -> list[TrainingScan]:
     return numbered
 
 
-def _count(number: int, singular: str, plural: str) -> str:
+def _format_count(number: int, singular: str, plural: str) -> str:
     """Return a number with its noun in singular or plural."""
     noun = singular if number == 1 else plural
     return f"{number} {noun}"
@@ -335,7 +337,7 @@ def _summarise_library(out: Path, library: Library) -> list[str]:
         entries = [e for e in library.entries if e.name == name]
         scans = len({e.scan for e in entries})
         specimens = len({e.specimen for e in entries if e.specimen is not None})
-        line = f"  {name}: {_count(len(entries), 'patch', 'patches')} in {_count(scans, 'scan', 'scans')}"
+        line = f"  {name}: {_format_count(len(entries), 'patch', 'patches')} in {_format_count(scans, 'scan', 'scans')}"
         if specimens > 1:
             line += f", {specimens} specimens"
         lines.append(line)

@@ -23,7 +23,7 @@ from polysight.materials.kinds import (
     PatchMeasurement,
     RatioEvidence,
     inverse_ratio,
-    literature,
+    list_literature_kinds,
     turn_covariance,
 )
 from polysight.materials.measure import (
@@ -242,7 +242,7 @@ def analyse(
     judged = relative.judged
     labels = [p.label for p in judged]
     inversion = relative.solution.inversion
-    calibrated = remove_leakage(relative.raw, inversion.known_leakage(relative.prior))
+    calibrated = remove_leakage(relative.raw, inversion.choose_leakage_to_remove(relative.prior))
     sh = smooth_inside(calibrated.h, segmentation, optics.smooth_px)
     sv = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
     sp = ratio(sh, sv)
@@ -393,7 +393,7 @@ class SceneScatter:
             border=border, tilts=tilts, lit_evenly=evenly, metal_rise=metal_rise, halo=halo,
             metal_std=float(np.hypot(uneven, metal_at_end)),
             behind=background_mean(raw.h, raw.v, segmentation, images.usable),
-            raised_std={} if plane is not None else _raised_errors(images, judged, reference.mask),
+            raised_std={} if plane is not None else _estimate_raised_std(images, judged, reference.mask),
         )  # fmt: skip
 
     @property
@@ -560,7 +560,7 @@ def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
 def _list_kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
     """Return what the patches may be: kinds of the library if it has one angle, else those of the literature alone."""
     if classifier is None or len(classifier.kinds) != 1:
-        return Kinds(literature(), theta_rad, with_sheets=True)
+        return Kinds(list_literature_kinds(), theta_rad, with_sheets=True)
     return classifier.kinds[0]
 
 
@@ -609,7 +609,7 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
     return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict
 
 
-def _raised_errors(images: Images, patches: Sequence[Patch], metal: npt.NDArray[np.bool_]) -> dict[int, float]:
+def _estimate_raised_std(images: Images, patches: Sequence[Patch], metal: npt.NDArray[np.bool_]) -> dict[int, float]:
     """Return patch number to the error of the phase of V / H, as the patch and the metal lie on different planes."""
     if images.raised_m is None or not metal.any():
         return {}

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.discriminant import ErrorDiscriminant
-from polysight.materials.kinds import Kind, Kinds, RatioEvidence, literature
+from polysight.materials.kinds import Kind, Kinds, RatioEvidence, list_literature_kinds
 from polysight.materials.library import (
     MEASURES,
     Distances,
@@ -408,7 +408,7 @@ class Classifier:
         self.distributions = self._model.distributions
         self.names = library.names
         self.permittivities: dict[str, complex] = self.distributions.permittivities
-        kinds = (*self._make_library_kinds(), *literature(library.names))
+        kinds = (*self._make_library_kinds(), *list_literature_kinds(library.names))
         self.kinds = tuple(Kinds(kinds, float(np.radians(angle)), with_sheets=True) for angle in self.angles_deg)
 
     def _make_library_kinds(self) -> tuple[Kind, ...]:

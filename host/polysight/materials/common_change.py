@@ -229,7 +229,7 @@ class _Field:
     of_itself: Real
 
     @classmethod
-    def along(cls, axes: tuple[int, int], length_m: float, places_m: Real, origin_m: Real) -> _Field:
+    def with_axes(cls, axes: tuple[int, int], length_m: float, places_m: Real, origin_m: Real) -> _Field:
         """Return a field whose covariance is Gaussian with the standard deviation `length_m`, at places [plate, 2].
 
         `axes` (x, y) has 1 for an axis along which the field changes, and 0 for one along which it is constant.
@@ -282,8 +282,8 @@ class _Fields:
             shared.append((fringe, fringe_m, common, stable))
             prior.append(fringe_prior * common_prior * (STABLE if stable else 1 - STABLE))
         return cls(
-            drifts=[_Field.along((0, 1), length_m, places_m, origin_m) for length_m in DRIFT_LENGTHS_M],
-            fringes={length_m: _Field.along((1, 1), length_m, places_m, origin_m) for length_m in FRINGE_LENGTHS_M},
+            drifts=[_Field.with_axes((0, 1), length_m, places_m, origin_m) for length_m in DRIFT_LENGTHS_M],
+            fringes={length_m: _Field.with_axes((1, 1), length_m, places_m, origin_m) for length_m in FRINGE_LENGTHS_M},
             shared=shared,
             log_prior=np.log(prior),
         )

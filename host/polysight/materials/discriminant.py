@@ -359,16 +359,16 @@ class ErrorDiscriminant(Model):
             law = np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
 
-        def left_out_quantile(deviations: Real, index: npt.NDArray, covariances: Real) -> float:
+        def find_left_out_quantile(deviations: Real, index: npt.NDArray, covariances: Real) -> float:
             """Return the squared distance that a share REJECTED of the library's own deviations exceeds."""
             d = deviations * left_out[index]
             distance2 = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[index], d)
             return float(np.quantile(distance2, 1 - REJECTED))
 
         self.patch_level = max(
-            law, left_out_quantile(patches, material, self._patch_covariances(self.pixels) + self.scan)
+            law, find_left_out_quantile(patches, material, self._patch_covariances(self.pixels) + self.scan)
         )
-        self.pixel_level = max(law, left_out_quantile(pixels, pixel_material, self._compute_pixel_covariances()))
+        self.pixel_level = max(law, find_left_out_quantile(pixels, pixel_material, self._compute_pixel_covariances()))
 
 
 def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informative: npt.NDArray) -> tuple[Real, Real]:

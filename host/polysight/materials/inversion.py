@@ -41,9 +41,9 @@ from polysight.materials.kinds import (
     PatchMeasurement,
     RatioEvidence,
     brightness_density,
+    compute_probability_of_same_material,
     log_layer_odds,
     permittivity_slope,
-    probability_of_same,
     split_complex,
     turn_covariance,
 )
@@ -259,7 +259,7 @@ class Inversion:
         """True if the scene reduced the uncertainty of both leakages to less than half of the prior's."""
         return max(self.leakage_std) < 0.5 * self.prior_std
 
-    def known_leakage(self, prior: RigPrior) -> tuple[complex, complex]:
+    def choose_leakage_to_remove(self, prior: RigPrior) -> tuple[complex, complex]:
         """Return the leakage (a, b) that is removed from pixels: the scene's if determined, else the prior's mean.
 
         An estimate that is not determined depends mostly on the assumed materials of the patches.
@@ -352,7 +352,7 @@ class SceneLikelihood:
         self.own = self._own_covariances(measurements)
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in measurements], np.float64)
         self.densities = None if kinds is None or not measurements else self._densities(kinds)
-        self.same = probability_of_same(measurements)
+        self.same = compute_probability_of_same_material(measurements)
         # Plates of one material count as one: else six of a material that no library has would shift the leakage.
         self.weights = np.append(1.0, 1 / self.same.sum(axis=1))
         self.dispersions = tuple(s.dispersion for s in measurements)

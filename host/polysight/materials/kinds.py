@@ -212,7 +212,7 @@ def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Comp
     return np.asarray(1 / ratio_from_permittivity(permittivity, theta_rad), np.complex128)
 
 
-def probability_of_same(measurements: Sequence[PatchMeasurement]) -> Real:
+def compute_probability_of_same_material(measurements: Sequence[PatchMeasurement]) -> Real:
     """Return how likely each two plates of a scene are of one material, float64 [patch, patch]; 1 on the diagonal.
 
     If they are, their V / H differ by errors and specimens alone; if not, by anything. All plates share leakage and
@@ -458,7 +458,7 @@ class DensityMaps:
         return lower_edge + fraction_y * (upper_edge - lower_edge)
 
 
-def literature(library: Collection[str] = ()) -> list[Kind]:
+def list_literature_kinds(library: Collection[str] = ()) -> list[Kind]:
     """Return the materials of the catalogue without those whose names are in `library`, which has measured them."""
     return [
         Kind(material.name, material.permittivity, material.spread, "literature", material.kind)
@@ -491,15 +491,15 @@ def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
     The rest are patches of no kind of the library. `sheets` is the share of thin plates in it.
     """
     in_library = np.array([kind.source == "library" for kind in kinds])
-    metal = np.array([kind.permittivity is None for kind in kinds]) & ~in_library
-    literature = ~in_library & ~metal
-    share_literature = LITERATURE_SHARE if literature.any() else 0.0
-    out = np.zeros(len(kinds))
-    for mask, share in ((in_library, 1.0), (metal, METAL_SHARE), (literature, share_literature)):
+    is_metal = np.array([kind.permittivity is None for kind in kinds]) & ~in_library
+    in_literature = ~in_library & ~is_metal
+    share_literature = LITERATURE_SHARE if in_literature.any() else 0.0
+    shares = np.zeros(len(kinds))
+    for mask, share in ((in_library, 1.0), (is_metal, METAL_SHARE), (in_literature, share_literature)):
         if mask.any():
-            out[mask] = share / mask.sum()
-    out[~in_library] *= 1 - sheets
-    return out, (1 - METAL_SHARE - share_literature) * (1 - sheets)
+            shares[mask] = share / mask.sum()
+    shares[~in_library] *= 1 - sheets
+    return shares, (1 - METAL_SHARE - share_literature) * (1 - sheets)
 
 
 def _half_space_coordinates(real: npt.ArrayLike, loss: npt.ArrayLike) -> Real:
@@ -541,7 +541,7 @@ def _interpolate_coordinate_density(real: Real, loss: Real) -> Real:
 
 @cache
 def draw_sheets(theta_rad: float) -> tuple[Complex, Real]:
-    """Return t of drawn thin plates before air or a holder, complex128 [draw], and a brightness, float64 [draw].
+    """Return t of drawn thin plates in front of air or a holder, complex128 [draw], and a brightness, float64 [draw].
 
     The brightness is ln of |r_s| over that of a half space with the same t. The plates are the same at every angle.
     """
@@ -562,18 +562,19 @@ def draw_sheet_dispersions(theta_rad: float, band_hz: tuple[float, float]) -> Re
     It is that of ln |r_s|, ln |t| and the phase of t: a line fitted with the range gate's weights over the sweep.
     """
     eps, holder, thickness_m = _draw_sheet_properties()
-    place = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES - 0.5
+    # Place of each frequency in the sweep, from -0.5 to 0.5.
+    position = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES - 0.5
     # Hann's window; scipy.signal takes a second to load.
     weight = np.hanning(_FREQUENCIES + 2)[1:-1]
     first_hz, last_hz = band_hz
     mean = np.zeros((2, eps.size), np.complex128)
     slope = np.zeros((2, eps.size), np.complex128)
-    for part, share in zip(place, weight / weight.sum(), strict=True):
-        frequency_hz = first_hz + (part + 0.5) * (last_hz - first_hz)
+    for offset, share in zip(position, weight / weight.sum(), strict=True):
+        frequency_hz = first_hz + (offset + 0.5) * (last_hz - first_hz)
         coefficients = np.stack(multilayer([eps, holder], [thickness_m, np.inf], frequency_hz, theta_rad))
         mean += share * coefficients
-        slope += share * part * coefficients
-    variance = float(np.sum(weight * place**2) / weight.sum())
+        slope += share * offset * coefficients
+    variance = float(np.sum(weight * position**2) / weight.sum())
     with np.errstate(divide="ignore", invalid="ignore"):
         of_s, of_p = slope / mean / variance
     change = np.stack([of_s.real, (of_p - of_s).real, (of_p - of_s).imag], axis=-1)
@@ -584,9 +585,11 @@ def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
     """Return the likelihood of a change over the sweep for each drawn thin plate over that for a half space, [draw]."""
     of_sheets = draw_sheet_dispersions(theta_rad, dispersion.band_hz)
     width = np.sqrt(dispersion.std**2 + DISPERSION_KERNEL**2 + (DISPERSION_MODEL * of_sheets) ** 2)
-    layers = _log_normal(dispersion.change - of_sheets, width)
-    usual = np.log(1 - ODD_DISPERSION) + _log_normal(dispersion.change, dispersion.std)
-    odd = np.log(ODD_DISPERSION) + _log_normal(dispersion.change, np.hypot(dispersion.std, ODD_DISPERSION_STD))
+    layers = _sum_log_normal_densities(dispersion.change - of_sheets, width)
+    usual = np.log(1 - ODD_DISPERSION) + _sum_log_normal_densities(dispersion.change, dispersion.std)
+    odd = np.log(ODD_DISPERSION) + _sum_log_normal_densities(
+        dispersion.change, np.hypot(dispersion.std, ODD_DISPERSION_STD)
+    )
     log_odds = layers - np.logaddexp(usual, odd)
     return np.asarray(np.exp(np.clip(log_odds, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)), np.float64)
 
@@ -598,7 +601,7 @@ def log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> f
     return float(np.log(np.mean(layer_odds(dispersion, kinds.theta_rad))))
 
 
-def _log_normal(difference: Real, std: Real) -> Real:
+def _sum_log_normal_densities(difference: Real, std: Real) -> Real:
     """Return the sum over the last axis of the logarithms of normal densities, but for a constant."""
     return np.sum(-0.5 * (difference / std) ** 2 - np.log(std), axis=-1)
 
@@ -606,12 +609,12 @@ def _log_normal(difference: Real, std: Real) -> Real:
 @cache
 def _draw_sheet_properties() -> tuple[Complex, Complex, Real]:
     """Return the drawn thin plates: permittivity, permittivity behind them, and thickness in metres, [draw] each."""
-    unit = np.random.default_rng(0).random((_SHEETS, 5))
+    uniform = np.random.default_rng(0).random((_SHEETS, 5))
     real, tangent, size_mm = (
         low * (high / low) ** part
-        for (low, high), part in zip((SHEET_REAL, SHEET_LOSS_TANGENT, SHEET_MM), unit.T[:3], strict=True)
+        for (low, high), part in zip((SHEET_REAL, SHEET_LOSS_TANGENT, SHEET_MM), uniform.T[:3], strict=True)
     )
-    eps_behind = np.where(unit[:, 3] < 0.5, 1.0, HOLDER_REAL[0] + (HOLDER_REAL[1] - HOLDER_REAL[0]) * unit[:, 4])
+    eps_behind = np.where(uniform[:, 3] < 0.5, 1.0, HOLDER_REAL[0] + (HOLDER_REAL[1] - HOLDER_REAL[0]) * uniform[:, 4])
     return real * (1 - 1j * tangent), eps_behind.astype(np.complex128), size_mm / 1e3
 
 

@@ -1,7 +1,7 @@
-"""The state of a scan for pages: a status in one sentence with what to do, and all that is shown below it.
+"""Describe the state of a scan for pages: a status in one sentence with what to do, and all that is shown below it.
 
-Pure functions of history, signs of life and images. A `Snapshot` is the whole state, a `Motion` the part that changes
-while the stage moves; both are sent as JSON.
+The functions are pure: they use only the history, the signs of life and the images that they are given. A `Snapshot` is
+the whole state, a `Motion` the part that changes while the stage moves; both are sent as JSON.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MASKED_SHARE = 0.05
 MAX_NOTICES = 30
 # Characters of an ISO time up to its seconds: the page and the manifest write different fractions.
 ISO_SECONDS_CHARACTERS = 19
-# Letter of a row by the end of its last take; a row without one has a dot.
+# Letter of a row, by how its last take ended; a row without a take has a dot.
 MARKS = {"committed": "c", "kept": "k", "rejected": "r"}
 
 
@@ -66,7 +66,7 @@ class Profile(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Shown:
+class ShownResults:
     """Results of the rows so far; replaced as a whole, never changed.
 
     Attributes
@@ -100,9 +100,10 @@ class LifeSigns:
     Attributes
     ----------
     life
-        What the scan program wrote last; None where there is nothing.
+        What the scan program wrote last; None if it wrote nothing.
     alive, killed
-        True if it wrote of late or, without `life`, the manifest grew; if its process has ended without a note of it.
+        True if it wrote recently or, without `life`, if the manifest grew recently; True if its process has ended and
+        it did not write why.
     alive_s
         Time of the last sign of life of a program that is not alive.
     pi_silent_s, pi_limit_s
@@ -122,7 +123,7 @@ class LifeSigns:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a snapshot is made from.
+    """Everything that a snapshot is made from.
 
     Attributes
     ----------
@@ -139,7 +140,7 @@ class Inputs:
     failure
         Why that program failed, from its log; None if it did not.
     gone
-        True if the folder was there, and is not any more.
+        True if the folder existed before, and does not now.
     verdict
         Of the products with materials, see :class:`polysight.page.watch.ProductsTail`.
     """
@@ -148,7 +149,7 @@ class Inputs:
     history: ScanHistory | None
     signs: LifeSigns
     pi: PiState = field(default_factory=PiState)
-    shown: Shown = field(default_factory=Shown)
+    shown: ShownResults = field(default_factory=ShownResults)
     control: bool = False
     problem: str = ""
     program: Program | None = None
@@ -207,8 +208,8 @@ class PicturesState(msgspec.Struct, frozen=True):
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     """The whole state of a scan; `scan` and what follows are empty where there is no scan yet.
 
-    `control`: it may be controlled. `sync` is the phase left over by board and row, degrees (nan: unknown); `snr_db`
-    the direct path over its scatter, and `lost` the share of bytes that are missing, likewise.
+    `control`: it may be controlled. By board and row: `sync` is the residual phase in degrees (nan: unknown), `snr_db`
+    the direct path over its scatter, and `lost` the share of bytes that are missing.
     """
 
     status: Status
@@ -320,7 +321,7 @@ def estimate_time_left(history: ScanHistory, now_s: float) -> tuple[int | None, 
     return round(time_left(rows_left, row_s, in_row_s)), basis
 
 
-def _describe_pictures(history: ScanHistory, shown: Shown) -> PicturesState:
+def _describe_pictures(history: ScanHistory, shown: ShownResults) -> PicturesState:
     """Return the counts of rows in the pictures, their size, and the ends of their colours."""
     image = history.instrument.image
     waiting = max(0, len(history.takes) - len(shown.rows))
@@ -352,7 +353,7 @@ def _collect_notices(inputs: Inputs) -> list[Finding]:
     return [notice for k, notice in enumerate(notices) if notice not in notices[:k]]
 
 
-def sync_notices(shown: Shown, columns: int) -> list[Finding]:
+def sync_notices(shown: ShownResults, columns: int) -> list[Finding]:
     """Return the warnings about the synchronisation of the last row."""
     notices = []
     for board, rows in shown.sync.items():
@@ -382,7 +383,7 @@ def sync_notices(shown: Shown, columns: int) -> list[Finding]:
 # --- the headline ---
 
 
-def say(key: str, **words: str | int) -> Status:
+def make_status(key: str, **words: str | int) -> Status:
     """Return the status of a state of the table, with its texts filled in."""
     state = STATES[key]
     filled = {"since": SINCE, **words}
@@ -399,16 +400,16 @@ def say(key: str, **words: str | int) -> Status:
     )
 
 
-def say_since(key: str, since_s: float, **words: str) -> Status:
+def make_status_since(key: str, since_s: float, **words: str) -> Status:
     """Return the status of a state that has lasted since a time."""
-    return msgspec.structs.replace(say(key, **words), since_s=since_s)
+    return msgspec.structs.replace(make_status(key, **words), since_s=since_s)
 
 
-def say_finding(key: str, finding: Finding | None, **words: str | int) -> Status:
+def make_status_of_finding(key: str, finding: Finding | None, **words: str | int) -> Status:
     """Return the status of a state that reports a finding."""
     if finding is None:
-        return say(key, what="", why="", do="", **words)
-    return say(key, what=f"{finding.what}.", why=finding.why, do=finding.do, **words)
+        return make_status(key, what="", why="", do="", **words)
+    return make_status(key, what=f"{finding.what}.", why=finding.why, do=finding.do, **words)
 
 
 def judge(inputs: Inputs) -> Status:
@@ -416,19 +417,19 @@ def judge(inputs: Inputs) -> Status:
     history = inputs.history
     folder = str(inputs.folder)
     if inputs.gone:
-        return say("folder_gone", folder=folder)
+        return make_status("folder_gone", folder=folder)
     if history is None:
         return _judge_start(inputs)
     if history.ended is not None:
         return _judge_end(inputs, history, history.ended)
-    # The first that has something to say is the worst.
+    # In order of weight: the first condition that applies is the worst.
     status = _judge_trouble(inputs, history) or _judge_rig(inputs, history) or _judge_rows(inputs, history)
     if status is not None:
         return status
     now = _describe_safe_rows(history)
     if inputs.pi.row >= 0:
         now = f"Row {inputs.pi.row} is being scanned."
-    return say("rows", now=now)
+    return make_status("rows", now=now)
 
 
 def _describe_safe_rows(history: ScanHistory) -> str:
@@ -440,12 +441,12 @@ def _judge_start(inputs: Inputs) -> Status:
     """Return the status of a folder without a manifest."""
     folder = str(inputs.folder)
     if inputs.problem:
-        return say("unreadable", what=inputs.problem, folder=folder)
+        return make_status("unreadable", what=inputs.problem, folder=folder)
     if inputs.program is not None and inputs.program.running:
-        return say("starting")
+        return make_status("starting")
     if inputs.failure is not None:
-        return say_finding("start_failed", inputs.failure)
-    return say("empty", folder=folder)
+        return make_status_of_finding("start_failed", inputs.failure)
+    return make_status("empty", folder=folder)
 
 
 def _may_have_result(inputs: Inputs, history: ScanHistory) -> bool:
@@ -465,22 +466,22 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
         all_safe = f"Every row is safe; {rows_with_gaps} are kept with gaps, masked."
     program = inputs.program
     if not _may_have_result(inputs, history):
-        return say("materials", all_safe=all_safe)
+        return make_status("materials", all_safe=all_safe)
     if program is not None and program.running and cut_fraction(program.started_utc) > cut_fraction(ended.ended_utc):
         if program.kind == "process":
-            return say("processing")
-        return say("resuming", safe=safe)
+            return make_status("processing")
+        return make_status("resuming", safe=safe)
     if ended.exit_status == "success" and len(history.takes) == history.plan.rows:
         # Between the last row and materials; whether it is processed is not known yet.
         if inputs.verdict is None and inputs.signs.life is not None and inputs.signs.alive:
-            return say("finishing")
+            return make_status("finishing")
         return _judge_result(inputs, all_safe)
     if ended.exit_status == "abort":
         key = "aborted" if ended.asked == "abort" else "stopped"
-        return say(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
+        return make_status(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
     problem = f"{sentence(ended.reason)}."
     do = sentence(ended.remedy) or f"`polysight resume {quote(folder)}`"
-    return say("failed", what=problem, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
+    return make_status("failed", what=problem, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
 
 
 def cut_fraction(iso_time: str) -> str:
@@ -491,13 +492,13 @@ def cut_fraction(iso_time: str) -> str:
 def _judge_result(inputs: Inputs, all_safe: str) -> Status:
     """Return the status of a scan whose rows are all recorded."""
     if inputs.verdict is not None:
-        return say(f"result_{inputs.verdict.level}", all_safe=all_safe)
+        return make_status(f"result_{inputs.verdict.level}", all_safe=all_safe)
     if inputs.signs.killed:
         do = f"`polysight process {quote(inputs.folder)} --out {quote(f'{inputs.folder}/products')}`"
-        return say("unprocessed", what="Its program was killed while it computed materials.", why="", do=do)
+        return make_status("unprocessed", what="Its program was killed while it computed materials.", why="", do=do)
     if inputs.failure is not None:
-        return say_finding("unprocessed", inputs.failure)
-    return say("finished", all_safe=all_safe)
+        return make_status_of_finding("unprocessed", inputs.failure)
+    return make_status("finished", all_safe=all_safe)
 
 
 def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
@@ -505,18 +506,18 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
     signs = inputs.signs
     folder = str(inputs.folder)
     safe = _describe_safe_rows(history)
-    if _connects(inputs, history):
-        return say("resuming" if history.takes else "starting", safe=safe)
+    if _is_connecting(inputs, history):
+        return make_status("resuming" if history.takes else "starting", safe=safe)
     if signs.killed or (not signs.alive and signs.life is None):
-        return say("killed", safe=safe, folder=folder)
+        return make_status("killed", safe=safe, folder=folder)
     if not signs.alive:
-        return say_since("frozen", signs.alive_s, safe=safe, folder=folder)
+        return make_status_since("frozen", signs.alive_s, safe=safe, folder=folder)
     if signs.pi_silent_s is not None and signs.pi_silent_s > signs.pi_limit_s:
-        return say_since("pi_silent", inputs.pi.heard_utc_s)
+        return make_status_since("pi_silent", inputs.pi.heard_utc_s)
     return _judge_request(signs.life or Life(), history, folder)
 
 
-def _connects(inputs: Inputs, history: ScanHistory) -> bool:
+def _is_connecting(inputs: Inputs, history: ScanHistory) -> bool:
     """True if the program that a page started does not take commands yet: it has written no sign of life of its own."""
     signs = inputs.signs
     program = inputs.program
@@ -530,16 +531,16 @@ def _connects(inputs: Inputs, history: ScanHistory) -> bool:
 
 
 def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | None:
-    """Return the status of a scan that was requested to pause, stop or abort, by anyone; None without a request."""
+    """Return the status of a scan with a request to pause, stop or abort, from any sender; None without a request."""
     asker = life.asker or "somebody"
     if life.asked == "abort":
-        return say("aborting", asker=asker)
+        return make_status("aborting", asker=asker)
     if life.asked == "stop":
-        return say("stopping", asker=asker)
+        return make_status("stopping", asker=asker)
     if history.paused:
-        return say("paused", asker=asker, safe=_describe_safe_rows(history), folder=folder)
+        return make_status("paused", asker=asker, safe=_describe_safe_rows(history), folder=folder)
     if life.asked == "pause":
-        return say("pausing", asker=asker)
+        return make_status("pausing", asker=asker)
     return None
 
 
@@ -548,18 +549,18 @@ def _judge_rig(inputs: Inputs, history: ScanHistory) -> Status | None:
     pi = inputs.pi
     all_rows_are_safe = len(history.takes) == history.plan.rows
     if pi.state == "fault" and pi.faults:
-        return say_finding("rig_fault", pi.faults[-1])
+        return make_status_of_finding("rig_fault", pi.faults[-1])
     if pi.state == "fault":
         do = "On the Pi: `journalctl -u polysight-pi`"
-        return say("rig_fault", what="It occurred before this view.", why="See the Pi's log", do=do)
+        return make_status("rig_fault", what="It occurred before this view.", why="See the Pi's log", do=do)
     if pi.state == "held":
-        return say("held")
+        return make_status("held")
     if all_rows_are_safe and pi.state == "homing":
-        return say("homing_again")
+        return make_status("homing_again")
     if all_rows_are_safe:
-        return say("finishing")
+        return make_status("finishing")
     if pi.state == "homing":
-        return say("homing")
+        return make_status("homing")
     return None
 
 
@@ -568,15 +569,15 @@ def _judge_rows(inputs: Inputs, history: ScanHistory) -> Status | None:
     pi = inputs.pi
     newest_warning = next((notice for notice in reversed(history.notices) if notice.level == "warning"), None)
     if pi.row >= 0 and history.marks.get(pi.row) == "rejected":
-        return say_finding("retake", newest_warning, row=pi.row, take=pi.take)
+        return make_status_of_finding("retake", newest_warning, row=pi.row, take=pi.take)
     late_since_s = _find_late_since_s(history, inputs.signs)
     if late_since_s:
-        return say_since("late", late_since_s)
+        return make_status_since("late", late_since_s)
     if history.rows_since_trouble < RECENT_ROWS and newest_warning is not None:
-        return say_finding("after_fault", newest_warning)
+        return make_status_of_finding("after_fault", newest_warning)
     poor = sync_notices(inputs.shown, history.plan.columns)
     if poor:
-        return say_finding("poor", poor[0])
+        return make_status_of_finding("poor", poor[0])
     return None
 
 

@@ -3,7 +3,7 @@
 Manifest, event log and products are read as they change (`ManifestTail`, `EventTail`, `ProductsTail`); `PiListener`
 receives the Pi's events. A snapshot is serialised once, so that a page costs only its transmission, and all pages see
 the same. `RowViewer` makes images and range profiles with the instrument's own pipeline, in a thread that may be slow,
-and replaces its results as a whole (`Shown`).
+and replaces its results as a whole (`ShownResults`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from polysight.page.status import (
     Motion,
     Profile,
     RowSync,
-    Shown,
+    ShownResults,
     Snapshot,
     cut_fraction,
     make_motion,
@@ -110,7 +110,7 @@ class RowViewer:
     """Forms images of committed rows of one scan in a thread; `content` has the facts, and grows as the scan runs."""
 
     def __init__(self, path: Path, content: Manifest) -> None:
-        self.shown = Shown()
+        self.shown = ShownResults()
         self._source = ScanFolder(path, content)
         # Rows to show and the take of each, those in the images, and those that failed.
         self._to_show: dict[int, int] = {}
@@ -203,7 +203,7 @@ class RowViewer:
         """Replace `shown` by the rows so far with these pictures and this profile."""
         sync = {name: dict(sorted(rows.items())) for name, rows in self._sync.items()}
         rows = tuple(sorted(self._done))
-        self.shown = Shown(self.shown.revision + 1, rows, pictures, profile, sync, self._problem)
+        self.shown = ShownResults(self.shown.revision + 1, rows, pictures, profile, sync, self._problem)
 
 
 class GrowingFile:
@@ -421,7 +421,7 @@ class Watch:
         self.control = control
         self.state = Versioned(0, b"{}")
         self.motion = Versioned(0, b"{}")
-        self.shown = Shown()
+        self.shown = ShownResults()
         self._lapse_s = lapse_s
         self._ended = threading.Event()
         self._looked = False
@@ -497,7 +497,7 @@ class Watch:
         if self._manifest.file.replaced or is_new_folder:
             self._close_parts()
             self._begin()
-            self.shown = Shown()
+            self.shown = ShownResults()
             facts = self._manifest.look()
         # Content that is read at the first look may be old.
         if facts and self._looked:

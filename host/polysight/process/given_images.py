@@ -476,7 +476,7 @@ def describe_illumination(images: Images, rig: Instrument) -> Illumination:
     )
 
 
-def given_reasons(pair: GivenPair, angle: Angle) -> list[Finding]:
+def list_reasons_of_given_images(pair: GivenPair, angle: Angle) -> list[Finding]:
     """Return what limits the verdict on given images: no direct path, an assumed geometry, an assumed angle."""
     # The last number of a reason is its weight: those of one level are listed by falling weight.
     reasons = [reason(
@@ -592,7 +592,7 @@ def analyse_given_images(
         images = conjugate(images)
         result = materials.analyse(images, replace(optics, other_sign=1 - pair.other_sign), scene, classifier)
     sign = sign_reasons(result.other_sign, conjugated, painted)
-    limits = [*given_reasons(pair, angle), *sign, *turn_reasons(result)]
+    limits = [*list_reasons_of_given_images(pair, angle), *sign, *turn_reasons(result)]
     # None: the plane of the plates was not estimated.
     verdict = join_reasons([*limits, *scene_reasons(result, None, classifier)])
     # With the verdict "no result" names and permittivities are withheld.

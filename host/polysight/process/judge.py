@@ -268,7 +268,7 @@ def error_budget(result: MaterialsResult, plane: PlaneEstimate | None) -> ErrorB
             paint_mm=round(inversion.paint_mm, 3),
         )
     leakage_h, leakage_v = inversion.leakage
-    removed_h, removed_v = inversion.known_leakage(result.prior)
+    removed_h, removed_v = inversion.choose_leakage_to_remove(result.prior)
     std_h, std_v = inversion.leakage_std
     angle_deg = float(np.degrees(np.mean(result.theta_rad) + inversion.theta_error_rad))
     angle_std_deg = float(np.degrees(inversion.theta_std_rad))

@@ -80,7 +80,7 @@ MAX_ROWS = 8
 _log = logging.getLogger(__name__)
 
 
-def made_with(rig: Instrument, filters: Filters) -> dict[str, Any]:
+def list_settings_of_samples(rig: Instrument, filters: Filters) -> dict[str, Any]:
     """Return the settings that samples depend on besides raw data and gate: the calibrated rig and its filters.
 
     They are plain values as JSON holds them, to be compared with a file.
@@ -191,7 +191,7 @@ class KeptSamples:
             self._scan = source
             self._folder = source.path / SAMPLES
         self._plan = source.plan
-        self._made = made_with(rig, filters)
+        self._made = list_settings_of_samples(rig, filters)
         self._quality = quality
         self._bands = settings.bands
         self._keep = samples == "keep"

@@ -29,7 +29,7 @@ from msgspec import UNSET
 from polysight.materials import axis_mm, image_centre_mm
 from polysight.products.maps import map_permittivity, nominal_incidence_rad
 from polysight.products.processed import ProcessedScan, read_products
-from polysight.results import Figure, PatchFigures, Verdict, declared_figures, to_plain
+from polysight.results import Figure, PatchFigures, Verdict, list_declared_figures, to_plain
 from polysight.store import MAX_BYTES
 from polysight.surfaces import Surface
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
@@ -499,8 +499,8 @@ def table_figures(scan: ProcessedScan) -> list[Figure]:
 def _patch_figures(patches: Sequence[PatchFigures]) -> tuple[Figure, ...]:
     """Return the figures that the patches' class declares: a subclass of `PatchFigures` may declare more."""
     if not patches:
-        return declared_figures(PatchFigures)
-    return declared_figures(type(patches[0]))
+        return list_declared_figures(PatchFigures)
+    return list_declared_figures(type(patches[0]))
 
 
 def pack_csv(scan: ProcessedScan) -> bytes:
@@ -597,7 +597,7 @@ def _make_matlab_name(key: str) -> str:
 _FOLDER = "export"
 
 
-def export_folder(folder: Path, out: Path | None) -> Path:
+def create_export_folder(folder: Path, out: Path | None) -> Path:
     """Create and return the folder for exports: `out`, or one next to `folder`. Raises ConfigError for a link."""
     if out is None:
         out = folder.parent / f"{folder.name}-{_FOLDER}"
@@ -614,7 +614,7 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
     """Write the requested formats ("netcdf", "mat", "csv"), all or none; return 0, the exit status of the command.
 
     Each format is printed to stderr before it is made, each file to stdout when all are written. `folder` is that of
-    the products or of their scan, `out` the folder to write to (:func:`export_folder`).
+    the products or of their scan, `out` the folder to write to (:func:`create_export_folder`).
 
     Raises
     ------
@@ -638,7 +638,7 @@ def export(folder: Path, formats: list[str], out: Path | None) -> int:
             "polysight process finds the materials",
             code=ErrorCode.FILE_MISSING,
         )
-    out = export_folder(scan.folder, out)
+    out = create_export_folder(scan.folder, out)
     packers = {
         "netcdf": ("image.nc", lambda: pack_netcdf(full_dataset(scan))),
         "mat": ("image.mat", lambda: pack_mat(scan)),

@@ -143,18 +143,18 @@ class Port(Protocol):
         ...
 
 
-def set_up_spi(divisor: int = SPI_DIVISOR) -> bytes:
+def encode_spi_setup(divisor: int = SPI_DIVISOR) -> bytes:
     """Return the initial commands of channel A."""
     clock = bytes((_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _DIVISOR, divisor, 0))
     return clock + bytes((_PINS, IDLE, SPI_DIRECTION, _NO_LOOPBACK))
 
 
-def set_up_interrupt() -> bytes:
+def encode_interrupt_setup() -> bytes:
     """Return the initial commands of channel B."""
     return bytes((_FULL_SPEED, _NO_ADAPTIVE, _THREE_PHASE, _PINS, INTERRUPT_IDLE, INTERRUPT_DIRECTION, _NO_LOOPBACK))
 
 
-def write_words(words: Sequence[int]) -> bytes:
+def encode_writes(words: Sequence[int]) -> bytes:
     """Return commands that shift words out: for each, chip select low, two bytes on the falling edge, select high."""
     select = bytes((_PINS, SELECTED_WRITE, SPI_DIRECTION)) * _SELECT_COMMANDS
     parts = bytearray()
@@ -163,7 +163,7 @@ def write_words(words: Sequence[int]) -> bytes:
     return bytes(parts) + bytes((_NOW,))
 
 
-def read_words(count: int) -> bytes:
+def encode_reads(count: int) -> bytes:
     """Return commands that shift words in: for each, chip select low, two bytes on the rising edge, select high."""
     select = bytes((_PINS, SELECTED_READ, SPI_DIRECTION)) * _SELECT_COMMANDS
     return (select + bytes((_READ_BYTES, 1, 0)) + _DESELECT) * count + bytes((_NOW,))
@@ -191,8 +191,8 @@ class UsbWords:
         self._sleep = sleep
         self._slow = slow
         divisor = SLOW_DIVISOR if slow else SPI_DIVISOR
-        self._spi.write(set_up_spi(divisor))
-        self._interrupt.write(set_up_interrupt())
+        self._spi.write(encode_spi_setup(divisor))
+        self._interrupt.write(encode_interrupt_setup())
 
     def write(self, words: Sequence[int]) -> None:
         """Shift words out. Raises DeviceError."""
@@ -200,7 +200,7 @@ class UsbWords:
         if self._slow:
             parts = [[word] for word in words]
         for part in parts:
-            self._spi.write(write_words(part))
+            self._spi.write(encode_writes(part))
             self._pause()
 
     def read(self, count: int) -> list[int]:
@@ -210,7 +210,7 @@ class UsbWords:
             counts = [1] * count
         words: list[int] = []
         for part_count in counts:
-            self._spi.write(read_words(part_count))
+            self._spi.write(encode_reads(part_count))
             data = _read_exactly(self._spi, 2 * part_count)
             words += struct.unpack(f">{part_count}H", data)
             self._pause()
@@ -305,6 +305,8 @@ class FtdiPort:
             self._library.tools.release_device(device)
 
 
+# Usual cause of an error while the link is in use.
+_PULLED = "the cable was pulled, or the board lost power"
 # Causes of an error of libusb by its number.
 _CAUSES = {
     errno.EBUSY: "another program uses this chip: mmWave Studio, or a second polysight; end it",
@@ -312,9 +314,6 @@ _CAUSES = {
     errno.EPERM: "no permission: the udev rule for 0451:fd03 (docs/how-to/install.md)",
     errno.ETIMEDOUT: "the chip does not answer: a loose cable, or a hub without power",
 }
-
-
-_PULLED = "the cable was pulled, or the board lost power"
 
 
 def _usb_error(what: str, e: BaseException | None, otherwise: str) -> DeviceError:
@@ -460,7 +459,7 @@ class _TcpPort:
         try:
             self._connection.sendall(data)
         except OSError as e:
-            raise self._lost_error(e.strerror or str(e)) from None
+            raise self._make_lost_error(e.strerror or str(e)) from None
 
     def _receive(self, size: int) -> bytes:
         """Receive exactly `size` bytes. Raises DeviceError if the connection ends before."""
@@ -469,13 +468,13 @@ class _TcpPort:
             while len(data) < size:
                 part = self._connection.recv(size - len(data))
                 if not part:
-                    raise self._lost_error("closed by the other side")
+                    raise self._make_lost_error("closed by the other side")
                 data += part
         except OSError as e:
-            raise self._lost_error(e.strerror or str(e)) from None
+            raise self._make_lost_error(e.strerror or str(e)) from None
         return data
 
-    def _lost_error(self, what: str) -> DeviceError:
+    def _make_lost_error(self, what: str) -> DeviceError:
         return DeviceError(
             f"radar at {self._address}: {what}",
             "its USB cable was pulled, or its program ended",

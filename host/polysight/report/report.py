@@ -32,7 +32,7 @@ from polysight.results import (
     PermittivityFigures,
     PlaneError,
     ScanQuality,
-    declared_figures,
+    list_declared_figures,
     percent,
     to_plain,
 )
@@ -190,7 +190,7 @@ def _list_provenance(scan: ProcessedScan) -> list[tuple[str, str]]:
 def _select_shown_figures(scan: ProcessedScan) -> list[Figure]:
     """Return the declared figures of patches that have a heading in tables for people."""
     kind = type(scan.segments[0]) if scan.segments else PatchFigures
-    return [figure for figure in declared_figures(kind) if figure.column.title]
+    return [figure for figure in list_declared_figures(kind) if figure.column.title]
 
 
 def _mark_commands(words: str) -> Markup:
@@ -265,7 +265,7 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
         "error": DASH,
         "relative_error": None,
         "pixels": patch.pixels_used,
-        "shown": [figure.format(patch) for figure in declared_figures(type(patch)) if figure.column.title],
+        "shown": [figure.format(patch) for figure in list_declared_figures(type(patch)) if figure.column.title],
     }
     if patch.metal_like:
         row["real"] = "metal-like"

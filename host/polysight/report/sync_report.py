@@ -99,13 +99,13 @@ class SyncReport:
         n = self._samples
         chirps = self.chirps / max(self.positions, 1)
 
-        def bound_tone(snr: float) -> tuple[float, float, float]:
+        def compute_bound_of_tone(snr: float) -> tuple[float, float, float]:
             phase = 1 / np.sqrt(2 * snr * n)
             f = np.sqrt(6 / (snr * n * (n**2 - 1))) / (2 * np.pi) * self._rate
             return float(f), float(phase), float(phase)
 
-        single_chirp = bound_tone(self.snr * self._rx)
-        mean = bound_tone(self.snr * self._rx * chirps)
+        single_chirp = compute_bound_of_tone(self.snr * self._rx)
+        mean = compute_bound_of_tone(self.snr * self._rx * chirps)
         # The residual of this stage is a difference of two signals with equal noise.
         f, phase, amplitude = (float(np.sqrt(2)) * bound for bound in mean)
         return {"aligned": single_chirp, "averaged": mean, "referenced": (f, phase, amplitude)}

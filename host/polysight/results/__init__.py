@@ -2,7 +2,7 @@
 
 `ScanMaterials`, `ScanQuality` and `ScanFacts` are the content of materials.json, quality.json and scan.json; their
 `read` takes files of any release. `PatchFigures` declares each figure of a patch once, with name, unit and title
-(`Column`); `declared_figures` lists them for tables, exports and datasets. With the verdict "no result" a
+(`Column`); `list_declared_figures` lists them for tables, exports and datasets. With the verdict "no result" a
 `ScanMaterials` cannot hold names or permittivities. `rules` holds the rules of the verdict, `join_reasons`
 joins what they find. `to_plain` converts all of it to JSON types.
 """
@@ -36,7 +36,7 @@ from polysight.results.materials import (
     PlaneError as PlaneError,
     ScanMaterials as ScanMaterials,
     TruthFigures as TruthFigures,
-    declared_figures as declared_figures,
+    list_declared_figures as list_declared_figures,
 )
 from polysight.results.quality import (
     Backlash as Backlash,

@@ -161,7 +161,7 @@ def _follow(path: Sequence[str], value: Any) -> Any:
 
 
 @lru_cache
-def declared_figures(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
+def list_declared_figures(kind: type["PatchFigures"]) -> tuple[Figure, ...]:
     """Return the figures declared in a class of patches, in the order of their declaration."""
     figures = [
         Figure(name, member.kind, member.column)

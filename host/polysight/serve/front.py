@@ -100,7 +100,7 @@ class RunningScan(msgspec.Struct, frozen=True):
 class Front:
     """State of the process: `reader` answers what this one does not, `starts` is true if programs can be started.
 
-    `stage` is what home and jog move; None: the page moves nothing.
+    `stage` homes and jogs the stage; None: the page cannot move it.
     """
 
     scans: Scans
@@ -183,7 +183,7 @@ def frame_page(name: str, title: str, style: str) -> str:
 
 
 def control_routes(front: Front) -> list[Route]:
-    """Return the routes of the running scans, and of the session of who has the token."""
+    """Return the routes of the running scans, and of the session that a holder of the token opens."""
     running = RunningScans(front.scans)
 
     async def open_session(request: Request) -> Response:
@@ -224,22 +224,22 @@ def command_route(front: Front) -> Route:
 
 def stage_routes(stage: StageControl) -> list[Route]:
     """Return the routes of home and jog; all are POST, since even looking asks the Pi."""
-    works: dict[str, Callable[[bytes], StagePlace]] = {
+    actions: dict[str, Callable[[bytes], StagePlace]] = {
         "look": lambda _: stage.look(),
         "home": lambda _: stage.home(),
         "stop": lambda _: stage.stop(),
         "jog": lambda body: stage.jog(decode_body(body, JogRequest)),
     }
 
-    def make_route(name: str, work: Callable[[bytes], StagePlace]) -> Route:
+    def make_route(name: str, action: Callable[[bytes], StagePlace]) -> Route:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
-            place = await run_in_own_thread(lambda: work(body))
+            place = await run_in_own_thread(lambda: action(body))
             return Response(msgspec.json.encode(place), media_type="application/json")
 
         return Route(f"/api/stage/{name}", endpoint, methods=["POST"])
 
-    return [make_route(name, work) for name, work in works.items()]
+    return [make_route(name, action) for name, action in actions.items()]
 
 
 async def run_in_own_thread(work: Callable[[], T]) -> T:
@@ -330,10 +330,10 @@ class Reader:
             finally:
                 writer.close()
         except (OSError, h11.RemoteProtocolError):
-            # The reading process was ended in the middle, and is started again. Half an answer stays cut off.
+            # The reading process ended during the request, and is started again. An incomplete answer is not repaired.
             if not is_answered:
                 problem = "The reading part of the server does not answer"
-                do = "load the page again; control goes on without it"
+                do = "load the page again; pause, stop and abort still work"
                 await refuse(503, ErrorCode.NO_ANSWER, problem, "it starts, or was ended", do)(scope, receive, send)
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -467,24 +467,24 @@ class CountedConnection(H11Protocol):
         return count > 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Count it."""
+        """Add the new connection to those that the limit counts."""
         super().connection_made(transport)
         self._limit.add(self)
 
     def data_received(self, data: bytes) -> None:
-        """Note that it was read."""
+        """Tell the limit that bytes of this connection were read."""
         super().data_received(data)
         if not self.transport.is_closing():
             self._limit.note_read(self)
 
     def on_response_complete(self) -> None:
-        """Note that it waits for the next request."""
+        """Tell the limit that this connection waits for its next request."""
         super().on_response_complete()
         if not self.transport.is_closing():
             self._limit.note_answered(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Count it out."""
+        """Remove the closed connection from those that the limit counts."""
         super().connection_lost(exc)
         self._limit.remove(self)
 

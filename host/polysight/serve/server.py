@@ -192,8 +192,8 @@ def _check_scan_folder(folder: Path) -> None:
     remedy = "give the folder of one scan"
     scans_below = Scans(folder).list()
     if scans_below:
-        newest = quote(folder / scans_below[0].name)
-        remedy += f": polysight preview {newest}; polysight serve {quote(folder)} shows them all"
+        newest = folder / scans_below[0].name
+        remedy += f": polysight preview {quote(newest)}; polysight serve {quote(folder)} shows them all"
     raise DataError(
         f"{folder}: no scan is in it, but {other_files[0]}", "a scan has a folder of its own", remedy,
         code=ErrorCode.FILE_FOREIGN,

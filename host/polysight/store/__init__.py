@@ -51,10 +51,10 @@ from polysight.store.scan_folder import (
     ScanFolder,
     check_inside,
     check_same_scan,
-    damaged_samples,
     dropped_rows,
     extract_connection,
-    locked_samples,
+    find_damaged_samples,
+    lock_samples,
     new_scan_id,
     open_npz,
     open_records,
@@ -66,4 +66,4 @@ from polysight.store.scan_folder import (
     with_connection,
 )
 from polysight.store.source import CubeRow, RawSource, RowData, Scan, Source, raw_source
-from polysight.store.validation import damaged_rows, describe_damage, to_json, to_text, validate
+from polysight.store.validation import describe_damage, find_damaged_rows, to_json, to_text, validate

@@ -475,7 +475,7 @@ def record_digest(record: Any) -> str:
     return f"{crc32(record.tobytes()):08x}"
 
 
-def damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
+def find_damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
     """Check the kept samples of all committed rows; return the rows without whole samples, with the files to blame."""
     folder = scan.path / SAMPLES
     boards = [board.name for board in scan.instrument.receivers]
@@ -494,7 +494,7 @@ def damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
 
 
 @contextmanager
-def locked_samples(scan: ScanFolder) -> Iterator[None]:
+def lock_samples(scan: ScanFolder) -> Iterator[None]:
     """Lock the kept samples, so that no program writes them meanwhile.
 
     Raises

@@ -94,7 +94,7 @@ def validate(path: Path) -> list[Finding]:
     return findings
 
 
-def damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
+def find_damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
     """Return the committed rows whose files differ from the commit, with the faults of each; reads every byte.
 
     Raises DeviceError on a read error: the row may be undamaged and must not be taken again.
@@ -260,7 +260,7 @@ def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
     if (scan.path / scan_folder.SAMPLES).exists():
         rows_without_raw = scan_folder.dropped_rows(scan)
         remedy_of_samples = "its raw data was dropped: restore the file from a copy, or images leave it out"
-        for row, names in scan_folder.damaged_samples(scan).items():
+        for row, names in scan_folder.find_damaged_samples(scan).items():
             problem = f"row {row} is damaged or missing (CRC)"
             findings += [_make_error(name, problem, remedy_of_samples) for name in names if row in rows_without_raw]
     else:

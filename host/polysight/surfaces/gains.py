@@ -1,12 +1,12 @@
-"""Gains of both receivers over direction, learnt from metal of known shape: what a permittivity is referenced to.
+"""Gains of both receivers over direction, learnt from metal of known shape: the reference of a permittivity.
 
 A metal sphere covers directions; a flat plate gives one. What TX sends depends on the direction of departure, and what
-a receiver takes on that of arrival. At the distance of the reference, one of these directions gives the other; at
-other distances it does not, and the error of the level is half the difference of what both say. H over V needs the
-direction of arrival alone: TX cancels.
+a receiver takes on that of arrival. At the distance of the reference, one of these directions gives the other. At other
+distances it does not; the error of the level is then half the difference of both estimates. H over V needs only the
+direction of arrival, because TX cancels.
 
-`find_voltages` gives the voltages of H and V without path and spreading, and what the coefficients of a surface would
-give. V sees a point from a stage position some 15 mm from H's, under an incidence of its own.
+`find_voltages` gives the voltages of H and V without path and spreading, and the rows that turn a surface's reflection
+coefficients into such voltages. V sees a point from another stage position (some 15 mm from H's), under another angle.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from polysight.surfaces.measure import Seen, Shape, find_shape
 from polysight.surfaces.optics import (
     Optics,
-    bends_by_incidence,
+    compute_polarisation_row,
     mix_twisted,
-    polarisation_row,
     reflect_curved,
     reflect_spherical,
+    resolve_curvature,
 )
 from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo, spreading, unit_legs
 from polysight.surfaces.window import WINDOW_M
@@ -101,13 +101,13 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
         spread = spreading(*solid, at_m, tx_m, receiver.at_m)
         b.append(echoes.move(at_m, k).amplitude * np.exp(1j * k * path) / spread)
         std.append(echoes.amplitude_std / spread)
-        rows.append(polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
+        rows.append(compute_polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
         _, cos = find_normals(shape.points, at_m, tx_m, receiver.at_m)
         theta.append(np.arccos(np.clip(cos, 0, 1)))
         paths.append(path)
     _, back, *_ = unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
     out, *_ = unit_legs(shape.points, seen_from["h"], tx_m, optics.h.at_m)
-    inside, across, twist = bends_by_incidence(*solid, seen.h.at_m, tx_m)
+    inside, across, twist = resolve_curvature(*solid, seen.h.at_m, tx_m)
     return Voltages(
         b=np.stack(b, axis=1),
         std=np.stack(std, axis=1),
@@ -129,7 +129,7 @@ def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> C
     eps_of_receivers = np.asarray(eps)[..., None]
     r_s, r_p = reflect_curved(eps_of_receivers, v.theta, v.bend_inside[:, None], v.bend_across[:, None], wave_number)
     mixed = mix_twisted(eps_of_receivers, v.theta, v.twist[:, None], wave_number)
-    # What the reflection of a spherical wave has beyond that of a plane one.
+    # The antennas are near: a spherical wave is reflected a little differently than a plane one.
     more_s, more_p = reflect_spherical(eps_of_receivers, v.theta, v.path_m, wave_number)
     return np.stack([r_s + more_s, r_p + more_p, mixed, mixed], axis=2)
 
@@ -184,8 +184,8 @@ class Gains:
     middle, departure_middle, degree
         Middles of the directions of arrival and of departure, and the degree of the polynomials.
     std
-        Standard deviation of each part of ln(H / V) within the directions covered: what the polynomial does not follow,
-        beyond the noise of the reference's points, and the next order of the reference's own curvature.
+        Standard deviation of each part of ln(H / V) within the directions covered: the misfit of the polynomial without
+        the noise of the reference's points, and the next order of the reference's own curvature.
     covered
         Smallest and largest direction, [2] each.
     terms_root, cell
@@ -213,7 +213,7 @@ class Gains:
         return np.exp(self._make_basis(arrival) @ self.ratio_terms)
 
     def level(self, v: Voltages) -> Array:
-        """Return ln|gain of H|, [n]: the mean of what arrival and departure say."""
+        """Return ln|gain of H|, [n]: the mean of the estimates from arrival and departure."""
         return np.mean(self._find_levels(v), axis=0)
 
     def estimate_level_std(self, v: Voltages) -> Array:
@@ -242,8 +242,9 @@ class Gains:
     def list_errors(self, arrival: Array) -> Array:
         """Return independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
 
-        What the polynomials do not follow differs from cell to cell of the directions; a wide object averages over it.
-        Errors of the polynomials' terms are common to all directions, and so is what lies beyond those covered.
+        The misfit of the polynomials differs from cell to cell of the directions; a wide object averages over it.
+        Errors of the polynomials' terms are common to all directions, and so are those of directions that are not
+        covered.
         """
         of_terms = self._make_basis(arrival) @ self.terms_root
         cells = np.floor((arrival - self.middle) / self.cell)
@@ -265,16 +266,16 @@ def _evaluate_polynomials(d: Array, degree: int) -> Array:
 def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
     """Return the coefficients of `values` [n] in `basis` [n, terms], and the residuals; outliers lose their weight."""
     coefficients = np.zeros(basis.shape[1], values.dtype)
-    rest = values
+    residual = values
     # Five rounds, and weights that halve at two standard deviations: chosen.
     for _ in range(5):
         root = np.sqrt(weight)
         coefficients = np.linalg.lstsq(basis * root[:, None], values * root, rcond=None)[0]
-        rest = values - basis @ coefficients
+        residual = values - basis @ coefficients
         # 1.48 turns the median of normal deviations into their standard deviation.
-        spread = 1.48 * np.median(np.abs(rest))
-        weight = weight / (1 + (np.abs(rest) / (2 * spread + 1e-9)) ** 2)
-    return coefficients, rest
+        spread = 1.48 * np.median(np.abs(residual))
+        weight = weight / (1 + (np.abs(residual) / (2 * spread + 1e-9)) ** 2)
+    return coefficients, residual
 
 
 def learn_gains(metal: Voltages, wave_number: float) -> Gains:
@@ -284,9 +285,9 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     """
     coefficients = reflect_points(np.inf, metal, wave_number)
     gain = metal.b / receive(metal, coefficients)
-    sound = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
-    metal = metal[sound]
-    gain = gain[sound]
+    is_valid = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
+    metal = metal[is_valid]
+    gain = gain[is_valid]
     ratio = gain[:, 0] / gain[:, 1]
     # No point counts as better than 1 % (chosen).
     weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
@@ -299,15 +300,15 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     # Phases are taken about their mean, so that none wraps.
     centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
     log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
-    ratio_terms, rest = _fit_robustly(basis, log_ratio, weight)
+    ratio_terms, residual = _fit_robustly(basis, log_ratio, weight)
     of_departure = _evaluate_polynomials(metal.departure - departure_middle, degree)
     level = np.log(np.abs(gain[:, 0]))
     level_terms = np.stack([_fit_robustly(terms, level, weight)[0] for terms in (basis, of_departure)])
     # The next order of metal's own correction, r_p / r_s = 1 + first order.
-    first_order = np.abs(coefficients[sound, 0, 1] / coefficients[sound, 0, 0] - 1)
+    first_order = np.abs(coefficients[is_valid, 0, 1] / coefficients[is_valid, 0, 0] - 1)
     next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
     noise2 = np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1)
-    misfit_std, noise_std = _compute_misfit_std(rest, noise2, metal.at_m)
+    misfit_std, noise_std = _compute_misfit_std(residual, noise2, metal.at_m)
     std = float(np.hypot(np.sqrt(max(0.0, misfit_std**2 - noise_std**2)), next_order))
     # A cell is as wide as the direction changes while the stage moves by a block; a plate has one direction.
     rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
@@ -329,13 +330,13 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     )
 
 
-def _compute_misfit_std(rest: Complex, noise2: Array, at_m: Array) -> tuple[float, float]:
+def _compute_misfit_std(residual: Complex, noise2: Array, at_m: Array) -> tuple[float, float]:
     """Return the standard deviation of each part of a fit's residuals, and its part by noise of variance `noise2` [n].
 
-    It is the root mean square over blocks of the mean residual, `rest` [n], in each block.
+    It is the root mean square over blocks of the mean `residual` [n] in each block.
     """
     # Outliers count as five times the median (chosen).
-    clipped = rest / np.maximum(1, np.abs(rest) / (5 * np.median(np.abs(rest)) + 1e-12))
+    clipped = residual / np.maximum(1, np.abs(residual) / (5 * np.median(np.abs(residual)) + 1e-12))
     block = number_blocks(at_m, (0.0, 0.0))
     count = np.bincount(block)
     sums = np.bincount(block, clipped.real) + 1j * np.bincount(block, clipped.imag)

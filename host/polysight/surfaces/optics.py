@@ -54,7 +54,7 @@ class Antenna:
     def field(self, directions: Array) -> Complex:
         """Field vectors [n, 3] in unit directions [n, 3]."""
         vector = self.wanted + self.leakage * self.other
-        return _carry(self.boresight, directions, vector)
+        return _carry_along_arc(self.boresight, directions, vector)
 
     def turn(self, angle_rad: float) -> Antenna:
         """Return the antenna with its polarisation turned about the boresight, right-handed."""
@@ -64,7 +64,7 @@ class Antenna:
         return replace(self, wanted=turned[0], other=turned[1])
 
 
-def _carry(start: Array, ends: Array, vector: NDArray) -> NDArray:
+def _carry_along_arc(start: Array, ends: Array, vector: NDArray) -> NDArray:
     """Turn `vector`, across the unit vector `start`, as `start` is turned to `ends` [n, 3] on the shortest arc."""
     along_ends = ends @ vector
     # Rodrigues' rotation for start . vector = 0; the limit is for an end opposite to the start (no arc is shortest).
@@ -133,7 +133,7 @@ def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float,
     p_axis *= np.sign(p_axis[0])
     s_share, p_share = parts
     vectors = (s_share * s_axis + p_share * p_axis, p_share * s_axis + s_share * p_axis)
-    at_boresight = [_carry(direction, boresight[None], vector)[0] for vector in vectors]
+    at_boresight = [_carry_along_arc(direction, boresight[None], vector)[0] for vector in vectors]
     return Antenna(at_m, boresight, at_boresight[0], at_boresight[1])
 
 
@@ -182,8 +182,8 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
     return VisibleNormals(float(tilts[0, 0]), float(tilts[1, 1]), (limits[0], limits[1]))
 
 
-def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:
-    """Coefficients [n, 4] of r_s, r_p, and of what the surface turns from s to p and from p to s, in a voltage.
+def compute_polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:
+    """Coefficients [n, 4] of r_s and r_p in a voltage, and of the reflections from s to p and from p to s.
 
     `points` and `normals` [n, 3] are seen from stage offsets `at_m` [n, 3].
     """
@@ -207,7 +207,7 @@ def polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx
     return np.stack(rows, axis=1)
 
 
-def bends_by_incidence(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> Array:
+def resolve_curvature(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> Array:
     """Curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m.
 
     `curvature` [n, 2, 2] is that along the `tangents` of the `normals`; `points`, `normals` and the stage offsets
@@ -251,14 +251,14 @@ def reflect_curved(
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
-    # s, then p. `inside` is half the variance of the angle times r''. Across the plane of incidence, the angle grows by
-    # half the squared deviation over tan(theta), and the plane turns by the deviation over sin(theta).
+    # s, then p. `inside` is half the variance of the angle times r''. For `across`, the angle grows by half the
+    # squared deviation over tan(theta), and the plane turns by the deviation over sin(theta).
     for local, r, other, up, down in zip(single_wave, middle, middle[::-1], above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
         inside = 1j * bend_inside / (4 * wave_number * cos) * second
-        beside = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
-        coefficients.append(local + inside + beside)
+        across = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
+        coefficients.append(local + inside + across)
     return coefficients[0], coefficients[1]
 
 
@@ -332,7 +332,7 @@ def _reflect_local(
 
     # Cylinder across the plane of incidence. Logarithmic derivatives along the normal, over k: of the waves towards the
     # surface and away from it in air (`into`, `out`), and of the wave in the medium (`behind`). `outer` and `inner` are
-    # what the curvature changes in them outside and inside.
+    # the changes by curvature outside and inside.
     outer = bend_inside / (2 * wave_number * cos**2)
     inner = bend_inside / (2 * wave_number * cos_medium**2)
     into = 1j * cos - outer

@@ -74,7 +74,7 @@ class DirectPath(NamedTuple):
         """Return the same without the `dead` RX [rx], for which everything is 0."""
         return _prepare(*self.geometry, tuple(np.flatnonzero(dead).tolist()))
 
-    def reordered(self, order: Sequence[int]) -> DirectPath:
+    def reorder_rx(self, order: Sequence[int]) -> DirectPath:
         """Return the same for RX in another order: recorded RX k is the one at place `order[k]`, from 0."""
         places = list(order)
         blocks = self.folded_steering.shape[1]

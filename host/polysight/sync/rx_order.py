@@ -116,7 +116,7 @@ def find_rx_order(
     part = _take_positions(aligned, chosen)
     best: tuple[float, _Vectors] | None = None
     for order in itertools.permutations(range(count)):
-        tried = reference_with(part, path.reordered(order))
+        tried = reference_with(part, path.reorder_rx(order))
         if np.count_nonzero(tried.found) < _FOUND * chosen.size:
             continue
         vectors = _measure(tried, path, expected, order)

@@ -7,5 +7,5 @@ Specification: docs/spec/simulated-rig.md.
 """
 
 from polysight_simulators.cards.adversary import KINDS, RADAR, Adversary, Arrival, Sent
-from polysight_simulators.cards.card import MAC, CardEndpoint, bound_udp
+from polysight_simulators.cards.card import MAC, CardEndpoint, bind_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network

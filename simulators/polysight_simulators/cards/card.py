@@ -26,7 +26,11 @@ from polysight_simulators.cards.sync_in import RECOVERY_US, Pulse, StageTrack, S
 from polysight_simulators.faults import Faults
 from polysight_simulators.radars import RadarBoard
 
+if TYPE_CHECKING:
+    from polysight_simulators.scene import SignalSource
+
 Rows = NDArray[np.uint8]
+Clock = Callable[[], float]
 # Option of linux/udp.h: the kernel cuts one buffer into equal datagrams.
 _UDP_SEGMENT = 103
 # Most bytes and packets of one call: below the largest UDP datagram.
@@ -42,6 +46,13 @@ _WAIT_TIMEOUT_S = 2.0
 _MAX_QUEUED_BYTES = 64 << 20
 # Largest delay of the packets that later calls make up for; chosen.
 _CATCH_UP_S = 0.01
+# Least time without data before a record ends, wall time: with a large time scale the card's own 30 s of wire time
+# would end before the stage has moved.
+NO_DATA_FLOOR_S = 10.0
+# Number of frames per call, which bounds the memory; chosen.
+FRAMES_PER_CALL = 64
+# Default MAC address of a card.
+MAC = b"\x12\x34\x56\x78\x90\x12"
 
 
 class ReceiveQueue:
@@ -56,7 +67,7 @@ class ReceiveQueue:
         except OSError:
             self._table = None
 
-    def look(self) -> tuple[int, int] | None:
+    def read_state(self) -> tuple[int, int] | None:
         """Return unread bytes and dropped datagrams; None if the socket is not on this machine."""
         if self._table is None:
             return None
@@ -101,7 +112,7 @@ class CardSender:
     ) -> None:
         self._command_to = command_to
         self._data_to = data_to
-        self._socket = bound_udp(*source)
+        self._socket = bind_udp(*source)
         self._segmented = _can_segment(self._socket)
         self._receiver = ReceiveQueue(*data_to)
         self._wait_for_receiver = wait_for_receiver
@@ -130,7 +141,7 @@ class CardSender:
 
     def count_dropped_by_receiver(self) -> int | None:
         """Return the number of datagrams dropped by the receiving socket; None if it is not on this machine."""
-        queue_state = self._receiver.look()
+        queue_state = self._receiver.read_state()
         if queue_state is None:
             return None
         _, dropped = queue_state
@@ -193,7 +204,7 @@ class CardSender:
         """Return True if the receiver has room, or has not read for too long."""
         if not self._wait_for_receiver:
             return True
-        queue_state = self._receiver.look()
+        queue_state = self._receiver.read_state()
         if queue_state is None or queue_state[0] <= _UNREAD_BYTES:
             self._waiting_since_s = None
             return True
@@ -236,7 +247,7 @@ class CardSender:
         self._receiver.close()
 
 
-def bound_udp(address: str, port: int) -> socket.socket:
+def bind_udp(address: str, port: int) -> socket.socket:
     """Return a UDP socket bound to an address of this machine. Raises DeviceError."""
     s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -259,19 +270,6 @@ def _can_segment(s: socket.socket) -> bool:
     except OSError:
         return False
     return True
-
-
-# Least time without data before a record ends, wall time: with a large time scale the card's own 30 s of wire time
-# would end before the stage has moved.
-NO_DATA_FLOOR_S = 10.0
-if TYPE_CHECKING:
-    from polysight_simulators.scene import SignalSource
-
-# Number of frames per call, which bounds the memory; chosen.
-FRAMES_PER_CALL = 64
-# Default MAC address of a card.
-MAC = b"\x12\x34\x56\x78\x90\x12"
-Clock = Callable[[], float]
 
 
 class CardEndpoint:
@@ -328,7 +326,7 @@ class CardEndpoint:
 
     def _bind(self, network: dca1000.Network) -> None:
         """Bind command socket and sender at these addresses. Raises DeviceError."""
-        self._commands = bound_udp(network.card_address, network.command_port)
+        self._commands = bind_udp(network.card_address, network.command_port)
         self._commands.setblocking(False)
         try:
             self.sender = CardSender(
@@ -523,7 +521,7 @@ class SimulatedCard:
         """Process rising edges of SYNC_IN at these wire times."""
         pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
         self._pulses += len(pulses)
-        self._send_frames(self._sync.frames(self._pulse_faults.select_seen(pulses)), track)
+        self._send_frames(self._sync.select_starting(self._pulse_faults.select_seen(pulses)), track)
         self.last_data_wall_s = self._clock_s()
 
     def _send_frames(self, started: list[Pulse], track: StageTrack) -> None:
@@ -531,7 +529,7 @@ class SimulatedCard:
         if not self.card.recording:
             self.endpoint.counts["frames_not_recorded"] += len(started)
             return
-        for run in _group_pulses(track.places(started)):
+        for run in _group_pulses(track.number_by_plan(started)):
             self._send_run(run, track)
 
     def _send_run(self, run: list[Pulse], track: StageTrack) -> None:
@@ -546,7 +544,7 @@ class SimulatedCard:
         frames = chirps.reshape(len(run), -1, *chirps.shape[2:])
         counts["frames"] += len(frames)
         for lvds in self._overflow.split(frames):
-            self.endpoint.emit(self.card.lvds(lvds.data, self.endpoint.wire_s()))
+            self.endpoint.emit(self.card.process_lvds(lvds.data, self.endpoint.wire_s()))
             if lvds.lost_bytes:
                 counts["overflows"] += 1
                 counts["overflow_bytes"] += lvds.lost_bytes

@@ -106,7 +106,7 @@ class Packets(NamedTuple):
 Output = Message | Packets
 
 
-def message(code: int, status: int) -> Message:
+def make_message(code: int, status: int) -> Message:
     """Return a reply, or with code 0x0A an asynchronous status."""
     return Message(struct.pack("<HHHH", REQUEST_HEADER, code, status, REQUEST_FOOTER))
 
@@ -250,12 +250,12 @@ class Card:
                 self._last_data_s = None
                 self._started_s = now_s
                 self.records += 1
-            return [message(code, 0)]
+            return [make_message(code, 0)]
         if code == Code.RECORD_STOP:
             if not self._recording:
-                return [message(code, 0)]
-            return [message(code, 0), *self._end(Status.RECORD_COMPLETED)]
-        return [message(code, self._configure(code, body, well_formed))]
+                return [make_message(code, 0)]
+            return [make_message(code, 0), *self._end(Status.RECORD_COMPLETED)]
+        return [make_message(code, self._configure(code, body, well_formed))]
 
     def _configure(self, code: int, body: bytes, well_formed: bool) -> int:
         """Execute a request other than record start and stop; return the status of its reply.
@@ -289,7 +289,7 @@ class Card:
             return 1
         return 0
 
-    def lvds(self, data: NDArray[np.generic], now_s: float) -> list[Output]:
+    def process_lvds(self, data: NDArray[np.generic], now_s: float) -> list[Output]:
         """Process LVDS data of the radar; return the packets it fills, [] without a record or if wrongly configured."""
         if not self._recording or not self._suits_radar:
             return []
@@ -303,7 +303,7 @@ class Card:
         """Report LVDS data lost before packetising, which leaves no gap in the sequence numbers."""
         if not self._recording:
             return []
-        return [message(Code.STATUS, Status.LVDS_BUFFER_FULL)]
+        return [make_message(Code.STATUS, Status.LVDS_BUFFER_FULL)]
 
     def tick(self, now_s: float) -> list[Output]:
         """End the record if :attr:`deadline_s` has passed: the short last packet, then the status."""
@@ -316,4 +316,4 @@ class Card:
         """End the record; return the short last packet, if any, and the status."""
         self._recording = False
         tail = self._packetiser.flush()
-        return [*([Packets(tail)] if len(tail) else []), message(Code.STATUS, status)]
+        return [*([Packets(tail)] if len(tail) else []), make_message(Code.STATUS, status)]

@@ -46,14 +46,14 @@ class SyncInput:
         self.too_soon = 0
 
     def arm(self) -> None:
-        """Arm the radar for the pulses of one row; frames left of the last row are dropped."""
+        """Arm the radar for the pulses of one row, whatever number of frames the row before has left."""
         self._frames_left = self._row_frames
         self.rearmed += 1
 
-    def frames(self, pulses: list[Pulse]) -> list[Pulse]:
+    def select_starting(self, pulses: list[Pulse]) -> list[Pulse]:
         """Return the pulses that start a frame; count the others as `too_soon` (a real radar faults) or `unarmed`."""
         if self._radar is not None:
-            return self._read_native(self._radar, pulses)
+            return self._trigger_board(self._radar, pulses)
         started = []
         for pulse in pulses:
             if self._frames_left == 0:
@@ -69,7 +69,7 @@ class SyncInput:
             started.append(pulse)
         return started
 
-    def _read_native(self, radar: RadarBoard, pulses: list[Pulse]) -> list[Pulse]:
+    def _trigger_board(self, radar: RadarBoard, pulses: list[Pulse]) -> list[Pulse]:
         """Return the pulses at which the simulated board starts a frame; count the others."""
         started = []
         for pulse in pulses:
@@ -132,10 +132,11 @@ class StageTrack:
         """True if the stage moves along x by its last motion line."""
         return bool(self._lines) and self._lines[-1].vx_um_s != 0
 
-    def places(self, pulses: list[Pulse]) -> list[Pulse]:
-        """Renumber the pulses by their place in the plan: row, point and pulse of the burst, in the order of a scan.
+    def number_by_plan(self, pulses: list[Pulse]) -> list[Pulse]:
+        """Return the pulses with new numbers, by their place in the plan: row, point and pulse of the burst.
 
-        A retaken row thus keeps its numbers. A pulse that belongs to no point keeps its number.
+        The numbers count in the order of a scan, so that a retaken row has the same ones. A pulse that belongs to no
+        point keeps its number.
         """
         renumbered: list[Pulse] = []
         edge_ns = -1

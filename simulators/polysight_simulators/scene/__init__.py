@@ -24,4 +24,4 @@ from polysight_simulators.scene.scene_file import (
     load_scene,
     without_offset,
 )
-from polysight_simulators.scene.simulated_scan import lost_bytes, row_offsets_mm, simulate, truth
+from polysight_simulators.scene.simulated_scan import find_lost_bytes, row_offsets_mm, simulate, truth

@@ -97,7 +97,7 @@ def row_offsets_mm(radar: SimulatedRig, row: Row) -> tuple[NDArray[np.floating],
     return x, np.full(len(x), row.y_mm)
 
 
-def lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> layouts.Gaps:
+def find_lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> layouts.Gaps:
     """Return the byte ranges of a row in lost packets, sorted and merged."""
     loss = radar.scene.disturbances.packet_loss
     size = row.points * radar.rig.burst.pulses * radar.rig.frame_bytes
@@ -189,7 +189,7 @@ def simulate(
             x, y = y, x
         first_chirp = row.index * len(x)
         payloads = {b.name: radar.chirps(b.name, x, y, first_chirp) for b in boards}
-        writer.write_row(row, payloads, {b.name: lost_bytes(radar, b.name, row) for b in boards})
+        writer.write_row(row, payloads, {b.name: find_lost_bytes(radar, b.name, row) for b in boards})
         if progress is not None:
             progress(row.index + 1, plan.rows)
     facts = {**truth(rig, scene, radar.seed), "scan_id": scan_id, "samples_clipped": radar.clipped}

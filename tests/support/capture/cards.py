@@ -63,7 +63,7 @@ class Cards:
                 has_room = endpoint.sender.queued_bytes < MAX_QUEUED_BYTES
                 streams = endpoint.counts["bytes_made"] < self._streaming[name]
                 if streams and endpoint.card.recording and has_room:
-                    endpoint.emit(endpoint.card.lvds(FRAMES, endpoint.wire_s()))
+                    endpoint.emit(endpoint.card.process_lvds(FRAMES, endpoint.wire_s()))
                 endpoint.tick()
                 endpoint.flush()
 

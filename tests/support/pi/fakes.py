@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from polysight_pi.trigger import Edge, Seen
+from polysight_pi.trigger import Edge, ReturnedPulses
 from polysight_shared.errors import DeviceError, PolysightError, ProtocolError
 from polysight_shared.faults import StageError
 from polysight_shared.raster import Stage
@@ -98,8 +98,8 @@ class FakeLines:
         self.t = max(self.t, edge.t_ns)
         return edge
 
-    def look_back(self, sent: int) -> Seen | None:
-        return None if self.seen is None else Seen(self.seen(sent))
+    def count_returned(self, sent: int) -> ReturnedPulses | None:
+        return None if self.seen is None else ReturnedPulses(self.seen(sent))
 
     def pulse(self, width_ns: int) -> tuple[int, int]:
         rise = self.t

@@ -105,7 +105,7 @@ class Bench:
         self.edge_ns = t_ns
         self.lines.t = max(self.lines.t, t_ns)
         with self.loop._lock:
-            self.loop._take(Edge(t_ns, self.seqno))
+            self.loop._answer_edge(Edge(t_ns, self.seqno))
         self.run_posted()
 
     @property

@@ -82,6 +82,13 @@ def test_a_number_that_is_none_is_refused_in_words(words, rule, text):
     assert refusal(*words[:-1], f"{words[-1]}={text}").endswith(f"{text} is not {rule}")
 
 
+def test_a_chirp_has_an_even_number_of_samples_at_least_8():
+    for text in ("8", "10", "256"):
+        assert build_parser().parse_args(["inspect", "a.bin", "--samples", text]).samples == int(text)
+    for text in ("6", "9", "0", "-8"):
+        assert refusal("inspect", "a.bin", f"--samples={text}").endswith(f"{text} is not an even number, 8 or more")
+
+
 @pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e5"])
 @pytest.mark.parametrize("place", ["{},0,40,40", "0,{},40,40", "0,0,{},40", "0,0,40,{}"])
 def test_a_metal_box_is_a_place_on_the_image(text, place):

@@ -139,6 +139,9 @@ def os_error(
     if e.errno == errno.ENOENT:
         # A folder that was renamed does not mean a full disk.
         cause = "it was moved, renamed or deleted"
+    if e.errno in (errno.ENOTDIR, errno.EEXIST):
+        cause = "a file has the name of a folder that is needed here"
+        remedy = "give another path"
     if e.errno == errno.EISDIR:
         cause = "a file is needed here"
         remedy = "give the path of a file"

@@ -52,6 +52,27 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, caps
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "sync-report nowhere",
+        "focus nowhere",
+        "surface nowhere",
+        "calibrate hpf nowhere",
+        "calibrate metal nowhere",
+        "calibrate sphere nowhere --radius 100",
+        "calibrate start-frequency nowhere",
+        "calibrate direct-path nowhere --target nowhere.toml",
+    ],
+)
+@pytest.mark.parametrize("name", ["file", "file/x"])
+def test_a_folder_that_cannot_be_made_is_refused_before_the_data_are_read(tmp_path, capsys, command, name):
+    assert main([*command.split(), "--out", str(tmp_path / name)]) == 5
+    message = capsys.readouterr().err
+    assert f"{tmp_path / 'file'}: Not a directory" in message
+    assert "a file has the name of a folder" in message
+
+
 @pytest.mark.parametrize("command", PICTURES)
 @pytest.mark.parametrize("name", ["x.jpg", "x.pdf", "x", "x.png.txt"])
 def test_a_picture_has_the_ending_of_its_format(tmp_path, capsys, command, name):

@@ -31,6 +31,7 @@ from polysight.polarimetry import Leakage, leakage_from_images, specular_inciden
 from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
+from polysight_shared.files import require_writable_folder
 from polysight_shared.tables import to_builtins
 
 # Least number of pixels that show metal in all scans of `leakage`; chosen: 25 remain in each quarter for the error.
@@ -81,6 +82,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     """
     from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
 
+    require_writable_folder(out.absolute())
     points = read_target(target)
     rig_file = load_rig_file(config)
     source = open_raw(scan, rig_file)
@@ -123,6 +125,7 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
     """
     from polysight.calibration import fit_filter
 
+    require_writable_folder(out.absolute())
     rig = load_rig_file(config)
     sources = [open_raw(folder, rig) for folder in scans]
     corners_khz = {(s.instrument.chirp.hpf1_khz, s.instrument.chirp.hpf2_khz) for s in sources}
@@ -155,6 +158,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
     from polysight.calibration import MetalFile, read_calibration, write_metal
     from polysight.imaging import sub_bands
 
+    require_writable_folder(out.absolute())
     source = open_raw(scan, load_rig_file(config))
     parts = ()
     if bands > 1:
@@ -180,6 +184,7 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
     """Choose start offsets that centre the direct paths in the IF band; return 0. Raises PolysightError."""
     from polysight.calibration import fit_start
 
+    require_writable_folder(out.absolute())
     source = open_raw(scan, load_rig_file(config))
     names = [b.name for b in source.instrument.receivers]
     boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}

@@ -33,6 +33,7 @@ from polysight.surfaces import (
 )
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
+from polysight_shared.files import require_writable_folder
 
 # Fronts of objects lie up to this before or behind the object plane; chosen.
 DEPTH_M = 0.12
@@ -78,6 +79,7 @@ def surface(
     Several scans are of one object on a turntable, which had turned by `turned_deg` about a vertical axis at `axis_mm`:
     x from the middle of the grid, z from the object plane (None: 0, 0).
     """
+    require_writable_folder(out.absolute())
     check_turns(len(scans), turned_deg)
     surfaces = [make_surface(scan, config, reference) for scan in scans]
     joined = surfaces[0]
@@ -162,6 +164,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     """`polysight calibrate sphere`: keep points of a metal sphere as reference of surfaces. Raises PolysightError."""
     from polysight.jobs.calibrate import print_result, rig_file_keys
 
+    require_writable_folder(out.absolute())
     raw = open_raw(scan, load_rig_file(config))
     _, optics, points = process_to_points(scan, config)
     metal = points[points.segment == 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ def jumping(board: str, row: int, degrees: float) -> Cubes:
     return cubes
 
 
-@pytest.mark.parametrize(("board", "row", "degrees"), [("RV", 14, 30.0), ("RV", 24, -30.0), ("RH", 20, 25.0)])
+@pytest.mark.parametrize(("board", "row", "degrees"), [("RV", 14, 30.0), ("RV", 24, -30.0), ("RH", 16, 25.0)])
 def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degrees):
     cubes = jumping(board, row, degrees)
     pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
@@ -47,6 +48,31 @@ def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degr
 def test_no_jump_is_found_without_one():
     for cubes in (jumping("RV", 20, 0.0), jumping("RV", 20, 2.0)):
         pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
+        assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
+
+
+def draw_scene(rng: np.random.Generator) -> dict[str, Any]:
+    """Uneven, tilted plates of drawn materials in most of nine places; rows 5 or 6 mm apart, few enough for aliases."""
+    plates: list[dict[str, Any]] = []
+    for x, y in itertools.product((-60, 0, 60), (-60, 0, 60)):
+        if plates and rng.random() < 0.35:
+            continue
+        plate: dict[str, Any] = {
+            "name": f"plate {len(plates)}", "centre_mm": [x + rng.uniform(-5, 5), y + rng.uniform(-5, 5)],
+            "size_mm": rng.uniform(30, 55, 2).tolist(), "tilt_deg": rng.normal(0, 0.7, 2).tolist(),
+            "height_mm": -rng.uniform(0, 6), "rough_mm": float(rng.choice([0.0, 0.08, 0.25])), "rough_length_mm": 15.0,
+        }  # fmt: skip
+        medium = {"permittivity": [rng.uniform(2, 7), rng.uniform(0, 1.5)]} if plates else {"metal": True}
+        plates.append(plate | medium)
+    grid = {"columns": 31, "rows": int(rng.integers(25, 68)), "step_x_mm": 10.0, "step_y_mm": float(rng.choice([5, 6]))}
+    return {"name": "drawn", "seed": int(rng.integers(1000000)), "grid": grid, "plates": plates}
+
+
+def test_no_drawn_scene_has_a_jump_of_its_own(request):
+    """With other limits every sixth had one, which was taken out of its images."""
+    rng = np.random.default_rng(3)
+    for _ in range(40 if request.config.getoption("--long") else 1):
+        pipeline = make_pipeline(Cubes(published_rig(), decode_scene(draw_scene(rng), "test")))  # type: ignore[arg-type]
         assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
 
 
@@ -69,4 +95,4 @@ def test_jumps_of_an_independent_world_are_found(degrees, row):
     jump = find_phase_jump(turned)
     assert jump is not None
     assert jump.row == row
-    assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=5)
+    assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=1)

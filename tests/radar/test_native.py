@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 
 from polysight.radar import board as boards
 from polysight.radar.commands import GET_DIE_ID
-from polysight.radar.control import NativeRadars, RadarState, radar_board
+from polysight.radar.control import NativeRadars, RadarState, make_radar_board
 from polysight.radar.diagnosis import ReplayedWords, read_trace
 from polysight.store.manifest import decode_line, encode_line
 from polysight_shared.config import Instrument, NativeRadar, Radar
@@ -256,7 +256,7 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
     assert any(line.error is not None for line in lines)
     # The first link's trace replays the bring-up without the board.
     replayed = ReplayedWords(files[0])
-    replayed_board = radar_board(rig, "LS", replayed, replayed, None)
+    replayed_board = make_radar_board(rig, "LS", replayed, replayed, None)
     replayed_board.configure()
     replayed_board.arm(FRAMES)
 

@@ -6,7 +6,7 @@ import random
 import pytest
 
 from polysight_shared.stage_line import Command, Immediate, Parameter
-from polysight_simulators.stage import homing_zero
+from polysight_simulators.stage import count_steps_to_zero
 from polysight_simulators.uno import HZ
 
 US = HZ // 1_000_000
@@ -92,7 +92,7 @@ def test_homing_finds_the_same_zero(host, accel: int):
     for x, y in ((900, 700), (377, 1111)):
         host.motion("MOVE", x, y, 2000)
         host.motion("HOME")
-        assert host.uno.motors == (homing_zero(),) * 3
+        assert host.uno.motors == (count_steps_to_zero(),) * 3
 
 
 def test_backlash_comes_from_below_and_runs_up(host):

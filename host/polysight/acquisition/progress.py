@@ -37,21 +37,21 @@ class ProcessingQueue:
         self._limit = limit
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="rows", initializer=_yield_to_capture)
         # Every row that was queued, and the unprocessed rows of this run.
-        self._all: list[Future[None]] = []
+        self._futures: list[Future[None]] = []
         self._of_this_run: list[Future[None]] = []
 
     def add_earlier(self, rows: Iterable[int]) -> None:
         """Queue rows that were committed before this run; the scan does not wait for them."""
         if self._on_row is not None:
-            self._all += [self._worker.submit(self._on_row, row) for row in rows]
+            self._futures += [self._worker.submit(self._on_row, row) for row in rows]
 
     def add(self, row: int) -> None:
         """Queue a row that was just committed."""
         self.add_earlier([row])
-        self._of_this_run += self._all[-1:]
+        self._of_this_run += self._futures[-1:]
 
     @property
-    def behind(self) -> int:
+    def over_limit(self) -> int:
         """Number of unprocessed rows of this run if it is above the limit, otherwise 0."""
         self._of_this_run = [f for f in self._of_this_run if not f.done()]
         if len(self._of_this_run) <= self._limit:
@@ -61,7 +61,7 @@ class ProcessingQueue:
     @property
     def left(self) -> int:
         """Number of unprocessed rows, of this run and of earlier ones."""
-        return sum(not f.done() for f in self._all)
+        return sum(not f.done() for f in self._futures)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until the oldest row of this run is processed, or for the timeout."""
@@ -70,7 +70,7 @@ class ProcessingQueue:
     def close(self, now: bool) -> BaseException | None:
         """Process the queued rows (with `now` only the current one); return the first error of processing, or None."""
         self._worker.shutdown(wait=True, cancel_futures=now)
-        return next((f.exception() for f in self._all if not f.cancelled() and f.exception() is not None), None)
+        return next((f.exception() for f in self._futures if not f.cancelled() and f.exception() is not None), None)
 
 
 def _yield_to_capture() -> None:

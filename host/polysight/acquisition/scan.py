@@ -328,7 +328,7 @@ class RunningScan:
     def _wait_for_processing(self) -> bool:
         """Wait until processing has caught up; return False if asked to stop now, or during the wait."""
         waited = False
-        while waiting := self._queue.behind:
+        while waiting := self._queue.over_limit:
             if self._stop.after_row:
                 return False
             if not waited:

@@ -1,7 +1,7 @@
 """The operator's notes and tags of a scan, in a file of the scan's folder.
 
-A scan folder may come from anybody: its notes are read only up to a limit, from a regular file, and shown without
-characters that would change the line or the reading direction.
+A scan folder may come from another person: its notes are read only up to a limit, from a regular file, and shown
+without characters that would change the line or the reading direction.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Notes(msgspec.Struct, frozen=True):
 
 
 def read_notes(folder: Path) -> Notes:
-    """Read the notes of a scan; empty if there are none, or the file is too large to be ours.
+    """Read the notes of a scan; empty if there are none, or the file is too large to have been written here.
 
     Raises
     ------

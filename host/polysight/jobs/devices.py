@@ -27,9 +27,9 @@ from polysight.radar import (
     SystemClock,
     WordLink,
     check_board,
+    make_radar_board,
     open_board,
     plan_lines,
-    radar_board,
     read_firmware,
     read_image,
     require,
@@ -274,7 +274,7 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     words = _open_words(rig, name, clock, trace, slow)
     # A flash is written by a board that was started without this image.
     image_for_ram = None if flash else checked_image
-    board = radar_board(rig, name, words, clock, image_for_ram)
+    board = make_radar_board(rig, name, words, clock, image_for_ram)
     try:
         if flash:
             sys.stdout.write(f"{name}: {_write_flash(board, image, checked_image)}\n")
@@ -301,7 +301,7 @@ def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[]
 
     firmware = read_firmware(rig)
     transmits = rig.transmitter.name == name
-    board = check_board(open_words, lambda w: radar_board(rig, name, w, clock, firmware), transmits, print_result)
+    board = check_board(open_words, lambda w: make_radar_board(rig, name, w, clock, firmware), transmits, print_result)
     report = {}
     if board:
         report = board.report()

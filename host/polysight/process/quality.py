@@ -163,7 +163,7 @@ class BoardRows:
         sweeps = sample_frequencies_hz(self.rig.chirp), block_frequencies_hz(self.rig.chirp)
         self._filters = {sweep.size: object_filter(self.rig, self.board, sweep) for sweep in sweeps}
         self._path = prepare(self.rig, self.board)
-        # What each row tells about the order of the RX.
+        # Order of the RX that each row shows; empty if it is the rig file's, or not known.
         self._orders: dict[int, tuple[int, ...]] = {}
         # The latest jump that was looked for, and the rows in which it was.
         self._jump: PhaseJump | None = None
@@ -229,9 +229,9 @@ class BoardRows:
 
     @property
     def rx_order(self) -> list[int]:
-        """Places in the rig file of the recorded RX, counted from 1, that most rows show which tell another order.
+        """Place in the rig file of each recorded RX, counted from 1: the order that most rows with another order show.
 
-        Empty if fewer than `OTHER_ORDER` of the rows tell it: rows without an echo cannot.
+        Empty if fewer than `OTHER_ORDER` of all rows show it; rows without an echo cannot.
         """
         for row, quality in list(self.rows.items()):
             if row not in self._orders:

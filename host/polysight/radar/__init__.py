@@ -13,9 +13,9 @@ from polysight.radar.control import (
     BoardState,
     RadarControl,
     RadarState,
+    make_radar_board,
     open_board,
     plan_lines,
-    radar_board,
     radar_control,
     read_firmware,
 )

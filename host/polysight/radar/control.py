@@ -110,7 +110,7 @@ def open_board(place: str, slow: bool = False) -> WordLink:
     return open_usb(place, slow)
 
 
-def radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
+def make_radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
     """Create a board of a rig with its word link and firmware."""
     native = rig.radar.native[name]
     commands = program(rig, rig.by_name(name))
@@ -230,7 +230,7 @@ class NativeRadars(RadarControl):
             opened.callback(self.close)
             for board in rig.boards:
                 words = self._open(board.name)
-                self._boards[board.name] = radar_board(rig, board.name, words, self._clock, firmware)
+                self._boards[board.name] = make_radar_board(rig, board.name, words, self._clock, firmware)
             for board in self._boards.values():
                 board.configure()
             self._check_distinct()
@@ -346,8 +346,8 @@ LINE = b"Retrigger\n"
 # Time between two looks whether a line was acknowledged (chosen).
 _POLL_MS = 5
 _START_SERVER = (
-    "start the control server of this board (beside mmWave Studio), or correct radar.servers in instrument.toml"
-    " (then continue the scan: `polysight resume SCAN --config instrument.toml`)"
+    "start the control server of this board (on the computer of mmWave Studio), or correct radar.servers in"
+    " instrument.toml (then continue the scan: `polysight resume SCAN --config instrument.toml`)"
 )
 
 
@@ -395,7 +395,7 @@ class LineServers(RadarControl):
                 self._reset.add(board)
         deadline = time.monotonic() + self._timeout_s
         for board in self._servers:
-            self._wait_taken(board, deadline)
+            self._wait_until_acknowledged(board, deadline)
 
     def states(self) -> dict[str, BoardState]:
         """Return `FAULT` for boards whose server reset the connection, otherwise `UNKNOWN` with its address."""
@@ -440,7 +440,7 @@ class LineServers(RadarControl):
             self._reset.add(board)
         return True
 
-    def _wait_taken(self, board: str, deadline: float) -> None:
+    def _wait_until_acknowledged(self, board: str, deadline: float) -> None:
         """Wait until the other machine acknowledged the line, or the connection ended.
 
         Raises DeviceError at the deadline (monotonic clock).

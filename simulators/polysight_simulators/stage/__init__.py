@@ -5,6 +5,6 @@ The program runs the sketch compiled for this machine; where that is not possibl
 the same ticks and send the same lines.
 """
 
-from polysight_simulators.stage.logic import homing_zero
+from polysight_simulators.stage.logic import count_steps_to_zero
 from polysight_simulators.stage.motion import NS_PER_TICK, TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig

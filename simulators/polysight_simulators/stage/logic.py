@@ -55,7 +55,7 @@ class Event(Enum):
     ALARM = 2
 
 
-def homing_zero() -> int:
+def count_steps_to_zero() -> int:
     """Return the steps from the closing point of a switch to the zero of homing.
 
     The creep sees the switch open after LOOKS readings (debouncing; one a step), takes the steps of its ramp to stop,
@@ -233,7 +233,7 @@ class StageLogic:
         _require(rate <= MAX_RATE, StageError.TOO_FAST)
         _require(self._is_within(x, y), StageError.SOFT_LIMIT)
         self._begin("move")
-        self._go(x, y, rate)
+        self._start_straight_leg(x, y, rate)
 
     def _start_row(self, x0: int, pitch: int, points: int, y: int, rate: int) -> None:
         """Begin a row of `points` triggers from `x0` on, signed `pitch` steps apart, at `y`.
@@ -263,7 +263,7 @@ class StageLogic:
             from_below = y - backlash
         else:
             from_below = y
-        self._go(x0 - run_up, from_below, self.parameters[Parameter.TRAVEL_SPEED])
+        self._start_straight_leg(x0 - run_up, from_below, self.parameters[Parameter.TRAVEL_SPEED])
 
     def _is_within(self, x: int, y: int) -> bool:
         return 0 <= x <= self.parameters[Parameter.TRAVEL_X] and 0 <= y <= self.parameters[Parameter.TRAVEL_Y]
@@ -280,7 +280,7 @@ class StageLogic:
         self._engine.pulses = 0
         self.heard = True
 
-    def _go(self, x: int, y: int, rate: int) -> None:
+    def _start_straight_leg(self, x: int, y: int, rate: int) -> None:
         self._arm(self._engine.start(Leg(x - self._engine.x, y - self._engine.y, rate)))
 
     def immediate(self, byte: int) -> bool:
@@ -320,7 +320,7 @@ class StageLogic:
             self._looked_ms = now_ms
             self._engine.look(self._inputs())
 
-    def _raise(self, alarm: StageError, position_lost: bool) -> Event:
+    def _raise_alarm(self, alarm: StageError, position_lost: bool) -> Event:
         """End all motion and latch an alarm; an emergency stop also switches the motors off."""
         self._engine.abandon()
         self._engine.set_accel(self.parameters[Parameter.ACCEL])
@@ -338,12 +338,12 @@ class StageLogic:
         engine = self._engine
         self._listen(now_ms)
         if engine.fault is not None:
-            return self._raise(engine.fault, True)
+            return self._raise_alarm(engine.fault, True)
         if engine.stable & EMERGENCY and self.alarm != StageError.EMERGENCY_STOP:
-            return self._raise(StageError.EMERGENCY_STOP, True)
+            return self._raise_alarm(StageError.EMERGENCY_STOP, True)
         if not self.busy:
             if self._stop and self.alarm is None:
-                return self._raise(StageError.STOPPED, False)
+                return self._raise_alarm(StageError.STOPPED, False)
             self._stop = False
             self._resume = False
             engine.abandon()
@@ -357,7 +357,7 @@ class StageLogic:
             engine.hold = True
             if engine.stepping:
                 return Event.NONE
-            return self._raise(self._stopping, self._stopping == StageError.HEARTBEAT_LOST)
+            return self._raise_alarm(self._stopping, self._stopping == StageError.HEARTBEAT_LOST)
         if self._resume:
             self._resume = False
             self._arm(engine.resume())
@@ -370,7 +370,7 @@ class StageLogic:
     def _plan_leg(self) -> Event:
         """Start what follows a finished leg, or report the end."""
         if self.activity == "travel" and self._engine.y != self._row_y:
-            self._go(self._engine.x, self._row_y, self.parameters[Parameter.TRAVEL_SPEED])
+            self._start_straight_leg(self._engine.x, self._row_y, self.parameters[Parameter.TRAVEL_SPEED])
             return Event.NONE
         if self.activity == "travel":
             self.activity = "row"
@@ -401,11 +401,11 @@ class StageLogic:
         if self._homing_leg_made and step == 0 and self._engine.reached:
             self._found_switches |= its_switch
         # A first search moves leg by leg, until it has found the switch or the whole travel.
-        searches_on = step == 0 and not self._found_switches & its_switch and self._searched_steps < farthest
-        if self._homing_leg_made and not searches_on:
+        still_searches = step == 0 and not self._found_switches & its_switch and self._searched_steps < farthest
+        if self._homing_leg_made and not still_searches:
             # Search and release end at the switch; the leg that pulls off does not meet it.
             if self._engine.reached != (step != 2):
-                return self._raise(StageError.HOMING_FAILED, True)
+                return self._raise_alarm(StageError.HOMING_FAILED, True)
             if self._phase == 2:
                 if self._was_homed:
                     self.lost_x = -self._engine.x
@@ -429,7 +429,7 @@ class StageLogic:
         # To the switch, slowly off it until it opens, and away from it.
         distance = (-farthest, MAX_RELEASE, PULL_OFF)[step]
         rate = CREEP_RATE if step == 1 else HOME_RATE
-        if searches_on:
+        if still_searches:
             distance = -FIRST_LEG
             rate = FIRST_RATE
             self._searched_steps += FIRST_LEG

@@ -14,7 +14,7 @@ from polysight_shared.config import load_instrument
 from polysight_shared.errors import PolysightError
 from polysight_shared.program import die_with_parent
 from polysight_simulators.process import command_line, run_program
-from polysight_simulators.stage import homing_zero
+from polysight_simulators.stage import count_steps_to_zero
 from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
 
 
@@ -54,7 +54,7 @@ def _run(args: argparse.Namespace) -> None:
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)
     rig = load_instrument(args.config)
     # Steps from the closing point of a limit switch to the stage's zero, on both axes.
-    zero_steps = homing_zero()
+    zero_steps = count_steps_to_zero()
     program = str(emulator())
     command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
     command += [

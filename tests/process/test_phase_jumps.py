@@ -11,6 +11,7 @@ from benchmarks.coverage import Cubes
 from tests.support.mangled_scans import PLATES, SCENE, distances
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig
+from tests.support.scenes import make_scene
 
 from polysight.process.quality import find_phase_jump
 from polysight_simulators.scene import decode_scene
@@ -74,6 +75,17 @@ def test_no_drawn_scene_has_a_jump_of_its_own(request):
     for _ in range(40 if request.config.getoption("--long") else 1):
         pipeline = make_pipeline(Cubes(published_rig(), decode_scene(draw_scene(rng), "test")))  # type: ignore[arg-type]
         assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
+
+
+@pytest.mark.parametrize(("columns", "rows", "step_mm"), [(14, 10, (14.0, 12.0)), (31, 24, (10.0, 12.0))])
+def test_rows_too_far_apart_or_too_few_have_no_jump(columns, rows, step_mm):
+    plates = [
+        {"name": "copper", "centre_mm": [-34.0, 0.0], "size_mm": [46.0, 60.0], "metal": True},
+        {"name": "mine", "centre_mm": [34.0, 0.0], "size_mm": [46.0, 60.0], "permittivity": [4.0, 0.4]},
+    ]
+    scene = make_scene(*plates, columns=columns, rows=rows, step_mm=step_mm, image={"columns": 40, "rows": 30})
+    pipeline = make_pipeline(Cubes(published_rig(), decode_scene(scene, "test")))  # type: ignore[arg-type]
+    assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
 
 
 @pytest.mark.parametrize("degrees", [30.0, -45.0, 15.0])

@@ -76,6 +76,9 @@ _LEAST_RAD = np.radians(9)
 _LEAST_CLEAR = 2.0
 # The error of the prediction relative to the part that turns, above which a row tells nothing; chosen.
 _MOST_ERROR = 1.0
+# Least number of rows that tell something: the clearest is compared with the third. Scenes with rows 12 mm apart, where
+# a row is not predicted from its neighbours, have 3 to 5, and jumps of their own; others 8 and more.
+_LEAST_SOUND = 10
 # Times that a jump is measured again with what was found turned back: until then the predictor was fitted across it.
 _AGAIN = 2
 # Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
@@ -389,10 +392,10 @@ def find_phase_jump(rows: Mapping[int, NDArray[np.complexfloating]]) -> PhaseJum
     is_sound = errors < _MOST_ERROR
     ratio = np.zeros(len(angles))
     ratio[is_sound] = np.abs(angles[is_sound]) / errors[is_sound]
-    if np.count_nonzero(is_sound) < _AT_END:
+    if np.count_nonzero(is_sound) < _LEAST_SOUND:
         return None
     row = int(np.argmax(ratio))
-    third = float(np.sort(ratio[is_sound])[-_AT_END])
+    third = float(np.sort(ratio[is_sound])[-3])
     is_clear = ratio[row] ** 2 > _LEAST_CLEAR * third
     angle = float(angles[row])
     if not is_clear or abs(angle) < _LEAST_RAD:

@@ -131,7 +131,7 @@ def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
         assert findings.verdict.level == "care"
     for found, std in zip(inversion.leakage, inversion.leakage_std, strict=True):
         assert abs(found - complex(*leak)) < 4 * std
-    assert {e.dominated_by for e in inversion.patches} <= {"leakage", "metal reference", "noise"}
+    assert {e.dominated_by for e in inversion.patches} <= {"leakage", "metal reference", "scatter"}
     assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
 
 

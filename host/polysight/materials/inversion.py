@@ -95,7 +95,7 @@ and the scale at which the 95 % region is as large as that of the normal distrib
 lie within 2.1 to 3.6 times the interval that holds 68 % (drawn scenes; normal: 1.96)."""
 LEAST_DISTANCE = 4.0
 """Least distance of t, or of 1 / t, from 1 (metal) for a permittivity, in standard deviations of t; chosen."""
-SOURCES = ("noise", "metal reference", "leakage", "incidence", "tilt")
+SOURCES = ("scatter", "metal reference", "leakage", "incidence", "tilt")
 """Sources of error in `PatchEstimate.shares`."""
 # Columns of a particle (see `SceneLikelihood`).
 LEAKAGE_H = (0, 1)
@@ -674,7 +674,7 @@ def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) 
     mean = np.tile(z.mean(axis=0), (len(z), 1))
     of_all = model.permittivities(z)[:, i] - value
     slope_at_mean = permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])
-    variance = {"noise": float(abs(slope_at_mean) ** 2 * np.trace(model.own[i]))}
+    variance = {"scatter": float(abs(slope_at_mean) ** 2 * np.trace(model.own[i]))}
     at_mean = model.permittivities(mean[:1])[0, i]
     for source, columns in COLUMNS_OF_SOURCE.items():
         alone = mean.copy()

@@ -82,7 +82,7 @@ class Tilts:
 LEVEL = Tilts({}, 1)
 """No tilt is known."""
 SHRINKS = {
-    "noise": "a larger plate, a finer grid or more pulses a position",
+    "scatter": "even plates with nothing behind them; a larger plate, a finer grid, or more pulses a position",
     "metal reference": "a larger metal plate, or `polysight calibrate metal`",
     "leakage": "measure leakage with metal strips: `polysight leakage`",
     "tilt": "lay the plates flat",

@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +16,14 @@ from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.cli.main import main
 from polysight.jobs import process
-from polysight.jobs.process import make_products, process_rows, publish_images
+from polysight.jobs.process import LiveProcessing, make_products, process_rows, publish_images
 from polysight.materials import STEEP
 from polysight.pipeline import Pipeline
-from polysight.products import QUALITY, making_products, read_products
+from polysight.products import QUALITY, folder, making_products, products_locked, read_products
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
-from polysight.store import ScanFolder
+from polysight.store import MANIFEST, ScanFolder
+from polysight.store.manifest import ManifestWriter
 from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_json
 
@@ -88,6 +89,68 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
     with refused(ErrorCode.NO_DATA):
         make_products(pipeline, out, ())
     assert read_products(out).valid.any()
+
+
+def test_a_scan_waits_at_its_end_for_a_program_that_is_writing_its_products(
+    make_scan: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """`process` may have begun before the scan was resumed."""
+    scan = make_scan(tmp_path / "scan", make_scene(COPPER, PET, columns=10, rows=11))
+    out = scan / "products"
+    running = LiveProcessing(scan, Settings(model="none"))
+    with ExitStack() as other:
+        other.enter_context(products_locked(out))
+        for row in range(11):
+            running.add_row(row)
+        assert not out.exists()
+        monkeypatch.setattr(folder.time, "sleep", lambda _: other.close())
+        running.finish()
+    assert f"waiting: another program is writing products in {out}" in capsys.readouterr().err
+    assert read_products(out).quality.coverage.rows_recorded == 11
+
+
+def test_products_without_the_rows_that_were_recorded_meanwhile_replace_none(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resumed = Path(shutil.copytree(scan, tmp_path / "scan"))
+    whole = (resumed / MANIFEST).read_bytes()
+    first = b"".join(line for line in whole.splitlines(keepends=True)[:-3])
+    assert first.count(b"row_committed") < whole.count(b"row_committed")
+    (resumed / MANIFEST).write_bytes(first)
+    add_rows = process.add_rows
+
+    def add_rows_and_resume(*words: object) -> None:
+        add_rows(*words)  # type: ignore[arg-type]
+        (resumed / MANIFEST).write_bytes(whole)
+
+    monkeypatch.setattr(process, "add_rows", add_rows_and_resume)
+    with refused(ErrorCode.BUSY, f"polysight process {resumed} --out {resumed / 'products'}"):
+        process.process(resumed, resumed / "products")
+    assert not (resumed / "products").exists()
+    # Elsewhere they are what was asked for.
+    (resumed / MANIFEST).write_bytes(first)
+    process.process(resumed, tmp_path / "out")
+    assert read_products(tmp_path / "out").quality.coverage.rows_absent
+
+
+def test_products_are_left_to_a_scan_that_was_resumed_meanwhile(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resumed = Path(shutil.copytree(scan, tmp_path / "scan"))
+    add_rows = process.add_rows
+    with ExitStack() as running:
+
+        def add_rows_and_resume(*words: object) -> None:
+            add_rows(*words)  # type: ignore[arg-type]
+            running.enter_context(ManifestWriter(resumed / MANIFEST, create=False))
+
+        monkeypatch.setattr(process, "add_rows", add_rows_and_resume)
+        with refused(ErrorCode.BUSY, "polysight preview"):
+            process.process(resumed, resumed / "products")
+    assert not (resumed / "products").exists()
 
 
 @pytest.mark.parametrize("is_steep", [True, False])

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -113,10 +115,11 @@ def check_inputs(settings: Settings, inputs: Inputs, calibration: Calibration, r
         metal_plate.check_axes(*axes_m)
 
 
-def publish_images(pipeline: Pipeline, out: Path) -> None:
+def publish_images(pipeline: Pipeline, out: Path, check: Callable[[], None] | None = None) -> None:
     """Write images and recording quality before the materials are known, unless `out` contains a report.
 
-    The stage's backlash is left to the final products. Raises PolysightError.
+    The stage's backlash is left to the final products. `check` raises if they must not be written; it is called when
+    `out` is locked. Raises PolysightError.
     """
     if (out / REPORT).exists():
         return
@@ -124,6 +127,8 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
     # these differ by less than 1e-6 of the peak, unless missing positions are filled (`sparse`).
     images = pipeline.form_images(from_sums=True)
     with making_products(out, pipeline.source.scan_id) as new:
+        if check is not None:
+            check()
         scan = collect_imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
         save_images(new, scan)
     # If the terminal was closed, processing still continues.
@@ -131,13 +136,19 @@ def publish_images(pipeline: Pipeline, out: Path) -> None:
         sys.stderr.write(f"image: {out / IMAGE}\n")
 
 
-def make_products(pipeline: Pipeline, out: Path, plates: Plates) -> Products:
+def make_products(
+    pipeline: Pipeline, out: Path, plates: Plates, check: Callable[[], None] | None = None, wait: bool = False
+) -> Products:
     """Write all products, replacing those in `out`; show the current step on stderr.
+
+    `check` as for :func:`publish_images`; with `wait` it waits while another program writes products in `out`.
 
     If no materials can be found (the given metal is not metal, a board has no signal), the images alone are written,
     unless `out` holds a report; the error says where they are. Raises PolysightError.
     """
-    with making_products(out, pipeline.source.scan_id) as new, current_step("image") as progress:
+    with making_products(out, pipeline.source.scan_id, wait) as new, current_step("image") as progress:
+        if check is not None:
+            check()
         # The rows were added before `out` was locked: `drop-raw` may have run in between.
         _check_dropped(pipeline, out)
         try:
@@ -255,8 +266,9 @@ def process(data: Path, out: Path, settings: Settings = DEFAULT, threads: int | 
     check_inputs(settings, inputs, pipeline.calibration, pipeline.rig, pixel_axes(pipeline))
     add_rows(pipeline, data, threads)
     _check_dropped(pipeline, out)
-    publish_images(pipeline, out)
-    products = make_products(pipeline, out, plates)
+    check = partial(_check_same_rows, pipeline, data, out)
+    publish_images(pipeline, out, check)
+    products = make_products(pipeline, out, plates, check)
     sys.stdout.write(products.summary())
     return products.exit_status
 
@@ -270,6 +282,26 @@ def _check_not_recorded(data: Path, out: Path) -> None:
             f"{data} is being scanned", f"the scan makes {out} when its rows have ended, and would find it in use",
             f"wait for its end (polysight preview {quote(data)} shows it); polysight process {quote(data)} --out DIR"
             " processes its present rows", code=ErrorCode.BUSY,
+        )  # fmt: skip
+
+
+def _check_same_rows(pipeline: Pipeline, data: Path, out: Path) -> None:
+    """Raise ScanError if products of fewer rows than the scan has now would go where the scan puts its own.
+
+    The scan may have been resumed since its rows were read; it may even have ended.
+    """
+    _check_not_recorded(data, out)
+    source = pipeline.source
+    if out.resolve() != (data / PRODUCTS).resolve() or not isinstance(source, ScanFolder):
+        return
+    read_rows = len(source.committed_rows())
+    source.reload()
+    rows = len(source.committed_rows())
+    if rows > read_rows:
+        raise ScanError(
+            f"{data} was resumed: {rows} rows are recorded, and {read_rows} were read",
+            f"{out} would lack the others",
+            f"polysight process {quote(data)} --out {quote(out)}", code=ErrorCode.BUSY,
         )  # fmt: skip
 
 
@@ -351,13 +383,18 @@ class LiveProcessing:
             for finding in rules.judge_rx_order(name, board.rx_order):
                 _log.warning("row %d: %s", row, format_one_line(finding))
         if self._source.complete:
-            publish_images(self._pipeline, self._folder / PRODUCTS)
+            try:
+                publish_images(self._pipeline, self._folder / PRODUCTS)
+            except ConfigError as e:
+                # Another program is still writing products there. `finish` waits for it, and writes these images, too.
+                if e.code != ErrorCode.BUSY:
+                    raise
 
     def finish(self) -> int:
         """Write the products, and print their summary; return the exit status (0 if there was no row)."""
         if self._pipeline is None:
             return 0
-        products = make_products(self._pipeline, self._folder / PRODUCTS, find_plates(self._folder))
+        products = make_products(self._pipeline, self._folder / PRODUCTS, find_plates(self._folder), wait=True)
         sys.stdout.write(products.summary())
         return products.exit_status
 

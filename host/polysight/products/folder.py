@@ -14,6 +14,7 @@ import errno
 import os
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -45,6 +46,8 @@ _BY_HAND = b'"by_hand": true'
 # AT_FDCWD and RENAME_EXCHANGE of renameat2(2): paths start at the current folder, and the two are swapped.
 _HERE = -100
 _EXCHANGE = 2
+# Time between two attempts to lock a folder that another program has locked, seconds; chosen.
+_TRY_AGAIN_S = 0.5
 
 
 class FolderLock:
@@ -126,15 +129,17 @@ def check_products_folder(out: Path, scan_id: str) -> None:
 
 
 @contextmanager
-def making_products(out: Path, scan_id: str) -> Iterator[Path]:
+def making_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Path]:
     """Yield a new folder for products; it replaces `out` if the block ends without an error.
 
     After an error `out` is unchanged. Hidden files of other programs, and boxes drawn by hand for this scan, are kept.
+    With `wait` it waits while another program writes products there, and says so on stderr.
 
     Raises
     ------
     ConfigError
-        as :func:`check_products_folder`; if the folder cannot be created, or another program writes products there.
+        as :func:`check_products_folder`; if the folder cannot be created, or another program writes products there
+        and `wait` is false.
     DeviceError
         if the new folder cannot replace `out`; the error names the new folder, which is kept.
     """
@@ -148,7 +153,7 @@ def making_products(out: Path, scan_id: str) -> Iterator[Path]:
     # It may also have been killed after them.
     shutil.rmtree(old, ignore_errors=True)
     check_products_folder(out, scan_id)
-    lock = _lock(out, new)
+    lock = _lock(out, new, wait)
     keep = False
     try:
         yield new
@@ -182,20 +187,32 @@ def products_locked(out: Path) -> Iterator[None]:
         shutil.rmtree(new, ignore_errors=True)
 
 
-def _lock(out: Path, new: Path) -> FolderLock:
-    """Create and lock the new folder next to `out`, and empty it. Raises ConfigError."""
-    try:
-        new.parent.mkdir(parents=True, exist_ok=True)
-        return _create_locked(new)
-    except BlockingIOError:
-        raise ConfigError(
-            f"{out}: another program is writing products there",
-            "it was started twice",
-            "give another --out, or wait",
-            code=ErrorCode.BUSY,
-        ) from None
-    except OSError as e:
-        raise _no_folder_error(out, e) from None
+def _lock(out: Path, new: Path, wait: bool = False) -> FolderLock:
+    """Create and lock the new folder next to `out`, and empty it; `wait` for a program that has locked it.
+
+    Raises ConfigError.
+    """
+    is_told = False
+    while True:
+        try:
+            new.parent.mkdir(parents=True, exist_ok=True)
+            return _create_locked(new)
+        except BlockingIOError:
+            if not wait:
+                raise ConfigError(
+                    f"{out}: another program is writing products there",
+                    "another polysight command of this scan has not ended",
+                    "wait until it has, or give another --out",
+                    code=ErrorCode.BUSY,
+                ) from None
+        except OSError as e:
+            raise _no_folder_error(out, e) from None
+        if not is_told:
+            # If the terminal was closed, it still waits.
+            with suppress(OSError):
+                sys.stderr.write(f"waiting: another program is writing products in {out}\n")
+            is_told = True
+        time.sleep(_TRY_AGAIN_S)
 
 
 def _no_folder_error(out: Path, e: OSError) -> ConfigError:

@@ -74,6 +74,34 @@ def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
         train.read_labelled_scan(folder)
 
 
+def test_a_box_of_no_finite_numbers_is_refused_without_advice_for_boxes_drawn_here(tmp_path):
+    folder = write_scan(tmp_path)
+    file = folder / "scan_7.json"
+    content = json.loads(file.read_text())
+    for corner in ("NaN", "Infinity", "1e400"):
+        content["labels"]["ceramic"] = [100, 90, 130, "corner"]
+        file.write_text(json.dumps(content).replace('"corner"', corner))
+        with refused(ErrorCode.VALUE_INVALID, "labels.ceramic", "finite", "fetch it again") as refusal:
+            train.read_labelled_scan(folder)
+        assert "polysight label" not in refusal.value.remedy
+
+
+@pytest.mark.parametrize("factor", [1e-33, 1.0, 1e30])
+def test_the_orientation_does_not_depend_on_the_unit_of_the_images(tmp_path, factor, recwarn):
+    folder = write_scan(tmp_path, upside_down=True)
+    for name in ("sar_h.npy", "sar_v.npy"):
+        np.save(folder / name, (factor * np.load(folder / name)).astype(np.complex64))
+    assert "last row" in train.image_orientation([train.read_labelled_scan(folder)])
+    assert not list(recwarn)
+
+
+def test_a_missing_image_is_told_in_words(tmp_path):
+    folder = write_scan(tmp_path)
+    (folder / "sar_v.npy").unlink()
+    with refused(ErrorCode.FILE_UNREADABLE, "sar_v.npy: cannot be read: No such file or directory"):
+        train.read_labelled_scan(folder)
+
+
 def test_folders_and_angles(tmp_path):
     write_scan(tmp_path)
     write_scan(tmp_path, name="another")

@@ -46,11 +46,21 @@ def test_values_come_out_relative_to_the_reference(tmp_path, protocol):
     assert np.median(entry.p.real) == pytest.approx(4.0, rel=0.03)
 
 
-@pytest.mark.parametrize(("answer", "mm"), [("3 mm", 3.0), ("0.5", 0.5), ("", None), (None, None), (2, 2.0)])
+@pytest.mark.parametrize(
+    ("answer", "mm"), [("3 mm", 3.0), ("0.5", 0.5), ("", None), ("thin", None), (None, None), (2, 2.0)]
+)
 def test_a_thickness_may_be_a_text(tmp_path, answer, mm):
     path = tmp_path / "PET_55.pkl"
     path.write_bytes(pickle.dumps(content(4) | {"thickness": answer}))
     assert read_material(path).thickness_mm == mm
+
+
+@pytest.mark.parametrize("angle", [float("nan"), float("inf"), 0, -55, 90, 550])
+def test_an_angle_that_is_none_is_refused(tmp_path, angle):
+    path = tmp_path / "PET_55.pkl"
+    path.write_bytes(pickle.dumps(content(4) | {"incident_angle": angle}))
+    with refused(ErrorCode.FILE_FOREIGN, "incident_angle"):
+        read_material(path)
 
 
 def test_older_names_of_numpy_are_read(tmp_path):

@@ -8,6 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight import polarimetry
 from polysight.imaging import Images
+from polysight.polarimetry.calibrate import ratio
 from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import incidence_deg, specular_midpoint_m
 
@@ -39,6 +40,16 @@ def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
         v = v * common
     n = rng.standard_normal((4, *SHAPE)) * noise / np.sqrt(2)
     return h + n[0] + 1j * n[1], v + n[2] + 1j * n[3]
+
+
+def test_a_ratio_that_is_no_number_is_nan_and_warns_of_nothing(recwarn):
+    h = np.array([1.0, 2.0, 1.0, np.nan, 1.0], np.complex64)
+    v = np.array([2.0, 1e-45, 0.0, 1.0, np.inf], np.complex64)
+    p = ratio(h, v)
+    assert p[0] == 0.5
+    assert np.isnan(p[1:].real).all()
+    assert np.isnan(p[1:].imag).all()
+    assert not list(recwarn)
 
 
 @given(complex_gain, complex_gain)

@@ -125,6 +125,17 @@ def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save
         assert {round(s.incidence_deg, 1) for s in scan.segments} == {round(scan.quality.incidence.one_deg, 1)}
 
 
+@pytest.mark.parametrize("text", ["plates, incidence 60 deg", "no angle", ""])
+def test_the_angle_in_the_description_of_a_labels_folder_comes_before_the_rigs(labels_folder, tmp_path, rig, text):
+    folder = Path(shutil.copytree(labels_folder, tmp_path / "plates"))
+    file = folder / "plates.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"description": text}))
+    scan = analyse_file(folder, rig)
+    is_told = any("the incidence angle is not known" in reason.what for reason in scan.verdict.reasons)
+    assert scan.quality.given_images.incidence_from == ("file" if "60" in text else "rig file")
+    assert is_told == ("60" not in text)
+
+
 def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(save_images, rig):
     axis = np.arange(150) * 2e-3
     scan = analyse_file(save_images(x_m=axis, y_m=axis), rig)

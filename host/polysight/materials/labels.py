@@ -27,6 +27,9 @@ from polysight.store import TRUTH
 from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import read_json
 
+# Name of the label files that `polysight label` writes; those of the published data have the names of their scans.
+_DRAWN_HERE = "labels.json"
+
 
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     """Return the plates in the content of truth.json: name, centre_mm, size_mm, and what it is of: permittivity,
@@ -223,7 +226,9 @@ def read_labels(path: Path) -> Labels:
     Raises DataError if the file is missing, not JSON, an entry is not four numbers, or the value of `unit`, `metal` or
     `specimens` is invalid.
     """
-    remedy = f"correct it, or remove it and draw the boxes again: rm {quote(path)}; polysight label SCAN"
+    remedy = "correct it, or fetch it again"
+    if path.name == _DRAWN_HERE:
+        remedy = f"correct it, or remove it and draw the boxes again: rm {quote(path)}; polysight label SCAN"
     try:
         raw: Any = read_json(path)
     except FileNotFoundError:
@@ -246,7 +251,7 @@ def read_labels(path: Path) -> Labels:
     out: dict[str, Box] = {}
     for name, box in boxes.items():
         if not (isinstance(box, list) and len(box) == 4 and all(_is_number(b) for b in box)):
-            raise invalid(f"labels.{name} = {box!r}", "four numbers [x0, y0, x1, y1]")
+            raise invalid(f"labels.{name} = {box!r}", "four finite numbers [x0, y0, x1, y1]")
         out[str(name)] = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
     unit = raw.get("unit", "pixel")
     metal = raw.get("metal")
@@ -263,7 +268,8 @@ def read_labels(path: Path) -> Labels:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """True for a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def pack_labels(labels: Labels) -> bytes:

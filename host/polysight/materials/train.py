@@ -145,7 +145,12 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
         path = folder / f"{name}.npy"
         try:
             image = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as e:
+        except OSError as e:
+            raise DataError(
+                f"{path}: cannot be read: {e.strerror}", "the download is not complete", "fetch it again",
+                code=ErrorCode.FILE_UNREADABLE,
+            ) from None  # fmt: skip
+        except (ValueError, EOFError) as e:
             raise DataError(
                 f"{path}: not an image: {e}", "the download is not complete", "fetch it again",
                 code=ErrorCode.FILE_UNREADABLE,
@@ -166,7 +171,12 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
 
 def compute_explained_variance(scan: LabelledScan) -> float:
     """Return the share of the variance of ln |H||V| over the pixels that the boxes explain, 0 to 1."""
-    level = np.log(np.maximum(np.abs(scan.h) * np.abs(scan.v), 1e-30)).astype(np.float64)
+    # In double precision and relative to the brightest pixel: the images are in arbitrary units.
+    product = np.abs(scan.h).astype(np.float64) * np.abs(scan.v).astype(np.float64)
+    brightest = float(product.max(initial=0.0))
+    if brightest > 0:
+        product = product / brightest
+    level = np.log(np.maximum(product, 1e-30))
     label = np.zeros(level.shape, int)
     for i, name in enumerate(scan.boxes, 1):
         label[scan.mask(name)] = i
@@ -304,6 +314,8 @@ def read_material(path: Path) -> Entry:
         scan = str(raw["collection_name"])
         reference = str(raw["ref_name"])
         thickness = _parse_thickness(raw.get("thickness"))
+        if not 0 < angle < 90:
+            raise ValueError(f"incident_angle {angle:g}: expected degrees, above 0 and below 90")
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as e:
         raise DataError(
             f"{path}: not a material file: {type(e).__name__}: {e}",
@@ -363,10 +375,14 @@ def _read_pixels(values: Any, file_bytes: int) -> npt.NDArray[np.complex128]:
 
 
 def _parse_thickness(value: Any) -> float | None:
-    """Return a thickness in mm, a number or a text such as "3 mm"; None if it is not given."""
-    if isinstance(value, str):
-        value = value.lower().removesuffix("mm").strip()
-    return None if value is None or value == "" else float(value)
+    """Return a thickness in mm, a number or a text such as "3 mm"; None if it is not given, or a text without one."""
+    if not isinstance(value, str):
+        return None if value is None else float(value)
+    try:
+        return float(value.lower().removesuffix("mm").strip())
+    except ValueError:
+        # Such as "thin", or nothing. Nothing depends on it.
+        return None
 
 
 @dataclass(frozen=True)

@@ -49,10 +49,13 @@ from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 
 def ratio(h: Image, v: Image) -> Image:
-    """Return the polarisation ratio h / v, complex, broadcast; NaN where v is zero or either is not finite."""
+    """Return the polarisation ratio h / v, complex, broadcast; NaN where it or one of both is not finite."""
     is_usable = (v != 0) & np.isfinite(v) & np.isfinite(h)
     quotient = np.full(np.broadcast_shapes(h.shape, v.shape), complex(np.nan, np.nan), np.result_type(h, v))
-    np.divide(h, v, out=quotient, where=is_usable)
+    # Outside the footprint v may be the smallest number there is: a ratio that overflows is none.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        np.divide(h, v, out=quotient, where=is_usable)
+    quotient[~np.isfinite(quotient)] = complex(np.nan, np.nan)
     return quotient
 
 

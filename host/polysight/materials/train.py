@@ -145,14 +145,10 @@ def read_labelled_scan(folder: Path) -> LabelledScan:
         path = folder / f"{name}.npy"
         try:
             image = np.load(path, allow_pickle=False)
-        except OSError as e:
+        except (OSError, ValueError, EOFError) as e:
+            reason = getattr(e, "strerror", None) or e
             raise DataError(
-                f"{path}: cannot be read: {e.strerror}", "the download is not complete", "fetch it again",
-                code=ErrorCode.FILE_UNREADABLE,
-            ) from None  # fmt: skip
-        except (ValueError, EOFError) as e:
-            raise DataError(
-                f"{path}: not an image: {e}", "the download is not complete", "fetch it again",
+                f"{path}: not an image: {reason}", "the download is not complete", "fetch it again",
                 code=ErrorCode.FILE_UNREADABLE,
             ) from None  # fmt: skip
         if image.ndim != 2 or not np.iscomplexobj(image):
@@ -173,10 +169,7 @@ def compute_explained_variance(scan: LabelledScan) -> float:
     """Return the share of the variance of ln |H||V| over the pixels that the boxes explain, 0 to 1."""
     # In double precision and relative to the brightest pixel: the images are in arbitrary units.
     product = np.abs(scan.h).astype(np.float64) * np.abs(scan.v).astype(np.float64)
-    brightest = float(product.max(initial=0.0))
-    if brightest > 0:
-        product = product / brightest
-    level = np.log(np.maximum(product, 1e-30))
+    level = np.log(np.maximum(product / max(float(product.max(initial=0.0)), 1e-300), 1e-30))
     label = np.zeros(level.shape, int)
     for i, name in enumerate(scan.boxes, 1):
         label[scan.mask(name)] = i
@@ -376,13 +369,10 @@ def _read_pixels(values: Any, file_bytes: int) -> npt.NDArray[np.complex128]:
 
 def _parse_thickness(value: Any) -> float | None:
     """Return a thickness in mm, a number or a text such as "3 mm"; None if it is not given, or a text without one."""
-    if not isinstance(value, str):
-        return None if value is None else float(value)
-    try:
-        return float(value.lower().removesuffix("mm").strip())
-    except ValueError:
-        # Such as "thin", or nothing. Nothing depends on it.
-        return None
+    if isinstance(value, str):
+        number = re.match(r"\s*(\d*\.?\d+)", value)
+        value = number and number[1]
+    return None if value is None else float(value)
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,10 @@ def _rewrite_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
     expected, limit, actual = match.groups()
     types = " or ".join(_TYPES.get(name, name) for name in expected.split(" | ") if name != "null")
     text = f"must be {types}" + (limit or "").replace("matching regex", "of the form")
-    if actual:
+    if actual == "float" and types == _TYPES["int"]:
+        # JSON and TOML tell 350 from 350.0.
+        text += ", without a decimal point"
+    elif actual:
         text += f", not {_TYPES.get(actual, actual)}"
     code = ErrorCode.TYPE_WRONG if actual and not limit else ErrorCode.VALUE_INVALID
     return text, code

@@ -1,11 +1,14 @@
 """Missing data of the published raw rows is masked and counted; unmasked data is as sent."""
 
+import json
+
 import msgspec
 import numpy as np
 import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
+from polysight.jobs.process import process_rows
 from polysight.store.open import open_source
 from polysight.store.published import RowLosses
 from polysight.store.published_rig import mirror_rig
@@ -151,6 +154,24 @@ def test_files_that_contradict_each_other_are_refused(tmp_path):
     file.rename(folder / "RH" / "6_0.bin")
     with refused(ErrorCode.FILE_FOREIGN, "column 6"):
         open_source(folder, BASE)
+
+
+@pytest.mark.parametrize("pulses", [1, 2, 4])
+def test_settings_of_another_number_of_chirps_are_refused(tmp_path, pulses):
+    folder, _ = record(tmp_path)
+    file = folder / "data_collection_cfg.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"num_trigger": pulses}))
+    with refused(ErrorCode.MISMATCH, f"num_trigger = {pulses}", f"{PULSES} chirps at each position"):
+        open_source(folder, BASE)
+
+
+def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):
+    folder, _ = record(tmp_path)
+    for file in (folder / "RV").iterdir():
+        file.unlink()
+    with refused(ErrorCode.NO_DATA, "fetch the files of both receiving boards again") as refusal:
+        process_rows(open_source(folder, BASE), folder)
+    assert "polysight resume" not in refusal.value.remedy
 
 
 @pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])

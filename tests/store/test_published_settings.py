@@ -1,12 +1,14 @@
 """The published settings make a rig; its synchronised cubes are read. Raw rows are in test_published_rows.py."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
+from polysight.cli.options import rig_file
 from polysight.store.open import open_source
 from polysight.store.published import PublishedCubes
 from polysight_shared.errors import ErrorCode
@@ -169,6 +171,49 @@ def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):
     (folder / "data_collection_cfg.json").write_text("{")
     with refused(ErrorCode.FILE_DAMAGED):
         open_source(folder, base)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("dx", 0),
+        ("dy", -3),
+        ("dx", 1e9),
+        ("total_x", 0),
+        ("num_trigger", 0),
+        ("period_frame", 0),
+        ("object_distance", -430),
+        ("board_dist", 0),
+        ("rxboard_angle_y", 1e9),
+    ],
+)
+def test_a_value_that_no_scan_has_is_refused_by_the_files_own_key(write, base, key, value):
+    folder = write(**{key: value})
+    with refused(ErrorCode.VALUE_INVALID, key, "data_collection_cfg.json", "docs/how-to/authors-data.md") as refusal:
+        open_source(folder, base)
+    assert "instrument.toml" not in str(refusal.value)
+    assert "step_x_mm" not in str(refusal.value)
+
+
+def test_a_whole_number_with_a_decimal_point_is_told_so(write, base):
+    folder = write(total_y=4.0)
+    with refused(ErrorCode.TYPE_WRONG, "total_y = 4.0: must be a whole number, without a decimal point"):
+        open_source(folder, base)
+
+
+def test_the_packaged_rig_file_is_that_of_published_data_alone(write, tmp_path, monkeypatch):
+    folder = write()
+    monkeypatch.chdir(tmp_path)
+    assert open_source(folder, rig_file(None, folder)).instrument.grid.columns == COLUMNS
+    (tmp_path / "instrument.toml").write_text("")
+    assert rig_file(None, folder) == Path("instrument.toml")
+    (tmp_path / "instrument.toml").unlink()
+    (folder / "instrument.toml").write_text("")
+    assert rig_file(None, folder) == folder / "instrument.toml"
+    # A scan folder has its own.
+    (tmp_path / "scan").mkdir()
+    (tmp_path / "scan" / "manifest.jsonl").write_text("")
+    assert rig_file(None, tmp_path / "scan") is None
 
 
 def test_synchronised_cubes_are_read(tmp_path, base):

@@ -166,8 +166,18 @@ def material_settings(args: argparse.Namespace) -> Settings:
 
 
 def rig_file(config: Path | None, data: Path) -> Path | None:
-    """Return the given rig file, or the one in the folder of the data, or in the current folder; None without any."""
-    return config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
+    """Return the given rig file, or the one in the folder of the data, or in the current folder; None without any.
+
+    For published data, which lacks the rig's geometry, the packaged one comes last: it is the published rig's.
+    """
+    found = config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
+    if found is not None:
+        return found
+    from polysight.store import MANIFEST, is_source
+
+    if is_source(data) and not (data / MANIFEST).exists():
+        return find_packaged(RIG)
+    return None
 
 
 Box = tuple[float, float, float, float]

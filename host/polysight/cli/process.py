@@ -222,7 +222,10 @@ def _add_data(sub: argparse.ArgumentParser, several: bool = False, images: bool 
         "--out", type=Path, required=True, metavar="DIR", help="folder of the results; earlier ones are replaced"
     )
     sub.add_argument(
-        "--config", type=Path, metavar="FILE", help="rig file of published data (default: instrument.toml beside it)"
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="rig file of published data (default: instrument.toml beside it or here, or the packaged one)",
     )
 
 

@@ -248,10 +248,13 @@ class KeptSamples:
                 self._folder, ", ".join(map(str, unreadable)), folder,
             )  # fmt: skip
         if not rows:
+            remedy = "fetch the files of both receiving boards again"
+            if isinstance(source, ScanFolder):
+                remedy = f"`polysight resume {quote(folder)}` takes the missing rows"
             raise DataError(
                 f"{folder}: no row is recorded whole",
                 "the scan was stopped in its first row, or files are missing",
-                f"`polysight resume {quote(folder)}` takes the missing rows of a scan folder",
+                remedy,
                 code=ErrorCode.NO_DATA,
             )
         return [row for row in rows if row not in unreadable]

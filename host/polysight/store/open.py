@@ -50,14 +50,15 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
         raise DataError(
             f"{path}: not a scan: contains no {MANIFEST}, {COLLECTION} or *{SYNCED}",
             "the path is wrong, or the download is not complete",
-            "give a scan folder, or a folder unsynced/<scan> or raw/<scan> of the published data",
+            "give a scan folder, or a folder unsynced/<scan> or raw/<scan> of the published data (polysight process:"
+            " also labels/<scan>, or a folder of such folders)",
             code=ErrorCode.FILE_FOREIGN,
         )
     if base is None:
         raise DataError(
             f"{path}: the published data does not contain the rig's geometry",
             "no rig file was given",
-            "give the instrument.toml of the published rig",
+            "give the instrument.toml of the published rig (on the command line --config FILE)",
             code=ErrorCode.KEY_MISSING,
         )
     if isinstance(base, Path):

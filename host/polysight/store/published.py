@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.store.published_rig import build_rig, mirror_rig, read_settings
+from polysight.store.published_rig import COLLECTION, build_rig, mirror_rig, read_settings
 from polysight.store.source import HEADER_LOCK, CubeRow, RowData, split_pieces
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError, ErrorCode
@@ -380,6 +380,27 @@ class PublishedScan(_Published):
         self._shape = RowShape(self._plan.columns, burst.pulses, self._instrument.frame_bytes)
         self._losses: dict[str, dict[int, RowLosses]] = {b.name: {} for b in base.receivers}
         self._files: dict[str, dict[int, Path]] = {b.name: self._list_row_files(b.name) for b in base.boards}
+        self._check_pulses()
+
+    def _check_pulses(self) -> None:
+        """Raise DataError if every row has the same whole number of chirps a position, but another than the settings.
+
+        Files that are short by lost data differ from each other.
+        """
+        boards = {board.name for board in self._instrument.receivers}
+        files = [file for name, of_board in self._files.items() if name in boards for file in of_board.values()]
+        sizes = {file.stat().st_size for file in files}
+        if len(files) < 2 or len(sizes) != 1:
+            return
+        pulses, rest = divmod(sizes.pop(), self._plan.columns * self._shape.frame_bytes)
+        if pulses > 0 and rest == 0 and pulses != self._shape.pulses:
+            raise DataError(
+                f"{self.path / COLLECTION}: num_trigger = {self._settings.num_trigger}, but every row has"
+                f" {pulses} chirps at each position",
+                "the settings are those of another scan",
+                f"correct num_trigger, or fetch {COLLECTION} again",
+                code=ErrorCode.MISMATCH,
+            )
 
     def _list_row_files(self, board_name: str) -> dict[int, Path]:
         """Return the files of a board by row; files with other names and rows outside the plan are left out.

@@ -7,32 +7,40 @@ and y for scans that were recorded column by column.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
 from polysight_shared import files
 from polysight_shared.config import Board, Instrument, MountStep
 from polysight_shared.errors import DataError, ErrorCode
-from polysight_shared.tables import decode
+from polysight_shared.tables import Count, NonNegative, Positive, decode
 
 # The two files with a scan's settings.
 COLLECTION = "data_collection_cfg.json"
 DEVICES = "devices_comm_cfg.json"
 
 
+# Where the keys of these files are explained, for error messages.
+_KEYS = "docs/how-to/authors-data.md names them"
+# Chosen, to refuse typing errors: distances of positions in mm, their number, and angles in degrees.
+_Step = Annotated[float, msgspec.Meta(gt=0, le=100)]
+_Positions = Annotated[int, msgspec.Meta(ge=1, le=99_999)]
+_Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
+
+
 class ChirpConfig(msgspec.Struct, frozen=True):
     """One of `chirp_configs`, in SI or in the units of TI's tools (GHz, MHz/us, us, ksps)."""
 
     # Start frequency and slope.
-    f0: float
-    slope: float
+    f0: Positive
+    slope: Positive
     # Times from the start of the ramp.
-    ramp_time: float
-    adc_start_time: float
+    ramp_time: Positive
+    adc_start_time: NonNegative
     # Samples of a chirp, and their rate.
-    num_adc: int
-    Fs: float
+    num_adc: Count
+    Fs: Positive
 
 
 class Collection(msgspec.Struct, frozen=True):
@@ -44,19 +52,19 @@ class Collection(msgspec.Struct, frozen=True):
     the base rig. `num_adc` is required, but the samples of a chirp are those of `chirp_configs`.
     """
 
-    dx: float
-    dy: float
-    total_x: int
-    total_y: int
-    num_trigger: int
-    period_frame: float
-    num_adc: int
-    object_distance: float
-    board_dist: float | None = None
-    txboard_angle_y: float | None = None
-    rxboard_v_angle_y: float | None = None
-    rxboard_angle_y: float | None = None
-    rxboard_angle_z: float | None = None
+    dx: _Step
+    dy: _Step
+    total_x: _Positions
+    total_y: _Positions
+    num_trigger: Count
+    period_frame: Positive
+    num_adc: Count
+    object_distance: Positive
+    board_dist: Positive | None = None
+    txboard_angle_y: _Angle | None = None
+    rxboard_v_angle_y: _Angle | None = None
+    rxboard_angle_y: _Angle | None = None
+    rxboard_angle_z: _Angle | None = None
     rxboard_tilt_offset: tuple[float, float, float] | None = None
     moving_direction: str = "row"
     num_chirp: int = 1
@@ -95,7 +103,7 @@ def read_json(path: Path, missing_ok: bool = False) -> dict[str, Any]:
 def read_settings(path: Path) -> Collection:
     """Read the settings of an `unsynced/<scan>` or `raw/<scan>` folder. Raises DataError or ConfigError."""
     content = {**read_json(path / DEVICES, missing_ok=True), **read_json(path / COLLECTION)}
-    settings = decode(content, Collection, str(path / COLLECTION))
+    settings = decode(content, Collection, str(path / COLLECTION), keys=_KEYS)
     if settings.moving_direction not in ("row", "col") or not settings.chirp_configs or settings.num_chirp != 1:
         raise DataError(
             f"{path}: moving_direction {settings.moving_direction!r}, {len(settings.chirp_configs)} chirp configs,"
@@ -131,7 +139,7 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
         "sample_rate_hz": _scale_if_below(chirp.Fs, least=1e5, factor=1e3),
         "linear_samples": [min(n, chirp.num_adc) for n in base.chirp.linear_samples],
     }
-    rig = decode(table, Instrument, str(path))
+    rig = decode(table, Instrument, f"the rig that {path / COLLECTION} describes", keys=_KEYS)
     notices: list[str] = []
     boards = tuple(msgspec.structs.replace(b, mount=_adapt_mount(b, settings, notices)) for b in rig.boards)
     return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from polysight.imaging import ImageBuilder, image_grid
-from polysight.imaging.plane import _interpolate_stack, focus_sweep
+from polysight.imaging.focus import _interpolate_stack, focus_sweep
 
 PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55, 60), (8, 55), (61, 58)]
 

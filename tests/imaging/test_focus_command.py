@@ -8,7 +8,7 @@ from tests.support.rigs import published_rig
 
 from polysight import report
 from polysight.cli.main import main
-from polysight.imaging.plane import Focus
+from polysight.imaging.focus import Focus
 from polysight.jobs import process as offline
 from polysight_simulators.scene import decode_scene, simulate
 

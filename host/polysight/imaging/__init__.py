@@ -12,6 +12,10 @@ from polysight.imaging.direct import (
     backproject as backproject,
     project as project,
 )
+from polysight.imaging.focus import (
+    Focus as Focus,
+    focus_sweep as focus_sweep,
+)
 from polysight.imaging.geometry import (
     Antennas as Antennas,
     Aperture as Aperture,
@@ -45,9 +49,7 @@ from polysight.imaging.images import (
 from polysight.imaging.plane import (
     PLANE_REACH_M as PLANE_REACH_M,
     UNKNOWN_PLANE as UNKNOWN_PLANE,
-    Focus as Focus,
     PlaneEstimate as PlaneEstimate,
-    focus_sweep as focus_sweep,
     move_to_plane as move_to_plane,
 )
 from polysight.imaging.resolution import (

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -38,6 +38,7 @@ from polysight.materials.kinds import (
     DensityMaps,
     HalfSpaces,
     Kinds,
+    PatchEstimate,
     PatchMeasurement,
     RatioEvidence,
     brightness_density,
@@ -80,6 +81,8 @@ PAINTED = 0.02
 POSSIBLY_PAINTED = 0.2
 """Prior probability that the metal is painted or coated; and posterior probability above which paint is an error of
 pixels and sub-bands, too. Both chosen: a lower second one would widen the errors of what is rather bare metal."""
+LEAST_PAINTED = 0.05
+"""Probability of paint from which it stays as probable for each patch as for the scene; chosen."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
 """Largest phase c by paint on metal, and c per thickness: 4 pi / lambda sin^2(theta) / cos(theta) (1 - 1 / eps) of a
@@ -163,42 +166,6 @@ class RigPrior:
     metal_rise: tuple[float, float] = (0.0, 0.0)
     lighting_std: tuple[float, float] = UNEVEN_LIGHT
     painted: float = PAINTED
-
-
-@dataclass(frozen=True)
-class PatchEstimate:
-    """Permittivity of one patch.
-
-    Attributes
-    ----------
-    inverse_ratio
-        t = 1 / P = r_p / r_s, corrected for all estimated errors.
-    inverse_ratio_covariance
-        float64 [2, 2] of its real and imaginary part.
-    permittivity
-        eps' - j eps''; None if t is too near to metal's (`LEAST_DISTANCE`), as are the next fields.
-    covariance
-        float64 [2, 2] of the real and the imaginary part of `permittivity`.
-    shares
-        Source (`SOURCES`) to its share of the covariance's trace; the sum is 1. Empty without a permittivity.
-    evidence
-        Evidence from which the patch is named; None if the scene was inverted without kinds.
-    half_widths_68
-        Half widths of the 68 % intervals about the real and the imaginary part of `permittivity`.
-    """
-
-    inverse_ratio: complex
-    inverse_ratio_covariance: Real
-    permittivity: complex | None
-    covariance: Real | None
-    shares: Mapping[str, float]
-    evidence: RatioEvidence | None = None
-    half_widths_68: tuple[float, float] | None = None
-
-    @property
-    def dominated_by(self) -> str | None:
-        """The source with the largest share of the error; None without shares."""
-        return max(self.shares, key=lambda s: self.shares[s], default=None)
 
 
 @dataclass(frozen=True)
@@ -295,7 +262,7 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
         # A patch is measured without the evidence that it, or another of its material, must be some material.
         without_patch = weights.copy()
         without_patch[1:] *= 1 - model.same[i]
-        particles, _ = _anneal(model, z, weights, without_patch, rng, parts)
+        particles = _anneal_without_patch(model, z, weights, without_patch, rng, parts)
         patches.append(_estimate(model, particles, i, rng))
     return _solution(model, (z, log_evidence, log_bare), tuple(patches))
 
@@ -536,13 +503,34 @@ def _complex(z: Real, columns: tuple[int, int]) -> Complex:
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
 
+def _anneal_without_patch(
+    model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator, parts: Real
+) -> Real:
+    """Move particles as `_anneal` to the posterior without a patch's evidence; paint stays as probable as before.
+
+    Paint is a fact of the scene, which all patches tell together. Without the patch that tells it best the metal would
+    be called bare, and the error bar of that patch would leave out the paint.
+    """
+    painted = model.paint(z)[:, 0] > 0
+    if painted.mean() < LEAST_PAINTED:
+        return _anneal(model, z, before, after, rng, parts)[0]
+    groups = []
+    for group in (painted, ~painted):
+        if group.any():
+            chosen = rng.choice(np.flatnonzero(group), len(z))
+            moved, _ = _anneal(model, z[chosen], before, after, rng, parts[chosen], keep_paint=True)
+            groups.append(moved[: group.sum()])
+    return np.concatenate(groups)
+
+
 def _anneal(
-    model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator, parts: Real | None = None
-) -> tuple[Real, float]:
+    model: SceneLikelihood, z: Real, before: Real, after: Real, rng: np.random.Generator,
+    parts: Real | None = None, keep_paint: bool = False,
+) -> tuple[Real, float]:  # fmt: skip
     """Move particles `z` from one posterior to another; return them, and ln of the second's evidence over the first's.
 
     `before` and `after` [1 + patch] are the weights of the log likelihoods in the two posteriors. `parts` are the log
-    likelihoods of `z`; None: they are computed.
+    likelihoods of `z`; None: they are computed. `keep_paint`: bare metal stays bare, painted metal painted.
     """
     parts = model.log_likelihoods(z) if parts is None else parts
     change = after - before
@@ -564,6 +552,8 @@ def _anneal(
             parts_proposed = model.log_likelihoods(proposed)
             log_odds = (parts_proposed - parts) @ weight - 0.5 * np.sum(proposed**2 - z**2, axis=1)
             accepted = (np.log(rng.random(len(z))) < log_odds)[:, None]
+            if keep_paint:
+                accepted &= (model.paint(proposed) > 0) == (model.paint(z) > 0)
             z = np.where(accepted, proposed, z)
             parts = np.where(accepted, parts_proposed, parts)
     return z, log_evidence
@@ -578,15 +568,7 @@ def _choose_step(gain: Real, largest_step: float) -> float:
 
     if effective_share(largest_step) >= 0.5:
         return largest_step
-    low = 0.0
-    high = largest_step
-    for _ in range(30):
-        middle = (low + high) / 2
-        if effective_share(middle) >= 0.5:
-            low = middle
-        else:
-            high = middle
-    return max(low, 1e-6)
+    return max(float(scipy.optimize.brentq(lambda step: effective_share(step) - 0.5, 0.0, largest_step)), 1e-6)
 
 
 def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:

@@ -8,7 +8,7 @@ inversion; its parts give the probabilities of names. Eq. 2 and 3 of the POLySIG
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -205,6 +205,43 @@ class RatioEvidence:
     brightness_off: float = np.nan
     brightness_std: float = np.nan
     dispersion: PatchDispersion | None = None
+
+
+@dataclass(frozen=True)
+class PatchEstimate:
+    """Permittivity of one patch.
+
+    Attributes
+    ----------
+    inverse_ratio
+        t = 1 / P = r_p / r_s, corrected for all estimated errors.
+    inverse_ratio_covariance
+        float64 [2, 2] of its real and imaginary part.
+    permittivity
+        eps' - j eps''; None if t is too near to metal's (`LEAST_DISTANCE` of inversion.py), as are the next fields.
+    covariance
+        float64 [2, 2] of the real and the imaginary part of `permittivity`.
+    shares
+        Source (`SOURCES` of inversion.py) to its share of the trace of `covariance`; the sum is 1. Empty without a
+        permittivity.
+    evidence
+        Evidence from which the patch is named; None if the scene was inverted without kinds.
+    half_widths_68
+        Half widths of the 68 % intervals about the real and the imaginary part of `permittivity`.
+    """
+
+    inverse_ratio: complex
+    inverse_ratio_covariance: Real
+    permittivity: complex | None
+    covariance: Real | None
+    shares: Mapping[str, float]
+    evidence: RatioEvidence | None = None
+    half_widths_68: tuple[float, float] | None = None
+
+    @property
+    def dominated_by(self) -> str | None:
+        """The source with the largest share of the error; None without shares."""
+        return max(self.shares, key=lambda s: self.shares[s], default=None)
 
 
 def inverse_ratio(permittivity: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:

@@ -17,8 +17,7 @@ import numpy.typing as npt
 import scipy
 
 from polysight.imaging import Dispersion, Image, Images, Mask
-from polysight.materials.inversion import PatchEstimate
-from polysight.materials.kinds import Kinds, PatchDispersion, PatchMeasurement, permittivity_slope
+from polysight.materials.kinds import Kinds, PatchDispersion, PatchEstimate, PatchMeasurement, permittivity_slope
 from polysight.materials.names import may_be_thin
 from polysight.materials.segment import Patch, Segmentation, touches_border
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY

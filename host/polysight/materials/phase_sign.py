@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.inversion import Inversion, PatchEstimate, RigPrior
-from polysight.materials.kinds import PatchMeasurement, split_complex
+from polysight.materials.inversion import Inversion, RigPrior
+from polysight.materials.kinds import PatchEstimate, PatchMeasurement, split_complex
 
 Real = npt.NDArray[np.float64]
 

@@ -482,6 +482,39 @@ def test_only_plates_whose_range_is_known_to_5_cm_have_a_height(monkeypatch):
         np.testing.assert_allclose(estimate.heights_m[list(known)], 0.004)
 
 
+RANDOM_HEIGHTS_M = np.random.default_rng(3).uniform(0, 6e-3, (40, 10))
+
+
+@pytest.mark.parametrize("tilt_rad", [0.0, 0.03])
+def test_plates_of_any_heights_are_on_a_plane_that_is_tilted_as_the_plates_are(monkeypatch, tilt_rad):
+    """Level plates of several thicknesses were said to lie on a plane tilted by up to 2.8 degrees."""
+    monkeypatch.setattr(plane, "_fit_plane_by_phase", lambda *_: None)
+    masks, grid = make_masks(5)
+    x_m = np.array([grid.x_m[mask.any(axis=0)].mean() for mask in masks])
+    truth_rad = (np.arctan(tilt_rad), 0.0)
+    errors_deg = {}
+    for name, own_rises in {"seen": [(tilt_rad + 1e-6, 1e-6)] * len(masks), "unseen": []}.items():
+        found = []
+        for heights_m in RANDOM_HEIGHTS_M:
+            board = SlopedBoard(masks, heights_m + tilt_rad * (x_m - x_m.mean()), [3e-4] * len(masks))
+            builder = SimpleNamespace(grid=grid, boards={"RH": board})
+            found.append(plane.find_plane(builder, masks, own_rises).tilt_rad)
+        errors_deg[name] = np.sqrt(np.mean(np.degrees(np.array(found) - truth_rad) ** 2))
+    assert errors_deg["seen"] < 0.4
+    assert errors_deg["unseen"] > 0.6
+
+
+def test_own_tilts_of_too_few_plates_or_unlike_ones_say_little_of_the_planes_tilt():
+    alike = plane.TiltPrior.from_plates([(0.01, 0.0), (0.01, 0.0), (0.01, 0.0)])
+    assert alike.mean[0] == pytest.approx(0.01, rel=0.1)
+    # Their tilt along y is not known.
+    assert (alike.mean[1], alike.std[1]) == (0.0, plane.TiltPrior.from_plates([]).std[1])
+    two = plane.TiltPrior.from_plates([(0.01, 0.01), (0.01, 0.01)])
+    assert (two.mean == 0).all()
+    unlike = plane.TiltPrior.from_plates([(-0.04, 0.01), (0.01, 0.01), (0.05, 0.01)])
+    assert unlike.std[0] > 2 * unlike.std[1]
+
+
 @pytest.mark.parametrize("level", [0.1, 1.0, 30.0])
 def test_a_plate_ends_where_its_amplitude_falls_to_half_of_that_inside(level):
     pixels = np.arange(60)

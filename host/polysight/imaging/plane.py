@@ -8,7 +8,9 @@ Both ways compare the echo with that of a mirror on the rig file's plane, seen f
 taper (weights of the positions) and masked positions have no influence. The image of that mirror is the *footprint*.
 
 One plane is fitted to most plates. Plates whose height by range is another, blocks of other thickness, are *raised*:
-each is imaged on a plane of its own, because at another distance it is seen at another angle.
+each is imaged on a plane of its own, because at another distance it is seen at another angle. Plates of several
+thicknesses lie near some tilted plane, too, but then the plates themselves are level: their own tilts, from the phase
+over each plate, are the prior of the plane's.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from polysight.imaging.images import Dispersion, ImageBuilder, Images
+from polysight.imaging.images import Dispersion, ImageBuilder, Images, Rise
 from polysight.imaging.samples import BoardSamples
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
@@ -46,6 +48,11 @@ _COHERENT = 0.7
 """Smallest coherence of a plate's pixels, |sum| / sum of magnitudes, if its phase is used (1: equal phases); chosen."""
 _TILT_PRIOR_RAD = 0.02
 """Prior standard deviation of the tilt along x and along y: about one degree (chosen)."""
+_OWN_TILT_STD = 5e-3
+"""Standard deviation of the plane's tilt if all plates have one tilt of their own, rise per metre: 0.3 degrees
+(chosen). A phase that grows over the scan, as by an error of the stage's scale, seems to tilt all plates alike."""
+_LEAST_OWN_TILTS = 3
+"""Least number of plates whose own tilts say something about the plane's; chosen: their scatter is needed."""
 _MIN_STD_M = 3e-4
 """Smallest standard deviation of a height by range, due to sidelobes of the plate's neighbours; chosen."""
 _MAX_RISE_BY_PHASE = 0.035
@@ -94,6 +101,39 @@ class RaisedPlate:
 
     height_m: float
     region: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class TiltPrior:
+    """Prior of the plane's tilt before heights are known: a normal distribution along x and along y.
+
+    `mean` and `std`, float64 [2], are in rise per metre.
+    """
+
+    mean: NDArray[np.float64]
+    std: NDArray[np.float64]
+
+    @classmethod
+    def from_plates(cls, rises: Sequence[Rise]) -> TiltPrior:
+        """Return the prior, given the plates' own rises along x and y, radians; a rise of 0 counts as unknown.
+
+        The tilt has a prior around 0 (`_TILT_PRIOR_RAD`). Plates on a tilted plane are tilted with it: the median of
+        theirs is a measurement of it, as precise as their scatter (1.25 standard deviations over the root of their
+        number: the error of a median) and `_OWN_TILT_STD` say.
+        """
+        mean = np.zeros(2)
+        std = np.full(2, _TILT_PRIOR_RAD)
+        for along, rise in enumerate(np.array(rises, np.float64).reshape(-1, 2).T):
+            known = rise[rise != 0]
+            if known.size < _LEAST_OWN_TILTS:
+                continue
+            median = float(np.median(known))
+            scatter = 1.48 * float(np.median(np.abs(known - median)))
+            own_std = float(np.hypot(_OWN_TILT_STD, 1.25 * scatter / np.sqrt(known.size)))
+            precision = np.array([_TILT_PRIOR_RAD, own_std]) ** -2
+            mean[along] = median * precision[1] / precision.sum()
+            std[along] = precision.sum() ** -0.5
+        return cls(mean, std)
 
 
 @dataclass(frozen=True)
@@ -209,7 +249,7 @@ UNKNOWN_PLANE = PlaneEstimate(
 """Estimate of a scene that does not determine the plane: the rig file's plane is used."""
 
 
-def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> PlaneEstimate:
+def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises: Sequence[Rise] = ()) -> PlaneEstimate:
     """Estimate the plane from the insides of flat patches; without any height the result is not `known`.
 
     Parameters
@@ -218,8 +258,11 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
         Has the rows, and a range gate that includes the plane (`depth_m`).
     masks
         bool [ny, nx], one per patch, on the builder's grid.
+    rises
+        The patches' own tilts along the builder's x and y, radians, 0 where unknown; none if no tilt is known.
     """
     grid = builder.grid
+    tilt = TiltPrior.from_plates(rises)
     x = grid.x_m - grid.x_m.mean()
     y = grid.y_m - grid.y_m.mean()
     ranges = [_estimate_heights_by_range(board, masks) for board in builder.boards.values()]
@@ -241,11 +284,11 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]]) -> Pla
     is_level = determined.copy()
     if is_precise.any():
         level_stds = np.hypot(stds[is_precise], _LEVEL_STD_M)
-        off_most = heights[is_precise] - _fit_most(places[is_precise], heights[is_precise], level_stds)
+        off_most = heights[is_precise] - _fit_most(places[is_precise], heights[is_precise], level_stds, tilt)
         is_level[is_precise] = np.abs(off_most) <= _LEVEL_STDS * level_stds
-    plane, covariance = _fit_plane(places[is_level], heights[is_level], np.hypot(stds[is_level], _MIN_STD_M))
+    plane, covariance = _fit_plane(places[is_level], heights[is_level], np.hypot(stds[is_level], _MIN_STD_M), tilt)
     by_phase = False
-    from_phases = _fit_plane_by_phase(builder, masks, places, is_level, (plane, covariance))
+    from_phases = _fit_plane_by_phase(builder, masks, places, is_level, (plane, covariance, tilt))
     if from_phases is not None:
         by_phase = True
         plane, covariance, phase_heights = from_phases
@@ -316,7 +359,12 @@ def move_to_plane(
     move
         False: return the images unchanged, without dispersion.
     """
-    plane = find_plane(builder, [mask.T if transposed else mask for mask in masks])
+    rises: list[Rise] = []
+    if images.illumination is not None:
+        rises = [images.illumination.rise(images.h, images.v, mask) for mask in masks]
+    if transposed:
+        rises = [(y, x) for x, y in rises]
+    plane = find_plane(builder, [mask.T if transposed else mask for mask in masks], rises)
     if not move:
         return plane, images
     if plane.worth_moving or plane.raised:
@@ -402,17 +450,18 @@ def _estimate_heights_by_phase(
     board: BoardSamples,
     masks: Sequence[NDArray[np.bool_]],
     places: NDArray[np.float64],
-    plane: NDArray[np.float64],
+    near: tuple[NDArray[np.float64], TiltPrior],
     chosen: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], float]:
     """Return the heights by phase [patch], metres, NaN where pixels are not coherent; and the radians per metre.
 
     Only patches of `chosen` [patch] get a height.
 
-    The multiple of the ambiguity of each height is the one with which all heights fit a plane best, near `plane` [3]
-    (height and rise along x and y, by range). `places` [patch, 2] are the middles of the patches, metres. `board` is
-    the one of H.
+    The multiple of the ambiguity of each height is the one with which all heights fit a plane best, `near` a plane [3]
+    (height and rise along x and y, by range) and with the prior of its tilt. `places` [patch, 2] are the middles of the
+    patches, metres. `board` is the one of H.
     """
+    plane, prior = near
     image, footprint, _ = board.image()
     moved_image = board.mirror_image(_STEP_M)
     phases = np.full(len(masks), np.nan)
@@ -443,11 +492,12 @@ def _estimate_heights_by_phase(
     lifted = heights + ambiguity_m * np.round((guesses + common_height[:, None] - heights) / ambiguity_m)
     lifted += ambiguity_m * np.round((np.median(guesses, axis=1) - np.median(lifted, axis=1)) / ambiguity_m)[:, None]
     # The matrix depends on the places alone, so one solution serves all trial tilts.
-    prior = np.diag([0.0, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
+    precision = np.array([0.0, *prior.std**-2])
+    mean = np.array([0.0, *prior.mean])
     weighted = design / _PHASE_STD_M**2
-    planes = np.linalg.solve(design.T @ weighted + prior, (lifted @ weighted).T).T
+    planes = np.linalg.solve(design.T @ weighted + np.diag(precision), (lifted @ weighted + precision * mean).T).T
     chi2 = ((lifted - planes @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
-    chi2 += ((planes[:, 1:] / _TILT_PRIOR_RAD) ** 2).sum(axis=1)
+    chi2 += (precision * (planes - mean) ** 2).sum(axis=1)
     best_heights = np.full(len(masks), np.nan)
     best_heights[with_phase] = lifted[int(np.argmin(chi2))]
     return best_heights, rad_per_m
@@ -458,23 +508,23 @@ def _fit_plane_by_phase(
     masks: Sequence[NDArray[np.bool_]],
     places: NDArray[np.float64],
     is_level: NDArray[np.bool_],
-    by_range: tuple[NDArray[np.float64], NDArray[np.float64]],
+    by_range: tuple[NDArray[np.float64], NDArray[np.float64], TiltPrior],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit a plane to the phases of the plates that are not raised; None if they fit none that agrees with the ranges.
 
     Returns the plane [3], its covariance [3, 3] and the heights by phase [patch]. `by_range` are plane and covariance
-    by range.
+    by range, and the prior of the tilt.
     """
-    plane, covariance = by_range
+    plane, covariance, prior = by_range
     # H: its reflection r_s has nearly the same phase for all plates.
     board_h = next(iter(builder.boards.values()))
-    phase_heights, rad_per_m = _estimate_heights_by_phase(board_h, masks, places, plane, is_level)
+    phase_heights, rad_per_m = _estimate_heights_by_phase(board_h, masks, places, (plane, prior), is_level)
     with_phase = np.isfinite(phase_heights)
     # A plane has three unknowns: only with four plates can their phases contradict it.
     if with_phase.sum() < 4:
         return None
     phase_stds = np.full(int(with_phase.sum()), _PHASE_STD_M)
-    phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds)
+    phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds, prior)
     residual = phase_heights[with_phase] - _evaluate_plane(phase_plane, places[with_phase])
     on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
     # Thin sheets have a phase of reflection of their own: the plane is accepted only if it agrees with the ranges.
@@ -486,39 +536,41 @@ def _fit_plane_by_phase(
 
 
 def _fit_most(
-    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
+    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64], tilt: TiltPrior
 ) -> NDArray[np.float64]:
     """Return the heights at the places [patch] of the plane on which most plates lie.
 
     Of planes through each plate, with tilts up to two standard deviations of the prior, the one with the least cost:
     squared distances in standard deviations, up to `_LEVEL_STDS` (MSAC; Torr and Zisserman, CVIU 78, 2000).
     """
-    tilts = np.linspace(-2, 2, 33) * _TILT_PRIOR_RAD
-    slopes = np.stack(np.meshgrid(tilts, tilts), axis=-1).reshape(-1, 2)
-    rises = slopes @ places.T
+    in_stds = np.linspace(-2, 2, 33)
+    off_mean = np.stack(np.meshgrid(in_stds, in_stds), axis=-1).reshape(-1, 2)
+    rises = (tilt.mean + off_mean * tilt.std) @ places.T
     # Height at the middle of the tilted plane through each plate, [tilt, plate].
     levels = heights - rises
-    prior = np.sum(slopes**2, axis=1) / _TILT_PRIOR_RAD**2
+    prior = np.sum(off_mean**2, axis=1)
     # [plate of the plane, tilt]. Plane by plane: a picture may have hundreds of patches.
     cost = [
         prior + np.minimum(((levels - through[:, None]) / stds) ** 2, _LEVEL_STDS**2).sum(axis=1)
         for through in levels.T
     ]
-    plate, tilt = np.unravel_index(np.argmin(cost), np.shape(cost))
-    return rises[tilt] + levels[tilt, plate]
+    plate, best = np.unravel_index(np.argmin(cost), np.shape(cost))
+    return rises[best] + levels[best, plate]
 
 
 def _fit_plane(
-    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64]
+    places: NDArray[np.float64], heights: NDArray[np.float64], stds: NDArray[np.float64], tilt: TiltPrior
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Fit a plane [3] (height at the middle, rise along x, along y); return it and its covariance [3, 3].
 
-    `heights` and `stds` [patch] are in metres. Height and tilt have a prior (`PRIOR_STD_M`, `_TILT_PRIOR_RAD`). The
-    covariance is scaled up if the scatter around the plane is larger than by the standard deviations of the heights.
+    `heights` and `stds` [patch] are in metres. Height (`PRIOR_STD_M`) and `tilt` have a prior. The covariance is scaled
+    up if the scatter around the plane is larger than by the standard deviations of the heights.
     """
     rows = np.column_stack([np.ones(len(places)), places]) / stds[:, None]
-    information = rows.T @ rows + np.diag([PRIOR_STD_M**-2, _TILT_PRIOR_RAD**-2, _TILT_PRIOR_RAD**-2])
-    plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds)), np.float64)
+    precision = np.array([PRIOR_STD_M**-2, *tilt.std**-2])
+    information = rows.T @ rows + np.diag(precision)
+    from_prior = precision * np.array([0.0, *tilt.mean])
+    plane = np.asarray(np.linalg.solve(information, rows.T @ (heights / stds) + from_prior), np.float64)
     covariance = np.linalg.inv(information)
     residual = (heights - _evaluate_plane(plane, places)) / stds
     freedom = max(len(places) - 3, 1)

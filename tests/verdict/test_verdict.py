@@ -351,3 +351,49 @@ def test_ripple_inside_given_boxes_names_the_edges_before_the_direct_path():
     assert "6 mm inside" in boxed.do
     (found,) = rules.judge_flatness((0.1, 0.05), 0.0)
     assert "boxes" not in found.why
+
+
+def test_positions_without_data_are_the_cause_of_what_they_do_to_an_image():
+    """Five of 73 rows without data: plates were called copies of others, by a second path (found from outside)."""
+    gaps = [
+        *rules.judge_copies([7, 13], (122.0, 0.0), -12.0, has_gaps=True),
+        *rules.judge_fringes(0.9, has_gaps=True),
+        *rules.judge_flatness((0.1, 0.05), 0.0, has_gaps=True),
+        *rules.judge_disturbed_plates({2: 0.2}, has_gaps=True),
+    ]
+    assert len(gaps) == 4
+    (masked,) = rules.judge_recording(Coverage(73, 73, 100, 100), 0.034)
+    for found in (*gaps, masked):
+        assert "--sparse" in found.do
+    for found in gaps:
+        assert "positions without data" in found.why
+        assert "second path" not in found.why
+        assert found.weight < masked.weight
+    without = [
+        *rules.judge_copies([7, 13], (122.0, 0.0), -12.0),
+        *rules.judge_fringes(0.9),
+        *rules.judge_flatness((0.1, 0.05), 0.0),
+        *rules.judge_disturbed_plates({2: 0.2}),
+    ]
+    assert all("second path" in found.why and "--sparse" not in found.do for found in without)
+
+
+@pytest.mark.parametrize(
+    ("masked", "is_filled", "advised"), [(0.03, False, True), (0.03, True, False), (0.9, False, False)]
+)
+def test_a_reconstruction_is_advised_where_it_would_help(masked, is_filled, advised):
+    (found,) = rules.judge_recording(Coverage(73, 73, 100, 100), masked, is_filled)
+    assert ("--sparse" in found.do) is advised
+
+
+@pytest.mark.parametrize(("std_deg", "told"), [(0.0, True), (0.29, True), (0.31, False)])
+def test_a_tilt_of_the_plane_is_told_beyond_its_standard_deviation(std_deg, told):
+    assert bool(rules.judge_plane(True, 0.0, (0.1, -0.8), 0.1, (0.0, std_deg))) is told
+
+
+def test_fringes_are_ascribed_to_what_lies_behind_where_that_disturbs_the_plates():
+    """A table behind the plates was called a second path, before the reason that names it (found from outside)."""
+    (fringes,) = rules.judge_fringes(0.9, behind=0.15)
+    (behind,) = rules.judge_background(0.15)
+    assert "behind the plates" in fringes.why
+    assert fringes.weight < behind.weight

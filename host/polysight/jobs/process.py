@@ -32,6 +32,7 @@ from polysight.process import (
     boxes_as_patches,
     collect_imaged_scan,
     is_given_images,
+    lacks_positions,
     load_classifier,
     make_reference,
     map_rows,
@@ -155,7 +156,8 @@ def make_products(
             products = pipeline.finish(new, plates, progress)
             if pipeline.quality.boards_masked:
                 raise _no_pixel_error(pipeline)
-            if has_steep_patch(new):
+            # Positions without data bend the phase of flat plates, too.
+            if has_steep_patch(new) and not lacks_positions(pipeline.quality):
                 progress("surfaces")
                 add_surfaces(pipeline, new)
             return replace(products, folder=out)

@@ -50,9 +50,19 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         if jump is not None:
             missing += rules.judge_phase_jump(name, jump.row, jump.angle_rad)
     share_masked = _divide(masked, positions, default=0.0 if len(in_order) < len(quality.boards) else 1.0)
-    recorded = rules.judge_recording(coverage, share_masked)
+    recorded = rules.judge_recording(coverage, share_masked, is_filled=bool(quality.filled))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + rules.judge_reconstruction(filled)
+
+
+def lacks_positions(quality: Quality) -> bool:
+    """Return true if more positions than a few of some board have no data, and were not reconstructed."""
+    if quality.filled:
+        return False
+    coverage = quality.coverage()
+    shares = [_divide(board.positions_masked, board.positions, default=1.0) for board in quality.boards.values()]
+    rows_absent = 1 - _divide(coverage.rows_recorded, coverage.rows_planned, default=0.0)
+    return max([rows_absent, *shares]) > rules.SOME_POSITIONS
 
 
 def _divide(part: float, whole: float, default: float) -> float:
@@ -106,7 +116,7 @@ def judge(
     tilt_deg = (0.0, 0.0)
     if "metal_reference" in quality.notes:
         tilt_deg = quality.notes["metal_reference"].tilt_deg
-    reasons += scene_reasons(result, plane, classifier, tilt_deg)
+    reasons += scene_reasons(result, plane, classifier, tilt_deg, has_gaps=lacks_positions(quality))
     if check.name:
         reasons += check_reasons(check_plate(check, result.rows()))
     return join_reasons(reasons)
@@ -117,10 +127,12 @@ def scene_reasons(
     plane: PlaneEstimate | None,
     classifier: Classifier | None,
     reference_tilt_deg: tuple[float, float] = (0.0, 0.0),
+    has_gaps: bool = False,
 ) -> list[Finding]:
     """Return reasons from the scene and its images; parameters are those of :func:`judge`.
 
-    `reference_tilt_deg` is the tilt of a metal plate that was scanned separately.
+    `reference_tilt_deg` is the tilt of a metal plate that was scanned separately. `has_gaps`: positions have no data,
+    and were not reconstructed.
     """
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
@@ -134,15 +146,15 @@ def scene_reasons(
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
     copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
     if copies is not None:
-        reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db)
+        reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db, has_gaps)
     reasons += rules.judge_image_shift(result.apart_mm)
     if result.drift is not None:
         reasons += rules.judge_drift(*result.drift.largest_drift(), result.drift.drifts)
-        reasons += rules.judge_fringes(result.drift.fringes)
+        reasons += rules.judge_fringes(result.drift.fringes, has_gaps, result.behind)
     reasons += rules.judge_halo(result.halo)
     reasons += rules.judge_background(result.behind)
-    reasons += rules.judge_flatness(result.ripple, result.relief_rad, is_boxed=bool(result.boxes))
-    reasons += rules.judge_disturbed_plates(result.errors_by_disturbance())
+    reasons += rules.judge_flatness(result.ripple, result.relief_rad, bool(result.boxes), has_gaps)
+    reasons += rules.judge_disturbed_plates(result.errors_by_disturbance(), has_gaps)
     reasons += rules.judge_passivity(no_half_spaces)
     # Many plates with more V than H: the channels may be exchanged.
     plates = len(result.patches) - len(no_plates) - (result.metal.label is not None)
@@ -162,7 +174,8 @@ def scene_reasons(
     if plane is not None:
         std = float(np.degrees(result.prior.theta_std_rad))
         tilt = (float(np.degrees(plane.tilt_rad[0])), float(np.degrees(plane.tilt_rad[1])))
-        reasons += rules.judge_plane(plane.known, 1e3 * plane.offset_m, tilt, std)
+        tilt_std = (float(np.degrees(plane.tilt_std_rad[0])), float(np.degrees(plane.tilt_std_rad[1])))
+        reasons += rules.judge_plane(plane.known, 1e3 * plane.offset_m, tilt, std, tilt_std)
     # Plates that have a permittivity: their tilts and brightness, and the angle of the library.
     judged = {r.patch.label for r in result.patches if r.refused is None}
     reasons += rules.judge_tilts({k: float(np.degrees(result.tilts.across_rad(k))) for k in judged})

@@ -78,8 +78,17 @@ MOST_OUTSHINING_DB = 6.0
 pictures)."""
 
 
-def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Finding]:
-    """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked."""
+RECONSTRUCT = "`polysight process SCAN --sparse` reconstructs them"
+"""Advice where positions have no data: separate plates are then as in a whole scan, but for a small, stated error."""
+
+
+def judge_recording(coverage: Coverage, masked_share: float = 0.0, is_filled: bool = False) -> list[Finding]:
+    """Judge rows, frames and manifest against the plan; `masked_share` of the recorded positions is masked.
+
+    `is_filled`: the positions without data were reconstructed.
+    """
+    # Of many missing positions a reconstruction is mostly invented.
+    advice = {"care": "" if is_filled else f"; {RECONSTRUCT}", "none": ""}
     reasons = []
     if coverage.rows_planned:
         rows_absent = 1 - coverage.rows_recorded / coverage.rows_planned
@@ -91,7 +100,7 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Findi
         reasons.append(reason(
             level, f"{missing} of {coverage.rows_planned} rows are absent ({100 * rows_absent:.1f} % of the positions)",
             "the scan was stopped, or rows were lost; plates there are missing or distorted",
-            "`polysight resume SCAN` records the missing rows", 5 + rows_absent,
+            f"`polysight resume SCAN` records the missing rows{advice[level]}", 5 + rows_absent,
         ))  # fmt: skip
     reasons += [
         reason("care", fault, "a recorded row is missing in the images", "run `polysight validate SCAN`", 6.0)
@@ -104,11 +113,12 @@ def judge_recording(coverage: Coverage, masked_share: float = 0.0) -> list[Findi
     # Frames of absent rows are absent, too: those were judged above.
     lost_share = max(masked_share, frames_absent - rows_absent)
     if lost_share > SOME_POSITIONS:
+        level = "none" if lost_share > FEW_POSITIONS else "care"
         reasons.append(reason(
-            "none" if lost_share > FEW_POSITIONS else "care",
-            f"{100 * lost_share:.1f} % of the recorded positions or frames are masked",
+            level, f"{100 * lost_share:.1f} % of the recorded positions or frames are masked",
             "packets were lost, or the direct path was not found there",
-            "look at each board's frames in the report; `polysight doctor` checks the network", 4 + lost_share,
+            f"look at each board's frames in the report; `polysight doctor` checks the network{advice[level]}",
+            4 + lost_share,
         ))  # fmt: skip
     return reasons
 
@@ -375,8 +385,14 @@ def judge_leakage(measured: bool, estimated: bool, relative_error: float) -> lis
     )]  # fmt: skip
 
 
-def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], theta_std_deg: float) -> list[Finding]:
-    """Judge the position of the plates' plane against the rig file."""
+def judge_plane(
+    known: bool,
+    offset_mm: float,
+    tilt_deg: tuple[float, float],
+    theta_std_deg: float,
+    tilt_std_deg: tuple[float, float] = (0.0, 0.0),
+) -> list[Finding]:
+    """Judge the position of the plates' plane against the rig file; a tilt counts beyond its standard deviation."""
     if not known or not all(map(is_known, (offset_mm, *tilt_deg))):
         error = ""
         if is_known(theta_std_deg):
@@ -393,6 +409,7 @@ def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], th
             "measure geometry.object_distance_mm and correct the rig file", 7.0,
         )]  # fmt: skip
     reasons = []
+    certain_tilt = max(abs(t) - std for t, std in zip(tilt_deg, tilt_std_deg, strict=True))
     tilt = max(abs(t) for t in tilt_deg)
     if abs(offset_mm) > PLANE_FAR_MM:
         reasons.append(reason(
@@ -400,7 +417,7 @@ def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], th
             "the object is at another distance, or object_distance_mm is wrong",
             "correct geometry.object_distance_mm in the rig file", 1.6,
         ))  # fmt: skip
-    if tilt > PLANE_TILT_DEG:
+    if certain_tilt > PLANE_TILT_DEG:
         reasons.append(reason(
             "care", f"the plates' plane is tilted by {tilt:.1f} degrees",
             "tilted plates reflect past the scanned positions",
@@ -409,11 +426,22 @@ def judge_plane(known: bool, offset_mm: float, tilt_deg: tuple[float, float], th
     return reasons
 
 
-def judge_copies(labels: Sequence[int], shift_mm: tuple[float, float], level_db: float) -> list[Finding]:
-    """Judge patches that are shifted, weaker copies of the plates; none without `labels`."""
+def judge_copies(
+    labels: Sequence[int], shift_mm: tuple[float, float], level_db: float, has_gaps: bool = False
+) -> list[Finding]:
+    """Judge patches that are shifted, weaker copies of the plates; none without `labels`.
+
+    `has_gaps`: positions have no data, and were not reconstructed.
+    """
     if not labels:
         return []
     place = f"x {shift_mm[0]:+z.0f}, y {shift_mm[1]:+z.0f} mm away and {-level_db:.0f} dB weaker"
+    if has_gaps:
+        return [reason(
+            "care", f"patches {', '.join(map(str, labels))} may repeat the plates, {place}",
+            "positions without data repeat the plates in the image; these patches may be plates that are distorted",
+            f"record the missing positions; {RECONSTRUCT}", 3.5,
+        )]  # fmt: skip
     return [reason(
         "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place}",
         "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
@@ -447,27 +475,50 @@ def judge_drift(amplitude: float, phase_rad: float, probability: float) -> list[
     )]  # fmt: skip
 
 
-def judge_fringes(probability: float) -> list[Finding]:
-    """Judge fringes of a second path, by their probability."""
+def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.0) -> list[Finding]:
+    """Judge fringes of a second path, by their probability; `has_gaps` as in :func:`judge_copies`.
+
+    `behind` is what :func:`judge_background` judges: where it disturbs V / H, it makes the fringes.
+    """
     if not is_known(probability) or probability <= FRINGES_CARE:
         return []
+    what = "V / H changes over the scan in fringes, more than the plates can tell"
+    if has_gaps:
+        return [reason(
+            "care", what, "positions without data do that to the image", f"record the missing positions; {RECONSTRUCT}",
+            2.8,
+        )]  # fmt: skip
+    if is_known(behind) and behind > BACKGROUND_CARE:
+        return [reason(
+            "care", what, "what lies behind the plates shines through them and does that, as a second path does",
+            "cover what lies behind the plates with absorber, or move it 300 mm away", 2.8,
+        )]  # fmt: skip
     return [reason(
-        "care", "V / H changes over the scan in fringes, more than the plates can tell",
-        "a second path beside the direct path (multipath), or a receiver that is overdriven, changes the gains",
-        "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.3,
+        "care", what,
+        "a second path beside the direct path (multipath) or an overdriven receiver changes the gains; bright edges of "
+        "the plates, and a table that shines through them, look alike",
+        "take reflectors away from the line between transmitter and receivers; cover what lies behind the plates with "
+        "absorber", 3.0,
     )]  # fmt: skip
 
 
-def judge_disturbed_plates(errors: Mapping[int, float]) -> list[Finding]:
-    """Judge plates that something disturbs: patch number to the error of its permittivity by slopes of its V / H."""
+def judge_disturbed_plates(errors: Mapping[int, float], has_gaps: bool = False) -> list[Finding]:
+    """Judge plates that something disturbs: patch number to the error of its permittivity by slopes of its V / H.
+
+    `has_gaps` as in :func:`judge_copies`.
+    """
     worst = {label: error for label, error in errors.items() if is_known(error) and error > DISTURBED_CARE}
     if not worst:
         return []
     patches = f"patch {min(worst)}" if len(worst) == 1 else f"patches {', '.join(map(str, sorted(worst)))}"
+    cause = "they are uneven, or copies of other plates lie there: a second path beside the direct path, or clipping"
+    action = "use even plates; take reflectors away from the line between transmitter and receivers"
+    if has_gaps:
+        cause = "positions without data lay weak copies of the plates over them"
+        action = f"record the missing positions; {RECONSTRUCT}"
     return [reason(
         "care", f"V / H changes within {patches}: an error of up to {100 * max(worst.values()):.0f} % in permittivity",
-        "copies of other plates lie there: a second path beside the direct path, clipping, or positions without data",
-        "take reflectors away from the line between transmitter and receivers; scan all positions", 2.5,
+        cause, action, 2.5,
     )]  # fmt: skip
 
 
@@ -516,11 +567,13 @@ def judge_background(relative_std: float) -> list[Finding]:
     )]  # fmt: skip
 
 
-def judge_flatness(ripple: tuple[float, float], relief_rad: float, is_boxed: bool = False) -> list[Finding]:
+def judge_flatness(
+    ripple: tuple[float, float], relief_rad: float, is_boxed: bool = False, has_gaps: bool = False
+) -> list[Finding]:
     """Judge how well flat plates fit: usual scatter of ln|V / H| and of its phase inside them, and their relief.
 
     A flat plate has one V / H, and a phase of H that is a plane. `is_boxed`: the plates' boxes were given; boxes
-    that reach within 3 mm of the plates' edges add the edges' ripple.
+    that reach within 3 mm of the plates' edges add the edges' ripple. `has_gaps` as in :func:`judge_copies`.
     """
     if is_known(relief_rad) and relief_rad > RELIEF_CARE_RAD:
         return [reason(
@@ -530,8 +583,13 @@ def judge_flatness(ripple: tuple[float, float], relief_rad: float, is_boxed: boo
         )]  # fmt: skip
     if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
         return []
-    cause = "a second path beside the direct path, positions without data, interference, or a small aperture do that"
-    action = "take reflectors away from the line between transmitter and receivers; scan all positions"
+    cause = (
+        "uneven plates or bright edges, a second path beside the direct path, interference, or a small aperture do that"
+    )
+    action = "use even plates; take reflectors away from the line between transmitter and receivers; scan a larger area"
+    if has_gaps:
+        cause = "positions without data do that to the image"
+        action = f"record the missing positions; {RECONSTRUCT}"
     if is_boxed:
         cause = f"boxes that reach the plates' edges, {cause}"
         action = f"draw the boxes at least 6 mm inside the plates; if it stays, {action}"

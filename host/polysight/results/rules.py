@@ -78,7 +78,7 @@ MOST_OUTSHINING_DB = 6.0
 pictures)."""
 
 
-RECONSTRUCT = "`polysight process SCAN --sparse` reconstructs them"
+RECONSTRUCT = "`polysight process SCAN --sparse --out DIR` reconstructs them"
 """Advice where positions have no data: separate plates are then as in a whole scan, but for a small, stated error."""
 
 

@@ -210,3 +210,17 @@ def test_options_override_the_scan(scan, rig, read_plan):
     values = read_plan("--like", scan, "--snr-db", "3", "--row-overhead-s", "0.5")
     assert values["position_snr_db"] == pytest.approx(3 + 12.04, abs=0.01)
     assert values["time_s"]["standstill"] == pytest.approx(15.0)
+
+
+def test_without_a_plan_more_time_is_advised_only_where_it_helps(capsys):
+    plan = ["plan", *RIG, "--columns", "40", "--rows", "30", "--minutes"]
+    assert main([*plan, "0.5"]) == 1
+    enough = re.search(r"--minutes (\d+) are enough", capsys.readouterr().err)[1]
+    assert main([*plan, enough]) == 0
+    capsys.readouterr()
+    # The steps themselves have aliases in this scene.
+    coarse = ["--step-y-mm", "12", "--scene-mm", "300,300"]
+    assert main([*plan, "30", *coarse]) == 1
+    told = capsys.readouterr().err
+    assert "more time does not help" in told
+    assert "--step-y-mm" in told

@@ -111,12 +111,13 @@ element vertex 4
 PLY_COLUMNS = ("x", "y", "z", "nx", "ny", "nz", "permittivity", "loss", "permittivity_std", "incidence_deg")
 
 
-def write_points(path: Path) -> None:
-    """Write four points of a surface, the last of which has no permittivity."""
+def write_points(path: Path, permittivities: tuple[float, ...] = (2.5, 3.0, 3.5, math.nan)) -> None:
+    """Write four points of a surface, the last of which has no permittivity unless all are given."""
     properties = "".join(f"property float {name}\n" for name in PLY_COLUMNS)
     rows = []
-    for x, permittivity in ((0, 2.5), (1, 3.0), (2, 3.5), (3, math.nan)):
-        rows.append(struct.pack("<10fi", x, 2 * x, -x, 0, 0, -1, permittivity, 0.1, 0.2, 55, 1))
+    for x, permittivity in enumerate(permittivities):
+        loss, error = (0.1, 0.2) if math.isfinite(permittivity) else (math.nan, math.nan)
+        rows.append(struct.pack("<10fi", x, 2 * x, -x, 0, 0, -1, permittivity, loss, error, 55, 1))
     head = f"{PLY_HEAD}{properties}property int segment\nend_header\n"
     path.write_bytes(head.encode() + b"".join(rows))
 
@@ -231,6 +232,17 @@ def test_the_points_of_surfaces_turn_and_are_coloured(page):
     drawn.append(page.browser.value(picture))
     assert len(set(drawn)) == len(drawn)
     page.check_whole()
+
+
+def test_surfaces_without_permittivity_begin_with_a_figure_that_they_have(page, scans):
+    write_points(scans / "one" / "products" / "surface.ply", (math.nan,) * 4)
+    page.open("/surface?scan=one")
+    page.browser.wait("document.getElementById('scale').innerText.includes('incidence')", "the scale")
+    page.open("/surface?scan=two")
+    page.browser.wait("document.getElementById('told').innerText.includes('no surfaces were measured')", "the reason")
+    assert "polysight surface" in page.browser.text("told")
+    # The browser itself reports the missing file.
+    page.browser.errors.clear()
 
 
 def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):

@@ -76,6 +76,8 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert len(payloads(scan)) == ROWS * BOARDS
     process = polysight("drop-raw", scan, typed="drop\n")
     assert process.returncode == 0, process.stderr
+    for board in ("RH", "RV"):
+        assert f"to be removed: raw/{board}: rows 0-{ROWS - 1} ({ROWS} files)\n" in process.stdout
     assert not payloads(scan)
     said = json.loads(products.pop("quality.json"))
     products_before = contents(scan / "products")

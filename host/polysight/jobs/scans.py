@@ -28,7 +28,16 @@ from polysight.catalogue import (
 )
 from polysight.jobs.output import confirm, print_json, print_lines
 from polysight.materials import UNKNOWN
-from polysight.products import QUALITY, REPORT, ProcessedScan, find_products, products_locked, read_products, write_json
+from polysight.products import (
+    QUALITY,
+    REPORT,
+    ProcessedScan,
+    find_products,
+    products_locked,
+    ranges_text,
+    read_products,
+    write_json,
+)
 from polysight.results import WARNING_SIGMAS, CheckResult, ComplexNumber, RawDropped, check_plate, read_object, to_plain
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such, quote
 from polysight_shared.files import require_writable, write_atomically
@@ -273,8 +282,9 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
     )
     paths = [path for boards in rows.files.values() for path in boards.values()]
     for folder_of_board in sorted({path.parent for path in paths}):
-        names = sorted(path.name for path in paths if path.parent == folder_of_board)
-        sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: {', '.join(names)}\n")
+        indices = sorted(int(path.stem) for path in paths if path.parent == folder_of_board)
+        files = f"{ranges_text(indices)} ({len(indices)} files)"
+        sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: rows {files}\n")
     answer = confirm(text, WORD, yes)
     if answer != WORD:
         raise ConfigError(
@@ -297,7 +307,7 @@ def _check_samples(scan: store.ScanFolder, rows: set[int]) -> None:
     if damaged:
         names = sorted({name for files in damaged.values() for name in files})
         raise DataError(
-            f"{scan.path}: samples of rows {', '.join(map(str, damaged))} are damaged or missing: {', '.join(names)}",
+            f"{scan.path}: samples of rows {ranges_text(sorted(damaged))} are damaged or missing: {', '.join(names)}",
             "without these samples images can be made from the raw data only",
             f"`polysight process {quote(scan.path)} --out DIR` makes them again",
             code=ErrorCode.FILE_DAMAGED,

@@ -336,9 +336,15 @@ class LayerFit:
                 size = ""
             else:
                 size = f" at {1e3 * r.thickness_m:.3g} mm"
+            freedom = f" for {self.freedom} degrees of freedom" if self.freedom > 0 else ""
             out.append(
                 f"{format_permittivity(r.permittivity)}{size} is not excluded: chi-square {r.chi2:.1f}, the best has"
-                f" {self.chi2:.1f} for {self.freedom} degrees of freedom"
+                f" {self.chi2:.1f}{freedom}"
+            )
+        if self.rivals and self.freedom <= 0:
+            out.append(
+                "there are as many unknowns as measured numbers: image the scan in 4 sub-bands or more"
+                " (`polysight process --bands 4`), or give the thickness"
             )
         if not self.rivals and self.ambiguous:
             out.append(
@@ -350,8 +356,10 @@ class LayerFit:
                 f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees of freedom"
             )
         # An error above a fifth of the value is large; of a small loss, one above 0.2. Chosen.
-        if self.std_real > 0.2 * self.permittivity.real or self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
+        if self.std_real > 0.2 * self.permittivity.real:
             out.append("the data hardly depend on this layer: its error bar is large")
+        elif self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
+            out.append(f"the data hardly tell the loss of this layer: it is known to +- {self.std_loss:.2f}")
         if self.at_limit:
             out.append(f"{' and '.join(self.at_limit)} at the limit of the search range: the true value may be beyond")
         return out

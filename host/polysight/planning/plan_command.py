@@ -52,6 +52,8 @@ from polysight_shared.tables import decode, to_builtins
 
 # Keys of [stage] that the Pi takes from its own rig file: acceleration, and the limit of the speed.
 _PI_KEYS = ("speed_mm_s", "accel_mm_s2")
+# Longest time of a plan, as of --minutes; chosen.
+_MOST_MINUTES = 100_000.0
 # Steps that are compared, as multiples of the rig file's; chosen.
 _STEP_MULTIPLES = (1, 2, 3, 4, 5)
 # Largest share of the time between two points that a burst may take; chosen, the rest allows for jitter of the speed.
@@ -122,7 +124,11 @@ class Changes:
             value = getattr(self, key)
             if value is not None:
                 table[section][key] = value
-        return decode(table, Instrument, f"{rig.name}, changed")
+        try:
+            return decode(table, Instrument, "this plan")
+        except ConfigError as e:
+            cause = f"these numbers, put into the rig file {rig.name!r}, break one of its rules"
+            raise ConfigError(e.what, cause, "give others: `polysight plan --help` lists them", code=e.code) from None
 
 
 def rig_lines(plan: Instrument, original: Instrument) -> str:
@@ -561,13 +567,36 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
             f"The first plan in full:\n\n{describe(plans[0])}\n{differences}"
         )
     else:
+        rig = changes.apply(rig)
+        cause, remedy = _explain_no_plan(rig, options.minutes, noise, overhead, options.scene_mm)
         sys.stderr.write(
             f"polysight plan: no plan within {options.minutes:g} minutes without aliases\n"
-            "  why: this aperture takes longer on this stage, or larger steps have aliases in this scene\n"
-            "  do: give more time, a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
-            " --accel-mm-s2\n"
+            f"  why: {cause}\n  do: {remedy}\n"
         )
     return int(not plans)
+
+
+def _explain_no_plan(
+    rig: Instrument, minutes: float, noise: Noise, row_overhead_s: float, scene_mm: tuple[float, float] | None
+) -> tuple[str, str]:
+    """Return why no plan was found, and what to do: more time where that helps, otherwise other steps."""
+    if not propose(rig, _MOST_MINUTES, 1, noise, row_overhead_s, scene_mm):
+        grid = rig.grid
+        return (
+            f"steps of {grid.step_x_mm:g} x {grid.step_y_mm:g} mm and multiples of them have aliases in this scene, or"
+            " the aperture does not fit the stage: more time does not help",
+            "give smaller steps (--step-x-mm, --step-y-mm) or a smaller --scene-mm",
+        )
+    plans: list[Forecast] = []
+    while not plans:
+        minutes *= 2
+        plans = propose(rig, minutes, len(_STEP_MULTIPLES) ** 2, noise, row_overhead_s, scene_mm)
+    enough = math.ceil(min(plan.time.minutes for plan in plans))
+    return (
+        "this aperture takes longer on this stage, and larger steps have aliases in this scene",
+        f"--minutes {enough} are enough; or give a smaller --width-mm or --height-mm, a smaller --scene-mm, or a higher"
+        " --accel-mm-s2",
+    )
 
 
 def _choose_assumptions(options: PlanOptions) -> tuple[Noise, float]:

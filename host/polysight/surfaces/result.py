@@ -579,7 +579,9 @@ def point_cloud(surface: Surface) -> bytes:
 def summary_lines(surface: Surface) -> list[str]:
     """Describe the surface for people: a line for each segment."""
     kind = "simulated " if surface.simulated else ""
-    lines = [f"{kind}scan {surface.scan_id}: {len(surface.segment)} points on {len(surface.segments)} surfaces"]
+    count = len(surface.segments)
+    counts = f"{len(surface.segment)} points on {count} surface{'s' * (count != 1)}"
+    lines = [f"{kind}scan {surface.scan_id}: {counts}; places are in the rig's frame, not from the image's centre"]
     for segment in surface.segments:
         x_mm, y_mm, z_mm = 1e3 * np.array(segment.centre_m)
         tilts_deg = [np.degrees(np.arctan2(part, -segment.normal[2])) for part in segment.normal[:2]]

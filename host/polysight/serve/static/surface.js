@@ -121,8 +121,13 @@ by("front").addEventListener("click", () => { Object.assign(view, { turn: 0, ris
 async function start() {
   by("scan").href = pageOf("scan", scanName);
   nest(by("colour"), ...Object.entries(COLOUR_NAMES).map(([value, text]) => make("option", text, null, { value })));
-  const reply = await reach("file/surface.ply", { scan: scanName, of: query.get("of") });
+  const reply = await reach("file/surface.ply", { scan: scanName, of: query.get("of") }).catch((error) => {
+    if (error.status !== 404) throw error;
+    throw Object.assign(error, { what: "no surfaces were measured in this scan", why: "", do: "`polysight surface SCAN --out DIR` measures them" });
+  });
   cloud = readPly(await reply.arrayBuffer());
+  // A surface without permittivity begins with the first figure that it has: points without one are pale.
+  by("colour").value = Object.keys(COLOUR_NAMES).find((name) => cloud[name]?.some(Number.isFinite)) ?? "segment";
   const ends = [cloud.x, cloud.y, cloud.z].map(findEnds);
   middle = ends.map(([low, high]) => (low + high) / 2);
   reach_mm = Math.max(10, ...ends.map(([low, high]) => (high - low) / 2));

@@ -15,7 +15,7 @@ from polysight import open_scan
 from polysight.cli.main import main
 from polysight.imaging import Images
 from polysight.jobs.batch import find_scans
-from polysight.materials import Labels
+from polysight.materials import Labels, Library
 from polysight.process import Inputs, analyse_given_images, read_given_images
 from polysight.products import ProcessedScan, write_image, write_json
 from polysight.settings import Settings
@@ -272,6 +272,21 @@ def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(save_images, pai
     out = tmp_path / "out"
     assert main(["process", str(scene), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 0
     assert ProcessedScan(out).materials.metal_reference.certain
+
+
+def test_a_library_is_trained_on_labelled_products_of_given_images(labels_folder, tmp_path):
+    for name in ("first", "second"):
+        folder = Path(shutil.copytree(labels_folder, tmp_path / name))
+        (folder / "plates.json").rename(folder / f"{name}.json")
+        assert main(["process", str(folder), "--out", str(tmp_path / "out" / name), "--model", "none"]) == 0
+        named = [f"{number}={box}" for number, box in enumerate(BOXES, 1)]
+        words = [word for pair in named for word in ("--rename", pair)]
+        assert main(["label", str(tmp_path / "out" / name), "--from-patches", "--metal", "1", *words]) == 0
+    products = [str(tmp_path / "out" / name) for name in ("first", "second")]
+    assert main(["train", *products, "--out", str(tmp_path / "library.npz")]) == 0
+    entries = Library.load(tmp_path / "library.npz").entries
+    assert {entry.name for entry in entries} == set(BOXES)
+    assert {round(entry.incidence_deg, 1) for entry in entries} == {ANGLE}
 
 
 def test_all_images_of_a_folder_are_found(labels_folder):

@@ -161,14 +161,19 @@ def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
 def _read_optics(saved: ProcessedScan) -> Optics:
     """Return incidence angle and leakage of saved images; leakage that processing removed is zero here.
 
-    Raises DataError if the products name no rig.
+    Raises DataError if the products name no rig, and are not of given images, whose angle is in their quality.
     """
     rig = saved.rig
-    path = saved.folder / SCAN
-    if rig is None:
-        raise DataError(f"{path}: names no rig", "an earlier release processed the scan", "process the scan again")
-    # "one": the same incidence angle for all pixels.
-    optics = Optics.from_rig(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
+    incidence = saved.quality.incidence
+    if rig is not None:
+        # "one": the same incidence angle for all pixels.
+        optics = Optics.from_rig(rig, incidence_choice(rig, saved.x_m, saved.y_m, "one"))
+    elif saved.quality.given_images and incidence and incidence.one_deg is not None:
+        optics = Optics(float(np.radians(incidence.one_deg)))
+    else:
+        raise DataError(
+            f"{saved.folder / SCAN}: names no rig", "an earlier release processed the scan", "process the scan again"
+        )
     budget = None
     if saved.materials is not None:
         budget = saved.materials.error_budget

@@ -470,7 +470,7 @@ def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iter
         raise DataError(
             f"{groups.size} scan to judge a classifier on",
             "whole scans are left out, and none would remain for training",
-            "process more scans", code=ErrorCode.NOT_ENOUGH_DATA,
+            "give two scans or more, of each incidence angle", code=ErrorCode.NOT_ENOUGH_DATA,
         )  # fmt: skip
     if not samples.shared.any():
         raise DataError(

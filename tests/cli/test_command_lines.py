@@ -160,6 +160,18 @@ def test_a_box_has_a_lower_left_and_an_upper_right_corner(text):
     assert text in refusal("process", "s", "--out", "o", f"--metal-box={text}")
 
 
+@pytest.mark.parametrize("text", ["0", "", "0,", ",45"])
+def test_the_axis_of_a_turntable_has_two_places(text):
+    assert refusal("surface", "s", "--out", "o", f"--axis={text}").endswith(
+        f"{text!r} is not of the form X,Z in mm, e.g. 0,45"
+    )
+
+
+@pytest.mark.parametrize("text", ["0,nan", "inf,0", "0,1001"])
+def test_the_axis_of_a_turntable_is_in_the_lab(text):
+    assert refusal("surface", "s", "--out", "o", f"--axis={text}").endswith("is not a shift of at most 1000 mm")
+
+
 def test_other_words_are_left_as_they_are():
     words = ["process", "-x", "--out", "-o", "--json", "-1", "--a=b"]
     assert join_negative_values(words) == words

@@ -38,6 +38,8 @@ def _parse_angles(text: str) -> tuple[float, ...]:
 def _parse_axis(text: str) -> tuple[float, float]:
     """Parse x and z of a turntable's axis, millimetres, separated by a comma."""
     x, _, z = text.partition(",")
+    if not (x and z):
+        raise argparse.ArgumentTypeError(f"{text!r} is not of the form X,Z in mm, e.g. 0,45")
     return _parse_shift(x), _parse_shift(z)
 
 

@@ -201,6 +201,22 @@ def test_wrong_files_are_refused_by_name(save_images, rig, changed, code, named)
     assert caught.value.remedy
 
 
+WITHOUT_PHASE = {
+    "magnitudes": lambda h, v: (np.abs(h) + 0j, np.abs(v) + 0j),
+    "real parts": lambda h, v: (h.real + 0j, v.real + 0j),
+    "one phase for both": lambda h, v: (h, np.abs(v) * np.exp(1j * np.angle(h))),
+}
+
+
+@pytest.mark.parametrize("lose", WITHOUT_PHASE.values(), ids=WITHOUT_PHASE.keys())
+def test_images_without_a_phase_between_the_channels_are_refused(save_images, pair, rig, lose):
+    """Without it every loss would be found to be zero, with a small error."""
+    h, v = lose(pair["h"], pair["v"])
+    path = save_images(h=h, v=v)
+    with refused(ErrorCode.VALUE_INVALID, path, "no phase between h and v"):
+        analyse_file(path, rig)
+
+
 def test_files_that_are_no_archive_are_refused(tmp_path, rig):
     path = tmp_path / "other.npz"
     with refused(ErrorCode.FILE_MISSING, path):

@@ -61,6 +61,8 @@ their file does not say it; and that published ones still are after `restore_pha
 reading. Chosen: the patches decide where they can."""
 MOST_RAISED_M = 0.1
 """Largest distance of a plate's plane from that of the others; chosen."""
+LEAST_PHASE_RAD = 1e-4
+"""Phase of V against H, or its distance from pi, which some pixel must exceed: noise alone gives far more; chosen."""
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
@@ -553,6 +555,21 @@ def make_reference(pair: GivenPair) -> PlaneReference:
     return plane_reference(pair.images, name=pair.scan_id)
 
 
+def _check_phases(pair: GivenPair) -> None:
+    """Raise DataError if V has the phase of H, or the opposite one, in all lit pixels.
+
+    Magnitudes and real parts are such images, however they are stored. A plate of metal alone may be one, too.
+    """
+    lit = pair.images.valid
+    product = pair.images.v[lit].astype(np.complex128) * np.conj(pair.images.h[lit])
+    if (np.abs(product.imag) > LEAST_PHASE_RAD * np.abs(product)).any():
+        return
+    raise DataError(
+        f"{pair.path}: no phase between h and v in any pixel", "the loss of a material is in the phase of V against H",
+        "save both complex images as they were formed, not magnitudes or real parts", code=ErrorCode.VALUE_INVALID,
+    )  # fmt: skip
+
+
 def analyse_given_images(
     pair: GivenPair,
     settings: Settings,
@@ -566,6 +583,7 @@ def analyse_given_images(
     for a recorded scan.
     """
     started_s = time.perf_counter()
+    _check_phases(pair)
     angle = choose_angle(pair, settings, rig)
     rig = place_rig(rig, angle.deg)
     classifier = load_classifier(settings, rig)

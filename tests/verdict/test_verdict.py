@@ -234,6 +234,13 @@ def test_paint_is_no_cause_where_a_dielectric_reference_explains_the_others_bett
     assert "may be painted" in paint.what
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_paint_is_said_of_a_given_reference_and_of_one_that_was_found(given):
+    (paint,) = rules.judge_metal("patch 5", True, True, given, False, False, painted=0.9, paint_mm=0.1)
+    assert "(patch 5) may be painted: probability 0.90, 0.10 mm" in paint.what
+    assert rules.judge_metal("patch 5", True, True, given, False, False, painted=0.1, paint_mm=0.1) == []
+
+
 @pytest.mark.parametrize(("stronger_v", "plates"), [([], 8), ([3], 1), ([1, 2], 4)])
 def test_a_single_plate_or_half_of_them_do_not_show_that_h_and_v_are_exchanged(stronger_v, plates):
     """Layers and liquids behind glass may reflect more V than H."""

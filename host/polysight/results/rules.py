@@ -333,9 +333,11 @@ def judge_metal(
             " places",
             f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
         )]  # fmt: skip
-    if is_given and painted > PAINT_TOLD:
+    if (is_given or certain) and painted > PAINT_TOLD:
+        given = "given " if is_given else ""
         return [reason(
-            "care", f"the given metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
+            "care",
+            f"the {given}metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
             "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet"
             " plate in the place of metal; permittivities are corrected for a coating, with its error",
             f"take the paint or film off {patch}, or use bare metal", 2.7,

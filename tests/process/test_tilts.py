@@ -5,10 +5,11 @@ import pytest
 from benchmarks.coverage import Cubes
 from tests.support.pipelines import make_pipeline
 
-from polysight.imaging import correct_tilt
+from polysight.imaging import Images, correct_tilt
 from polysight.imaging.images import Illumination
 from polysight.imaging.plane import find_plane
-from polysight.materials.segment import box_mask
+from polysight.materials.result import SMEAR, STEEP, Tilts
+from polysight.materials.segment import Segmentation, box_mask, make_patch
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_simulators.scene import decode_scene
 
@@ -141,6 +142,36 @@ def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     assert np.isfinite(factors).all()
     assert factors.min() > 0.5
     assert factors.max() < 2
+
+
+@pytest.mark.parametrize(
+    ("level_h", "level_v", "row", "refused"),
+    [
+        (0.05, 0.05, 70, SMEAR),
+        (0.3, 0.002, 70, SMEAR),  # of H alone, as by a row that only H's board lacks
+        (0.05, 0.05, 40, STEEP),  # not at the end of what is illuminated: a curved object is as dim
+        (0.5, 0.2, 70, STEEP),
+    ],
+)
+def test_a_dim_steep_patch_at_the_end_of_the_scan_is_a_smear(level_h, level_v, row, refused):
+    """Positions without data spread plates to the end of the scan, where the footprint's correction lifts them."""
+    usable = np.ones((100, 100), bool)
+    usable[90:] = False
+    axis_m = (np.arange(100) - 49.5) * 2e-3
+    plate = np.zeros((100, 100), bool)
+    plate[5:23, 30:50] = True
+    other = np.zeros((100, 100), bool)
+    other[row : row + 18, 30:50] = True
+    h, v = (
+        (plate + level * other * np.exp(-1j * 0.1 * 1900 * axis_m)).astype(np.complex64) for level in (level_h, level_v)
+    )
+    images = Images(h, v, axis_m, axis_m, usable)
+    lit = Illumination(
+        np.ones((2, 100, 100), np.complex64), np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3)
+    )
+    patches = tuple(make_patch(i, mask, axis_m, axis_m, 5.0, usable) for i, mask in ((1, plate), (2, other)))
+    tilts = Tilts.estimate(images, lit, Segmentation(plate + 2 * other.astype(np.int32), patches))
+    assert tilts.refusals() == {2: refused}
 
 
 @pytest.mark.parametrize("radius_m", [0.1, 0.3, np.inf])

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from polysight.materials import SMEAR
 from polysight.results import rules
 from polysight.results.verdict import Coverage, NoResult, Verdict, join_reasons, percent, read_verdict, reason
 from polysight_shared.findings import Finding
@@ -232,6 +233,14 @@ def test_paint_is_no_cause_where_a_dielectric_reference_explains_the_others_bett
     (paint,) = rules.judge_metal("patch 5", False, False, True, False, False, painted=1.0, paint_mm=0.1)
     assert "may be no metal: patch 2" in doubt.what
     assert "may be painted" in paint.what
+
+
+@pytest.mark.parametrize("labels", [[4], [4, 7]])
+def test_smears_are_told_with_their_own_cause_and_advice(labels):
+    assert rules.judge_smears({}) == []
+    (told,) = rules.judge_smears(dict.fromkeys(labels, SMEAR))
+    assert all(str(label) in told.what for label in labels)
+    assert (told.why, told.do) == (SMEAR.why, SMEAR.do)
 
 
 @pytest.mark.parametrize("given", [True, False])

@@ -13,7 +13,6 @@ data set.
 from typing import TYPE_CHECKING, Any
 
 from polysight.materials.analyse import (
-    STEEP as STEEP,
     KnownScene as KnownScene,
     Optics as Optics,
     analyse as analyse,
@@ -92,6 +91,8 @@ from polysight.materials.names import (
 )
 from polysight.materials.result import (
     PATCHES as PATCHES,
+    SMEAR as SMEAR,
+    STEEP as STEEP,
     MatchedPatch as MatchedPatch,
     MaterialsResult as MaterialsResult,
     ScanPatches as ScanPatches,

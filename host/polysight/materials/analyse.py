@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging import MAX_RISE, Image, Images, Rise, correct_tilt
+from polysight.imaging import Image, Images, Rise, correct_tilt
 from polysight.materials.classify import PAPER, Classifier
 from polysight.materials.common_change import CommonChange, estimate_common_change
 from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, RigPrior, invert
@@ -58,7 +58,7 @@ from polysight.materials.metal import (
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.phase_sign import join_signs, mirror_phases
-from polysight.materials.result import LEVEL, MAX_BEND, MaterialsResult, PatchResult, Tilts, pixel_features
+from polysight.materials.result import LEVEL, MaterialsResult, PatchResult, Tilts, pixel_features
 from polysight.materials.segment import (
     Box,
     Patch,
@@ -186,14 +186,6 @@ def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None
 BEHIND_PATCH = 0.6
 """Background in a plate over that beside the plates: of tables in scenes of the independent generator. It is less than
 1: what changes plates and metal alike cancels in their ratio, and a table is brightest at its own edges."""
-STEEP = Finding(
-    "error",
-    "tilted or curved beyond what is modelled",
-    f"its phase rises by more than {np.degrees(MAX_RISE):.1f} degrees, or bends as that of a radius below "
-    f"{1 / MAX_BEND:.1f} m: H and V see other places, turned polarisations",
-    "lay it flat, or measure it as it is with `polysight surface`",
-)
-"""Why a steep patch gets no permittivity."""
 UNEVEN_METAL = 0.5
 """Error of each part of the metal's ln(V / H), as a share of the distance between its value by root mean squares and by
 the median of pixels: where metal lies at the end of the scan neither is right (`benchmarks coverage`)."""
@@ -519,7 +511,7 @@ class _Scene:
         rv = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
         background_rms = background(raw.h, raw.v, segmentation, images.usable)
         refused = check_patches(segmentation, rh, rv, background_rms, reference.mask)
-        refused |= {p.label: STEEP for p in segmentation.patches if p.label in self.tilts.steep}
+        refused |= self.tilts.refusals()
         judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
         scatter = SceneScatter.collect(
             channels=(rh, rv), raw=raw, judged=judged, segmentation=segmentation, reference=reference,

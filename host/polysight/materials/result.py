@@ -39,6 +39,26 @@ MAX_BEND = 3.5
 """Curvature above which a patch is not a flat plate, 1 / m. Flat plates that are uneven by 0.25 mm have up to 1.4 in
 drawn scenes and ripple of the published picture up to 3; sheets bent to a radius of 150 mm have 5.6, spheres of 100 mm
 6 to 10."""
+STEEP = Finding(
+    "error",
+    "tilted or curved beyond what is modelled",
+    f"its phase rises by more than {np.degrees(MAX_RISE):.1f} degrees, or bends as that of a radius below "
+    f"{1 / MAX_BEND:.1f} m: H and V see other places, turned polarisations",
+    "lay it flat, or measure it as it is with `polysight surface`",
+)
+"""Why a steep patch gets no permittivity."""
+SMEAR = Finding(
+    "error",
+    "a smear at the end of the scan",
+    "positions without data or with a wrong phase spread plates along x or y, and the correction of the footprint lifts"
+    " what lies at the end of the illuminated area",
+    "nothing needs to lie there; scan again without gaps if something does",
+)
+"""Why a steep patch that is a smear gets no permittivity."""
+SMEAR_LEVEL = 0.1
+END_PX = 3
+"""Largest level of a smear, relative to the brightest patch, and its largest distance from pixels that are not
+illuminated. Chosen: smears by one to five missing rows, or by a step of the phase, had levels below 0.03."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +66,13 @@ class Tilts:
     """Tilts of the plates: patch number to rise along x and y, radians; patches without an estimate are missing.
 
     `across` is the index of the axis across the plane of incidence; `steep` are the patches that are steeper than the
-    model allows.
+    model allows, `smears` those of them that are no objects, but smears at the end of the scan.
     """
 
     rises: dict[int, Rise]
     across: int
     steep: frozenset[int] = frozenset()
+    smears: frozenset[int] = frozenset()
 
     @classmethod
     def estimate(cls, images: Images, illumination: Illumination, segmentation: Segmentation) -> Tilts:
@@ -67,7 +88,11 @@ class Tilts:
         usable_rises = {
             label: (x if abs(x) < MAX_RISE else 0.0, y if abs(y) < MAX_RISE else 0.0) for label, (x, y) in rises.items()
         }
-        return cls(usable_rises, illumination.across, steep)
+        return cls(usable_rises, illumination.across, steep, find_smears(images, segmentation) & steep)
+
+    def refusals(self) -> dict[int, Finding]:
+        """Return patch number to why it has no permittivity, of the steep patches."""
+        return {label: SMEAR if label in self.smears else STEEP for label in self.steep}
 
     def in_plane(self, label: int) -> Rise:
         """Return the rise of a patch along the plane of incidence and across it, radians; 0 if it is not known."""
@@ -77,6 +102,20 @@ class Tilts:
     def across_rad(self, label: int) -> float:
         """Return the rise of a patch across the plane of incidence, radians; 0 if it is not known."""
         return self.rises[label][self.across] if label in self.rises else 0.0
+
+
+def find_smears(images: Images, segmentation: Segmentation) -> frozenset[int]:
+    """Return the patches that are dim in both channels together, and lie at the end of the illuminated area."""
+    near_end = scipy.ndimage.binary_dilation(~images.usable, iterations=END_PX)
+    # A smear is often of one channel: with the other, which is dark there, it is dimmer than a plate.
+    level = {
+        p.label: float(np.sqrt(np.median(np.abs(images.h[p.mask])) * np.median(np.abs(images.v[p.mask]))))
+        for p in segmentation.patches
+    }
+    brightest = max(level.values(), default=0.0)
+    return frozenset(
+        p.label for p in segmentation.patches if level[p.label] < SMEAR_LEVEL * brightest and (near_end & p.mask).any()
+    )
 
 
 LEVEL = Tilts({}, 1)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import PlaneEstimate
-from polysight.materials import NOT_PASSIVE, STRONGER_V, Classifier, MaterialsResult, find_copies
+from polysight.materials import NOT_PASSIVE, SMEAR, STRONGER_V, Classifier, MaterialsResult, find_copies
 from polysight.process.quality import Quality, RowFigures
 from polysight.results import (
     ErrorBudget,
@@ -137,14 +137,17 @@ def scene_reasons(
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
     no_half_spaces = _find_no_half_spaces(result)
-    no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces}
+    smears = {label: SMEAR for label, what in refused.items() if what == SMEAR.what}
+    objects = [r.patch for r in result.patches if r.patch.label not in smears]
+    no_plates = {k: v for k, v in refused.items() if k not in no_half_spaces and k not in smears}
     # Patches and images.
     left_out = result.segmentation.left_out
     usable = max(1, int(result.calibrated.usable.sum()))
     filled_share = max((float(mask.sum()) / usable for mask in left_out), default=0.0)
-    reasons += rules.judge_patches(no_plates, len(result.patches), len(left_out), filled_share)
+    reasons += rules.judge_patches(no_plates, len(objects), len(left_out), filled_share)
+    reasons += rules.judge_smears(smears)
     pixel_mm = abs(float(result.calibrated.x_m[1] - result.calibrated.x_m[0])) * 1e3
-    copies = find_copies([r.patch for r in result.patches], result.calibrated.h, result.calibrated.v, pixel_mm)
+    copies = find_copies(objects, result.calibrated.h, result.calibrated.v, pixel_mm)
     if copies is not None:
         reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db, has_gaps)
     reasons += rules.judge_image_shift(result.apart_mm)

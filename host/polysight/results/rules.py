@@ -633,6 +633,17 @@ def judge_passivity(refused: Mapping[int, Finding]) -> list[Finding]:
     return reasons
 
 
+def judge_smears(smears: Mapping[int, Finding]) -> list[Finding]:
+    """Judge patches that are smears and no objects: number to why."""
+    if not smears:
+        return []
+    fault = next(iter(smears.values()))
+    subject = f"patch {next(iter(smears))} is no object, but"
+    if len(smears) > 1:
+        subject = f"patches {', '.join(map(str, smears))} are no objects, but each is"
+    return [reason("care", f"{subject} {fault.what}", fault.why, fault.do, 1.9)]
+
+
 def judge_exchange(stronger_v: Sequence[int], plates: int) -> list[Finding]:
     """Judge whether H and V are exchanged: `stronger_v` are the patches of `plates` that reflect more V than H.
 

@@ -58,7 +58,7 @@ def test_synchronisation_undoes_every_disturbance(image_scene):
 def test_a_scene_without_disturbances_has_no_jump_of_the_phase(image_scene):
     """Its rows are as far apart as its image allows, so that a row is predicted badly from its neighbours."""
     scan = image_scene("nine-materials")
-    assert [board.find_phase_jump() for board in scan.pipeline.quality.boards.values()] == [None, None]
+    assert [board.find_phase_jumps() for board in scan.pipeline.quality.boards.values()] == [(), ()]
 
 
 def test_metal_gives_one_at_every_pixel_within_noise(image_scene):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig
 from tests.support.scenes import make_scene
 
-from polysight.process.quality import find_phase_jump
+from polysight.process.quality import PhaseJump, find_phase_jumps
 from polysight_simulators.scene import decode_scene
 from polysight_worlds import METAL, Plate, Stack, World, published_rig as independent_rig, record
 from polysight_worlds.world import nine_places
@@ -35,8 +37,7 @@ def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degr
     cubes = jumping(board, row, degrees)
     pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
     findings = pipeline.examine(pipeline.form_images())
-    jump = pipeline.quality.boards[board].find_phase_jump()
-    assert jump is not None
+    (jump,) = pipeline.quality.boards[board].find_phase_jumps()
     assert abs(jump.row - row) <= 1
     assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=6)
     assert findings.verdict.level == "care"
@@ -49,7 +50,7 @@ def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degr
 def test_no_jump_is_found_without_one():
     for cubes in (jumping("RV", 20, 0.0), jumping("RV", 20, 2.0)):
         pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
-        assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
+        assert not any(board.find_phase_jumps() for board in pipeline.quality.boards.values())
 
 
 def draw_scene(rng: np.random.Generator) -> dict[str, Any]:
@@ -74,7 +75,7 @@ def test_no_drawn_scene_has_a_jump_of_its_own(request):
     rng = np.random.default_rng(3)
     for _ in range(40 if request.config.getoption("--long") else 1):
         pipeline = make_pipeline(Cubes(published_rig(), decode_scene(draw_scene(rng), "test")))  # type: ignore[arg-type]
-        assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
+        assert not any(board.find_phase_jumps() for board in pipeline.quality.boards.values())
 
 
 @pytest.mark.parametrize(("columns", "rows", "step_mm"), [(14, 10, (14.0, 12.0)), (31, 24, (10.0, 12.0))])
@@ -85,26 +86,58 @@ def test_rows_too_far_apart_or_too_few_have_no_jump(columns, rows, step_mm):
     ]
     scene = make_scene(*plates, columns=columns, rows=rows, step_mm=step_mm, image={"columns": 40, "rows": 30})
     pipeline = make_pipeline(Cubes(published_rig(), decode_scene(scene, "test")))  # type: ignore[arg-type]
-    assert all(board.find_phase_jump() is None for board in pipeline.quality.boards.values())
+    assert not any(board.find_phase_jumps() for board in pipeline.quality.boards.values())
 
 
-@pytest.mark.parametrize("degrees", [30.0, -45.0, 15.0])
-@pytest.mark.parametrize("row", [60, 100, 130])
-def test_jumps_of_an_independent_world_are_found(degrees, row):
+@pytest.fixture(scope="module")
+def independent_rows():
+    """Echoes of nine plates in V's board, row by row, in one range cell; without a jump, of an independent world."""
     rig = independent_rig()
     places = nine_places((rig.centre_m[0], rig.centre_m[1]))
     stacks = [METAL, *(Stack(below=complex(e, -0.4)) for e in (2.2, 3.0, 3.6, 4.2, 5.0, 6.0, 7.0, 2.6))]
     plates = [Plate(str(i), place, (0.046, 0.046), s) for i, (place, s) in enumerate(zip(places, stacks, strict=True))]
     echoes = record(rig, rig.v, World(tuple(plates)))
     direct_m = np.linalg.norm(rig.v.position - rig.tx.position)
-    # One range cell: echoes relative to the direct path, summed over the sweep.
+    # Relative to the direct path, summed over the sweep.
     middle_m = 0.308
     turn = np.exp(2j * np.pi * rig.frequencies_hz * (direct_m + middle_m) / 299792458.0)
     cell = np.tensordot(turn, echoes, 1)
-    rows = {k: cell[k][None] for k in range(len(cell))}
-    assert find_phase_jump(rows) is None
-    turned = {k: v * np.exp(1j * np.radians(degrees) * (k >= row)) for k, v in rows.items()}
-    jump = find_phase_jump(turned)
-    assert jump is not None
+    return {k: cell[k][None] for k in range(len(cell))}
+
+
+def turn(rows, jumps):
+    """The same rows with jumps: row before which the phase jumps to degrees."""
+    return {
+        k: echo * np.exp(1j * np.radians(sum(degrees for row, degrees in jumps.items() if k >= row)))
+        for k, echo in rows.items()
+    }
+
+
+@pytest.mark.parametrize("degrees", [30.0, -45.0, 15.0])
+@pytest.mark.parametrize("row", [60, 100, 130])
+def test_jumps_of_an_independent_world_are_found(independent_rows, degrees, row):
+    assert find_phase_jumps(independent_rows) == ()
+    (jump,) = find_phase_jumps(turn(independent_rows, {row: degrees}))
     assert jump.row == row
     assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=1)
+
+
+@pytest.mark.parametrize("jumps", [{60: 30.0, 100: -45.0}, {64: -20.0, 98: -60.0, 130: -58.0}])
+def test_each_of_several_jumps_is_found_one_by_one(independent_rows, jumps):
+    """Of three jumps of a board only one was found, and the others tore plates apart (found from outside)."""
+    found = find_phase_jumps(turn(independent_rows, jumps))
+    assert [jump.row for jump in found] == list(jumps)
+    assert np.degrees([jump.angle_rad for jump in found]) == pytest.approx(list(jumps.values()), abs=1.5)
+
+
+def test_rows_are_turned_back_by_all_jumps_and_the_longest_section_keeps_its_phase(monkeypatch):
+    pipeline = make_pipeline(Cubes(published_rig(), decode_scene(EMPTY, "test")))  # type: ignore[arg-type]
+    board = pipeline.quality.boards["RV"]
+    monkeypatch.setattr(board, "find_phase_jumps", lambda: (PhaseJump(4, 0.5), PhaseJump(25, -0.2)))
+    turned: dict[str, Any] = {}
+    builder = SimpleNamespace(
+        boards={name: SimpleNamespace(turn_rows=partial(turned.__setitem__, name)) for name in ("RH", "RV")}
+    )
+    pipeline.quality.remove_phase_jumps([builder])  # type: ignore[list-item]
+    assert not turned["RH"].any()
+    np.testing.assert_allclose(turned["RV"][[0, 3, 4, 24, 25, -1]], [0.5, 0.5, 0.0, 0.0, 0.2, 0.2])

@@ -46,9 +46,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
         missing += _report_disturbances(name, list(board.figures.values()))
         missing += rules.judge_dead_rx(name, board.dead_rx, len(board.rows))
-        jump = board.find_phase_jump()
-        if jump is not None:
-            missing += rules.judge_phase_jump(name, jump.row, jump.angle_rad)
+        missing += rules.judge_phase_jumps(name, [(jump.row, jump.angle_rad) for jump in board.find_phase_jumps()])
     share_masked = _divide(masked, positions, default=0.0 if len(in_order) < len(quality.boards) else 1.0)
     recorded = rules.judge_recording(coverage, share_masked, is_filled=bool(quality.filled))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]

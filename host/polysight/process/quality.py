@@ -81,6 +81,8 @@ _MOST_ERROR = 1.0
 _LEAST_SOUND = 10
 # Times that a jump is measured again with what was found turned back: until then the predictor was fitted across it.
 _AGAIN = 2
+# Most jumps of a board that are looked for, one after another (a loose cable makes several); chosen.
+_MOST_JUMPS = 4
 # Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
 _AT_END = 3
 
@@ -168,8 +170,8 @@ class BoardRows:
         self._path = prepare(self.rig, self.board)
         # Order of the RX that each row shows; empty if it is the rig file's, or not known.
         self._orders: dict[int, tuple[int, ...]] = {}
-        # The latest jump that was looked for, and the rows in which it was.
-        self._jump: PhaseJump | None = None
+        # The latest jumps that were looked for, and the rows in which they were.
+        self._jumps: tuple[PhaseJump, ...] = ()
         self._searched_rows: dict[int, RowQuality] = {}
 
     def add(self, row: int, recorded: RowData | CubeRow, frames_valid: int, synced: SyncedRow) -> None:
@@ -249,8 +251,8 @@ class BoardRows:
             return []
         return list(order)
 
-    def find_phase_jump(self) -> PhaseJump | None:
-        """Find the clearest jump of the echo's phase between two rows; None if there is none."""
+    def find_phase_jumps(self) -> tuple[PhaseJump, ...]:
+        """Find the clear jumps of the echo's phase between two rows, in the order of rows."""
         # A copy: threads may add rows meanwhile.
         rows = dict(self.rows)
         is_searched = rows.keys() == self._searched_rows.keys() and all(
@@ -258,9 +260,9 @@ class BoardRows:
         )
         if not is_searched:
             plan = plan_raster(self.rig.grid)
-            self._jump = find_phase_jump({row: r.echo[:, :: plan.row(row).direction] for row, r in rows.items()})
+            self._jumps = find_phase_jumps({row: r.echo[:, :: plan.row(row).direction] for row, r in rows.items()})
             self._searched_rows = rows
-        return self._jump
+        return self._jumps
 
     @property
     def direct_snr_db(self) -> float | None:
@@ -375,19 +377,32 @@ class PhaseJump(NamedTuple):
     angle_rad: float
 
 
-def find_phase_jump(rows: Mapping[int, NDArray[np.complexfloating]]) -> PhaseJump | None:
-    """Find the clearest jump of the phase from row to row; None if there is none.
+def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[PhaseJump, ...]:
+    """Find the clear jumps of the phase from row to row, at most `_MOST_JUMPS`, in the order of rows.
 
     `rows`: number to echoes, complex [rx, position], positions from the smallest x. Numbers that are missing count as
-    rows without echo.
+    rows without echo. What was found is turned back before the next jump is looked for.
     """
     if len(rows) < 2 * _AT_END:
-        return None
+        return ()
     first = min(rows)
     shape = next(iter(rows.values())).shape
     echoes = np.zeros((max(rows) - first + 1, *shape), complex)
     for number, echo in rows.items():
         echoes[number - first] = echo
+    jumps: list[PhaseJump] = []
+    while len(jumps) < _MOST_JUMPS:
+        jump = _find_clearest_jump(echoes)
+        # What is left of a jump is no jump of its own.
+        if jump is None or any(abs(jump.row - other.row) <= 1 for other in jumps):
+            break
+        echoes[jump.row :] *= np.exp(-1j * jump.angle_rad)
+        jumps.append(jump)
+    return tuple(PhaseJump(first + jump.row, jump.angle_rad) for jump in sorted(jumps))
+
+
+def _find_clearest_jump(echoes: NDArray[np.complex128]) -> PhaseJump | None:
+    """Find the clearest jump of echoes [row, rx, position]; None if no jump is clear."""
     angles, errors = _measure_jumps(echoes)
     is_sound = errors < _MOST_ERROR
     ratio = np.zeros(len(angles))
@@ -404,7 +419,7 @@ def find_phase_jump(rows: Mapping[int, NDArray[np.complexfloating]]) -> PhaseJum
         turned = echoes.copy()
         turned[row:] *= np.exp(-1j * angle)
         angle += float(_measure_jumps(turned)[0][row])
-    return PhaseJump(first + row, angle)
+    return PhaseJump(row, angle)
 
 
 def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -495,22 +510,26 @@ class Quality:
         return [name for name, b in self.boards.items() if b.positions and b.positions_masked == b.positions]
 
     def remove_phase_jumps(self, builders: Iterable[ImageBuilder]) -> None:
-        """Turn the rows on the shorter side of each board's phase jump back, in all images that the builders form."""
+        """Turn rows back by each board's phase jumps, in all images that the builders form.
+
+        The longest section without a jump keeps its phase.
+        """
         for name, board in self.boards.items():
+            jumps = board.find_phase_jumps()
             angles_rad = np.zeros(self.source.plan.rows)
-            jump = board.find_phase_jump()
-            if jump is not None and 2 * jump.row > len(angles_rad):
-                angles_rad[jump.row :] = -jump.angle_rad
-            elif jump is not None:
-                angles_rad[: jump.row] = jump.angle_rad
+            for jump in jumps:
+                angles_rad[jump.row :] -= jump.angle_rad
+            ends = [0, *(jump.row for jump in jumps), len(angles_rad)]
+            longest = int(np.argmax(np.diff(ends)))
+            angles_rad -= angles_rad[ends[longest]]
             for builder in builders:
                 builder.boards[name].turn_rows(angles_rad)
 
     @property
     def jump_rad(self) -> float:
         """Largest jump of a board's phase between two rows of the scan, radians; 0 if none was found."""
-        jumps = [board.find_phase_jump() for board in self.boards.values()]
-        return max((abs(jump.angle_rad) for jump in jumps if jump is not None), default=0.0)
+        jumps = [jump for board in self.boards.values() for jump in board.find_phase_jumps()]
+        return max((abs(jump.angle_rad) for jump in jumps), default=0.0)
 
     def coverage(self) -> Coverage:
         """Compare rows, positions and frames with the plan; missing rows count as not received."""

@@ -193,12 +193,15 @@ def judge_rx_order(board: str, order: Sequence[int]) -> list[Finding]:
     )]  # fmt: skip
 
 
-def judge_phase_jump(board: str, row: int, angle_rad: float) -> list[Finding]:
-    """Judge a jump of the phase of a board's echo before a row."""
+def judge_phase_jumps(board: str, jumps: Sequence[tuple[int, float]]) -> list[Finding]:
+    """Judge jumps of the phase of a board's echo: (the row before which it jumps, angle in radians) of each."""
+    if not jumps:
+        return []
+    places = ", ".join(f"by {np.degrees(angle_rad):+z.0f} degrees before row {row}" for row, angle_rad in jumps)
     return [reason(
-        "care", f"{board}: the phase of the echo jumps by {np.degrees(angle_rad):+z.0f} degrees before row {row}",
-        "a cable or connector was touched, or the board was knocked; the direct path does not show it; it was"
-        " removed from the images as measured between the rows, and the errors contain what may be left",
+        "care", f"{board}: the phase of the echo jumps {places}",
+        "a cable or connector is loose or was touched, or the board was knocked; the direct path does not show it; it"
+        " was removed from the images as measured between the rows, and the errors contain what may be left",
         "fix cables and boards, and scan again", 4.7,
     )]  # fmt: skip
 

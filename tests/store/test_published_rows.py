@@ -165,6 +165,18 @@ def test_settings_of_another_number_of_chirps_are_refused(tmp_path, pulses):
         open_source(folder, BASE)
 
 
+@pytest.mark.parametrize("rows", [ROWS - 1, ROWS])
+def test_rows_beyond_the_settings_are_left_out_with_a_notice(tmp_path, rows):
+    folder, _ = record(tmp_path)
+    file = folder / "data_collection_cfg.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"total_y": rows}))
+    scan = open_source(folder, BASE)
+    assert list(scan.rows()) == list(range(rows))
+    told = [notice for notice in scan.notices if "left out" in notice]
+    assert len(told) == (ROWS - rows) * len(BASE.boards)
+    assert all(f"{ROWS - rows} files of rows beyond the {rows}" in notice for notice in told)
+
+
 def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):
     folder, _ = record(tmp_path)
     for file in (folder / "RV").iterdir():

@@ -408,6 +408,7 @@ class PublishedScan(_Published):
         Raises DataError if one starts at another column than the plan.
         """
         files = {}
+        beyond = 0
         for file in (self.path / board_name).glob("*.bin"):
             match = _ROW_FILE.fullmatch(file.name)
             if match is None:
@@ -419,6 +420,11 @@ class PublishedScan(_Published):
             if row < self._plan.rows:
                 self._check_start(file, start, row)
                 files[row] = file
+            else:
+                beyond += 1
+        if beyond:
+            told = f"{beyond} files of rows beyond the {self._plan.rows} of {COLLECTION} are left out"
+            self.notices += (f"{self.path / board_name}: {told}",)
         return files
 
     def _check_start(self, file: Path, start: int, row: int) -> None:

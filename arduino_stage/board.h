@@ -37,7 +37,7 @@ constexpr uint16_t MAX_POINTS = 9999;
 
 // Debouncing: an input changes after this many equal readings, one per step, at rest one per millisecond. A glitch of
 // 100 us is read at most four times at MAX_RATE; a real switch closes for milliseconds.
-constexpr uint8_t LOOKS = 5;
+constexpr uint8_t DEBOUNCING_READINGS = 5;
 // An immediate byte counts as a heartbeat only after this much silence, so that continuous chatter never does.
 constexpr uint8_t QUIET_MS = 4;  // chosen: 46 bytes at BAUD
 

@@ -39,7 +39,7 @@ class Motion {
   // Plan a leg and start the step timer.
   void start(const Leg& leg);
 
-  // Read and debounce the switches (board::LOOKS). step() does this too; the main program does it each millisecond
+  // Read and debounce the switches (board::DEBOUNCING_READINGS). step() does this too; the main program does it each millisecond
   // while the stage is at rest.
   void look_at_switches();
   // The debounced switches: bits of Input.

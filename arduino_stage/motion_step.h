@@ -35,11 +35,11 @@ IN_INTERRUPT uint16_t ticks_of(uint16_t v) {
   return quotient;
 }
 
-// The switches change after board::LOOKS equal readings in a row.
+// The switches change after board::DEBOUNCING_READINGS equal readings in a row.
 IN_INTERRUPT void Motion::look(uint8_t inputs) {
   if (inputs == stable_) {
     looks_ = 0;
-  } else if (++looks_ >= board::LOOKS) {
+  } else if (++looks_ >= board::DEBOUNCING_READINGS) {
     stable_ = inputs;
     looks_ = 0;
   }

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from benchmarks.data import make_synced_row, point_row, published_scene
 from benchmarks.measure import Line, add_arguments, keep_on_one_core, show, write
 from benchmarks.published import Synchroniser
-from polysight.capture.dca1000 import raw_words
+from polysight.capture.dca1000 import encode_row_words
 from polysight.imaging import ImageBuilder, backproject
 from polysight.imaging.geometry import Antennas, row_offsets_m, scene_gate_m
 from polysight.imaging.samples import reduction
@@ -62,7 +62,7 @@ def _quantise_bursts(bursts: NDArray[np.complexfloating]) -> NDArray[np.int16]:
     """
     positions, chirps, rx, samples = bursts.shape
     flat = 1000 * bursts.transpose(2, 0, 1, 3).reshape(rx, positions * chirps, samples)
-    return raw_words(flat).reshape(positions, chirps, samples, 2, rx)
+    return encode_row_words(flat).reshape(positions, chirps, samples, 2, rx)
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ class Cards:
         return max(sender.hear()["seconds"] for sender in self.senders)
 
     def queues(self) -> list[int]:
-        """Bytes of kernel memory that wait at each board's port.
+        """Return bytes of kernel memory that wait at each board's port.
 
         In /proc/net/udp word 1 is the local `address:port`, word 4 the `sent:received` bytes that wait, hexadecimal.
         """

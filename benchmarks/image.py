@@ -50,7 +50,7 @@ class Bench:
         for row, cube_row in self._read_rows():
             board_samples.add_row(row, make_synced_row(self.rig, cube_row))
         # Beside the image there are the footprint and a notice.
-        image, _, _ = board_samples.current() if live else board_samples.image()
+        image, _, _ = board_samples.image_current_sums() if live else board_samples.image()
         return image
 
     def _read_rows(self) -> Iterator[tuple[int, NDArray[np.complex64]]]:
@@ -196,12 +196,12 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
         for row, start in enumerate(starts):
             imager.add_row(row, samples[:, :, row] * weights[row], weights[row], float(start))
         # The footprint, whose time counts; then the image, all RX with a factor of 1.
-        imager.constant_of_sum()
+        imager.image_summed_constant_echo()
         images["rows"] = imager.image_of_sum(np.ones(len(samples)))
 
     def image_batch() -> None:
         imager, _ = choose_imager(aperture)
-        imager.constant(mirror, weights)
+        imager.image_constant_echo(mirror, weights)
         images["batch"] = imager.image(samples * weights)
 
     jobs = {

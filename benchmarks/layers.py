@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes, image_scan, lay_metal_plate
 from polysight.data import find_packaged
 from polysight.jobs.process import make_plane_reference
-from polysight.materials import METAL, Layer, LayerFit, fit_row, match_truth, truth_plates
+from polysight.materials import METAL_PERMITTIVITY, Layer, LayerFit, fit_row, match_truth, truth_plates
 from polysight.polarimetry import PlaneReference
 from polysight.process import Inputs
 from polysight.results import PatchFigures
@@ -174,7 +174,7 @@ def given_stack(plate: Plate, within: float | None = None) -> list[Layer]:
         return [Layer("glass", wall.epsilon, (wall.thickness_mm or 0.0) / 1e3), Layer("liquid")]
     behind = []
     if plate.name.startswith(ON_METAL):
-        behind = [Layer("metal", METAL)]
+        behind = [Layer("metal", METAL_PERMITTIVITY)]
     size = (plate.layers[0].thickness_mm or 0.0) / 1e3
     limits = RANGE_M
     if within is not None:

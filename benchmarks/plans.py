@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.data import RIG, SCENE
 from benchmarks.sparse_scans import predict_image
-from polysight.capture.dca1000 import row_words
+from polysight.capture.dca1000 import view_row_words
 from polysight.imaging import Image, ImageBuilder, Images
 from polysight.imaging.sparse import reconstruct
 from polysight.materials import (
@@ -34,7 +34,7 @@ from polysight.materials import (
     pixel_accuracy,
     truth_plates,
 )
-from polysight.planning import Changes, scan_time
+from polysight.planning import PlanChanges, scan_time
 from polysight.polarimetry import incidence_choice
 from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.config import Instrument, load_instrument
@@ -64,7 +64,7 @@ def build_scanned_images(rig: Instrument, scene: Scene) -> tuple[ImageBuilder, I
             x, y = row_offsets_mm(radar, row)
             payload = radar.chirps(board.name, x, y, first_chirp=row.index * len(x)).view(np.uint8).ravel()
             # All bytes are there: no gaps.
-            frames, valid = row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
+            frames, valid = view_row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
             synced = synchronise_row(frames, valid, setup)
             true.add_row(board.name, row.index, synced)
             triggers = np.stack([row.x_mm, np.full(row.points, row.y_mm)], axis=1) / 1e3
@@ -143,7 +143,7 @@ def measure(
 ) -> None:
     """Print a line of the table (HEAD) about one scan, of which `every` n-th row was scanned."""
     # Only the rows that are scanned take time.
-    scanned = Changes(step_y_mm=every * rig.grid.step_y_mm).apply(rig)
+    scanned = PlanChanges(step_y_mm=every * rig.grid.step_y_mm).apply(rig)
     result = name_patches(rig, images, plates)
     pairs = [(r, r.truth) for r in result.patches if r.truth is not None]
     right = sum(r.verdict is not None and r.verdict.name == t.name for r, t in pairs)
@@ -180,7 +180,7 @@ def published_plan(rig: Instrument, scene: Scene) -> Iterator[Made]:
 
 def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan at 100 mm/s with shorter bursts, whose rows fill whole packets; then leave rows out of it."""
-    rig = Changes(speed_mm_s=100.0, pulses=13, period_us=750.0).apply(rig)
+    rig = PlanChanges(speed_mm_s=100.0, pulses=13, period_us=750.0).apply(rig)
     builder, uncompensated = build_scanned_images(rig, scene)
     yield "fast", rig, builder.finish(), 1
     yield "fast, motion not compensated", rig, uncompensated.finish(), 1
@@ -192,19 +192,19 @@ def fast(rig: Instrument, scene: Scene) -> Iterator[Made]:
 
 def short(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan at 100 mm/s with fewer chirps."""
-    rig = Changes(speed_mm_s=100.0, period_us=750.0, pulses=6).apply(rig)
+    rig = PlanChanges(speed_mm_s=100.0, period_us=750.0, pulses=6).apply(rig)
     yield "fast, 6 chirps", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
 def wide(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan with the published burst, rows twice as far apart, at the speed of `first_proposal`."""
-    rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm).apply(rig)
+    rig = PlanChanges(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm).apply(rig)
     yield "half the rows, published burst", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
 def first_proposal(rig: Instrument, scene: Scene) -> Iterator[Made]:
     """Scan by the first proposal of `polysight plan --minutes 30` for the published rig."""
-    rig = Changes(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
+    rig = PlanChanges(speed_mm_s=47.0, step_y_mm=2 * rig.grid.step_y_mm, pulses=55, period_us=730.0).apply(rig)
     yield "first proposal for 30 minutes", rig, build_scanned_images(rig, scene)[0].finish(), 1
 
 
@@ -224,11 +224,11 @@ def main() -> int:
     scene = msgspec.structs.replace(load_scene(SCENE), grid={})
     rig = load_instrument(RIG)
     x, y = args.coarser
-    rig = Changes(step_x_mm=x * rig.grid.step_x_mm, step_y_mm=y * rig.grid.step_y_mm).apply(rig)
+    rig = PlanChanges(step_x_mm=x * rig.grid.step_x_mm, step_y_mm=y * rig.grid.step_y_mm).apply(rig)
     disturbances = scene.disturbances
     still = scene.with_disturbances(ideal=True, leakage_h=disturbances.leakage_h, leakage_v=disturbances.leakage_v)
     # Without noise and motion a burst of two pulses is as good as a long one.
-    ideal = build_scanned_images(Changes(pulses=2).apply(rig), still)[0].finish()
+    ideal = build_scanned_images(PlanChanges(pulses=2).apply(rig), still)[0].finish()
     plates = truth_plates(truth(rig, scene, scene.seed))
     print(HEAD, flush=True)
     measure("ideal", rig, ideal, ideal, plates)

@@ -156,7 +156,7 @@ class ScanKind:
 
 def see_shapes(
     shapes: Sequence[worlds.Shape], nuisances: worlds.ShapeNuisances, scan: ScanKind, number: int
-) -> surfaces.Seen:
+) -> surfaces.SeenEchoes:
     """Scan shapes and return their specular points; scans of one rig with another `number` have other noise."""
     boards = scan.boards
     cubes = worlds.scan_shapes(shapes, scan.offsets_m, nuisances, boards=boards, number=number)
@@ -171,7 +171,7 @@ def see_shapes(
 
 
 @cache
-def see_reference(nuisances: worlds.ShapeNuisances, scan: ScanKind) -> surfaces.Seen:
+def see_reference(nuisances: worlds.ShapeNuisances, scan: ScanKind) -> surfaces.SeenEchoes:
     """Find the points of the metal sphere that the same rig scanned before."""
     points = see_shapes([worlds.reference_sphere()], nuisances, scan, number=1)
     metal = points[points.segment == 0]

@@ -26,7 +26,7 @@ import polysight_worlds as generator
 from polysight.data import find_packaged
 from polysight.imaging import Antennas, Dispersion, Illumination, Images, illumination_geometry
 from polysight.materials import (
-    DISCRIMINANT,
+    DISCRIMINANT_MODEL,
     UNKNOWN,
     Classifier,
     Entry,
@@ -37,7 +37,7 @@ from polysight.materials import (
     analyse,
     axis_mm,
 )
-from polysight.materials.inversion import LIBRARY_SHARE, MOVED, RigPrior
+from polysight.materials.inversion import LIBRARY_SHARE, MOVED_PROBABILITY, RigPrior
 from polysight.materials.kinds import inverse_ratio
 from polysight.materials.labels import patches_from_labels
 from polysight.materials.result import PatchResult
@@ -201,7 +201,7 @@ def table_2_classifier(theta_rad: float) -> Classifier:
             )
             entries.append(entry)
     # The library is not judged: that takes longer than a scene, and no name depends on it.
-    return Classifier(Library(tuple(entries)), model=DISCRIMINANT)
+    return Classifier(Library(tuple(entries)), model=DISCRIMINANT_MODEL)
 
 
 def illumination_of_worlds(shape: tuple[int, int], pixel_m: float) -> Illumination:
@@ -274,8 +274,8 @@ def analyse_world(
     # Amplitudes of these images are relative to the direct path.
     prior = RigPrior(THETA_STD_RAD, channels_known=True)
     if leakage is not None:
-        # MOVED: probability that the mount has moved since its leakage was measured.
-        prior = replace(prior, leakage=leakage, leakage_std=LEAKAGE_STD, leakage_measured=True, moved=MOVED)
+        # MOVED_PROBABILITY: probability that the mount has moved since its leakage was measured.
+        prior = replace(prior, leakage=leakage, leakage_std=LEAKAGE_STD, leakage_measured=True, moved=MOVED_PROBABILITY)
     theta_rad = np.radians(pair.incidence_deg) + theta_error_rad
     analysis = analyse(images, Optics(theta_rad, prior), known_scene, classifier)
     if not searched:

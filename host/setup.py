@@ -1,4 +1,4 @@
-"""What pyproject.toml cannot say: how the loops are compiled; a wheel is for one platform and any Python.
+"""Settings that pyproject.toml cannot contain: compilation of the loops; a wheel is for one platform, any Python.
 
 With POLYSIGHT_WHEEL set to a platform of `polysight/sync/build.py`, wheels are made for that one. POLYSIGHT_KERNELS is
 a library that was compiled for this machine before: it is taken if it is one of these sources.
@@ -65,7 +65,7 @@ class PlatformWheel(bdist_wheel):
     """The kernels need no Python: one wheel serves all versions on a platform."""
 
     def get_tag(self):
-        """Such as py3-none-linux_x86_64."""
+        """Return the tag of the wheel, such as py3-none-linux_x86_64."""
         return "py3", "none", TARGET or super().get_tag()[2]
 
 

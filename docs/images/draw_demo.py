@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
 
-from polysight.report import INK, MUTED, PALETTE, STAMP
+from polysight.report import INK, MUTED, PALETTE, STAMP_COLOUR
 
 # Title of each image to the levels at the ends of its colours; chosen by eye.
 SHOWN_DB = {"H, s-polarised": (-35, 0), "V, p-polarised": (-35, 0), "P = H / V": (-3, 24)}
@@ -70,7 +70,7 @@ def draw(products: Path, to: Path) -> None:
     for ax in axes:
         ax.set(xlim=(-REACH_MM, REACH_MM), ylim=(-REACH_MM, REACH_MM), xticks=[], yticks=[], anchor="N")
         ax.text(
-            0.98, 0.02, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom", fontsize=12, color=STAMP,
+            0.98, 0.02, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom", fontsize=12, color=STAMP_COLOUR,
             fontweight="bold", path_effects=[withStroke(linewidth=3, foreground="white")],
         )  # fmt: skip
     # The scale: a line of 50 mm.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from polysight.capture.dca1000 import row_words
+from polysight.capture.dca1000 import view_row_words
 from polysight.imaging import ImageBuilder
 from polysight.store.scan_folder import ScanFolder
 from polysight.sync import BoardSetup, synchronise_row
@@ -24,7 +24,7 @@ for board in rig.receivers:
     setup = BoardSetup.from_rig(rig, board)
     for row in scan.rows():
         raw = scan.read_row(board.name, row)
-        frames, valid = row_words(raw.payload, raw.missing, raw.frames_expected, rig.chirp.samples, rx)
+        frames, valid = view_row_words(raw.payload, raw.missing, raw.frames_expected, rig.chirp.samples, rx)
         builder.add_row(board.name, row, synchronise_row(frames, valid, setup))
 images = builder.finish()
 

@@ -33,7 +33,7 @@ _NAMES = {
     "polysight.materials": ("Library", "PaperKNeighborsClassifier"),
     "polysight.polarimetry.xarray_labels": ("fresnel", "multilayer", "permittivity_from_ratio"),
 }
-_HOME = {name: module for module, names in _NAMES.items() for name in names}
+_MODULE_OF_NAME = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "Classifier",
@@ -62,9 +62,9 @@ def __getattr__(name: str) -> object:
     """Import a public name when it is first used."""
     from importlib import import_module
 
-    if name not in _HOME:
+    if name not in _MODULE_OF_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOME[name]), name)
+    value = globals()[name] = getattr(import_module(_MODULE_OF_NAME[name]), name)
     return value
 
 

@@ -20,12 +20,12 @@ class Pipeline:
         inputs: process.Inputs = process.NO_INPUTS,
         *,
         live: bool = False,
-        samples: process.Use = "none",  # "read" restores samples kept earlier, "keep" also saves those of other rows
+        samples: process.SampleUse = "none",  # "read" restores samples kept earlier, "keep" also saves other rows'
     ) -> None:
         self.source = source
         self.settings = settings
         self.inputs = inputs
-        self.calibration = calibration.calibration_of_scan(source)
+        self.calibration = calibration.load_scan_calibration(source)
         rig = self.calibration.rig(source.instrument)
         filters = self.calibration.high_passes(rig)
         self.plane = imaging.UNKNOWN_PLANE
@@ -70,7 +70,7 @@ class Pipeline:
             else:
                 self.quality.remove_phase_jumps((self.samples.filled, *self.sub_bands.builders))
                 images = self.samples.filled.finish()
-        self.quality.note(**self.synchroniser.recording_facts())
+        self.quality.add_entries(**self.synchroniser.recording_facts())
         return images.transpose() if self.source.mirrored else images
 
     def place_plane(self, images: imaging.Images, move: bool = True) -> imaging.Images:
@@ -95,7 +95,7 @@ class Pipeline:
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
             result = materials.analyse(images, replace(optics, jump_rad=self.quality.jump_rad), known_scene, classifier)
             metal_plane = None if known_scene is None else known_scene.plane  # of a plate scanned separately
-            self.quality.note_materials(result, incidence, images.valid, metal_plane)
+            self.quality.add_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):
             band_images = self.sub_bands.finish(self.source.mirrored, self.plane.form_images)
             if band_images:
@@ -105,13 +105,13 @@ class Pipeline:
     def examine(self, images: imaging.Images, plates: materials.Plates = ()) -> process.Findings:
         """Find plane and materials, and judge them; a verdict "no result" removes names and permittivities."""
         classifier = process.load_classifier(self.settings, self.rig)
-        scene = process.boxes_as_patches(self.settings, self.inputs, images.x_m, images.y_m)
+        scene = process.convert_boxes_to_patches(self.settings, self.inputs, images.x_m, images.y_m)
         has_metal = scene.metal is not None
         metal_plane = self.calibration.metal_plane(self.rig, self.inputs.reference, has_metal, self.settings.bands)
         images = self.place_plane(images)
         if metal_plane is not None:
             # Only pixels whose gain the scan of the metal plate has measured can be judged.
-            images = images.within(metal_plane.valid_on(images.x_m, images.y_m))
+            images = images.limit_to_area(metal_plane.valid_on(images.x_m, images.y_m))
             scene = replace(scene, metal=metal_plane)
         result = self.find_materials(images, replace(scene, plates=plates), classifier)
         verdict = process.judge(self.quality, result, self.plane, classifier, self.rig.check)
@@ -129,6 +129,6 @@ class Pipeline:
         progress("materials")
         findings = self.examine(images, plates)
         progress("figures and report")
-        unnamed = process.why_unnamed(self.settings, self.rig)
+        unnamed = process.explain_unnamed(self.settings, self.rig)
         scan = process.collect_processed_scan(out, self.source, self.rig, findings, self.quality, unnamed)
         return process.save_materials(out, scan, findings.analysis, unnamed)

@@ -22,30 +22,30 @@ from polysight_pi.lines import (
     request_output,
 )
 from polysight_pi.stage import BenchStage
-from polysight_pi.trigger import MIN_PART, BurstSpec, make_spi_burst
+from polysight_pi.trigger import MIN_DURATION_SHARE, BurstSpec, make_spi_burst
 from polysight_shared.config import Instrument, Pi
-from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, os_error
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, convert_os_error
 from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
-from polysight_shared.sockets import is_loopback, make_server_context, publisher, replier
+from polysight_shared.sockets import create_publisher, create_replier, is_loopback, make_server_context
 
 # Free space that the journals need: a scan of 70,000 positions journals about 20 MB.
 JOURNAL_BYTES = 100 << 20
 # Number of SPI transfers that are timed; chosen, the shortest counts.
-TRANSFERS = 5
-# Longest duration of a bit relative to the nominal one (`MIN_PART` is the shortest): the system call adds about 100 us
-# to a transfer of 22 ms.
-MAX_PART = 1.05
+TIMED_TRANSFERS = 5
+# Longest duration of a bit relative to the nominal one (`MIN_DURATION_SHARE` is the shortest): the system call adds
+# about 100 us to a transfer of 22 ms.
+MAX_DURATION_SHARE = 1.05
 # Number of pulses whose two system calls (set the line, clear it) are timed; chosen.
-PAIRS = 500
+TIMED_PULSES = 500
 # Pause between two pairs: the shortest period of the pulses.
 PAUSE_NS = 300_000
 # The device tree's name of the computer.
-MODEL = Path("/proc/device-tree/model")
+MODEL_FILE = Path("/proc/device-tree/model")
 # Parameters of the kernel's modules.
-MODULES = Path("/sys/module")
+MODULES_FOLDER = Path("/sys/module")
 # Remedy for a kernel that does not release outputs.
-STRICT = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
+STRICT_REMEDY = "put `dtparam=strict_gpiod` into /boot/firmware/config.txt and reboot the Pi"
 # Verdict in the command's output for each level of a finding.
 VERDICTS = {"ok": "ok", "note": "ok", "warning": "warn", "error": "fail"}
 
@@ -56,7 +56,7 @@ def to_json(finding: Finding) -> dict[str, Any]:
     return {"name": finding.where, "verdict": VERDICTS[finding.level], "found": text, "remedy": finding.do}
 
 
-def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
+def run_check(name: str, check: Callable[..., str | Finding], *args: object) -> Finding:
     """Run `check(*args)`. A text it returns becomes a finding of level `ok`, an error it raises one of level `error`.
 
     `name` is the subject of the finding.
@@ -66,7 +66,7 @@ def attempt(name: str, check: Callable[..., str | Finding], *args: object) -> Fi
     except PolysightError as e:
         return Finding.of_error(e, where=name)
     except OSError as e:
-        return Finding("error", os_error(e).what, do=AS_THE_SERVICE, where=name)
+        return Finding("error", convert_os_error(e).what, do=AS_THE_SERVICE, where=name)
     if isinstance(result, Finding):
         return result
     return Finding("ok", result, where=name)
@@ -76,20 +76,20 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
     """Run every check, in the order of bring-up; `wires` is the socket of simulated wires, None for GPIO."""
     pi = instrument.pi
     keys = Path(pi.key_dir)
-    yield attempt("plan", _check_plan, instrument)
+    yield run_check("plan", _check_plan, instrument)
     if wires is not None:
-        yield attempt("simulated wires", _check_wires, instrument, wires)
+        yield run_check("simulated wires", _check_wires, instrument, wires)
     else:
         yield _check_real_time()
         yield from check_lines(instrument)
-    yield attempt("stage", _check_stage, instrument)
+    yield run_check("stage", _check_stage, instrument)
     # A rig file that keeps less space free than the journals usually need passes with that.
-    yield attempt(
+    yield run_check(
         "journal", _check_journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES)
     )
-    yield attempt("keys", _check_keys, keys, (pi.command_address, pi.event_address))
-    yield attempt("command address", _check_address, replier, pi.command_address, keys)
-    yield attempt("event address", _check_address, publisher, pi.event_address, keys)
+    yield run_check("keys", _check_keys, keys, (pi.command_address, pi.event_address))
+    yield run_check("command address", _check_address, create_replier, pi.command_address, keys)
+    yield run_check("event address", _check_address, create_publisher, pi.event_address, keys)
 
 
 def _check_plan(instrument: Instrument) -> str:
@@ -123,11 +123,11 @@ def _check_stage(instrument: Instrument) -> str:
 def _check_journal(path: Path, needed_bytes: int) -> str:
     """Check that the journal folder can be written and that no service uses it, and the free space."""
     Journal(path).close()
-    free = shutil.disk_usage(path).free
-    if free < needed_bytes:
-        summary = f"{path}: {free >> 20} MiB free, {needed_bytes >> 20} MiB wanted"
+    free_bytes = shutil.disk_usage(path).free
+    if free_bytes < needed_bytes:
+        summary = f"{path}: {free_bytes >> 20} MiB free, {needed_bytes >> 20} MiB wanted"
         raise DeviceError(summary, "the disk fills", "remove old journals there", code=ErrorCode.DISK_FULL)
-    return f"{path} can be written, {free >> 20} MiB are free"
+    return f"{path} can be written, {free_bytes >> 20} MiB are free"
 
 
 def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
@@ -159,28 +159,28 @@ def _check_address(make_socket: Callable[..., zmq.Socket[bytes]], address: str, 
 # --- the lines --------------------------------------------------------------------------------------------------------
 
 
-def check_lines(instrument: Instrument, model: Path = MODEL, modules: Path = MODULES) -> Iterator[Finding]:
+def check_lines(instrument: Instrument, model: Path = MODEL_FILE, modules: Path = MODULES_FOLDER) -> Iterator[Finding]:
     """Check the trigger line and the SYNC_IN line, and measure the pulse width on this computer; SYNC_IN stays low.
 
     `model` is the device tree's file with the computer's name, `modules` the folder of the kernel modules' parameters.
     """
     pi = instrument.pi
-    wiring = attempt("wiring", check_wiring, pi)
+    wiring = run_check("wiring", check_wiring, pi)
     if wiring.level != "ok":
         yield wiring
         return
-    chip = attempt("GPIO chip", _check_chip, pi)
+    chip = run_check("GPIO chip", _check_chip, pi)
     yield chip
     if chip.level == "ok":
-        yield attempt(f"trigger line {pi.trigger_in}", _check_trigger, pi)
+        yield run_check(f"trigger line {pi.trigger_in}", _check_trigger, pi)
         check_output = _check_output
         measure = measure_width
         if pi.wiring == "spi":
             check_output = _check_spi
             measure = measure_clock
-        yield attempt(f"SYNC_IN line {pi.sync_out[0]}", check_output, pi)
+        yield run_check(f"SYNC_IN line {pi.sync_out[0]}", check_output, pi)
         yield Finding("ok", pi.pulse_source, where="pulses")
-        yield attempt("pulse width", measure, instrument)
+        yield run_check("pulse width", measure, instrument)
     if pi.wiring != "spi" and model.exists() and model.read_bytes().startswith(b"Raspberry Pi"):
         yield _check_release(modules)
 
@@ -216,7 +216,7 @@ def measure_width(instrument: Instrument) -> str | Finding:
     lines = GpiodLines(instrument.pi)
     widths_ns: list[int] = []
     try:
-        for _ in range(PAIRS):
+        for _ in range(TIMED_PULSES):
             lines.sleep_until(lines.now_ns() + PAUSE_NS)
             widths_ns.append(lines.measure())
     finally:
@@ -230,12 +230,12 @@ def measure_clock(instrument: Instrument) -> str | Finding:
     try:
         burst = make_spi_burst(BurstSpec.from_burst(instrument.burst), device.bufsiz)
         zeros = bytes(len(burst.data))
-        times_ns = [device.transfer(zeros, burst.clock_hz) for _ in range(TRANSFERS)]
+        times_ns = [device.transfer(zeros, burst.clock_hz) for _ in range(TIMED_TRANSFERS)]
     finally:
         device.close()
     bit_ns = min(end_ns - begin_ns for begin_ns, end_ns in times_ns) / (8 * len(zeros))
     summary = f"a bit lasts {bit_ns / 1e3:.3f} us, nominal {burst.bit_ns / 1e3:.3f} us; the same clock sets the period"
-    if MIN_PART <= bit_ns / burst.bit_ns <= MAX_PART:
+    if MIN_DURATION_SHARE <= bit_ns / burst.bit_ns <= MAX_DURATION_SHARE:
         return summary + " (SPI controller, measured now with the line low)"
     remedy = "fix the Pi's core clock in /boot/firmware/config.txt: `core_freq=250` on a 3, `core_freq_min=500` on a 4"
     return Finding("error", summary, do=remedy, where="pulse width")
@@ -268,4 +268,4 @@ def _check_release(modules: Path) -> Finding:
             if parameter.read_text().strip() != "Y":
                 return Finding("ok", "lines become inputs again when their program ends", where="line release")
             summary = f"{module} keeps the level of outputs: a program killed during a pulse leaves them high"
-    return Finding("warning", summary, do=STRICT, where="line release")
+    return Finding("warning", summary, do=STRICT_REMEDY, where="line release")

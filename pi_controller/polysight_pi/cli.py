@@ -43,33 +43,33 @@ def _run(args: argparse.Namespace, instrument: Instrument) -> int:
 def _check(args: argparse.Namespace, instrument: Instrument) -> int:
     """Print each finding as soon as it is there; return 1 if one is an error."""
     from polysight_pi.checks import check_all, to_json
-    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.client import refuse_while_service_runs
 
-    refuse_beside_service(instrument)
+    refuse_while_service_runs(instrument)
     findings = []
     for finding in check_all(instrument, args.wires):
-        f = to_json(finding)
-        findings.append(f)
+        content = to_json(finding)
+        findings.append(content)
         if not args.json:
-            _write(f"{f['verdict']:5} {f['name']}: {f['found']}")
+            _write(f"{content['verdict']:5} {content['name']}: {content['found']}")
         if not args.json and finding.do:
             _write(f"        do: {finding.do}")
     if args.json:
         _write(json.dumps(findings))
-    return int(any(f["verdict"] == "fail" for f in findings))
+    return int(any(content["verdict"] == "fail" for content in findings))
 
 
 def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
     """Send bursts and print their width and jitter; return 1 if one had a fault."""
     from polysight_pi import system
-    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.client import refuse_while_service_runs
     from polysight_pi.lines import open_lines
     from polysight_pi.service import log
     from polysight_pi.trigger import BurstSpec, send_burst
     from polysight_shared.faults import explain
     from polysight_shared.raster import WIDTH_TEXT
 
-    refuse_beside_service(instrument)
+    refuse_while_service_runs(instrument)
     lines = open_lines(instrument, args.wires)
     try:
         if args.wires is None:
@@ -97,18 +97,20 @@ def _pulse(args: argparse.Namespace, instrument: Instrument) -> int:
         _write(f"latest rising edge {jitter_us:.2f} us after its deadline")
     faults = [r.fault for r in records if r.fault]
     for number in sorted(set(faults)):
-        e = explain(number)
-        sys.stderr.write(f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {e.problem}\n")
-        sys.stderr.write(f"  why: {e.cause}\n  do: {e.remedy}\n")
+        explanation = explain(number)
+        sys.stderr.write(
+            f"error: fault {number} in {faults.count(number)} of {len(records)} bursts: {explanation.problem}\n"
+        )
+        sys.stderr.write(f"  why: {explanation.cause}\n  do: {explanation.remedy}\n")
     return int(bool(faults))
 
 
 def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
     """Move the homed stage by a distance and print its position."""
-    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.client import refuse_while_service_runs
     from polysight_pi.stage import BenchStage
 
-    refuse_beside_service(instrument)
+    refuse_while_service_runs(instrument)
     with BenchStage(instrument.stage) as stage:
         speed_mm_s = args.speed or instrument.stage.travel_speed_mm_s
         return _print_position(args, stage.jog(args.dx, args.dy, speed_mm_s))
@@ -116,10 +118,10 @@ def _jog(args: argparse.Namespace, instrument: Instrument) -> int:
 
 def _buzz(args: argparse.Namespace, instrument: Instrument) -> int:
     """Move an axis by 1 mm each way and print the position."""
-    from polysight_pi.client import refuse_beside_service
+    from polysight_pi.client import refuse_while_service_runs
     from polysight_pi.stage import BenchStage
 
-    refuse_beside_service(instrument)
+    refuse_while_service_runs(instrument)
     if not args.json:
         _write(f"{args.axis}: 1 mm away from its limit switch, 2 mm back, 1 mm forward")
     with BenchStage(instrument.stage) as stage:
@@ -168,13 +170,13 @@ def _show_events(args: argparse.Namespace, instrument: Instrument) -> int:
 
 def _make_keys(args: argparse.Namespace) -> int:
     """Make the keys of Pi and host, or add, remove and list clients. Works without a rig file if `--dir` is given."""
-    from polysight_pi.keys import COPY, allow, make_keys, read_allowed, revoke
+    from polysight_pi.keys import COPY_INSTRUCTION, allow_client, make_keys, read_allowed, revoke_client
 
     folder = args.dir or Path(_load_rig(args).pi.key_dir)
     if args.revoke:
-        revoke(folder, args.revoke)
+        revoke_client(folder, args.revoke)
     if args.client:
-        for path in allow(folder, args.client):
+        for path in allow_client(folder, args.client):
             _write(str(path))
         _write(f"copy them to that client as host.key and host.key_secret, with {folder / 'pi.key'}")
     if args.revoke or args.client or args.list:
@@ -183,7 +185,7 @@ def _make_keys(args: argparse.Namespace) -> int:
         return 0
     for path in make_keys(folder, args.replace):
         _write(str(path))
-    _write(COPY)
+    _write(COPY_INSTRUCTION)
     return 0
 
 
@@ -228,54 +230,55 @@ def _load_rig(args: argparse.Namespace) -> Instrument:
 
 
 # Options of several commands.
-WIRES = _make_option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
+WIRES_OPTION = _make_option("--wires", type=Path, metavar="SOCKET", help="socket of simulated wires, instead of GPIO")
 STAGE_PORT = _make_option("--stage-port", metavar="TTY", help="serial port of the stage; replaces stage.port")
-JOURNAL = _make_option(
+JOURNAL_OPTION = _make_option(
     "--journal", dest="journal_dir", metavar="DIR", help="folder of the journals; replaces pi.journal_dir"
 )
-JSON = _make_option("--json", action="store_true", help="print JSON, for programs")
+JSON_OPTION = _make_option("--json", action="store_true", help="print JSON, for programs")
 # Settings of options that are a number of things or a distance.
-COUNT = {"type": _parse_positive, "metavar": "N"}
-MM = {"type": float, "default": 0.0, "metavar": "MM"}
+COUNT_SETTINGS = {"type": _parse_positive, "metavar": "N"}
+DISTANCE_SETTINGS = {"type": float, "default": 0.0, "metavar": "MM"}
 # Name, action, help, example (the words after the name) and options of each command.
 COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
     ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
-        WIRES, STAGE_PORT, JOURNAL,
+        WIRES_OPTION, STAGE_PORT, JOURNAL_OPTION,
         _make_option("--command-address", metavar="tcp://HOST:PORT", help="replaces pi.command_address"),
         _make_option("--event-address", metavar="tcp://HOST:PORT", help="replaces pi.event_address"),
     )),
     ("check", _check, "check lines, ports, permissions, keys and disk; nothing moves", "--config instrument.toml", (
-        WIRES, STAGE_PORT, JOURNAL, JSON,
+        WIRES_OPTION, STAGE_PORT, JOURNAL_OPTION, JSON_OPTION,
     )),
     ("pulse", _pulse, "send bursts on SYNC_IN and print their width and jitter", "--count 100", (
-        WIRES, JSON, _make_option("--count", **COUNT, default=10, help="number of bursts (%(default)s)"),
+        WIRES_OPTION, JSON_OPTION,
+        _make_option("--count", **COUNT_SETTINGS, default=10, help="number of bursts (%(default)s)"),
     )),
     ("buzz", _buzz, "move an axis by 1 mm each way, slowly, before the first homing", "x", (
-        _make_option("axis", choices=("x", "y"), help="axis; y is the vertical one"), STAGE_PORT, JSON,
+        _make_option("axis", choices=("x", "y"), help="axis; y is the vertical one"), STAGE_PORT, JSON_OPTION,
     )),
     ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
-        STAGE_PORT, JSON, _make_option("--dx", **MM, help="along x, millimetres (0)"),
-        _make_option("--dy", **MM, help="along y, millimetres (0)"),
+        STAGE_PORT, JSON_OPTION, _make_option("--dx", **DISTANCE_SETTINGS, help="along x, millimetres (0)"),
+        _make_option("--dy", **DISTANCE_SETTINGS, help="along y, millimetres (0)"),
         _make_option("--speed", type=_parse_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
     )),
     ("home", _home, "home the stage, through the service if it runs", "--config instrument.toml", (
-        STAGE_PORT, JSON,
+        STAGE_PORT, JSON_OPTION,
     )),
     ("events", _show_events, "print events as JSON lines, live or from the journal", "--scan-id my-scan --from-seq 1", (
         _make_option("--scan-id", metavar="ID", help="print the journal of this scan instead of live events"),
-        _make_option("--from-seq", **COUNT, default=1, help="first event from the journal (%(default)s)"),
-        _make_option("--count", **COUNT, help="stop after this number of events"),
+        _make_option("--from-seq", **COUNT_SETTINGS, default=1, help="first event from the journal (%(default)s)"),
+        _make_option("--count", **COUNT_SETTINGS, help="stop after this number of events"),
         _make_option("--limit-s", type=float, default=10.0, metavar="S", help="timeout without an event (%(default)s)"),
     )),
     ("keys", _make_keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
         _make_option("--dir", type=Path, metavar="DIR", help="folder of the keys; replaces pi.key_dir"),
         _make_option("--replace", action="store_true", help="replace existing keys"),
         _make_option("--client", metavar="NAME", help="make keys for one more client and allow it"),
-        _make_option("--revoke", metavar="NAME", help="remove this client from the list, at once"),
+        _make_option("--revoke", metavar="NAME", help="remove this client from the list; it is refused immediately"),
         _make_option("--list", action="store_true", help="list the allowed clients"),
     )),
     ("take-over", _take_over, "control the run of another program, as a person at the Pi", "abort", (
-        _make_option("what", choices=("hold", "resume", "abort", "end"), help="action on the run"), JOURNAL,
+        _make_option("what", choices=("hold", "resume", "abort", "end"), help="action on the run"), JOURNAL_OPTION,
     )),
 )  # fmt: skip
 
@@ -292,19 +295,19 @@ def _make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"polysight-pi {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, action, text, example, options in COMMANDS:
-        p = commands.add_parser(
+        command_parser = commands.add_parser(
             name,
             help=text,
             description=text[0].upper() + text[1:] + ".",
             epilog=f"example:  polysight-pi {name} {example}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        p.set_defaults(action=action)
-        p.add_argument(
+        command_parser.set_defaults(action=action)
+        command_parser.add_argument(
             "--config", type=Path, default=Path("instrument.toml"), metavar="FILE", help="rig file (%(default)s)"
         )
         for flags, settings in options:
-            p.add_argument(*flags, **settings)
+            command_parser.add_argument(*flags, **settings)
     return parser
 
 
@@ -327,11 +330,11 @@ def main(argv: list[str] | None = None) -> int:
         close_standard_output()
         return 0
     except Exception as e:
-        from polysight_shared.errors import PolysightError, os_error
+        from polysight_shared.errors import PolysightError, convert_os_error
 
         if isinstance(e, OSError):
             cause = "a path is wrong, the disk is full, or it belongs to another user"
-            error = os_error(e, cause, remedy=AS_THE_SERVICE)
+            error = convert_os_error(e, cause, remedy=AS_THE_SERVICE)
         elif isinstance(e, PolysightError):
             error = e
         else:

@@ -1,6 +1,6 @@
 """Client of the running service, for the commands `home`, `take-over` and `events`. The host has a client of its own.
 
-Commands that use the hardware themselves are refused while the service runs (`refuse_beside_service`).
+Commands that use the hardware themselves are refused while the service runs (`refuse_while_service_runs`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.stage import MOTION_TIMEOUT_S
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
-from polysight_shared.errors import DeviceError, ErrorCode, os_error
-from polysight_shared.sockets import Socket, requester, subscriber
+from polysight_shared.errors import DeviceError, ErrorCode, convert_os_error
+from polysight_shared.sockets import Socket, create_requester, create_subscriber
 
 # A program that does not accept a connection in this time counts as not running (chosen).
 CONNECT_TIMEOUT_S = 2.0
@@ -45,7 +45,7 @@ def _open_service(instrument: Instrument) -> Iterator[Ask]:
     context: zmq.Context[Socket] = zmq.Context()
     address = instrument.pi.command_address
     try:
-        client = requester(context, address, Path(instrument.pi.key_dir))
+        client = create_requester(context, address, Path(instrument.pi.key_dir))
 
         def ask(command: m.AnyCommand) -> m.AnyReply:
             """Send a command and return the reply. Raises DeviceError for a refusal, or without an answer."""
@@ -77,7 +77,7 @@ def _is_listening(address: str) -> bool:
     return True
 
 
-def refuse_beside_service(instrument: Instrument) -> None:
+def refuse_while_service_runs(instrument: Instrument) -> None:
     """Raise DeviceError if the service of this rig runs: it holds the trigger's GPIO lines, stage and ports."""
     if _is_listening(instrument.pi.command_address):
         raise DeviceError(
@@ -127,7 +127,9 @@ def take_over(instrument: Instrument, action: str) -> str:
     try:
         owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
     except OSError as e:
-        raise os_error(e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE) from None
+        raise convert_os_error(
+            e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE
+        ) from None
     reason = "a person at the Pi took over the run"
     with _open_service(instrument) as ask:
         if action == "end":
@@ -144,7 +146,7 @@ def follow_events(instrument: Instrument, timeout_s: float) -> Iterator[Any]:
     """Yield live events as dicts, for JSON. Raises DeviceError after `timeout_s` without one."""
     context: zmq.Context[Socket] = zmq.Context()
     try:
-        listener = subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
+        listener = create_subscriber(context, instrument.pi.event_address, Path(instrument.pi.key_dir))
         while listener.poll(round(timeout_s * 1e3)):
             # The last part of a message is the event.
             yield msgspec.to_builtins(m.unpack_event(listener.recv_multipart()[-1]))
@@ -172,5 +174,5 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)
-            # Not from_seq plus their count: where a journal file was lost during a scan, numbers are missing.
+            # Do not count the events instead: if a journal file was lost during a scan, numbers are missing.
             from_seq = reply.events[-1].seq + 1

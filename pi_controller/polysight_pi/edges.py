@@ -98,7 +98,7 @@ class RowMotion(NamedTuple):
     def time_points(self, stops: list[int]) -> tuple[list[float], float]:
         """Return the time of each point and that of the row's end, seconds, if the stage rests at the `stops`.
 
-        `stops` are steps from the beginning of the row, ascending. The time at rest is not included, because nobody
+        `stops` are steps from the beginning of the row, ascending. The time at rest is not included, because no one
         knows it: an interval in which a stop lies is a lower limit.
         """
         times: list[float] = []
@@ -106,8 +106,8 @@ class RowMotion(NamedTuple):
         point = 0
         for begin, end in pairwise([0, *stops, self.length]):
             leg = _Leg.plan(end - begin, self)
-            while point < self.points and (place := self.run_up + point * abs(self.step)) <= end:
-                times.append(begin_s + leg.time_s(place - begin))
+            while point < self.points and (steps_from_start := self.run_up + point * abs(self.step)) <= end:
+                times.append(begin_s + leg.time_s(steps_from_start - begin))
                 point += 1
             begin_s += leg.time_s(end - begin)
         return times, begin_s
@@ -246,8 +246,8 @@ class EdgeTimes:
         points_s, end_s = self._motion.time_points(stops)
         for point in range(1, self._motion.points):
             interval_s = (self._edges_ns[point] - self._edges_ns[point - 1]) * 1e-9
-            place = self._motion.run_up + point * abs(self._motion.step)
-            waited = any(place - abs(self._motion.step) <= stop < place for stop in stops)
+            steps_from_start = self._motion.run_up + point * abs(self._motion.step)
+            waited = any(steps_from_start - abs(self._motion.step) <= stop < steps_from_start for stop in stops)
             expected_s = points_s[point] - points_s[point - 1]
             if waited and interval_s > expected_s:
                 continue

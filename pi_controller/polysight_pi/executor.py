@@ -28,7 +28,7 @@ from polysight_pi.machine import Machine, RefusedError
 from polysight_pi.stage import StageDriver, StageLost, StageNews
 from polysight_pi.trigger import BurstSent, BurstSpec, LoopFault, TriggerLoop
 from polysight_shared import __version__, messages as m
-from polysight_shared.errors import PolysightError, os_error
+from polysight_shared.errors import PolysightError, convert_os_error
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.raster import (
     MAX_WIDTH_NS,
@@ -55,7 +55,7 @@ LATE_S = 3.0
 HUNG_S = 10.0
 # Commands that wait or are executed; further ones are refused. Chosen: a host has one at a time.
 COMMANDS_WAITING = 64
-# The same for `Replay`, whose reply is large and comes from the disk; chosen.
+# Commands `Replay` that wait or are executed: their reply is large and comes from the disk; chosen.
 REPLAYS_WAITING = 4
 # Lines of the stage that wait; further ones are dropped, so that an endless flood cannot fill the memory; chosen.
 LINES_WAITING = 64
@@ -66,9 +66,9 @@ REPLAYED_IN_A_ROW = 20
 # Commands that count as a heartbeat of the run's host.
 OF_THE_RUN = (m.BeginRun, m.RunRow, m.EndRun)
 # Commands that only the run's owner may send.
-OWNED = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)
+OWNER_COMMANDS = (m.RunRow, m.EndRun, m.Hold, m.Resume, m.Abort)
 # Commands that are accepted once their event is on the disk.
-JOURNALLED = (m.BeginRun, m.EndRun, m.RunRow)
+JOURNALLED_COMMANDS = (m.BeginRun, m.EndRun, m.RunRow)
 
 
 class Request(NamedTuple):
@@ -94,7 +94,7 @@ def refuse(error: PolysightError | OSError) -> m.Refused:
     """Return the refusal of a command that raised this error."""
     if isinstance(error, OSError):
         cause = "the operating system refused it"
-        return make_refusal(PiFault.BAD_REQUEST, os_error(error).what, cause, "check the Pi's disk")
+        return make_refusal(PiFault.BAD_REQUEST, convert_os_error(error).what, cause, "check the Pi's disk")
     return make_refusal(getattr(error, "number", PiFault.BAD_REQUEST), error.what, error.why, error.remedy)
 
 
@@ -111,12 +111,12 @@ class Executor:
         stage: StageDriver,
         loop: TriggerLoop,
         journal: JournalThread,
-        turned: Callable[[], None] = lambda: None,
+        on_turn: Callable[[], None] = lambda: None,
         find_late: Callable[[], str] = lambda: "",
     ) -> None:
         self._loop = loop
         self.journal = journal
-        self._turned = turned
+        self._turned = on_turn
         self._find_late = find_late
         # Secret that is accepted as the owner of every run, for a person at the Pi.
         self.take_over_key = secrets.token_hex(16)
@@ -239,31 +239,33 @@ class Executor:
         except queue.Empty:
             pass
         self._machine.check_deadlines()
-        late = self._find_late()
-        if late and self.unresponsive_s > LATE_S:
+        late_part = self._find_late()
+        if late_part and self.unresponsive_s > LATE_S:
             # After a pause of the whole program, the first thread to wake finds the others late.
-            late += f", nor has the executor turned for {self.unresponsive_s:.1f} s: the computer was too busy or slept"
-        if late:
-            self._machine.stop_motion(PiFault.PROGRAM_LATE, late)
+            late_part += (
+                f", nor has the executor turned for {self.unresponsive_s:.1f} s: the computer was too busy or slept"
+            )
+        if late_part:
+            self._machine.stop_motion(PiFault.PROGRAM_LATE, late_part)
         self._refresh_replies()
         self._send_replies()
         self._turned_s = time.monotonic()
-        if not late:
+        if not late_part:
             self._turned()
 
     def _send_replies(self) -> None:
         """Send the replies of this turn; those of journalled commands follow when their events are on the disk."""
         replies = self._replies
         self._replies = []
-        behind_journal: list[tuple[Request, m.AnyReply]] = []
+        replies_after_journal: list[tuple[Request, m.AnyReply]] = []
         for request, reply in replies:
             self._count_as_heartbeat(request.command)
-            if isinstance(request.command, JOURNALLED) and isinstance(reply, m.Accepted):
-                behind_journal.append((request, reply))
+            if isinstance(request.command, JOURNALLED_COMMANDS) and isinstance(reply, m.Accepted):
+                replies_after_journal.append((request, reply))
             else:
                 request.answer(reply)
 
-        self._commit(behind_journal)
+        self._commit(replies_after_journal)
 
     def _commit(self, behind_journal: list[tuple[Request, m.AnyReply]]) -> None:
         """Have the events so far written, then these replies sent; they wait for a later turn while too much waits."""
@@ -335,10 +337,10 @@ class Executor:
             return self._replay(request, command)
         if self._ending:
             raise RefusedError(PiFault.NOT_READY, "polysight-pi is ending", "SIGTERM or SIGINT", "start it again")
-        if self._waits_for_journal and isinstance(command, (*JOURNALLED, m.Pulse)):
+        if self._waits_for_journal and isinstance(command, (*JOURNALLED_COMMANDS, m.Pulse)):
             self._deferred.append(request)
             return None
-        owned = isinstance(command, OWNED)
+        owned = isinstance(command, OWNER_COMMANDS)
         if run and isinstance(command, m.Home):
             # A run whose host is lost does not prevent homing; a host of an older release sends no owner.
             owned = run.owns_home and self._machine.host_lives

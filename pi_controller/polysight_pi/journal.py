@@ -46,7 +46,7 @@ SPARE_BYTES = 4 << 20
 # Bytes after a damaged record that are searched for a good one; chosen, as long as the longest record.
 SEARCHED_BYTES = 1 << 20
 # Suffix of the copy of a damaged journal.
-DAMAGED = ".damaged"
+DAMAGED_SUFFIX = ".damaged"
 # Longest queue of jobs and largest batch of events; chosen. A row stops long before they are full, because the journal
 # then counts as late (executor.LATE_S).
 JOBS_WAITING = 256
@@ -164,7 +164,7 @@ class JournalFile:
             tail = file.read()
         if _holds_records(tail):
             # The first name that is free: .damaged, .damaged2, .damaged3 and so on.
-            names = (self.path.with_name(f"{self.path.name}{DAMAGED}{n or ''}") for n in (0, *range(2, 1000)))
+            names = (self.path.with_name(f"{self.path.name}{DAMAGED_SUFFIX}{n or ''}") for n in (0, *range(2, 1000)))
             copy = next(name for name in names if not name.exists())
             shutil.copyfile(self.path, copy)
             self.damage = (
@@ -360,12 +360,12 @@ class Journal:
         path = self.journal_path(scan_id)
         try:
             written = path.stat().st_size if path.exists() else 0
-            free = shutil.disk_usage(self.folder).free
+            free_bytes = shutil.disk_usage(self.folder).free
         except OSError as e:
             raise JournalFullError(self.folder, e) from None
         needed_bytes = max(0, positions * CAPTURE_BYTES - written) + SPARE_BYTES
-        if free < needed_bytes:
-            room = f"{free / 1e6:.1f} MB free, {needed_bytes / 1e6:.1f} MB needed for {positions} positions"
+        if free_bytes < needed_bytes:
+            room = f"{free_bytes / 1e6:.1f} MB free, {needed_bytes / 1e6:.1f} MB needed for {positions} positions"
             raise JournalFullError(self.folder, OSError(errno.ENOSPC, room))
 
     def write(self, events: Sequence[NewEvent]) -> None:
@@ -493,7 +493,7 @@ class JournalThread:
 
     def add(self, kind: type[m.AnyEvent], **fields: Any) -> None:
         """Add an event to the batch; events that are not journalled are published immediately."""
-        if issubclass(kind, m.JOURNALLED):
+        if issubclass(kind, m.JOURNALLED_EVENTS):
             self._events.append(NewEvent.now(kind, **fields))
         else:
             self._journal.publish_now(kind, **fields)

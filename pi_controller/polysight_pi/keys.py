@@ -18,11 +18,11 @@ from polysight_shared.sockets import HOST_KEYS
 # Names of the two pairs of keys that `make_keys` makes.
 KEY_PAIRS = ("pi", "host")
 # File with the list of allowed clients.
-ALLOWED = "allowed_clients"
+ALLOWED_FILE = "allowed_clients"
 # Length of a public key of 32 bytes in Z85 (ZeroMQ RFC 32: 5 characters for 4 bytes).
 KEY_CHARACTERS = 40
 # Instruction in messages after keys were made.
-COPY = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"
+COPY_INSTRUCTION = f"copy {' and '.join(HOST_KEYS)} to the host, into its pi.key_dir; pi.key_secret stays on the Pi"
 
 
 class AllowedKeys:
@@ -41,7 +41,7 @@ class AllowedKeys:
         """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
         # Keep the last list if the file is missing or unreadable.
         with suppress(OSError, ValueError):
-            stat = (self._folder / ALLOWED).stat()
+            stat = (self._folder / ALLOWED_FILE).stat()
             stamp = (stat.st_mtime_ns, stat.st_size)
             if self._stamp != stamp:
                 self._names = read_allowed(self._folder)
@@ -54,7 +54,7 @@ class AllowedKeys:
 def read_allowed(folder: Path) -> dict[str, str]:
     """Return the names of the clients that may connect, by public key (Z85 text)."""
     try:
-        lines = (folder / ALLOWED).read_text(encoding="utf-8").splitlines()
+        lines = (folder / ALLOWED_FILE).read_text(encoding="utf-8").splitlines()
     except FileNotFoundError:
         with suppress(OSError, ValueError):
             return {_derive_public(folder, "host"): "host"}
@@ -77,7 +77,7 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
         raise ConfigError(
             f"{existing[0]} exists",
             "keys were made before; new ones lock out every host that has the old ones",
-            f"keep them, or give --replace, then {COPY}",
+            f"keep them, or give --replace, then {COPY_INSTRUCTION}",
             code=ErrorCode.FILE_EXISTS,
         )
     folder.mkdir(parents=True, exist_ok=True)
@@ -86,7 +86,7 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
     return files
 
 
-def allow(folder: Path, name: str) -> list[Path]:
+def allow_client(folder: Path, name: str) -> list[Path]:
     """Make keys for one more client and allow it. Return its files; the secret one is for that client only.
 
     Raises ConfigError if the name is taken or not valid.
@@ -107,7 +107,7 @@ def allow(folder: Path, name: str) -> list[Path]:
     return files
 
 
-def revoke(folder: Path, name: str) -> None:
+def revoke_client(folder: Path, name: str) -> None:
     """Remove a client from the list: its next command is refused, and it cannot connect again."""
     names = read_allowed(folder)
     remaining = {key: client for key, client in names.items() if client != name}
@@ -131,6 +131,6 @@ def _create_pair(folder: Path, name: str) -> list[Path]:
 
 def _write_allowed(folder: Path, names: dict[str, str]) -> None:
     """Replace the list of allowed clients (names by public key) as a whole."""
-    new = folder / (ALLOWED + ".new")
+    new = folder / (ALLOWED_FILE + ".new")
     new.write_text("".join(f"{key} {name}\n" for key, name in names.items()), encoding="utf-8")
-    new.replace(folder / ALLOWED)
+    new.replace(folder / ALLOWED_FILE)

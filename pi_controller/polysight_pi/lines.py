@@ -30,8 +30,8 @@ from polysight_shared.wires import WireClient, WireEdge
 EVENT_BUFFER = 1024
 # A sleep may end this much late (chosen), so the rest of a wait polls the clock.
 SPIN_NS = 100_000
-# So long before a pulse its code is brought into the caches (`GpiodLines.sleep_until`); chosen, longer than a system
-# call takes.
+# Time before a pulse at which its code is loaded into the caches (`GpiodLines.sleep_until`); chosen, longer than a
+# system call takes.
 WARM_NS = 30_000
 # Timeout for the pulses of simulated wires: a busy machine delivers them late.
 SIMULATED_LOOK_BACK_S = 2.0
@@ -43,7 +43,7 @@ TWO_CALLS_NS = 1000
 SET_VALUES = 0xC010B40F
 _VALUES = struct.Struct("=QQ")
 # The module parameter of spidev: longest transfer, bytes.
-BUFSIZ = Path("/sys/module/spidev/parameters/bufsiz")
+BUFSIZ_FILE = Path("/sys/module/spidev/parameters/bufsiz")
 # _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8); mode 0, without chip select where the driver has that.
 MESSAGE = 0x40206B00
 WRITE_MODE = 0x40016B01
@@ -52,11 +52,13 @@ MODE_0 = 0x00
 # struct spi_ioc_transfer: tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
 _TRANSFER = struct.Struct("=QQIIHBBBBBB")
 # Likely cause and remedy by error number, of GPIO lines and of SPI devices.
-_RIGHTS = "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
+_RIGHTS_REMEDY = (
+    "60-polysight.rules sets the device's group (udev), `sudo usermod -aG gpio,spi USER` adds the user to it"
+)
 _REASONS = {
     errno.EBUSY: ("it is in use", "end that program; `systemctl stop polysight-pi` if it is polysight itself"),
-    errno.EACCES: ("no permission", _RIGHTS),
-    errno.EPERM: ("no permission", _RIGHTS),
+    errno.EACCES: ("no permission", _RIGHTS_REMEDY),
+    errno.EPERM: ("no permission", _RIGHTS_REMEDY),
     errno.ENOENT: ("there is no such device", "set pi.gpio_chip in instrument.toml to a label or path that exists"),
     errno.EINVAL: ("the chip has no such line, or cannot set it so", "correct [pi] in instrument.toml (see gpioinfo)"),
     errno.ENXIO: ("the chip reports no edges on this line", "use a line of the Pi's own header as pi.trigger_in"),
@@ -64,7 +66,7 @@ _REASONS = {
 }
 _SPI_REASONS = {
     errno.ENOENT: ("SPI is off", "put `dtparam=spi=on` into /boot/firmware/config.txt and reboot the Pi"),
-    errno.EACCES: ("no permission", _RIGHTS),
+    errno.EACCES: ("no permission", _RIGHTS_REMEDY),
     errno.EMSGSIZE: ("the transfer is longer than spidev's buffer", "raise bufsiz as `polysight-pi check` says"),
 }
 
@@ -88,10 +90,10 @@ def open_lines(instrument: Instrument, wires: Path | None = None) -> Lines:
     """
     pi = instrument.pi
     check_wiring(pi)
-    by_spi = pi.wiring == "spi"
+    is_spi = pi.wiring == "spi"
     if wires is not None:
-        return SpiWireLines(wires, pi) if by_spi else WireLines(wires, pi)
-    return SpiLines(pi) if by_spi else GpiodLines(pi)
+        return SpiWireLines(wires, pi) if is_spi else WireLines(wires, pi)
+    return SpiLines(pi) if is_spi else GpiodLines(pi)
 
 
 def load_gpiod() -> Any:
@@ -303,13 +305,13 @@ class GpiodLines(TriggerInput):
         """
         # Looked up before the line is set: nothing but the two calls is inside a pulse.
         now = time.monotonic_ns
-        clear = self._clear
+        clear_request = self._clear
         try:
             begin_ns = now()
             set_line()
             if width_ns > TWO_CALLS_NS:
                 super().sleep_until(begin_ns + width_ns)
-            clear()
+            clear_request()
             return begin_ns, now()
         except OSError as e:
             raise _line_lost_error(e) from None
@@ -357,7 +359,7 @@ class SpiDevice:
     def bufsiz(self) -> int:
         """Longest transfer that spidev accepts, bytes."""
         try:
-            return int(BUFSIZ.read_text())
+            return int(BUFSIZ_FILE.read_text())
         except (OSError, ValueError):
             return DEFAULT_BUFSIZ
 

@@ -33,11 +33,11 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 STATUS_EVENT_S = 0.24
 REST_STATUS_EVENT_S = 1.0
 # Consecutive statuses at rest after which the stage's report of a motion's end counts as lost; chosen.
-RESTS = 3
+RESTING_STATUSES = 3
 # Number of requests to repeat that report; a stage that was reset, and whose banner was lost, never answers them.
 MAX_REPEAT_REQUESTS = 3
 # Errors of the stage after which its position is not known.
-POSITION_LOST = (
+POSITION_LOST_ERRORS = (
     StageError.NOT_HOMED, StageError.IN_ALARM, StageError.LIMIT_SWITCH, StageError.EMERGENCY_STOP, StageError.DISABLED,
 )  # fmt: skip
 
@@ -168,7 +168,7 @@ class Machine:
         """The name of the state in messages."""
         return cast(m.State, WIRE_STATE.get(self.state, self.state))
 
-    def _nothing(self, *_: object) -> None:
+    def _do_nothing(self, *_: object) -> None:
         pass
 
     # --- time -------------------------------------------------------------------------------------------------------
@@ -277,8 +277,8 @@ class Machine:
         elif reply.kind == "alarm" and reply.number == StageError.STOPPED:
             self.handle_event("stopped")
         elif reply.kind == "alarm":
-            e = explain(reply.number)
-            summary = f"stage alarm {reply.number}: {e.problem} ({e.cause}); {e.remedy}"
+            explanation = explain(reply.number)
+            summary = f"stage alarm {reply.number}: {explanation.problem} ({explanation.cause}); {explanation.remedy}"
             self.handle_event("stage lost", PiFault.STAGE_ALARM, summary)
         elif reply.kind == "done" and homing and answers_home:
             self.stage.note_position(reply)
@@ -303,11 +303,11 @@ class Machine:
             self._rests += 1
         else:
             self._rests = 0
-        if self._rests > RESTS * MAX_REPEAT_REQUESTS:
+        if self._rests > RESTING_STATUSES * MAX_REPEAT_REQUESTS:
             self._rests = 0
             reason = "it rests, and does not say how its motion ended: it was reset"
             self.handle_event("stage lost", PiFault.STAGE_LOST, reason)
-        elif self._rests and self._rests % RESTS == 0:
+        elif self._rests and self._rests % RESTING_STATUSES == 0:
             # Ask the stage to repeat the end of its motion. The lambda reads `link` inside `_tell_stage`, which handles
             # a link that is lost.
             self._tell_stage(lambda: self.stage.link.repeat())
@@ -436,7 +436,7 @@ class Machine:
             self.handle_event("stage lost", e.number, str(e))
             raise
         except StageRefusedError as e:
-            if e.number in POSITION_LOST:
+            if e.number in POSITION_LOST_ERRORS:
                 self.handle_event("not homed")
             raise
         self._is_placed = False
@@ -465,7 +465,7 @@ class Machine:
 
     def _stop_jog(self, status: m.RowStatus, number: int, reason: str) -> None:
         """Send STOP; the jog ends with the stage's alarm, or the stage counts as lost if that does not come."""
-        if self.jog is None or not self.jog.decide(status, number, reason):
+        if self.jog is None or not self.jog.set_result(status, number, reason):
             return
         self._deadline_s = min(self._deadline_s, self._clock() + TIMEOUTS_S["stopping"])
         self._tell_stage(lambda: self.stage.link.send_byte(Immediate.STOP))
@@ -482,7 +482,7 @@ class Machine:
         jog = self.jog
         if jog is None:
             return
-        jog.decide(status, number, reason)
+        jog.set_result(status, number, reason)
         command = jog.command
         self._journal.add(
             m.Jogged, axis=command.axis, from_mm=command.from_mm, distance_mm=command.distance_mm,
@@ -533,14 +533,14 @@ class Machine:
 
     # --- actions: how a row ends ------------------------------------------------------------------------------------
 
-    def _decide(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
+    def _set_result(self, status: m.RowStatus, number: int, reason: str, lasting: bool = False) -> None:
         """Set the row's result and disarm the trigger loop, unless there is no row or its result is set already.
 
         `lasting`: the state after the row is `fault`, not `ready` or `homed`; noted in either case.
         """
         if self.row is not None:
             self.row.lasting |= lasting
-            if self.row.decide(status, number, reason):
+            if self.row.set_result(status, number, reason):
                 self._loop.disarm()
 
     def _stop(self, *_: object) -> str | None:
@@ -561,14 +561,14 @@ class Machine:
     def _abort(self, reason: str) -> str | None:
         # STOP first: `_decide` waits for the burst under way, and the call that sets its line may hang.
         next_state = self._stop()
-        self._decide("aborted", PiFault.ABORTED, reason)
+        self._set_result("aborted", PiFault.ABORTED, reason)
         return next_state
 
     def terminate(self) -> bool:
         """Stop the stage because the program is being ended. Returns True if a row has to end first."""
         self._terminating = True
         self.handle_event("Abort", "polysight-pi was ended")
-        # Nobody waits for the end of a jog: the stage stops it by itself.
+        # No client waits for the end of a jog: the stage ends it without a command.
         self._finish_jog()
         if self.state == "stopping":
             self._deadline_s = self._clock() + END_TIMEOUT_S
@@ -579,7 +579,7 @@ class Machine:
         next_state = self._stop()
         self._report_fault(number, reason)
         self._finish_jog("fault", number, reason)
-        self._decide("fault", number, reason, lasting)
+        self._set_result("fault", number, reason, lasting)
         return next_state
 
     def _fail(self, number: int, reason: str) -> str | None:
@@ -593,7 +593,7 @@ class Machine:
         if self.state != "fault":
             self._report_fault(number, reason)
         self._finish_jog("fault", number, reason)
-        self._decide("fault", number, reason, lasting=True)
+        self._set_result("fault", number, reason, lasting=True)
 
     def _lose_position(self) -> None:
         self.homed = False
@@ -629,7 +629,7 @@ class Machine:
         """Handle the stage at rest after STOP; it may have reached the row's end before."""
         if reply is not None:
             self._current.points = max(0, _read_integer(reply, "points", self._current.row.points))
-        self._decide("aborted", PiFault.ABORTED, "the stage was stopped")
+        self._set_result("aborted", PiFault.ABORTED, "the stage was stopped")
         self._clear_alarm()
 
     def _clear_alarm(self) -> None:
@@ -638,7 +638,7 @@ class Machine:
         try:
             self._tell_stage(self.stage.clear)
         except StageRefusedError as e:
-            self.homed = self.homed and e.number not in POSITION_LOST
+            self.homed = self.homed and e.number not in POSITION_LOST_ERRORS
 
     def _finish_row(self) -> str:
         """Judge and journal the row; return the next state."""
@@ -671,11 +671,17 @@ class Machine:
 
     def _report_fault(self, number: int, reason: str) -> None:
         """Journal a fault, and keep it for Status if it is the first one."""
-        e = explain(number)
+        explanation = explain(number)
         if not self.fault:
             self.fault = int(number)
             self.reason = reason
-        self._journal.add(m.Fault, number=int(number), problem=f"{e.problem}: {reason}", cause=e.cause, remedy=e.remedy)
+        self._journal.add(
+            m.Fault,
+            number=int(number),
+            problem=f"{explanation.problem}: {reason}",
+            cause=explanation.cause,
+            remedy=explanation.remedy,
+        )
 
 
 def _read_integer(reply: Reply, key: str, absent: int = 0) -> int:

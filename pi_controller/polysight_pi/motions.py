@@ -24,7 +24,7 @@ class _Motion:
     fault: int = 0
     reason: str = ""
 
-    def decide(self, status: m.RowStatus, fault: int = 0, reason: str = "") -> bool:
+    def set_result(self, status: m.RowStatus, fault: int = 0, reason: str = "") -> bool:
         """Set the result; return False if it is set already."""
         if self.status is not None:
             return False
@@ -58,7 +58,7 @@ class RunningRow(_Motion):
     take: int
     # The orders to the trigger loop: number of edges, and the burst for each. Bursts that it reports name their job.
     job: Job
-    # The same row in motor steps.
+    # The row in motor steps.
     motion: RowMotion
     # The edges so far, with the stage's reports.
     edges: EdgeTimes
@@ -84,17 +84,17 @@ class RunningRow(_Motion):
         if self.points == self.triggers == points and counts == Counts(points, points, pulses):
             time_problem = self.edges.judge(self.was_held, self.done_ns)
             if time_problem:
-                self.decide("fault", PiFault.EDGE_TIME, time_problem)
+                self.set_result("fault", PiFault.EDGE_TIME, time_problem)
             elif self.was_held:
-                self.decide("done", reason="held during the row: some positions were passed below full speed")
+                self.set_result("done", reason="held during the row: some positions were passed below full speed")
             else:
-                self.decide("done")
+                self.set_result("done")
             return
         reason = (
             f"{points} points requested, {self.points} passed by the stage with {self.triggers} trigger pulses, "
             f"{counts.edges} edges received, {counts.bursts} bursts and {counts.pulses} of {pulses} pulses sent"
         )
-        self.decide("fault", PiFault.POINTS_MISMATCH, reason)
+        self.set_result("fault", PiFault.POINTS_MISMATCH, reason)
 
 
 def estimate_row_duration_s(row: Row, stage: Stage, speed_mm_s: float) -> float:

@@ -26,7 +26,7 @@ class Rule(NamedTuple):
     # The possible next states, the default first; the action may return one of the others. "same": no change.
     leads_to: str
     # Method of `Machine` that is called, without its leading underscore.
-    action: str = "nothing"
+    action: str = "do_nothing"
 
 
 # A pair of event and state has at most one rule.

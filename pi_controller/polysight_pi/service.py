@@ -33,7 +33,14 @@ from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, PolysightError, ProtocolError, VersionError
 from polysight_shared.faults import PiFault
 from polysight_shared.program import die_with_parent
-from polysight_shared.sockets import EVENT_TOPIC, authenticator, is_loopback, make_server_context, publisher, replier
+from polysight_shared.sockets import (
+    EVENT_TOPIC,
+    create_authenticator,
+    create_publisher,
+    create_replier,
+    is_loopback,
+    make_server_context,
+)
 
 # Time for which closed sockets still send (chosen).
 LINGER_MS = 200
@@ -62,9 +69,9 @@ class Server:
         self._secret = not is_loopback(command_address)
         try:
             # Bound before the others, whose connections it authenticates.
-            self._zap = authenticator(self._context)
-            self._commands = replier(self._context, command_address, key_dir)
-            self._events = publisher(self._context, event_address, key_dir)
+            self._zap = create_authenticator(self._context)
+            self._commands = create_replier(self._context, command_address, key_dir)
+            self._events = create_publisher(self._context, event_address, key_dir)
         except PolysightError:
             self._context.destroy(linger=0)
             raise

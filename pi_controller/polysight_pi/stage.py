@@ -46,7 +46,7 @@ ANSWER_TIMEOUT_S = 0.5
 # How often a line is sent before the stage counts as lost (chosen).
 TRIES = 4
 # Error numbers of answers that report a damaged line: it is sent again.
-RETRIED = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
+RETRIED_ERRORS = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 # Status requests to a moving stage per heartbeat, so that a lost one does not stop it.
 STATUS_PER_HEARTBEAT = 4
 # Timeout of a status request, in heartbeats. With the time until the next request and the read timeout, a silent stage
@@ -84,9 +84,9 @@ class StageRefusedError(DeviceError):
     """The stage answered a line with `error:<number>`."""
 
     def __init__(self, verb: str, number: int) -> None:
-        e = explain(number)
-        summary = f"stage refused {verb}: error {number}, {e.problem}"
-        super().__init__(summary, e.cause, e.remedy, code=ErrorCode.REFUSED_BY_PEER)
+        explanation = explain(number)
+        summary = f"stage refused {verb}: error {number}, {explanation.problem}"
+        super().__init__(summary, explanation.cause, explanation.remedy, code=ErrorCode.REFUSED_BY_PEER)
         self.number = number
 
 
@@ -96,7 +96,7 @@ class StageLost(NamedTuple):
     reason: str
 
 
-# What the reader thread of a link reports.
+# Reports of a link's reader thread.
 StageNews = Reply | StageLost
 
 
@@ -137,7 +137,7 @@ class StatusWatch:
             self._unanswered_since_s = now_s
         return True
 
-    def heard(self) -> None:
+    def note_answer(self) -> None:
         """Note that the stage has answered a status request."""
         self._unanswered_since_s = None
 
@@ -176,7 +176,7 @@ class StageLink:
     caller_late_s
         Returns for how long the thread that commands the stage has not completed a turn. A stage in motion is stopped
         if that and the time since its last command exceed `CALLER_LATE_S`, or the heartbeat would keep a stage moving
-        that nobody controls.
+        that no program controls.
     bound_now_ns
         Returns the earliest and the latest time that it can be now on the clock of the trigger edges, for the times of
         each reply.
@@ -292,7 +292,7 @@ class StageLink:
             self._commanded_s = time.monotonic()
             self._write(self._last_line)
             answer = self._answer(sequence)
-            if answer is not None and answer.number not in RETRIED:
+            if answer is not None and answer.number not in RETRIED_ERRORS:
                 return answer
         raise StageLostError(
             f"stage at {self.port} does not answer {verb} {self.lost}".rstrip(),
@@ -411,7 +411,7 @@ class StageLink:
         # Only the answer to the request is a sign of life; a serial line can chatter without end, and repeat itself.
         asked_ns = 0
         if reply.kind == "status":
-            self._watch.heard()
+            self._watch.note_answer()
             if self._asked_ns:
                 asked_ns = self._asked_ns.popleft()
         # Its last byte came now; the stage wrote the line before its first one.
@@ -635,9 +635,11 @@ class BenchStage:
 
     def _finish(self, sequence: int) -> Position:
         """Wait for the end of the motion with this sequence number; return the position."""
-        late = StageLostError(f"the motion has not ended after {MOTION_TIMEOUT_S:.0f} s", "the motors stall", "look")
+        timeout_error = StageLostError(
+            f"the motion has not ended after {MOTION_TIMEOUT_S:.0f} s", "the motors stall", "look"
+        )
         try:
-            return self._wait(lambda r: r.kind == "done" and r.sequence == sequence, MOTION_TIMEOUT_S, late)
+            return self._wait(lambda r: r.kind == "done" and r.sequence == sequence, MOTION_TIMEOUT_S, timeout_error)
         except KeyboardInterrupt:
             self._driver.link.send_byte(Immediate.STOP)
             raise
@@ -653,8 +655,10 @@ class BenchStage:
             if isinstance(news, StageLost):
                 raise StageLostError(news.reason, "cable unplugged", "check the USB cable")
             if news.kind == "alarm":
-                e = explain(news.number)
-                raise DeviceError(f"stage alarm {news.number}: {e.problem}", e.cause, e.remedy)
+                explanation = explain(news.number)
+                raise DeviceError(
+                    f"stage alarm {news.number}: {explanation.problem}", explanation.cause, explanation.remedy
+                )
             self._driver.note_position(news)
             if matches(news):
                 return Position(self._driver.x_mm, self._driver.y_mm)

@@ -17,19 +17,19 @@ _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
 # Real-time priorities of the trigger thread and of the others. All share the interpreter's lock, so a thread that
 # holds it must not be preempted by other programs.
-PRIORITY = 50
+TRIGGER_PRIORITY = 50
 OTHERS_PRIORITY = 40
 # Longest time for which a thread keeps the interpreter while others wait. The default of 5 ms is three periods of the
 # published rig's pulses.
 SWITCH_INTERVAL_S = 100e-6
 # Memory above which connections are cut. The program needs 30 to 60 MB, a subscriber that does not read up to 50.
 MAX_BYTES = 160 << 20
-# The limit is at least so far above the memory that is left after connections were cut, because not all freed memory
+# Least distance of the limit from the memory that is left after connections were cut, because not all freed memory
 # returns to the system. Chosen.
 SPARE_BYTES = 64 << 20
-# Time between two looks at the memory, and for how long connections are cut after too much was seen; chosen.
-LOOK_S = 0.05
-SETTLE_S = 0.5
+# Time between two checks of the memory, and time in which connections are cut after too much was used; chosen.
+CHECK_INTERVAL_S = 0.05
+CUTTING_TIME_S = 0.5
 
 
 def prepare_process() -> list[str]:
@@ -56,8 +56,8 @@ def prepare_thread() -> list[str]:
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0) != 0:
-        return ["timer slack stays at 50 us: pulses may be that late", *_request_real_time(PRIORITY)]
-    return _request_real_time(PRIORITY)
+        return ["timer slack stays at 50 us: pulses may be that late", *_request_real_time(TRIGGER_PRIORITY)]
+    return _request_real_time(TRIGGER_PRIORITY)
 
 
 def _request_real_time(priority: int) -> list[str]:
@@ -74,11 +74,11 @@ def notify_systemd(state: str) -> None:
     """Notify the service manager, if there is one (sd_notify(3)): `READY=1`, or `WATCHDOG=1` to feed the watchdog."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if address:
-        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as s:
-            # "@" is shown for the zero byte that begins the name of an abstract socket.
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as notify_socket:
+            # "@" stands for the zero byte that begins the name of an abstract socket.
             if address.startswith("@"):
                 address = "\0" + address[1:]
-            s.sendto(state.encode("ascii"), address)
+            notify_socket.sendto(state.encode("ascii"), address)
 
 
 class MemoryWatch(threading.Thread):
@@ -95,7 +95,7 @@ class MemoryWatch(threading.Thread):
         self._ended = threading.Event()
         # The file stays open: later there may be no free descriptor to open it.
         self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
-        self._most_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)
+        self._limit_bytes = max(MAX_BYTES, self.resident_bytes() + SPARE_BYTES)
 
     def resident_bytes(self) -> int:
         """Return the memory in use by this process."""
@@ -103,22 +103,22 @@ class MemoryWatch(threading.Thread):
 
     def run(self) -> None:
         """Check the memory regularly until :meth:`stop`."""
-        while not self._ended.wait(LOOK_S):
-            held_bytes = self.resident_bytes()
-            if held_bytes <= self._most_bytes:
+        while not self._ended.wait(CHECK_INTERVAL_S):
+            used_bytes = self.resident_bytes()
+            if used_bytes <= self._limit_bytes:
                 continue
             # If there is no free descriptor, the next check tries again.
             with suppress(OSError):
                 cut = self._cut_connections()
-                # A client that connects again and floods on would fill the memory before the next check.
-                for _ in range(round(SETTLE_S / LOOK_S)):
-                    self._ended.wait(LOOK_S)
+                # A client that connects again and continues to flood would fill the memory before the next check.
+                for _ in range(round(CUTTING_TIME_S / CHECK_INTERVAL_S)):
+                    self._ended.wait(CHECK_INTERVAL_S)
                     cut += self._cut_connections()
                 ctypes.CDLL(None).malloc_trim(0)
                 left_bytes = self.resident_bytes()
-                self._most_bytes = max(MAX_BYTES, left_bytes + SPARE_BYTES)
-                held_mib = held_bytes >> 20
-                self._warn(f"{held_mib} MiB in memory: {cut} connections were cut, {left_bytes >> 20} MiB are left")
+                self._limit_bytes = max(MAX_BYTES, left_bytes + SPARE_BYTES)
+                used_mib = used_bytes >> 20
+                self._warn(f"{used_mib} MiB in memory: {cut} connections were cut, {left_bytes >> 20} MiB are left")
 
     def _cut_connections(self) -> int:
         """Shut down the TCP connections at the ports (ZeroMQ closes them). Return their number."""
@@ -128,10 +128,13 @@ class MemoryWatch(threading.Thread):
             with suppress(OSError):
                 if not str(link.readlink()).startswith("socket:"):
                     continue
-                with socket.socket(fileno=os.dup(int(link.name))) as s:
-                    if s.family in (socket.AF_INET, socket.AF_INET6) and s.getsockname()[1] in self._ports:
-                        s.getpeername()
-                        s.shutdown(socket.SHUT_RDWR)
+                with socket.socket(fileno=os.dup(int(link.name))) as connection:
+                    if (
+                        connection.family in (socket.AF_INET, socket.AF_INET6)
+                        and connection.getsockname()[1] in self._ports
+                    ):
+                        connection.getpeername()
+                        connection.shutdown(socket.SHUT_RDWR)
                         cut += 1
         return cut
 

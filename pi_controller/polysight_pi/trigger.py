@@ -29,8 +29,8 @@ FIRST_PULSE_DELAY_NS = round(FIRST_PULSE_DELAY_S * 1e9)
 # Timeout of waiting for an edge, after which the loop checks if it has to stop or to send a burst without an edge;
 # chosen.
 LOOK_UP_S = 0.1
-# The trigger wire is off if so many consecutive stage statuses came without an edge, while the stage passed at least
-# so many points; chosen: one status may come just before its edge.
+# The trigger wire is off if `SILENT_STATUSES` consecutive stage statuses came without an edge, while the stage passed
+# at least `SILENT_POINTS` points; chosen: one status may come just before its edge.
 SILENT_STATUSES = 2
 SILENT_POINTS = 2
 # Low bits before the first pulse, and at least as many after the last (a byte is chosen): MOSI keeps the last level.
@@ -41,7 +41,7 @@ MIN_BYTES = 96
 DEFAULT_BUFSIZ = 4096
 # Shortest duration of a transfer relative to the nominal one: a shorter one was clocked too fast, its frames are too
 # close. 2 % is chosen.
-MIN_PART = 0.98
+MIN_DURATION_SHARE = 0.98
 
 
 class Edge(NamedTuple):
@@ -219,26 +219,26 @@ def send_burst(
     first = start_ns
     last = start_ns
     end = start_ns
-    sent = 0
+    sent_pulses = 0
     width_max = 0
     jitter = 0
     fault = 0
-    while sent < spec.pulses and not fault and not stop():
-        deadline = start_ns + sent * spec.period_ns
+    while sent_pulses < spec.pulses and not fault and not stop():
+        deadline = start_ns + sent_pulses * spec.period_ns
         lines.sleep_until(deadline)
         if previous_rise_ns is not None and lines.now_ns() - previous_rise_ns < MIN_PERIOD_NS:
             fault = int(PiFault.PERIOD_TOO_SHORT)
             break
         last, end = lines.pulse(spec.width_ns)
         previous_rise_ns = last
-        if sent == 0:
+        if sent_pulses == 0:
             first = last
-        sent += 1
+        sent_pulses += 1
         jitter = max(jitter, last - deadline)
         width_max = max(width_max, end - last)
         if lines.check_width and end - last > MAX_WIDTH_NS:
             fault = int(PiFault.PULSE_TOO_LONG)
-    return BurstRecord(sent, first, last, end, width_max_ns=width_max, jitter_ns=jitter, fault=fault)
+    return BurstRecord(sent_pulses, first, last, end, width_max_ns=width_max, jitter_ns=jitter, fault=fault)
 
 
 def _send_bits(
@@ -270,7 +270,7 @@ def _send_bits(
     if spec.period_ns * burst.clock_hz % 10**9:
         jitter_ns += round(burst.bit_ns / 2)
     fault = 0
-    if took_ns < MIN_PART * burst.duration_ns:
+    if took_ns < MIN_DURATION_SHARE * burst.duration_ns:
         fault = int(PiFault.PERIOD_TOO_SHORT)
     elif lines.check_width and width_ns > MAX_WIDTH_NS:
         fault = int(PiFault.PULSE_TOO_LONG)
@@ -292,17 +292,17 @@ def send_untriggered_burst(
 
     The pause between two transfers is at least one period; the record's jitter does not cover it.
     """
-    part = spec
-    while isinstance(lines, BitLines) and part.pulses > 1:
+    partial_spec = spec
+    while isinstance(lines, BitLines) and partial_spec.pulses > 1:
         try:
-            make_spi_burst(part, lines.bufsiz)
+            make_spi_burst(partial_spec, lines.bufsiz)
             break
         except ConfigError:
-            part = part._replace(pulses=-(-part.pulses // 2))
-    total = send_burst(lines, part, start_ns, previous_rise_ns, stop)
+            partial_spec = partial_spec._replace(pulses=-(-partial_spec.pulses // 2))
+    total = send_burst(lines, partial_spec, start_ns, previous_rise_ns, stop)
     while 0 < total.pulses < spec.pulses and not total.fault and not stop():
-        part = part._replace(pulses=min(part.pulses, spec.pulses - total.pulses))
-        record = send_burst(lines, part, total.last_ns + spec.period_ns, total.last_ns, stop)
+        partial_spec = partial_spec._replace(pulses=min(partial_spec.pulses, spec.pulses - total.pulses))
+        record = send_burst(lines, partial_spec, total.last_ns + spec.period_ns, total.last_ns, stop)
         if not record.pulses:
             return total._replace(fault=record.fault)
         total = record._replace(
@@ -319,7 +319,7 @@ def send_untriggered_burst(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A row whose edges are answered. Compared by identity, so that a late result is not taken for another row's."""
+    """A row whose edges are answered. Compared by identity, so that a late result does not count for another row."""
 
     # Number of edges that are expected.
     points: int
@@ -347,7 +347,7 @@ class LoopFault(NamedTuple):
     job: Job | None
     # Number of the PiFault.
     number: int
-    # What happened, for people.
+    # Description of the event, for people.
     detail: str
 
 
@@ -520,14 +520,14 @@ class TriggerLoop:
         self.sees_pulses = returned is not None
         if returned is None:
             return record, ""
-        differ = ""
+        difference = ""
         if returned.pulses != record.pulses:
-            differ = f"{record.pulses} pulses sent, {returned.pulses} seen"
+            difference = f"{record.pulses} pulses sent, {returned.pulses} seen"
         width_ns = returned.width_max_ns or record.width_max_ns
         fault = record.fault
         if returned.width_max_ns > MAX_WIDTH_NS:
             fault = fault or int(PiFault.PULSE_TOO_LONG)
-        return record._replace(pulses=returned.pulses, width_max_ns=width_ns, fault=fault), differ
+        return record._replace(pulses=returned.pulses, width_max_ns=width_ns, fault=fault), difference
 
     def _send_without_edge(self, spec: BurstSpec) -> None:
         """Send a burst that `send` has requested, and post its result."""
@@ -535,14 +535,14 @@ class TriggerLoop:
         start_ns = self._lines.now_ns()
         if self._last_rise_ns is not None:
             start_ns = max(start_ns, self._last_rise_ns + spec.period_ns)
-        r = send_untriggered_burst(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
-        self._note_sent(r)
-        r, unseen = self._count_returned(r)
+        record = send_untriggered_burst(self._lines, spec, start_ns, self._last_rise_ns, self._stop.is_set)
+        self._note_sent(record)
+        record, unseen = self._count_returned(record)
         result = Pulsed(
-            pulses=r.pulses,
-            width_max_ns=r.width_max_ns,
-            jitter_ns=r.jitter_ns,
-            fault=r.fault or (PiFault.PULSES_UNSEEN if unseen else 0),
+            pulses=record.pulses,
+            width_max_ns=record.width_max_ns,
+            jitter_ns=record.jitter_ns,
+            fault=record.fault or (PiFault.PULSES_UNSEEN if unseen else 0),
             timed_by=self.timed_by,
             pulses_seen=self.sees_pulses,
         )
@@ -580,5 +580,5 @@ class TriggerWatch:
         # The stage counts from 0 in each row.
         self._points = min(self._points, points)
         self._statuses += 1
-        # At that time a status could count fewer points than there were edges: those do not count as passed since.
+        # An edge can arrive before the status that counts its point: such points have not been passed without an edge.
         return self._statuses >= SILENT_STATUSES and points - max(edges, self._points) >= SILENT_POINTS

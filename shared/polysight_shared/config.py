@@ -438,10 +438,10 @@ class Instrument(Section, frozen=True):
         require(len(set(hosts)) == len(hosts), "each board needs its own host_address and data_port")
         unknown = sorted(set(self.radar.servers) - set(names))
         require(not unknown, f"radar.servers has unknown boards {unknown}; the boards are {names}")
-        without = [n for n in names if n not in self.radar.servers]
+        without_server = [n for n in names if n not in self.radar.servers]
         require(
-            self.radar.control != "line_server" or not without,
-            f'radar.control = "line_server" needs radar.servers for every board; it is missing for {without}',
+            self.radar.control != "line_server" or not without_server,
+            f'radar.control = "line_server" needs radar.servers for every board; it is missing for {without_server}',
         )
         require(
             self.radar.control != "native" or set(self.radar.native) == set(names),

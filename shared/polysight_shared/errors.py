@@ -57,7 +57,7 @@ def expand_paths(text: str) -> str:
     if package is None or package.origin is None:
         return text
     host = Path(package.origin).parent
-    folder = next((place for place in (host / "data", host.parents[1]) if (place / "docs").is_dir()), None)
+    folder = next((candidate for candidate in (host / "data", host.parents[1]) if (candidate / "docs").is_dir()), None)
     if folder is None:
         return text
     return re.sub(r"(?<![\w/])docs/[\w/-]+\.md", lambda page: str(folder / page[0]), text)
@@ -71,12 +71,12 @@ def quote(path: Path | str) -> str:
     return shlex.quote(text)
 
 
-def advice(*parts: str) -> str:
+def join_advice(*parts: str) -> str:
     """Join the parts of a remedy that are not empty."""
     return "; ".join(part for part in parts if part)
 
 
-def did_you_mean(word: str, known_words: Iterable[str]) -> str:
+def suggest_word(word: str, known_words: Iterable[str]) -> str:
     """Return `did you mean 'step_mm'?` with the most similar known word; "" if none is similar."""
     similar = get_close_matches(word, list(known_words), n=1, cutoff=0.7)
     if not similar:
@@ -96,7 +96,7 @@ class DataError(PolysightError):
     exit_status = 3
 
 
-def no_such(path: Path) -> DataError:
+def make_missing_path_error(path: Path) -> DataError:
     """Return the error for a missing file or folder."""
     if path.is_file():
         problem = f"{path}: is a file"
@@ -107,7 +107,7 @@ def no_such(path: Path) -> DataError:
     except OSError:
         names_beside = []
         cause = f"the path is wrong: {path.parent} does not exist either"
-    remedy = did_you_mean(path.name, names_beside) or "give the path of an existing file or folder"
+    remedy = suggest_word(path.name, names_beside) or "give the path of an existing file or folder"
     return DataError(f"{path}: does not exist", cause, remedy, code=ErrorCode.FILE_MISSING)
 
 
@@ -127,7 +127,7 @@ class DeviceError(PolysightError):
     exit_status = 5
 
 
-def os_error(
+def convert_os_error(
     e: OSError,
     cause: str = "the disk is full, a path is wrong, or you may not write there",
     remedy: str = "check the path, its permissions and the free space (df -h)",
@@ -148,7 +148,7 @@ def os_error(
     code = ErrorCode.OTHER
     if e.errno in (errno.ENOSPC, errno.EDQUOT):
         code = ErrorCode.DISK_FULL
-    return DeviceError(summary, cause, advice(remedy, *getattr(e, "__notes__", ())), code=code)
+    return DeviceError(summary, cause, join_advice(remedy, *getattr(e, "__notes__", ())), code=code)
 
 
 class ScanError(PolysightError):

@@ -99,7 +99,7 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _name_instead(path: Path) -> Iterator[None]:
-    """Let an OSError of the block name this path, instead of a file that nobody asked for."""
+    """Let an OSError of the block name this path, instead of an internal file that the user does not know."""
     try:
         yield
     except OSError as e:
@@ -125,7 +125,7 @@ def require_writable(path: Path) -> None:
 
 def require_writable_folder(folder: Path) -> None:
     """Raise PermissionError or NotADirectoryError if nothing can be made in a folder, which need not exist."""
-    parent = next(place for place in (folder, *folder.parents) if place.exists())
+    parent = next(candidate for candidate in (folder, *folder.parents) if candidate.exists())
     if not parent.is_dir():
         raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(parent))
     if not os.access(parent, os.W_OK | os.X_OK):
@@ -189,7 +189,7 @@ def write_together(files: Mapping[Path, bytes]) -> None:
 
 
 @contextmanager
-def folder_held(folder: Path) -> Iterator[None]:
+def hold_folder(folder: Path) -> Iterator[None]:
     """Let one program, and one thread of it, at a time read and replace a small file of a folder; the others wait.
 
     The folder itself is locked with flock(2): a kill releases it, and nothing is left on the disk. Where folders cannot

@@ -50,8 +50,8 @@ class Finding(msgspec.Struct, frozen=True):
         return cls("error", error.what, error.why, error.remedy, where, error.code)
 
     def __str__(self) -> str:
-        place = f"{self.where}: " if self.where else ""
-        lines = [f"{self.level}: {place}{self.what}"]
+        prefix = f"{self.where}: " if self.where else ""
+        lines = [f"{self.level}: {prefix}{self.what}"]
         if self.why:
             lines.append(f"why: {self.why}")
         if self.do:

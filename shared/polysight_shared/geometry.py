@@ -25,7 +25,7 @@ def _turn(v: Vector, axis: str, degrees: float) -> Vector:
     return (c * x - s * y, s * x + c * y, z)
 
 
-def place(point_mm: Vector, mount: tuple[MountStep, ...]) -> Vector:
+def transform_to_rig(point_mm: Vector, mount: tuple[MountStep, ...]) -> Vector:
     """Transform a point of a board (mm) by the steps of its mount, in order; returns metres in the rig frame."""
     v = point_mm
     for step in mount:
@@ -39,7 +39,7 @@ def place(point_mm: Vector, mount: tuple[MountStep, ...]) -> Vector:
 def tx_position_m(rig: Instrument) -> Vector:
     """Return the position of the transmitting antenna at stage offset zero, metres, rig frame."""
     board = rig.transmitter
-    return place(rig.antennas.tx_mm[board.tx_antenna], board.mount)
+    return transform_to_rig(rig.antennas.tx_mm[board.tx_antenna], board.mount)
 
 
 def rx_positions_m(rig: Instrument, board: Board) -> tuple[Vector, ...]:
@@ -47,7 +47,7 @@ def rx_positions_m(rig: Instrument, board: Board) -> tuple[Vector, ...]:
 
     RX1 is first, unless the board has an `rx_order`.
     """
-    positions = [place(p, board.mount) for p in rig.antennas.rx_mm]
+    positions = [transform_to_rig(p, board.mount) for p in rig.antennas.rx_mm]
     if not board.rx_order:
         return tuple(positions)
     return tuple(positions[number - 1] for number in board.rx_order)
@@ -62,7 +62,7 @@ def direct_path_m(rig: Instrument, board: Board) -> tuple[float, ...]:
 def specular_midpoint_m(rig: Instrument, board: Board) -> Vector:
     """Return the point of the object plane that reflects TX into the board's first RX, stage offset zero, metres."""
     tx = tx_position_m(rig)
-    rx = place(rig.antennas.rx_mm[0], board.mount)
+    rx = transform_to_rig(rig.antennas.rx_mm[0], board.mount)
     z = rig.geometry.object_distance_mm / 1e3
     # Mirror RX in the object plane: the straight path from TX to it crosses the plane at this part of its length.
     t = (z - tx[2]) / ((z - tx[2]) + (z - rx[2]))

@@ -57,8 +57,8 @@ WIRES = "wires"
 # "gpiomem", the registers of the GPIO lines, is in scans of old releases.
 _HARDWARE = (GPIOD, SPI, "gpiomem")
 Timing = Literal["", "spi", "one-shot", "program"]
-"""What times a burst: "spi": the SPI controller, all edges; "one-shot": a monostable circuit the widths, the program
-the periods; "program": the program, all edges; "" in events of earlier releases."""
+"""Part that times a burst. "spi": the SPI controller times all edges. "one-shot": a monostable circuit times the
+widths, the program the periods. "program": the program times all edges. "" in events of earlier releases."""
 
 
 def is_simulated(backend: str) -> bool:
@@ -198,7 +198,7 @@ class Fault(Event, frozen=True, kw_only=True, rename=_KEYS_ON_THE_WIRE):
 
 # All events; those that are stored in the journal.
 AnyEvent = RunStarted | RunStopped | RowStarted | RowFinished | Capture | StageStatus | Heartbeat | Fault | Jogged
-JOURNALLED = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault, Jogged)
+JOURNALLED_EVENTS = (RunStarted, RunStopped, RowStarted, RowFinished, Capture, Fault, Jogged)
 
 # --- commands: host -> Pi, REQ/REP ------------------------------------------------------------------------------------
 

@@ -29,23 +29,23 @@ HANDSHAKE_TIMEOUT_MS = 5000
 # Bit masks of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
 COMMAND_IO_THREAD = 0b01
 EVENT_IO_THREAD = 0b10
-_CHANGE = "change the address in instrument.toml"
-_NO_ADDRESS = ("the address does not exist on this machine", _CHANGE)
-_NO_RIGHTS = ("this user may not use it", f"{_CHANGE}: ports below 1024 need rights")
+_CHANGE_REMEDY = "change the address in instrument.toml"
+_NO_ADDRESS_CAUSE = ("the address does not exist on this machine", _CHANGE_REMEDY)
+_NO_RIGHTS_CAUSE = ("this user may not use it", f"{_CHANGE_REMEDY}: ports below 1024 need rights")
 # Cause and remedy of what bind and connect answer.
 _CAUSES = {
-    zmq.EADDRINUSE: ("another program uses this port", f"stop it (ss -ltnp shows it), or {_CHANGE}"),
-    zmq.EADDRNOTAVAIL: _NO_ADDRESS,
-    errno.ENODEV: _NO_ADDRESS,
-    errno.EACCES: _NO_RIGHTS,
-    errno.EPERM: _NO_RIGHTS,
+    zmq.EADDRINUSE: ("another program uses this port", f"stop it (ss -ltnp shows it), or {_CHANGE_REMEDY}"),
+    zmq.EADDRNOTAVAIL: _NO_ADDRESS_CAUSE,
+    errno.ENODEV: _NO_ADDRESS_CAUSE,
+    errno.EACCES: _NO_RIGHTS_CAUSE,
+    errno.EPERM: _NO_RIGHTS_CAUSE,
 }
 
 
 def host_name(address: str) -> str:
     """Return the host of `tcp://host:port` (port `*`: any free one). Raises ConfigError for another form."""
-    scheme, _, rest = address.partition("://")
-    host, _, port = rest.rpartition(":")
+    scheme, _, host_and_port = address.partition("://")
+    host, _, port = host_and_port.rpartition(":")
     if scheme != "tcp" or not host or not (port == "*" or port.isdigit()):
         raise ConfigError(
             f"address {address!r} is not of the form tcp://host:port",
@@ -71,7 +71,7 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
 
     `key_dir` has PI_KEYS or HOST_KEYS in the format of zmq.auth. Which clients the
-    server accepts is decided by the program that answers at its `authenticator`.
+    server accepts is decided by the program that answers at its `create_authenticator`.
     """
     if is_loopback(address):
         return
@@ -123,7 +123,7 @@ def _make(
             socket.connect(address)
     except zmq.ZMQError as e:
         socket.close()
-        cause, remedy = _CAUSES.get(e.errno, ("the system refuses it", _CHANGE))
+        cause, remedy = _CAUSES.get(e.errno, ("the system refuses it", _CHANGE_REMEDY))
         code = ErrorCode.OTHER
         if e.errno == zmq.EADDRINUSE:
             code = ErrorCode.BUSY
@@ -135,7 +135,7 @@ def _make(
 
 
 def make_server_context() -> zmq.Context[Socket]:
-    """Create a context for `publisher` and `replier`, with an I/O thread for each.
+    """Create a context for `create_publisher` and `create_replier`, with an I/O thread for each.
 
     With one thread for both, 1,000 subscribers that came and left kept a command waiting for 50 to 170 ms; with two,
     20 to 60 ms (on a PC).
@@ -143,7 +143,7 @@ def make_server_context() -> zmq.Context[Socket]:
     return zmq.Context(io_threads=2)
 
 
-def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+def create_publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the Pi's PUB socket, bound. `context`: from `make_server_context`.
 
     Its queue has 100,000 events for each subscriber (chosen: a scan of 70,000 positions fits); further ones are lost to
@@ -154,7 +154,7 @@ def publisher(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     return _make(context, zmq.PUB, address, key_dir, bind=True, options=options)
 
 
-def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+def create_replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the Pi's ROUTER socket, bound, for REQ sockets. `context`: from `make_server_context`.
 
     A longer message than MAX_COMMAND_BYTES closes its connection. Sending to a disconnected client raises zmq.ZMQError
@@ -165,24 +165,24 @@ def replier(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     return _make(context, zmq.ROUTER, address, key_dir, bind=True, options=options)
 
 
-def authenticator(context: zmq.Context[Any]) -> Socket:
+def create_authenticator(context: zmq.Context[Any]) -> Socket:
     """Create the REP socket to which ZeroMQ sends each CURVE client of this context for approval (ZAP, RFC 27)."""
     socket: Socket = context.socket(zmq.REP)
     socket.bind("inproc://zeromq.zap.01")
     return socket
 
 
-def subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+def create_subscriber(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the host's SUB socket, connected, subscribed to all events, with a long queue."""
     options: dict[int, int | bytes] = {zmq.RCVHWM: 100_000, zmq.SUBSCRIBE: EVENT_TOPIC}
     return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
 
 
-def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+def create_observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
 
     The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that was
-    stopped, or whose machine has failed. The host's own `subscriber` is rather kept: it must lose no events.
+    stopped, or whose machine has failed. The host's own `create_subscriber` is rather kept: it must lose no events.
     """
     # Times in ms: a heartbeat each second; after five seconds without one the Pi drops this subscriber. Chosen.
     options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}
@@ -190,7 +190,7 @@ def observer(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     return _make(context, zmq.SUB, address, key_dir, bind=False, options=options)
 
 
-def requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
+def create_requester(context: zmq.Context[Any], address: str, key_dir: Path) -> Socket:
     """Create the host's REQ socket, connected; relaxed (REQ_RELAXED): it may send again when a reply was lost.
 
     If the server refused the handshake, `send` raises zmq.Again after `SEND_TIMEOUT_MS`.

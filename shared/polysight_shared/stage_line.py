@@ -132,13 +132,13 @@ class Command(msgspec.Struct, frozen=True):
     def decode(line: bytes) -> Command:
         """Parse a sealed command line. Raises ProtocolError."""
         body = unseal(line)
-        m = _COMMAND.fullmatch(body)
-        if m is None or int(m[1]) > MAX_SEQUENCE:
+        match = _COMMAND.fullmatch(body)
+        if match is None or int(match[1]) > MAX_SEQUENCE:
             raise ProtocolError(f"not a stage command: {body!r}")
-        args = tuple(int(a) for a in m[3].split())
+        args = tuple(int(a) for a in match[3].split())
         if any(not -(2**31) <= a < 2**31 for a in args):
             raise ProtocolError(f"stage arguments {args} must be 32-bit integers")
-        return Command(int(m[1]), m[2], args)
+        return Command(int(match[1]), match[2], args)
 
 
 class Reply(msgspec.Struct, frozen=True):
@@ -181,7 +181,7 @@ class Reply(msgspec.Struct, frozen=True):
     def decode(line: bytes) -> Reply:
         """Parse a sealed reply line. Raises ProtocolError."""
         body = unseal(line)
-        head, *rest = body.split(" ")
+        head, *field_texts = body.split(" ")
         kind, _, number = head.partition(":")
         if kind == "polysight-stage":
             kind = "banner"
@@ -191,17 +191,17 @@ class Reply(msgspec.Struct, frozen=True):
             raise ProtocolError(f"stage reply without a valid number: {body!r}")
         sequence: int | None = None
         if kind in ("ok", "error", "done"):
-            if not rest or not re.fullmatch(r"N([0-9]{1,5}|-)", rest[0]):
+            if not field_texts or not re.fullmatch(r"N([0-9]{1,5}|-)", field_texts[0]):
                 raise ProtocolError(f"stage reply without a sequence number: {body!r}")
-            tag = rest.pop(0)
+            tag = field_texts.pop(0)
             if tag != "N-":
                 sequence = int(tag[1:])
         fields: dict[str, str] = {}
-        for word in rest:
-            m = _FIELD.fullmatch(word)
-            if m is None or m[1] in fields:
+        for word in field_texts:
+            match = _FIELD.fullmatch(word)
+            if match is None or match[1] in fields:
                 raise ProtocolError(f"stage reply with an invalid field {word!r}: {body!r}")
-            fields[m[1]] = m[2]
+            fields[match[1]] = match[2]
         return Reply(kind, sequence, int(number or 0), fields)
 
     def integer(self, key: str) -> int:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, did_you_mean
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, suggest_word
 from polysight_shared.files import read_bounded
 
 # Chosen: far above any table written by hand.
@@ -130,7 +130,7 @@ def _suggest_key(key: str, kind: Any) -> str:
     if key in tables_of_key:
         tables = [f"[{table}]" if table else "the top" for table in sorted(tables_of_key[key])]
         return f"it belongs to {' or '.join(tables)}"
-    return did_you_mean(key, tables_of_key) or "it is not a key of this file"
+    return suggest_word(key, tables_of_key) or "it is not a key of this file"
 
 
 def _collect_keys(kind: Any, table: str, tables_of_key: dict[str, set[str]]) -> None:

@@ -43,9 +43,9 @@ def _simulate(args: argparse.Namespace) -> None:
         scene = msgspec.structs.replace(scene, seed=scene.seed + 1000 * args.specimens)
     began = time.perf_counter()
 
-    def show(done: int, rows: int) -> None:
-        left_s = (time.perf_counter() - began) / done * (rows - done)
-        sys.stderr.write(f"\rsimulated row {done} of {rows}, {left_s:.0f} s left ")
+    def show(rows_done: int, rows: int) -> None:
+        left_s = (time.perf_counter() - began) / rows_done * (rows - rows_done)
+        sys.stderr.write(f"\rsimulated row {rows_done} of {rows}, {left_s:.0f} s left ")
 
     quiet = args.json or not sys.stderr.isatty()
     folder = simulate(
@@ -72,8 +72,8 @@ def _check(args: argparse.Namespace) -> None:
     """Run `check`: load each scene and apply it to the rig. Raises PolysightError for the first scene with an error."""
     rig = load_instrument(args.config)
     for path in args.scenes:
-        scanned = apply_scene(rig, load_scene(path))
-        check_burst_fits(scanned.grid, scanned.burst, scanned.stage)
+        scanned_rig = apply_scene(rig, load_scene(path))
+        check_burst_fits(scanned_rig.grid, scanned_rig.burst, scanned_rig.stage)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -52,7 +52,7 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 # Faults that need this value of `radar.control` in the rig file.
-OF_CONTROL = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
+CONTROL_OF_FAULT = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
 
 
 def read_faults(
@@ -105,12 +105,12 @@ def read_faults(
     if unknown := sorted(set(board_tables) - set(boards)):
         raise ConfigError(f"faults for unknown boards {unknown}", f"the boards are {list(boards)}", "correct the name")
     faults = {name: decode({**common, **board_tables.get(name, {})}, Faults, f"faults of {name}") for name in boards}
-    for name, f in faults.items():
-        for required, keys in OF_CONTROL.items():
-            without_effect = [key for key in keys if getattr(f, key)]
-            if without_effect and control not in (None, required):
+    for name, board_faults in faults.items():
+        for required, keys in CONTROL_OF_FAULT.items():
+            keys_without_effect = [key for key in keys if getattr(board_faults, key)]
+            if keys_without_effect and control not in (None, required):
                 raise ConfigError(
-                    f"faults {without_effect} of {name}: the rig has radar.control = {control!r}",
+                    f"faults {keys_without_effect} of {name}: the rig has radar.control = {control!r}",
                     f"they need {required!r}",
                     "leave them out, or change radar.control (--native makes it native)",
                     code=ErrorCode.VALUES_CONFLICT,

@@ -36,11 +36,11 @@ def move_to_subnet(rig: Instrument, subnet: str) -> Instrument:
     servers = {name: f"{cards[name]}:{port.rpartition(':')[2]}" for name, port in rig.radar.servers.items()}
     native = table["radar"].get("native", {})
     for name, board in native.items():
-        place = f"tcp://{cards[name]}:{_RADAR_PORT}"
+        address = f"tcp://{cards[name]}:{_RADAR_PORT}"
         # The acknowledgement of LDO bypass repeats the name of its board, which changes here.
         if board["usb_serial"] and board["ldo_bypass_acknowledged"] == board["usb_serial"]:
-            board["ldo_bypass_acknowledged"] = place
-        board |= {"usb_serial": place, "usb_path": "", "die_id": ""}
+            board["ldo_bypass_acknowledged"] = address
+        board |= {"usb_serial": address, "usb_path": "", "die_id": ""}
     table["radar"] = {**table["radar"], "servers": servers, "native": native}
     pi = f"tcp://{subnet}.{_PI_HOST_PART}"
     table["pi"] |= {"command_address": f"{pi}:{_COMMAND_PORT}", "event_address": f"{pi}:{_EVENT_PORT}"}
@@ -59,10 +59,10 @@ def is_free(rig: Instrument) -> bool:
             for address, port in udp:
                 stack.enter_context(bind_udp(address, port))
             for address, port in tcp:
-                s = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+                tcp_socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
                 # Addresses of a rig that has just ended count as free.
-                s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                s.bind((address, int(port)))
+                tcp_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                tcp_socket.bind((address, int(port)))
         except (OSError, DeviceError):
             return False
     return True
@@ -75,9 +75,9 @@ def move_to_free_subnet(rig: Instrument) -> Instrument:
     """
     generator = random.Random()
     for _ in range(_TRIES):
-        moved = move_to_subnet(rig, f"127.{generator.randint(1, 254)}.{generator.randint(0, 255)}")
-        if is_free(moved):
-            return moved
+        moved_rig = move_to_subnet(rig, f"127.{generator.randint(1, 254)}.{generator.randint(0, 255)}")
+        if is_free(moved_rig):
+            return moved_rig
     raise DeviceError(
         f"no free loopback subnet in {_TRIES} tries",
         "only 127.0.0.1 exists on this machine (not Linux?), or too many simulated rigs run",

@@ -6,7 +6,7 @@ import sys
 import threading
 from collections.abc import Callable
 
-from polysight_shared.errors import PolysightError, os_error
+from polysight_shared.errors import PolysightError, convert_os_error
 from polysight_shared.program import die_with_parent
 
 
@@ -45,7 +45,7 @@ def run_program(run: Callable[[], object]) -> int:
         sys.stderr.write(f"error: {e}\n")
         return e.exit_status
     except OSError as e:
-        error = os_error(e)
+        error = convert_os_error(e)
         sys.stderr.write(f"error: {error}\n")
         return error.exit_status
     except KeyboardInterrupt:

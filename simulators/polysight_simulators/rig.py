@@ -105,7 +105,7 @@ def derive(rig: Instrument, scene: Scene | None, folder: Path, native: bool = Fa
     return move_to_free_subnet(decode(table, Instrument, f"{rig.name}, simulated"))
 
 
-class Child:
+class RigProcess:
     """One process of the rig, with its log."""
 
     def __init__(self, name: str, command: list[str], logs: Path) -> None:
@@ -193,7 +193,7 @@ class RigProcesses:
         self._logs = folder / "logs"
         self._logs.mkdir(parents=True, exist_ok=True)
         self._stop = stop
-        self.children: list[Child] = []
+        self.children: list[RigProcess] = []
         try:
             self._start(rig, scene, options)
         except PolysightError:
@@ -217,14 +217,14 @@ class RigProcesses:
         if options.with_pi:
             self._wait([self._launch("pi", [_find_pi_program(), "run", "--config", config, "--wires", wires])])
 
-    def _start_module(self, name: str, module: str, *arguments: str) -> Child:
+    def _start_module(self, name: str, module: str, *arguments: str) -> RigProcess:
         return self._launch(name, [sys.executable, "-m", f"polysight_simulators.{module}", *arguments])
 
-    def _launch(self, name: str, command: list[str]) -> Child:
-        self.children.append(Child(name, command, self._logs))
+    def _launch(self, name: str, command: list[str]) -> RigProcess:
+        self.children.append(RigProcess(name, command, self._logs))
         return self.children[-1]
 
-    def _wait(self, started: list[Child]) -> None:
+    def _wait(self, started: list[RigProcess]) -> None:
         """Wait until these processes are ready, or `stop` is set.
 
         Raises DeviceError if one ends or the time is over.

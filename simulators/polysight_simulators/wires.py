@@ -200,13 +200,13 @@ class WireHub:
         Disconnect it if more than the limit is left.
         """
         try:
-            sent = client.connection.send(client.pending)
+            sent_bytes = client.connection.send(client.pending)
         except BlockingIOError:
-            sent = 0
+            sent_bytes = 0
         except OSError:
             self._drop(client)
             return
-        del client.pending[:sent]
+        del client.pending[:sent_bytes]
         if len(client.pending) > self._max_pending:
             self._disconnect(client, f"{len(client.pending)} unread bytes")
             return

@@ -17,7 +17,7 @@ from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.store import ScanFolder, place_again
 from polysight_shared.config import Board
 from polysight_shared.errors import ScanError
-from polysight_simulators.cards import KINDS, Adversary, Arrival
+from polysight_simulators.cards import NETWORK_TROUBLES, Adversary, Arrival
 
 
 class AdversarialCard(FakeCard):
@@ -36,7 +36,7 @@ class AdversarialCard(FakeCard):
             return
         troubled = self._chance.random() < self.rate
         if troubled:
-            troubles = tuple(self._chance.sample(KINDS, self._chance.randint(1, 3)))
+            troubles = tuple(self._chance.sample(NETWORK_TROUBLES, self._chance.randint(1, 3)))
         else:
             troubles = ()
         sent = self.adversary.record(

@@ -16,11 +16,11 @@ from tests.support.store.small_scan import SmallScan
 
 from polysight.acquisition import control as control_module, scan as host_run
 from polysight.acquisition.control import (
-    ALIVE,
-    CONTROL,
+    ALIVE_FILE,
+    CONTROL_FOLDER,
     ControlFolder,
-    Life,
     ScanCommand,
+    SignOfLife,
     StopRequest,
     read_life,
     read_start_ticks,
@@ -68,7 +68,7 @@ def test_a_sender_waits_until_its_command_is_obeyed(tmp_path):
     sender = threading.Thread(target=lambda: send_command(tmp_path, ScanCommand.STOP))
     with ControlFolder(tmp_path, stop) as control:
         control.open()
-        wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
+        wait_for((tmp_path / CONTROL_FOLDER / ALIVE_FILE).exists, "the first sign of life")
         sender.start()
         sender.join()
         assert stop.after_row
@@ -77,7 +77,7 @@ def test_a_sender_waits_until_its_command_is_obeyed(tmp_path):
 
 def test_touch_in_a_shell_is_a_command(control):
     folder, stop = control
-    (folder / CONTROL / "pause").touch()
+    (folder / CONTROL_FOLDER / "pause").touch()
     wait_for(lambda: stop.paused, "the pause")
 
 
@@ -100,22 +100,22 @@ def test_alive_says_who_scans_and_what_was_asked_and_goes_at_the_end(tmp_path):
         with refused(ErrorCode.NO_ANSWER, "materials"):
             send_command(tmp_path, ScanCommand.ABORT)
         assert not stop.now
-    assert not (tmp_path / CONTROL).exists()
+    assert not (tmp_path / CONTROL_FOLDER).exists()
 
 
 def test_after_the_rows_no_command_is_obeyed(tmp_path):
     stop = StopRequest()
     with ControlFolder(tmp_path, stop) as control:
         control.open()
-        wait_for((tmp_path / CONTROL / ALIVE).exists, "the first sign of life")
+        wait_for((tmp_path / CONTROL_FOLDER / ALIVE_FILE).exists, "the first sign of life")
         control.end_rows()
         wait_for(lambda: (life := read_life(tmp_path)) is not None and life.doing == "materials", "the end of the rows")
-        (tmp_path / CONTROL / "pause").touch()
+        (tmp_path / CONTROL_FOLDER / "pause").touch()
         # Commands are read before each sign of life.
         stop.request("a signal")
         wait_for(lambda: (life := read_life(tmp_path)) is not None and life.asked != "", "a sign of life after it")
         assert not stop.paused
-        assert (tmp_path / CONTROL / "pause").exists()
+        assert (tmp_path / CONTROL_FOLDER / "pause").exists()
 
 
 def test_a_sign_of_life_is_written_once_an_interval(tmp_path, monkeypatch):
@@ -133,25 +133,25 @@ def test_a_sign_of_life_is_written_once_an_interval(tmp_path, monkeypatch):
 
 def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):
     """Also if another process has its process number now."""
-    (tmp_path / CONTROL).mkdir()
+    (tmp_path / CONTROL_FOLDER).mkdir()
     lives = [
-        (Life(os.getpid(), read_start_ticks(os.getpid()) or 0, socket.gethostname()), False),
-        (Life(os.getpid(), 1, socket.gethostname()), True),
-        (Life(2**22 + 1, 1, socket.gethostname()), True),
-        (Life(2**22 + 1, 1, "another machine"), False),
+        (SignOfLife(os.getpid(), read_start_ticks(os.getpid()) or 0, socket.gethostname()), False),
+        (SignOfLife(os.getpid(), 1, socket.gethostname()), True),
+        (SignOfLife(2**22 + 1, 1, socket.gethostname()), True),
+        (SignOfLife(2**22 + 1, 1, "another machine"), False),
     ]
     for life, killed in lives:
-        (tmp_path / CONTROL / ALIVE).write_bytes(msgspec.json.encode(life))
+        (tmp_path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(msgspec.json.encode(life))
         assert read_life(tmp_path).killed is killed
     for content in (b"", b"{", b"[]", b"\xff", b'{"pid": "x"}'):
-        (tmp_path / CONTROL / ALIVE).write_bytes(content)
+        (tmp_path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(content)
         assert not read_life(tmp_path).killed
 
 
 def test_commands_for_an_earlier_scan_are_deleted(tmp_path):
-    (tmp_path / CONTROL).mkdir()
+    (tmp_path / CONTROL_FOLDER).mkdir()
     for command in ScanCommand:
-        (tmp_path / CONTROL / command).touch()
+        (tmp_path / CONTROL_FOLDER / command).touch()
     with open_control(tmp_path) as stop:
         send_command(tmp_path, ScanCommand.CONTINUE)
     assert (stop.after_row, stop.paused) == (False, False)
@@ -169,10 +169,10 @@ def test_command_without_a_running_scan_is_refused(tmp_path):
 
 
 def test_command_that_is_not_accepted_is_withdrawn(tmp_path):
-    (tmp_path / CONTROL).mkdir()
+    (tmp_path / CONTROL_FOLDER).mkdir()
     with refused(ErrorCode.NO_ANSWER, "abort"):
         send_command(tmp_path, ScanCommand.ABORT, limit_s=0.2)
-    assert list((tmp_path / CONTROL).iterdir()) == []
+    assert list((tmp_path / CONTROL_FOLDER).iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):

@@ -14,9 +14,9 @@ import pytest
 from tests.support.acquisition.arrival_model import MS, PAYLOAD, pulse_times
 from tests.support.capture.records import log_packets, make_mask
 
-from polysight.acquisition.pulse_times import PlacedFrames, frames_to_move, move_frames, place_frames
-from polysight.capture.placement import Past, Placed, place_record
-from polysight_simulators.cards import KINDS, RADAR, Adversary, Sent
+from polysight.acquisition.pulse_times import PlacedFrames, find_frames_to_move, move_frames, place_frames
+from polysight.capture.placement import EarlierRecords, PlacedRecord, place_record
+from polysight_simulators.cards import NETWORK_TROUBLES, RADAR_TROUBLES, Adversary, SentRecord
 
 # Points, pulses, bytes of a frame
 GRIDS = [
@@ -26,7 +26,7 @@ GRIDS = [
     (30, 1, 4096),
     (24, 8, 1456),
 ]
-TROUBLES = (*KINDS, *RADAR)
+TROUBLES = (*NETWORK_TROUBLES, *RADAR_TROUBLES)
 FRAME_NS = 128_000
 # Share of the right bytes that may be masked, in rows whose place and times are certain
 MAX_MASKED = 0.005
@@ -36,7 +36,7 @@ MAX_MASKED = 0.005
 class Kept:
     """A row as a scan stores it."""
 
-    placed: Placed
+    placed: PlacedRecord
     frames: PlacedFrames | None
     out: np.ndarray
     masked: np.ndarray
@@ -44,7 +44,7 @@ class Kept:
     placed_out: np.ndarray  # as the packets' counters say
 
 
-def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
+def keep(sent: SentRecord, past: EarlierRecords, pulses: np.ndarray, frame: int) -> Kept:
     """Place a take and decide which of its data is stored, as acquisition does."""
     log = log_packets(sent, pulses.size * frame, 64)
     placed, out = place_record(log, frame, past, int(pulses[0, 0]) - 5 * MS)
@@ -56,7 +56,7 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
     is_whole = placed.complete and frames is not None and not frames.contradicted
     missing = placed.missing
     placed_out = out
-    if (moved := frames_to_move(placed, frames)) is not None:
+    if (moved := find_frames_to_move(placed, frames)) is not None:
         out, missing = move_frames(out, placed.holes, int(placed.arrivals[-1, 1]), moved.slots, frame)
     return Kept(
         placed=placed,
@@ -68,12 +68,12 @@ def keep(sent: Sent, past: Past, pulses: np.ndarray, frame: int) -> Kept:
     )
 
 
-def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent]]:
+def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
     """One to three takes of a rig, each with up to three faults."""
     chance = random.Random(seed)
     points, count, frame = GRIDS[seed % len(GRIDS)]
     card = Adversary(chance, frame, 0, 1)
-    past = Past.after_reset()
+    past = EarlierRecords.after_reset()
     for number in range(chance.randint(1, 3)):
         troubles = tuple(chance.sample(TROUBLES, chance.randint(1, 3)))
         pulses = pulse_times(points, count) + number * 10**11
@@ -82,11 +82,11 @@ def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, Sent]]:
         past = judged_take.placed.past
         if past.lost:
             card.reset_by_host()
-            past = Past.after_reset()
+            past = EarlierRecords.after_reset()
         yield troubles, judged_take, sent
 
 
-def wrong_bytes(kept: Kept, sent: Sent) -> int:
+def wrong_bytes(kept: Kept, sent: SentRecord) -> int:
     truth = np.frombuffer(sent.data, dtype=np.uint8)
     return int((kept.out[~kept.masked] != truth[~kept.masked]).sum())
 
@@ -114,7 +114,7 @@ def test_a_perfect_take_after_trouble_is_committed(grid):
     points, count, frame = GRIDS[grid]
     chance = random.Random(grid)
     card = Adversary(chance, frame)
-    past = Past.after_reset()
+    past = EarlierRecords.after_reset()
     pulses = pulse_times(points, count)
     refused = 0
     for number in range(40):
@@ -125,7 +125,7 @@ def test_a_perfect_take_after_trouble_is_committed(grid):
         past = judged_take.placed.past
         if past.lost:
             card.reset_by_host()
-            past = Past.after_reset()
+            past = EarlierRecords.after_reset()
     assert refused == 0
 
 
@@ -147,5 +147,5 @@ def test_rows_that_were_once_kept_with_wrong_bytes(case, points, count, frame):
         card = Adversary(random.Random(f"{case} {seed}"), frame)
         pulses = pulse_times(points, count)
         sent = card.take(pulses.reshape(-1), CASES[case])
-        judged_take = keep(sent, Past.after_reset(), pulses, frame)
+        judged_take = keep(sent, EarlierRecords.after_reset(), pulses, frame)
         assert wrong_bytes(judged_take, sent) == 0

@@ -13,7 +13,15 @@ from tests.support.refusals import refused
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import run_scan
-from polysight.radar.control import LINE, BoardState, Endless, LineServers, RadarControl, RadarState, radar_control
+from polysight.radar.control import (
+    RETRIGGER_LINE,
+    BoardState,
+    Endless,
+    LineServers,
+    RadarControl,
+    RadarState,
+    open_radar_control,
+)
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.config import Instrument, Radar
 from polysight_shared.errors import DeviceError, ErrorCode
@@ -65,7 +73,7 @@ def test_a_server_that_closes_after_each_line_gets_a_new_connection(server):
             if client is None:
                 radars.arm(1)
                 client = server.accept()
-                assert client.recv(100) == LINE
+                assert client.recv(100) == RETRIGGER_LINE
             client.close()
             wait_for(lambda: radars._is_closed("RH"), "radar")
             assert radars.states()["RH"].state is RadarState.UNKNOWN
@@ -75,13 +83,13 @@ def test_a_reset_is_a_fault_until_the_next_line(server):
     with LineServers({"RH": server.address}, 5.0) as radars:
         client = server.accept()
         radars.arm(1)
-        assert client.recv(100) == LINE
+        assert client.recv(100) == RETRIGGER_LINE
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.close()
         wait_for(lambda: radars.states()["RH"].state is RadarState.FAULT, "radar")
         assert "reset" in radars.states()["RH"].detail
         radars.arm(1)
-        assert server.accept().recv(100) == LINE
+        assert server.accept().recv(100) == RETRIGGER_LINE
         assert radars.states()["RH"].state is RadarState.UNKNOWN
 
 
@@ -163,7 +171,7 @@ def test_wrong_radar_tables_are_refused(make_instrument, radar, rule):
 
 
 def test_backend_is_that_of_the_rig_file(make_instrument):
-    assert isinstance(radar_control(make_instrument()), Endless)
+    assert isinstance(open_radar_control(make_instrument()), Endless)
     assert make_instrument().radar == Radar()
 
 
@@ -273,6 +281,6 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
     with refused(ErrorCode.ROW_INCOMPLETE, "RH", server.address):
         run_scan(msgspec.structs.replace(rig.instrument, radar=radar), tmp_path / "s")
     lines = [server.accept().recv(1000) for _ in rig.instrument.boards]
-    assert lines == [LINE * 3] * 3
+    assert lines == [RETRIGGER_LINE * 3] * 3
     rejected = rejection_reasons(ScanFolder.load(tmp_path / "s"))
     assert any("may not have obeyed" in r for r in rejected)

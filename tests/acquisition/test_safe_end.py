@@ -25,7 +25,7 @@ from polysight.settings import DEFAULT
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_shared import messages as m
-from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, ScanError, os_error
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, ScanError, convert_os_error
 from polysight_shared.faults import explain
 
 
@@ -212,7 +212,7 @@ def test_every_error_names_the_rows_that_are_safe(rig, tmp_path, monkeypatch):
         run_scan(rig.instrument, tmp_path / "s")
     safe = f"0 of 4 rows are safe; `polysight resume {tmp_path / 's'}` continues from there"
     assert e.value.__notes__ == [safe]
-    assert os_error(e.value).remedy.endswith(safe)
+    assert convert_os_error(e.value).remedy.endswith(safe)
 
 
 def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):

@@ -10,7 +10,7 @@ from polysight.acquisition.control import StopRequest
 from polysight.acquisition.row import ON_REQUEST, FaultKind, Take, TakeFault
 from polysight.acquisition.scan import run_scan
 from polysight.capture.dca1000 import Status
-from polysight.page.history import CAUSES, notice_of_rejection
+from polysight.page.history import CAUSES, make_rejection_notice
 from polysight.store import RowFault
 from polysight_shared.faults import PiFault, explain
 from polysight_shared.messages import RowFinished
@@ -123,7 +123,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
         fault = TakeFault(kind, "text", "RV", 103 if kind is FaultKind.PI_FAULT else 0)
-        notice = notice_of_rejection(0, 1, [str(fault)], [fault.to_row_fault()], "")
+        notice = make_rejection_notice(0, 1, [str(fault)], [fault.to_row_fault()], "")
         assert notice.why
         assert notice.do
     assert set(CAUSES) == set(FaultKind) - {FaultKind.PI_FAULT}
@@ -133,12 +133,12 @@ def test_words_follow_the_kind_alone():
     """The cause shown depends on the kind of the fault, not on the text of the reason."""
     reason = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (cause, do) in CAUSES.items():
-        notice = notice_of_rejection(0, 1, [reason], [TakeFault(kind, reason, "RV").to_row_fault()], "")
+        notice = make_rejection_notice(0, 1, [reason], [TakeFault(kind, reason, "RV").to_row_fault()], "")
         assert (notice.why, notice.do) == (cause, do)
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
-    notice = notice_of_rejection(0, 1, [str(pulse_too_long)], [pulse_too_long.to_row_fault()], "")
+    notice = make_rejection_notice(0, 1, [str(pulse_too_long)], [pulse_too_long.to_row_fault()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).cause.lower()
     for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
-        notice = notice_of_rejection(0, 1, [reason], unknown, "")
+        notice = make_rejection_notice(0, 1, [reason], unknown, "")
         assert (notice.why, notice.facts["detail"]) == ("", reason)
         assert notice.do

@@ -18,7 +18,7 @@ from polysight.acquisition.progress import ScanProgress, time_left, typical_row_
 from polysight.acquisition.row import row_limit_s
 from polysight.acquisition.scan import run_scan
 from polysight.jobs.live_scan import ScanBar
-from polysight.page.history import seconds
+from polysight.page.history import parse_seconds
 from polysight.page.status import estimate_time_left
 from polysight_shared.raster import Row
 
@@ -104,7 +104,7 @@ def test_the_page_has_the_same_time_left(rig, tmp_path):
             add_fact(history, fact | {"committed_utc": utc.format(1, fact["row"] + 1)})
     add_fact(history, {"fact": "scan_paused", "paused_utc": utc.format(1, 3)})
     add_fact(history, {"fact": "scan_continued", "continued_utc": utc.format(2, 3)})
-    seconds_left, _ = estimate_time_left(history, seconds(utc.format(2, 3)) + 20)
+    seconds_left, _ = estimate_time_left(history, parse_seconds(utc.format(2, 3)) + 20)
     assert seconds_left == pytest.approx(time_left(1, 60.0, 20.0))
 
 

@@ -8,7 +8,7 @@ from sklearn.utils.estimator_checks import check_estimator
 
 from polysight import Classifier, Library, PaperKNeighborsClassifier
 from polysight.materials import SIMULATED_LIBRARY, Samples, ratio_columns
-from polysight.materials.classify import PAPER, PaperKnn, Weights
+from polysight.materials.classify import PAPER_MODEL, PaperKnn, Weights
 
 # Checks that scikit-learn skips by itself here: array API without its switch, and estimators without decision_function.
 NOT_CHECKED = {"check_array_api_input", "check_classifiers_multilabel_output_format_decision_function"}
@@ -103,5 +103,5 @@ def test_scans_left_out_are_judged_by_scikit_learn_and_by_us_alike(library):
     X, y, scans = library.columns()
     theirs = cross_val_score(Classifier("knn"), X[::9], y[::9], groups=scans[::9], cv=LeaveOneGroupOut())
     ours = Classifier("knn").score_by_scans(library)
-    assert ours.model == PAPER
+    assert ours.model == PAPER_MODEL
     assert abs(theirs.mean() - ours.pixels) < 0.15

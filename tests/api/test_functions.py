@@ -12,7 +12,7 @@ from tests.support.refusals import refused
 
 import polysight
 from polysight import compare, fresnel, multilayer, open_scan, permittivity_from_ratio
-from polysight.planning import Changes
+from polysight.planning import PlanChanges
 from polysight.products.processed import read_image
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
 
@@ -158,7 +158,7 @@ def test_an_unknown_change_of_a_plan_is_refused_with_those_that_are_known():
     with pytest.raises(ConfigError) as caught:
         polysight.plan(speed=1, spead_mm_s=2)
     assert caught.value.code == ErrorCode.VALUE_INVALID
-    assert all(word in str(caught.value) for word in ("spead_mm_s", *(field.name for field in fields(Changes))))
+    assert all(word in str(caught.value) for word in ("spead_mm_s", *(field.name for field in fields(PlanChanges))))
 
 
 @pytest.mark.parametrize("changes", [{"width_mm": "wide"}, {"columns": None}, {"pulses": [7]}])

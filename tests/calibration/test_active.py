@@ -15,10 +15,10 @@ from polysight.calibration.files import (
     MetalFile,
     PlacesFile,
     SourceScan,
-    calibration_of_rig,
-    calibration_of_scan,
     copy_into_scan,
     load_calibration,
+    load_rig_calibration,
+    load_scan_calibration,
     read_calibration,
     write_calibration,
     write_metal,
@@ -89,12 +89,12 @@ def test_relative_paths_are_relative_to_the_rig_file(tmp_path, make_rig):
     (tmp_path / "sub" / "rig.toml").write_text(tomli_w.dumps(table))
     rig = load_instrument(tmp_path / "sub" / "rig.toml")
     assert rig.calibration.hpf == str(path)
-    assert calibration_of_rig(rig).high_pass("RH").corners_hz == (180.5e3, 355.25e3)
+    assert load_rig_calibration(rig).high_pass("RH").corners_hz == (180.5e3, 355.25e3)
 
 
 def test_without_files_nothing_changes(make_rig):
     rig = make_rig()
-    calibration = calibration_of_rig(rig)
+    calibration = load_rig_calibration(rig)
     assert calibration.rig(rig) is rig
     assert calibration.high_pass("RH") is calibration.reference() is None
     assert calibration.files() == {}
@@ -106,10 +106,10 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
     assert sorted(load_facts(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
     assert not [f for f in validate(scan.path) if f.level == "error"]
-    copies_before = calibration_of_scan(scan)
+    copies_before = load_scan_calibration(scan)
     for original in hpf.parent.iterdir():
         original.unlink()
-    copies_after = calibration_of_scan(ScanFolder.load(scan.path))
+    copies_after = load_scan_calibration(ScanFolder.load(scan.path))
     assert copies_after.filters == copies_before.filters
     assert copies_after.high_pass("RH").corners_hz == (180.5e3, 355.25e3)
     np.testing.assert_array_equal(copies_after.reference().h, copies_before.reference().h)
@@ -121,7 +121,7 @@ def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_
     metal = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "b")
     hpf = hpf.rename(hpf.with_name("latest.toml"))
     metal = metal.rename(metal.with_name("latest.toml"))
-    calibration = calibration_of_scan(create(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
+    calibration = load_scan_calibration(create(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
     assert set(calibration.files()) == {"hpf", "metal"}
 
 
@@ -136,16 +136,16 @@ def test_a_changed_or_missing_copy_is_refused(tmp_path, rig_naming, hpf):
     copy = next((scan.path / "calibration").iterdir())
     copy.write_text(copy.read_text().replace("180.5", "190.5"))
     with refused(ErrorCode.FILE_DAMAGED, copy, hpf):
-        calibration_of_scan(scan)
+        load_scan_calibration(scan)
     copy.unlink()
     with refused(ErrorCode.FILE_DAMAGED, copy, hpf):
-        calibration_of_scan(scan)
+        load_scan_calibration(scan)
 
 
 def test_the_calibration_of_an_existing_scan_is_not_overwritten(tmp_path, rig_naming, hpf):
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf))
     copy_into_scan(rig_naming(hpf=write_calibration(filter_file(200.0), hpf.parent)), scan.path, True)
-    assert calibration_of_scan(scan).high_pass("RH").corners_hz[0] == 180.5e3
+    assert load_scan_calibration(scan).high_pass("RH").corners_hz[0] == 180.5e3
 
 
 def test_a_missing_file_is_refused_before_the_scan_is_created(tmp_path, rig_naming):

@@ -97,8 +97,8 @@ def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, make_
 
 
 def test_of_many_rows_as_many_as_asked_for_are_read_evenly_spaced(make_rig, monkeypatch):
-    monkeypatch.setattr(files, "row_words", lambda *_: (None, None))
+    monkeypatch.setattr(files, "view_row_words", lambda *_: (None, None))
     recorded = SimpleNamespace(payload=None, missing=(), frames_expected=0)
     source = SimpleNamespace(instrument=make_rig(), rows=lambda: iter((0, 1, 3, 4, 5, 8)), read_row=lambda *_: recorded)
     for limit, rows in ((None, [0, 1, 3, 4, 5, 8]), (6, [0, 1, 3, 4, 5, 8]), (3, [0, 3, 8]), (1, [0])):
-        assert [row for row, _, _ in files.board_rows(source, "RH", limit)] == rows
+        assert [row for row, _, _ in files.read_board_rows(source, "RH", limit)] == rows

@@ -13,8 +13,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_sta
 from tests.support.capture.records import FULL, log_packets, make_mask
 
 from polysight.capture.dca1000 import Counters
-from polysight.capture.placement import Past, Placed, place_record
-from polysight_simulators.cards import KINDS, Adversary, Sent
+from polysight.capture.placement import EarlierRecords, PlacedRecord, place_record
+from polysight_simulators.cards import NETWORK_TROUBLES, Adversary, SentRecord
 
 STEPS = 20
 # Bytes of a frame, frames of a row
@@ -34,7 +34,7 @@ GRIDS = [
 MAX_REFUSED = 1
 
 
-def wrong_bytes(sent: Sent, placed: Placed, out: np.ndarray) -> int:
+def wrong_bytes(sent: SentRecord, placed: PlacedRecord, out: np.ndarray) -> int:
     """Bytes that are not masked and are not those of the row."""
     mask = make_mask(out.size, placed.missing)
     assert not placed.located or not out[mask].any()
@@ -67,12 +67,12 @@ class Rows(RuleBasedStateMachine):
         else:
             sequence = chance.randrange(2**32)
         self.card = Adversary(chance, self.frame, count, sequence)
-        self.past = Past(Counters(count, sequence))
+        self.past = EarlierRecords(Counters(count, sequence))
         # The next record's start is known
         self.sure = True
         self.refused = 0
 
-    def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[Sent, Placed]:
+    def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[SentRecord, PlacedRecord]:
         sent = self.card.record(self.frames, troubles)
         log = log_packets(sent, self.size, batch)
         placed, out = place_record(log, self.frame, self.past, sent.not_before_ns if pulses_known else 0)
@@ -85,15 +85,17 @@ class Rows(RuleBasedStateMachine):
         self.sure = placed.located
         if placed.past.lost:  # as the host does before the next row
             self.card.reset_by_host()
-            self.past = Past.after_reset()
+            self.past = EarlierRecords.after_reset()
         return sent, placed
 
-    def check_mask(self, sent: Sent, placed: Placed) -> None:
+    def check_mask(self, sent: SentRecord, placed: PlacedRecord) -> None:
         """If the start is known and the card sent one complete record, exactly the lost bytes are masked."""
         if placed.complete:  # and right, as was seen before
             return
         spoils = {"truncate", "turn_header_bit", "two_paths", "reset_between"}
-        if not (self.sure and self.past.start and sent.whole and self.card.resets == 0) or spoils & {*sent.troubles}:
+        if not (self.sure and self.past.start and sent.is_complete and self.card.resets == 0) or spoils & {
+            *sent.troubles
+        }:
             return
         received_heads = {a.packet[:10] for a in sent.arrivals if a.record == sent.number}
         start = self.past.start.byte_count
@@ -104,7 +106,7 @@ class Rows(RuleBasedStateMachine):
             assert (make_mask(self.size, placed.missing) == make_mask(self.size, lost_ranges)).all()
 
     @rule(
-        troubles=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3, unique=True).map(tuple),
+        troubles=st.lists(st.sampled_from(NETWORK_TROUBLES), min_size=1, max_size=3, unique=True).map(tuple),
         batch=st.sampled_from([1, 7, 64]),
         pulses_known=st.booleans(),
     )
@@ -127,7 +129,7 @@ class Rows(RuleBasedStateMachine):
     def resume(self):
         """The host's program is started again: it has no state, and resets the card."""
         self.card.reset_by_host()
-        self.past = Past.after_reset()
+        self.past = EarlierRecords.after_reset()
         self.sure = True
         self.refused = 0
 

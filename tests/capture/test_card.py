@@ -23,9 +23,9 @@ from polysight_simulators.faults import Faults
 
 def test_configures_as_seen_on_a_real_card(scripted_card):
     client, card = scripted_card(lambda code, _: [reply(code, 0x0402 if code == Code.VERSION else 0)])
-    client.alive()
+    client.check_alive()
     client.configure(Card())
-    assert str(client.version()) == "2.8"
+    assert str(client.read_version()) == "2.8"
     client.record_start()
     client.record_stop()
     client.reset_fpga()
@@ -48,7 +48,7 @@ def test_replies_and_status_count_from_any_source_port(scripted_card, source_por
     client, _ = scripted_card(
         lambda code, _: [reply(Code.STATUS, Status.NO_LVDS_DATA), reply(code, 0x0402)], source_port=source_port
     )
-    assert str(client.version()) == "2.8"
+    assert str(client.read_version()) == "2.8"
     assert client.take_status() == Status.NO_LVDS_DATA
     assert client.strangers == 0
     with pytest.raises(OSError, match="not connected"):
@@ -59,7 +59,7 @@ def test_status_messages_are_not_replies(scripted_card):
     client, card = scripted_card(
         lambda code, _: [reply(Code.STATUS, Status.LVDS_BUFFER_FULL), reply(Code.VERSION, 1), b"noise", reply(code)]
     )
-    client.alive()
+    client.check_alive()
     assert client.take_status() == Status.LVDS_BUFFER_FULL
     client.record_start()
     card.say(reply(Code.STATUS, Status.RECORD_COMPLETED))
@@ -70,7 +70,7 @@ def test_status_messages_are_not_replies(scripted_card):
 
 def test_lost_reply_is_retried(scripted_card):
     client, card = scripted_card(lambda code, _: [reply(code)], unanswered=[(Code.ALIVE, 1)])
-    client.alive()
+    client.check_alive()
     assert [c for c, _ in card.seen] == [Code.ALIVE, Code.ALIVE]
 
 
@@ -91,7 +91,7 @@ def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_car
 
     monkeypatch.setattr(card, "dca1000", SimpleNamespace(**vars(dca1000) | {"encode_request": encode}))
     monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=monotonic))
-    client.alive()
+    client.check_alive()
     assert [code for code, _ in sent_to.seen] == [Code.ALIVE]
 
 
@@ -106,7 +106,7 @@ def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripte
     monkeypatch.setattr(card.select, "select", lambda readable, *_: (readable, [], []))
     monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=itertools.count(0.0, 1e3).__next__))
     with refused(ErrorCode.NO_ANSWER, "ALIVE"):
-        client.alive()
+        client.check_alive()
     assert client.take_status() == Status(0)
 
 
@@ -126,7 +126,7 @@ def test_refusal_is_an_error_but_not_for_stop(scripted_card):
 def test_silent_card_is_named(scripted_card):
     client, card = scripted_card(lambda *_: [], unanswered=[(Code.ALIVE, n) for n in (1, 2, 3)])
     with refused(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
-        client.alive()
+        client.check_alive()
     wait_for(lambda: len(card.seen) == 3, "three requests")
 
 

@@ -11,9 +11,9 @@ from polysight_shared.errors import ErrorCode, ProtocolError
 
 
 def test_vectors_seen():
-    assert d.configure_packet_data(1470, 25.0) == bytes.fromhex("be05350c0000")
-    assert d.configure_fpga_data(4) == bytes.fromhex("01010102031e")
-    assert d.configure_fpga_data(2) == bytes.fromhex("01020102031e")
+    assert d.encode_packet_configuration(1470, 25.0) == bytes.fromhex("be05350c0000")
+    assert d.encode_fpga_configuration(4) == bytes.fromhex("01010102031e")
+    assert d.encode_fpga_configuration(2) == bytes.fromhex("01020102031e")
     assert d.encode_request(d.Code.ALIVE) == bytes.fromhex("5aa509000000aaee")
     assert d.decode_reply(bytes.fromhex("5aa50e000204aaee")) == d.Reply(d.Code.VERSION, 0x0402)
     assert str(d.decode_version(0x0402)) == "2.8"
@@ -32,9 +32,9 @@ def test_out_of_range_is_refused():
     with pytest.raises(ProtocolError):
         d.encode_request(3, bytes(505))
     with pytest.raises(ProtocolError):
-        d.configure_packet_data(1470, 600.0)
+        d.encode_packet_configuration(1470, 600.0)
     with pytest.raises(ProtocolError):
-        d.configure_fpga_data(3)
+        d.encode_fpga_configuration(3)
     with pytest.raises(ProtocolError):
         d.decode_packet_header(bytes(10))
 

@@ -11,7 +11,14 @@ import pytest
 from tests.support.paths import REPO
 
 from polysight.capture.dca1000 import Status
-from polysight.capture.network import Hop, neighbour_mac, route_interface, silent_card, silent_hop, silent_radar
+from polysight.capture.network import (
+    Hop,
+    explain_silent_card,
+    explain_silent_radar,
+    find_silent_hop,
+    neighbour_mac,
+    route_interface,
+)
 from polysight.capture.placement import Losses, PacketCounts
 from polysight.capture.receiver import RowCapture
 from polysight_shared.config import Board
@@ -47,9 +54,9 @@ def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str 
 
 def test_an_interface_that_does_not_tell_its_link_is_passed_over(tmp_path):
     root = kernel(tmp_path, carrier=None)
-    assert silent_hop(CARD, root) is Hop.LINK
+    assert find_silent_hop(CARD, root) is Hop.LINK
     (root / "sys/class/net/eth1/operstate").write_text("unknown\n")
-    assert silent_hop(CARD, root) is Hop.CARD
+    assert find_silent_hop(CARD, root) is Hop.CARD
 
 
 @pytest.mark.parametrize(
@@ -67,17 +74,17 @@ def test_an_interface_that_does_not_tell_its_link_is_passed_over(tmp_path):
 )
 def test_every_hop_reads_differently(tmp_path, given, hop, says):
     root = kernel(tmp_path, **given)
-    assert silent_hop(CARD, root) is hop
-    error = silent_card(BOARD, "it did not answer", root)
+    assert find_silent_hop(CARD, root) is hop
+    error = explain_silent_card(BOARD, "it did not answer", root)
     assert (error.what, says in error.why) == ("it did not answer", True)
     assert error.remedy
 
 
 def test_unknown_hops_are_not_guessed(tmp_path):
-    assert silent_hop(CARD, tmp_path) is Hop.UNKNOWN
+    assert find_silent_hop(CARD, tmp_path) is Hop.UNKNOWN
     assert route_interface(CARD, tmp_path) is None
     assert neighbour_mac(CARD, tmp_path) is None
-    assert silent_hop("127.0.0.5", kernel(tmp_path, routes="")) is Hop.UNKNOWN
+    assert find_silent_hop("127.0.0.5", kernel(tmp_path, routes="")) is Hop.UNKNOWN
 
 
 def row(**given) -> RowCapture:
@@ -97,7 +104,7 @@ def row(**given) -> RowCapture:
     ],
 )
 def test_a_radar_that_does_not_stream(got, says):
-    error = silent_radar(BOARD, got)
+    error = explain_silent_radar(BOARD, got)
     assert says in error.why
     assert "RH" in error.what
 

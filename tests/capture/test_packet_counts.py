@@ -4,7 +4,7 @@ from hypothesis import assume, given, strategies as st
 from tests.support.capture.records import FULL, Card, encode_packet, is_original_or_masked, place
 
 from polysight.capture.dca1000 import Counters, decode_packet_header
-from polysight.capture.placement import PacketCounts, Past
+from polysight.capture.placement import EarlierRecords, PacketCounts
 
 # Bytes of a frame, frames of a row
 GRIDS = [(4096, 62), (4096, 91), (64, 910), (512, 30), (1456, 7)]
@@ -32,7 +32,7 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
     assume(many > 2)
     restart_packet = 1 + int(cut * (many - 2))
     card = Card(size, *start)
-    past = Past(Counters(*start))
+    past = EarlierRecords(Counters(*start))
     for _ in range(rows):
         placed, _ = place(size, card.record().packets, past, frame, batch)
         assert not others_than(placed.counts)

@@ -21,7 +21,7 @@ from tests.support.capture.records import (
 )
 
 from polysight.capture.dca1000 import Counters, PacketLog
-from polysight.capture.placement import Evidence, Losses, Past, place_record
+from polysight.capture.placement import EarlierRecords, Evidence, Losses, place_record
 from polysight.capture.row_files import read_packets, write_packets
 
 # A busy machine is not a fault
@@ -168,7 +168,7 @@ def test_every_disorder_at_once(
 )
 def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, sequence, skip, chance: random.Random):
     """Each record ends with a short packet: sequence and byte count drift apart, but every record is found."""
-    start = Past(Counters(count, sequence))
+    start = EarlierRecords(Counters(count, sequence))
     for n in range(records):
         record = Record.make(frames * frame, count, sequence, seed=n)
         head = chance.randint(0, skip) if len(record.packets) > 2 * skip + 2 else 0
@@ -336,12 +336,12 @@ def test_without_its_end_no_record_is_certain(lost, dropped):
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_a_lost_start_is_known_again_after_a_reset(size):
     card = Card(size, 70_000, 9)
-    past = place(size, card.record().packets[:-3], Past(Counters(70_000, 9)), FRAME)[0].past
+    past = place(size, card.record().packets[:-3], EarlierRecords(Counters(70_000, 9)), FRAME)[0].past
     assert past.lost
     assert not place(size, card.record().packets, past, FRAME)[0].located
     card.reset()
     again = card.record()
-    placed, out = place(size, again.packets, Past.after_reset(), FRAME)
+    placed, out = place(size, again.packets, EarlierRecords.after_reset(), FRAME)
     assert placed.complete
     assert out.tobytes() == again.data
 
@@ -349,7 +349,7 @@ def test_a_lost_start_is_known_again_after_a_reset(size):
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
 def test_of_a_card_that_counts_anew_in_every_record_every_second_take_is_kept(size):
     card = Card(size)
-    past = Past.after_reset()
+    past = EarlierRecords.after_reset()
     accepted = []
     for _ in range(6):
         card.reset()
@@ -357,7 +357,7 @@ def test_of_a_card_that_counts_anew_in_every_record_every_second_take_is_kept(si
         placed, out = place(size, record.packets, past, FRAME)
         assert is_original_or_masked(record, placed, out)
         accepted.append(placed.complete)
-        past = Past.after_reset() if placed.past.lost else placed.past
+        past = EarlierRecords.after_reset() if placed.past.lost else placed.past
     assert accepted == [True, False] * 3
 
 
@@ -419,7 +419,7 @@ def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
     elsewhere = encode_packet(99, 5 * size, bytes([9] * 99))
     packets = [*record.packets, *([late_packet] if "conflict" in trouble else []), elsewhere]
     log = make_log(size, packets)
-    past = Past.after_reset()
+    past = EarlierRecords.after_reset()
     payload_before = log.payload[: log.payload_bytes].copy()
     placed, out = place_record(log, FRAME, past)
     assert (log.payload[: payload_before.size] == payload_before).all()
@@ -437,7 +437,7 @@ def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
         block = [np.frombuffer(p, dtype=np.uint8) for p in record.packets[0 if located else 2 :]]
         for k, packet in enumerate(block):
             log.add(packet[None, :], np.array([len(packet)]), 100 + k)
-        placed, out = place_record(log, FRAME, Past(Counters(70_000, 9)), not_before_ns=50)
+        placed, out = place_record(log, FRAME, EarlierRecords(Counters(70_000, 9)), not_before_ns=50)
         assert placed.located == located
         assert is_original_or_masked(record, placed, out)
 
@@ -445,9 +445,9 @@ def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
 def test_a_whole_record_elsewhere_is_not_the_rows():
     """A second card with the same address sends one whole row, and the packets of the right card are lost."""
     twin = Card(SHORT_END, 5_000_000, 40_000)
-    placed, _ = place(SHORT_END, twin.record().packets, Past(Counters(70_000, 9)), FRAME)
+    placed, _ = place(SHORT_END, twin.record().packets, EarlierRecords(Counters(70_000, 9)), FRAME)
     assert not placed.located
     earlier_record = Record.make(SHORT_END, 0, 1)
     mixed = [p for pair in zip(earlier_record.packets, twin.record().packets, strict=True) for p in pair]
-    placed, out = place(SHORT_END, mixed, Past.after_reset(), FRAME)
+    placed, out = place(SHORT_END, mixed, EarlierRecords.after_reset(), FRAME)
     assert is_original_or_masked(earlier_record, placed, out)

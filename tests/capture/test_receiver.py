@@ -17,7 +17,7 @@ from tests.support.capture.records import FULL, encode_packets
 from tests.support.processes import wait_for
 from tests.support.refusals import refused
 
-from polysight.acquisition.capture_rig import record_ended
+from polysight.acquisition.capture_rig import has_record_ended
 from polysight.acquisition.control import read_start_ticks
 from polysight.capture import network, receiver_process
 from polysight.capture.dca1000 import Status
@@ -284,7 +284,7 @@ def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
     ],
 )
 def test_a_record_ends_with_whichever_is_first(progress, status, now_s, ended):
-    assert record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
+    assert has_record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
 
 
 class SuspendedClocks:

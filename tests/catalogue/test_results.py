@@ -11,7 +11,7 @@ from tests.support.scenes import COPPER, PET
 
 from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, read_result, thumbnail
 from polysight.catalogue.pictures import MAPS
-from polysight.catalogue.results import SIGNIFICANT, measure_scatter
+from polysight.catalogue.results import SIGNIFICANT_STDS, measure_scatter
 from polysight.products import map_permittivity, read_products
 from polysight_shared.errors import DataError, ErrorCode
 
@@ -137,7 +137,7 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
     sigmas = stated / measure_scatter(stated)
     assert measure_scatter(stated[4000:]) == pytest.approx(1 / 3, rel=0.03)
     assert (sigmas[4000:] > 2.448).mean() == pytest.approx(0.03, abs=0.025)
-    assert (sigmas[:4000] > SIGNIFICANT).mean() > 0.95
+    assert (sigmas[:4000] > SIGNIFICANT_STDS).mean() > 0.95
     assert measure_scatter(3 * stated) == 1.0
     assert np.isnan(measure_scatter(np.array([np.nan])))
 
@@ -172,7 +172,7 @@ def test_colours_of_differences_in_standard_deviations_reach_twice_the_significa
     """A map without a significant difference looks like one; a larger difference widens the scale."""
     comparison = compare(processed / "one", processed / "two")
     shape = comparison.sigmas.shape
-    for sigmas, high in ((0.5, 2 * SIGNIFICANT), (30.0, 30.0)):
+    for sigmas, high in ((0.5, 2 * SIGNIFICANT_STDS), (30.0, 30.0)):
         picture = draw_comparison(replace(comparison, sigmas=np.full(shape, sigmas)), "sigmas")
         assert (picture.low, picture.high) == (0.0, pytest.approx(high))
 

@@ -14,7 +14,7 @@ from tests.support.page.live_view import open_control
 from tests.support.products import judged_products
 from tests.support.store.facts import load_facts
 
-from polysight.catalogue import NOTES, PROGRAM, Notes, Scans, find_program, read_notes, scans, write_notes
+from polysight.catalogue import NOTES_FILE, PROGRAM_FOLDER, Notes, Scans, find_program, read_notes, scans, write_notes
 from polysight.catalogue.scans import Program, explain_failure, is_scan
 from polysight.results import NoResult
 from polysight.store import MANIFEST, ScanFolder, manifest
@@ -123,10 +123,10 @@ def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
     index = root / ".polysight" / "list.json"
     age_files(root)
     write_notes(root / "done", Notes("cat"))
-    written = (root / "done" / NOTES).stat()
+    written = (root / "done" / NOTES_FILE).stat()
     Scans(root, index=index).list()
-    (root / "done" / NOTES).write_text((root / "done" / NOTES).read_text().replace("cat", "dog"))
-    os.utime(root / "done" / NOTES, ns=(written.st_atime_ns, written.st_mtime_ns))
+    (root / "done" / NOTES_FILE).write_text((root / "done" / NOTES_FILE).read_text().replace("cat", "dog"))
+    os.utime(root / "done" / NOTES_FILE, ns=(written.st_atime_ns, written.st_mtime_ns))
     assert Scans(root, index=index).summary("done").notes == "dog"
 
 
@@ -224,7 +224,7 @@ def test_damaged_scans_are_listed_and_break_nothing(root):
         (root / f"bad{k}").mkdir()
         (root / f"bad{k}" / MANIFEST).write_bytes(content)
     (root / "done" / "products" / "materials.json").write_text("[")
-    (root / "done" / NOTES).write_text("{")
+    (root / "done" / NOTES_FILE).write_text("{")
     summaries = {s.name: s for s in Scans(root).list()}
     assert {summaries[f"bad{k}"].state for k in range(5)} == {"damaged"}
     assert (summaries["done"].state, summaries["done"].verdict) == ("finished", "damaged")
@@ -239,7 +239,7 @@ def test_links_hidden_folders_and_unprintable_names_are_not_followed(root, tmp_p
     shutil.copytree(root / "done", root / "a\u202eb")
     names = {s.name for s in Scans(root).list()}
     assert not names & {"link", ".hidden/one", "a\u202eb"}
-    assert Scans(root).left_out() == ["a\\u202eb", "link"]
+    assert Scans(root).list_left_out() == ["a\\u202eb", "link"]
     for name in ("link", ".hidden/one", "../elsewhere", "", "done/", "done/products/..", "week"):
         with pytest.raises(DataError):
             Scans(root).folder(name)
@@ -256,7 +256,7 @@ def test_one_scan_alone_is_shown_where_it_was_asked_for(root):
 def test_notes_come_back_as_they_were_written(root):
     written = write_notes(root / "done", Notes("two\nlines, Eichenholz 木", ("oak", " oak ", "", "b")))
     assert written == read_notes(root / "done") == Notes("two\nlines, Eichenholz 木", ("oak", "b"))
-    assert json.loads((root / "done" / NOTES).read_text(encoding="utf-8"))["tags"] == ["oak", "b"]
+    assert json.loads((root / "done" / NOTES_FILE).read_text(encoding="utf-8"))["tags"] == ["oak", "b"]
     assert Scans(root).summary("done").tags == ("oak", "b")
     assert "\u202e" not in write_notes(root / "done", Notes("a\u202eb\x00c", ("\x1b[31m",))).notes
 
@@ -265,17 +265,17 @@ def test_notes_come_back_as_they_were_written(root):
 def test_too_long_notes_are_refused(root, notes):
     with pytest.raises(ConfigError):
         write_notes(root / "done", notes)
-    assert not (root / "done" / NOTES).exists()
+    assert not (root / "done" / NOTES_FILE).exists()
 
 
 def test_pipes_and_links_in_a_folder_keep_no_list_waiting(root, tmp_path_factory):
     victim = tmp_path_factory.mktemp("elsewhere") / "file"
     victim.write_text("as it was")
-    for k, name in enumerate((MANIFEST, NOTES)):
+    for k, name in enumerate((MANIFEST, NOTES_FILE)):
         shutil.copytree(root / "done", root / f"odd{k}")
         (root / f"odd{k}" / name).unlink(missing_ok=True)
         os.mkfifo(root / f"odd{k}" / name)
-    (root / "done" / f".{NOTES}.part").symlink_to(victim)
+    (root / "done" / f".{NOTES_FILE}.part").symlink_to(victim)
     summaries = {s.name: s for s in Scans(root).list()}
     assert (summaries["odd0"].state, summaries["odd1"].notes) == ("products", "")
     write_notes(root / "done", Notes("mine"))
@@ -300,14 +300,14 @@ def test_of_a_huge_record_and_status_only_the_beginning_is_read(tmp_path):
     """Damaged files are replaced by sparse files of 64 MiB."""
     record = {"pid": 0, "ticks": 0, "words": [], "started_utc": ""}
     for name, content in (("scan.json", json.dumps(record)), ("scan.status", "7\n")):
-        path = tmp_path / PROGRAM / name
+        path = tmp_path / PROGRAM_FOLDER / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(content)
         os.truncate(path, 64 << 20)
     tracemalloc.start()
     try:
         find_program(tmp_path, "scan")
-        scans._read_status(tmp_path / PROGRAM / "scan.status")
+        scans._read_status(tmp_path / PROGRAM_FOLDER / "scan.status")
         _, peak_bytes = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -16,7 +16,7 @@ from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
 from polysight.catalogue import Scans
 from polysight.radar import commands, messages as radar_messages
-from polysight.radar.commands import DEVICE_CONFIGURATION, Command, program
+from polysight.radar.commands import DEVICE_CONFIGURATION, Command, make_program
 from polysight.radar.messages import Direction, Kind, SubBlock, decode, decode_event
 from polysight.serve.commands import command_routes
 from polysight.serve.front import Front, make_app
@@ -149,8 +149,8 @@ def test_stage_line_examples_are_a_dialogue():
 def test_card_requests():
     requests = {
         ("record start", "request"): (dca1000.Code.RECORD_START, b""),
-        ("configure FPGA", "request"): (dca1000.Code.CONFIGURE_FPGA, dca1000.configure_fpga_data()),
-        ("packets", "request"): (dca1000.Code.CONFIGURE_PACKET, dca1000.configure_packet_data(1470, 25.0)),
+        ("configure FPGA", "request"): (dca1000.Code.CONFIGURE_FPGA, dca1000.encode_fpga_configuration()),
+        ("packets", "request"): (dca1000.Code.CONFIGURE_PACKET, dca1000.encode_packet_configuration(1470, 25.0)),
         ("version", "request"): (dca1000.Code.VERSION, b""),
     }
     for labels, (code, data) in requests.items():
@@ -187,12 +187,12 @@ def test_data_packet_headers():
 
 def test_sub_blocks_are_those_of_the_published_rig():
     rig = native_rig()
-    board_program = program(rig, rig.by_name("RH"))
+    board_program = make_program(rig, rig.by_name("RH"))
     sent: list[Command] = [
         DEVICE_CONFIGURATION,
         *board_program.basic,
         *board_program.waveform,
-        *board_program.frames(rig.grid.columns * 16),
+        *board_program.make_frame_commands(rig.grid.columns * 16),
     ]
     table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}
     for message in sent:
@@ -211,7 +211,7 @@ def test_sub_blocks_are_those_of_the_published_rig():
 def test_the_page_names_every_sub_block_that_is_sent():
     page = text("mmwavelink.md")
     numbers = {c.ID for c in vars(commands).values() if isinstance(c, type) and isinstance(getattr(c, "ID", None), int)}
-    bare = {c.ID for c in vars(commands).values() if isinstance(c, commands.Fixed)}
+    bare = {c.ID for c in vars(commands).values() if isinstance(c, commands.ConstantCommand)}
     assert len(numbers | bare) > 20
     assert not [hex(n) for n in numbers | bare if f"0x{n:04X}" not in page]
 

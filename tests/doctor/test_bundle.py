@@ -12,7 +12,7 @@ from tests.support.store.faulty_disk import FaultyDisk
 from zmq.auth import create_certificates
 
 from polysight.cli.main import main
-from polysight.doctor.bundle import HIDDEN, Redactor, write_bundle
+from polysight.doctor.bundle import REDACTION, Redactor, write_bundle
 from polysight.doctor.context import DoctorOptions, ok
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DeviceError
@@ -67,7 +67,7 @@ def test_the_bundle_has_no_key(place: Path, bundle: dict[str, bytes]) -> None:
     for text in bundle.values():
         for key in (*keys, TOKEN):
             assert key.encode() not in text
-    assert HIDDEN.encode() in bundle["logs/0-pi.log"]
+    assert REDACTION.encode() in bundle["logs/0-pi.log"]
 
 
 def test_the_bundle_has_no_raw_data(bundle: dict[str, bytes]) -> None:
@@ -130,7 +130,7 @@ def test_a_key_with_equals_signs_is_removed_as_a_whole(tmp_path: Path) -> None:
     # Z85, the form of CurveZMQ's keys, has "=" among its characters: one piece between them may be short.
     key = "0123456789abc=0123456789abc=0123456789ab"
     (tmp_path / "host.key_secret").write_text(f'curve\n    secret-key = "{key}"\n')
-    assert Redactor([tmp_path])(f"connected with {key}") == f"connected with {HIDDEN}"
+    assert Redactor([tmp_path])(f"connected with {key}") == f"connected with {REDACTION}"
 
 
 def test_tokens_of_known_forms_are_removed_without_a_name() -> None:

@@ -15,7 +15,7 @@ from tests.support.scenes import small_scene
 from tests.support.simulated_rig import Rig, running
 
 from polysight.acquisition.pi_client import PiClient
-from polysight.catalogue import PROGRAM, find_program
+from polysight.catalogue import PROGRAM_FOLDER, find_program
 from polysight.store import ScanFolder, validate
 from polysight_shared.messages import BeginRun
 from polysight_shared.raster import plan_raster
@@ -148,7 +148,7 @@ def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
 def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
     folder = lab.start("third", rows=ROWS)
     lab.wait_rows(folder, 1)
-    program_before = json.loads((folder / PROGRAM / "scan.json").read_text())
+    program_before = json.loads((folder / PROGRAM_FOLDER / "scan.json").read_text())
     pid = program_before["pid"]
     # The priority of a program in a terminal, not that of the reading process
     assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
@@ -172,7 +172,7 @@ def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
     lab.serve()
     lab.open("/watch?scan=third", PHONE)
     lab.wait_headline("All is well")
-    assert json.loads((folder / PROGRAM / "scan.json").read_text()) == program_before
+    assert json.loads((folder / PROGRAM_FOLDER / "scan.json").read_text()) == program_before
     assert _program(folder).running
     lab.click("pause")
     lab.wait_headline("Paused")

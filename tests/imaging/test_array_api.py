@@ -66,7 +66,7 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make):
 
     for result, want in (
         (imager.image(put(samples)), plain.image(samples)),
-        (imager.constant(put(echo), put(weights)), plain.constant(echo, weights)),
+        (imager.image_constant_echo(put(echo), put(weights)), plain.image_constant_echo(echo, weights)),
         (imager.samples(put(pixels)), plain.samples(pixels)),
     ):
         assert type(result) is type(put(samples))

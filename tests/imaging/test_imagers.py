@@ -66,7 +66,7 @@ def test_spectral_and_row_by_row_equal_the_direct_sum(aperture, grid, shifts):
     echo = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(d, a.frequencies_hz)).astype(np.complex64)
     weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
     images = [make(a).image(samples) for make in IMAGERS]
-    echoes = [make(a).constant(echo, weights) for make in IMAGERS]
+    echoes = [make(a).image_constant_echo(echo, weights) for make in IMAGERS]
     for (spectral, rows, direct), peak in ((images, np.prod(a.shape)), (echoes, weights.sum() * echo.size)):
         # Relative to a point's peak; rounding errors average out less over few positions.
         if a.shape[3] > 300:
@@ -143,9 +143,9 @@ def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
     alone = []
     for y, echo in zip(samples, echoes, strict=True):
         forget()
-        alone.append((SpectralImager(a).image(y.copy()), SpectralImager(a).constant(echo, weights)))
+        alone.append((SpectralImager(a).image(y.copy()), SpectralImager(a).image_constant_echo(echo, weights)))
     imagers = SpectralImager(a), SpectralImager(a)
-    kept = [(imagers[i].image(samples[i]), imagers[i].constant(echoes[i], weights)) for i in (0, 1, 0, 1)]
+    kept = [(imagers[i].image(samples[i]), imagers[i].image_constant_echo(echoes[i], weights)) for i in (0, 1, 0, 1)]
     for i, image in enumerate(kept):
         np.testing.assert_array_equal(image, alone[i % 2])
 

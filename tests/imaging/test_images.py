@@ -217,7 +217,7 @@ def test_the_change_of_a_plane_over_the_sweep_is_what_its_reflectivity_changes(m
         row = np.broadcast_to((1 / antennas.direct_m[:, None] + echo)[:, None], (4, 31, 256))
         for index in range(21):
             builder.add_row(board.name, index, synced_row(np.ascontiguousarray(row, np.complex64)))
-    dispersion = builder.disperse()
+    dispersion = builder.form_dispersion()
     valid = builder.finish().valid
     for channel in (dispersion.h, dispersion.v):
         # The window leaves a little of the direct path.
@@ -256,8 +256,8 @@ def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig
 def test_a_gate_of_more_multiplications_than_one_product_may_have_is_applied(make_rig, synced_row, monkeypatch):
     rig = make_rig(15, 9, pixels=(16, 14))
     images = []
-    for most in (reduced._PRODUCT, 1):
-        monkeypatch.setattr(reduced, "_PRODUCT", most)
+    for most in (reduced._MAX_PRODUCT, 1):
+        monkeypatch.setattr(reduced, "_MAX_PRODUCT", most)
         builder = ImageBuilder(rig)
         for name, index, row in _random_rows(rig, synced_row, np.random.default_rng(8)):
             builder.add_row(name, index, row)
@@ -403,7 +403,7 @@ def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeyp
 
     builder = SimpleNamespace(
         finish=lambda offset: images_of(nominal + offset),
-        disperse=lambda offset: Dispersion(nominal + offset, nominal, (76e9, 80e9)),
+        form_dispersion=lambda offset: Dispersion(nominal + offset, nominal, (76e9, 80e9)),
     )
     estimate = replace(UNKNOWN_PLANE, offset_m=offset_m, plates=1)
     monkeypatch.setattr(plane, "find_plane", lambda *_: estimate)

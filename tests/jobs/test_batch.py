@@ -16,7 +16,7 @@ from tests.support.store.plain_scan import write_scan
 
 from polysight.cli.main import main
 from polysight.jobs import batch, batch as many
-from polysight.process import cores
+from polysight.process import count_cores
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import ScanFolder, drop
@@ -59,7 +59,7 @@ def worker(tmp_path, monkeypatch):
     """Replaces the program that processes a scan: it behaves as the scan's name says."""
     file = tmp_path / "worker.py"
     file.write_text(WORKER)
-    monkeypatch.setattr(many, "PROGRAM", (sys.executable, str(file)))
+    monkeypatch.setattr(many, "WORKER_COMMAND", (sys.executable, str(file)))
 
 
 def scans(folder, *names):
@@ -221,7 +221,7 @@ def test_scans_at_a_time_follow_cores_and_memory():
     assert batch.fit_scans(70_000, cores=8, free_bytes=3 * need) == 2
     assert batch.fit_scans(70_000, cores=8, free_bytes=0) == 1
     assert many.free_memory_bytes() > 0
-    assert cores() >= 1
+    assert count_cores() >= 1
 
 
 def test_the_table_names_every_scan_and_counts(tmp_path):
@@ -293,8 +293,9 @@ import sys
 from pathlib import Path
 from polysight.jobs import batch
 child = "from polysight.jobs import batch; import os, sys, time;" \
-    "batch.exit_with_parent(os.environ[batch.ALIVE]); open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
-batch.PROGRAM = (sys.executable, "-c", child, sys.argv[2])
+    "batch.exit_with_parent(os.environ[batch.PARENT_PIPE_VARIABLE]);" \
+    "open(sys.argv[1], 'w').write(str(os.getpid())); time.sleep(600)"
+batch.WORKER_COMMAND = (sys.executable, "-c", child, sys.argv[2])
 batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys.argv[1] + "-out"))[0])
 """
 
@@ -325,7 +326,8 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     (tmp_path / "worker.py").write_text(WORKER.replace("time.sleep(600)", KILLS_ITS_WORKER))
     preload = tmp_path / "preload.py"
     preload.write_text(
-        f"from polysight.jobs import batch\nbatch.PROGRAM = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
+        "from polysight.jobs import batch\n"
+        f"batch.WORKER_COMMAND = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
     )
     names = ("a", "b", "slow", "c")
     scans(tmp_path / "in", *names)

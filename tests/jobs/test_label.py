@@ -11,7 +11,7 @@ from tests.support.refusals import refused
 from polysight.cli.main import build_parser, main
 from polysight.jobs.label import Edits, apply_edits, label
 from polysight.materials import read_labels
-from polysight.products import find_labels, find_products, making_products, write_image, write_json
+from polysight.products import find_labels, find_products, replace_products, write_image, write_json
 from polysight_shared.errors import ErrorCode
 
 NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
@@ -156,7 +156,7 @@ def test_boxes_by_hand_outlive_products_of_the_same_scan_alone(products, scan_id
     write_json(products / "scan.json", {"scan_id": "one", "simulated": True})
     assert main(["label", str(products), *NAMED]) == 0
     drawn = boxes(products)
-    with making_products(products, scan_id) as new:
+    with replace_products(products, scan_id) as new:
         (new / "labels.json").write_text(json.dumps({"labels": {"patch": [0, 0, 3, 3]}}))
     assert (boxes(products) == drawn) == kept
     assert (products / "labels.png").exists() == kept

@@ -14,7 +14,7 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 from tests.support.scenes import COPPER, make_scene
 
-from polysight.catalogue import NOTES, Notes, probe, read_notes
+from polysight.catalogue import NOTES_FILE, Notes, probe, read_notes
 from polysight.cli.main import build_parser, main
 from polysight.jobs import scans
 from polysight.results import ComplexNumber
@@ -124,7 +124,7 @@ def test_notes_are_of_a_scan(root, folder):
     args = build_parser().parse_args(["note", str(root / folder), "--text", "oak"])
     with refused(ErrorCode.FILE_MISSING, root / folder):
         args.run(args)
-    assert not (root / folder / NOTES).exists()
+    assert not (root / folder / NOTES_FILE).exists()
 
 
 @pytest.mark.parametrize("option", ["--text", "--tag", "--untag"])

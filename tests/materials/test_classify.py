@@ -11,8 +11,8 @@ from tests.support.refusals import refused
 
 from polysight.cli.main import main
 from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, fit_library
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, classifier_sentence
-from polysight.materials.result import PATCHES, match_patches, pack_patches, read_patches
+from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, classifier_sentence
+from polysight.materials.result import PATCHES_FILE, match_patches, pack_patches, read_patches
 from polysight.materials.train import make_entries
 from polysight_papers.sensys2026.patches import Errors, draw, groups
 from polysight_shared.errors import ErrorCode
@@ -51,14 +51,14 @@ def folders(two_angles, tmp_path):
     library.save(tmp_path / "library.npz")
     for angle, content in packed.items():
         (tmp_path / f"{angle:g}").mkdir()
-        (tmp_path / f"{angle:g}" / PATCHES).write_bytes(content)
+        (tmp_path / f"{angle:g}" / PATCHES_FILE).write_bytes(content)
     return tmp_path
 
 
 @pytest.fixture
 def scans(folders):
     """The patches of the two scans, in the order of the angles."""
-    return [read_patches(folders / f"{angle:g}" / PATCHES) for angle in ANGLES]
+    return [read_patches(folders / f"{angle:g}" / PATCHES_FILE) for angle in ANGLES]
 
 
 def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabilities_names(powders, tmp_path):
@@ -66,7 +66,7 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabil
     library = Library.load(tmp_path / "powders.npz")
     assert set(library.fit["angles"]) == {"55", "60", "55+60"}
     for fit in library.fit["angles"].values():
-        assert fit["model"] == DISCRIMINANT
+        assert fit["model"] == DISCRIMINANT_MODEL
         assert set(fit["judged"]) == set(MODELS)
         assert 0 <= fit["calibration_error"] < 0.2
         assert fit["pixel_accuracy"] == fit["judged"][fit["model"]]["pixels"]
@@ -92,10 +92,10 @@ def test_two_scans_are_enough_to_learn_from():
 
 def test_another_model_can_be_asked_for_and_the_report_says_so(powders):
     knn = Classifier(powders, model="knn", angles_deg=[60.0])
-    assert knn.model == PAPER
-    assert classifier_sentence(knn).startswith(PAPER)
+    assert knn.model == PAPER_MODEL
+    assert classifier_sentence(knn).startswith(PAPER_MODEL)
     earlier = Classifier(powders, model="linear discriminant", angles_deg=[60.0])
-    assert earlier.model == DISCRIMINANT
+    assert earlier.model == DISCRIMINANT_MODEL
     with refused(ErrorCode.VALUE_INVALID, "guess"):
         Classifier(powders, model="guess", angles_deg=[60.0])
 
@@ -155,13 +155,13 @@ def test_two_scans_as_typed(folders, capsys):
     answer = json.loads(capsys.readouterr().out)
     assert answer["source"] == "simulated"
     assert answer["incidence_deg"] == pytest.approx(ANGLES)
-    assert answer["model"] == DISCRIMINANT
+    assert answer["model"] == DISCRIMINANT_MODEL
     assert sum(p["name"] == p["truth"] for p in answer["patches"]) >= 8
     assert main([*arguments, "--model", "knn"]) == 0
     out = capsys.readouterr().out
     assert out.startswith("simulated: 9 patches at 55.0 and 60.0 degrees")
     assert "of 9 patches named right" in out
-    assert PAPER in out
+    assert PAPER_MODEL in out
 
 
 def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
@@ -178,7 +178,7 @@ def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
         if b and other_truth in b
     }
     assert len(swap) == 2
-    with np.load(folders / angle / PATCHES) as stored:
+    with np.load(folders / angle / PATCHES_FILE) as stored:
         content = dict(stored)
     features = content["features"].copy()
     first = np.cumsum([0, *[len(p.features) for p in second_scan.patches]])
@@ -188,7 +188,7 @@ def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
     features[rows_of_patch[first_truth]] = middle[other_truth]
     features[rows_of_patch[other_truth]] = middle[first_truth]
     content["features"] = features
-    np.savez(folders / angle / PATCHES, **content)
+    np.savez(folders / angle / PATCHES_FILE, **content)
     command = ["classify", str(folders / "55"), str(folders / angle), "--library", str(folders / "library.npz")]
     assert main([*command, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
@@ -205,9 +205,9 @@ def test_one_scan_and_wrong_folders_as_typed(folders, capsys):
     assert "9 patches at 60.0 degrees" in capsys.readouterr().out
     assert main(["classify", str(folders / "60"), str(folders), *library]) != 0
     assert "polysight process" in capsys.readouterr().err
-    (folders / "60" / PATCHES).write_bytes(b"no archive")
+    (folders / "60" / PATCHES_FILE).write_bytes(b"no archive")
     assert main(["classify", str(folders / "60"), *library]) != 0
-    assert PATCHES in capsys.readouterr().err
+    assert PATCHES_FILE in capsys.readouterr().err
 
 
 def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.materials.classify import DISCRIMINANT, PAPER, fit_weights
-from polysight.materials.discriminant import REJECTED, ErrorDiscriminant
+from polysight.materials.classify import DISCRIMINANT_MODEL, PAPER_MODEL, fit_weights
+from polysight.materials.discriminant import REJECTED_SHARE, ErrorDiscriminant
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.train import fit_samples, score, score_unseen_materials
 from polysight_shared.errors import ErrorCode
@@ -64,7 +64,7 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
 
 
 def test_a_phase_of_180_degrees_is_no_edge():
-    assert score(draw_pixels(2), DISCRIMINANT).patches == 1.0
+    assert score(draw_pixels(2), DISCRIMINANT_MODEL).patches == 1.0
 
 
 def test_a_patch_alone_is_named_as_before_and_scans_do_not_touch_each_other():
@@ -79,8 +79,8 @@ def test_a_patch_alone_is_named_as_before_and_scans_do_not_touch_each_other():
 
 
 def test_known_patches_are_called_unknown_at_the_stated_rate():
-    rates = [score(draw_pixels(seed, pixels=6), DISCRIMINANT).unknown for seed in range(12)]
-    assert np.mean(rates) == pytest.approx(REJECTED, abs=0.015)
+    rates = [score(draw_pixels(seed, pixels=6), DISCRIMINANT_MODEL).unknown for seed in range(12)]
+    assert np.mean(rates) == pytest.approx(REJECTED_SHARE, abs=0.015)
 
 
 def test_probabilities_mean_what_they_say():
@@ -99,7 +99,7 @@ def test_probabilities_mean_what_they_say():
 
 
 def test_a_material_that_was_never_learnt_is_unknown():
-    missed = score_unseen_materials(draw_pixels(4), DISCRIMINANT)
+    missed = score_unseen_materials(draw_pixels(4), DISCRIMINANT_MODEL)
     assert set(missed) == {f"m{i}" for i in range(5)}
     assert min(missed.values()) > 0.9
 
@@ -160,7 +160,7 @@ def test_two_angles_are_independent_and_tell_more():
     model = ErrorDiscriminant().fit(both_angles)
     for covariance in (model.scan, model.between, model.within):
         assert np.abs(covariance[:3, 3:]).max() < 1e-12
-    assert score(both_angles, DISCRIMINANT).pixels > score(first_angle, DISCRIMINANT).pixels
+    assert score(both_angles, DISCRIMINANT_MODEL).pixels > score(first_angle, DISCRIMINANT_MODEL).pixels
 
 
 def add_lonely_material(samples, scans=1):
@@ -171,7 +171,7 @@ def add_lonely_material(samples, scans=1):
     return together(samples, lonely_samples)
 
 
-@pytest.mark.parametrize("model", [DISCRIMINANT, PAPER])
+@pytest.mark.parametrize("model", [DISCRIMINANT_MODEL, PAPER_MODEL])
 def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
     """The material cannot be learnt from other scans: the accuracy is that of the others, and a note names it."""
     some = draw_pixels(12, scans=4, pixels=4)
@@ -201,11 +201,11 @@ def test_the_channels_alone_are_judged_on_the_same_materials():
 
 def test_a_material_of_two_scans_among_many_is_judged():
     """This holds for any split of the scans into folds."""
-    assert score(add_lonely_material(draw_pixels(13, scans=20, pixels=3), scans=2), DISCRIMINANT).not_judged == ()
+    assert score(add_lonely_material(draw_pixels(13, scans=20, pixels=3), scans=2), DISCRIMINANT_MODEL).not_judged == ()
 
 
 def test_scans_without_a_common_material_are_refused():
     samples = draw_pixels(14, scans=5)
     disjoint = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
-        score(disjoint, DISCRIMINANT)
+        score(disjoint, DISCRIMINANT_MODEL)

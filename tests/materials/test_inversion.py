@@ -12,8 +12,8 @@ from polysight.materials.kinds import (
     Kinds,
     PatchMeasurement,
     compute_probability_of_same_material,
+    find_permittivity_slope,
     list_literature_kinds,
-    permittivity_slope,
 )
 from polysight.materials.phase_sign import join_signs, mirror_phases
 from polysight.materials.result import ratio_error
@@ -94,7 +94,7 @@ def test_slope_is_the_derivative(tr, ti):
     t = complex(tr, ti)
     step = 1e-6
     by = (permittivity_from_ratio(t + step, THETA) - permittivity_from_ratio(t - step, THETA)) / (2 * step)
-    assert permittivity_slope(t, THETA) == pytest.approx(by, rel=1e-5, abs=1e-6)
+    assert find_permittivity_slope(t, THETA) == pytest.approx(by, rel=1e-5, abs=1e-6)
 
 
 def test_without_errors_the_truth_comes_back():

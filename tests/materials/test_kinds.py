@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from polysight.materials.kinds import HalfSpaces, Kinds, inverse_ratio, list_literature_kinds, permittivity_slope
+from polysight.materials.kinds import (
+    HalfSpaces,
+    Kinds,
+    find_permittivity_slope,
+    inverse_ratio,
+    list_literature_kinds,
+)
 from polysight.polarimetry import fresnel
 
 THETA = np.radians(55.0)
@@ -40,7 +46,9 @@ def test_materials_that_no_table_has_lie_near_those_that_one_has():
     """Per step of their coordinates they are several times rarer where no material was ever measured."""
     usual = KINDS.compute_half_space_density(inverse_ratio(np.array([2.5 - 0.02j]), THETA), 0.02**2 * np.eye(2))
     odd = KINDS.compute_half_space_density(inverse_ratio(np.array([2.5 - 4.0j]), THETA), 0.02**2 * np.eye(2))
-    slopes = [abs(complex(permittivity_slope(inverse_ratio(eps, THETA), THETA))) for eps in (2.5 - 0.02j, 2.5 - 4.0j)]
+    slopes = [
+        abs(complex(find_permittivity_slope(inverse_ratio(eps, THETA), THETA))) for eps in (2.5 - 0.02j, 2.5 - 4.0j)
+    ]
     # Densities of t become those of permittivities, and then of the coordinates: ln eps' and about ln eps''.
     per_cell = [float(usual[0]) / slopes[0] ** 2 * 0.06, float(odd[0]) / slopes[1] ** 2 * 4.0]
     assert per_cell[0] > 5 * per_cell[1]

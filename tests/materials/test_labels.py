@@ -7,7 +7,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight import materials
-from polysight.process import Inputs, boxes_as_patches
+from polysight.process import Inputs, convert_boxes_to_patches
 from polysight.settings import DEFAULT
 from polysight_shared.errors import ErrorCode
 
@@ -109,8 +109,10 @@ def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
     old = materials.read_labels(path)
     assert (old.unit, old.by_hand, old.metal) == ("pixel", False, None)
     assert old.is_metal("copper")
-    assert old.in_mm(X_M, Y_M).boxes["copper"] == pytest.approx(COPPER)
-    assert old.patches(X_M, Y_M)[0].patches[0].mask.sum() == old.in_mm(X_M, Y_M).patches(X_M, Y_M)[0].labels.sum()
+    assert old.convert_to_mm(X_M, Y_M).boxes["copper"] == pytest.approx(COPPER)
+    assert (
+        old.patches(X_M, Y_M)[0].patches[0].mask.sum() == old.convert_to_mm(X_M, Y_M).patches(X_M, Y_M)[0].labels.sum()
+    )
 
 
 @pytest.mark.parametrize(
@@ -126,9 +128,9 @@ def test_keys_of_another_form_are_refused(tmp_path, more):
 def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
     overlapping = materials.Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
     with refused(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
-        boxes_as_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
+        convert_boxes_to_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
     labels = materials.Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
-    drawn = boxes_as_patches(DEFAULT, Inputs(labels), X_M, Y_M)
+    drawn = convert_boxes_to_patches(DEFAULT, Inputs(labels), X_M, Y_M)
     assert (drawn.metal, drawn.names) == (1, {1: "tin", 2: "oak"})
 
 

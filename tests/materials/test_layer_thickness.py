@@ -11,7 +11,7 @@ from tests.support.rigs import published_rig
 from polysight import multilayer
 from polysight.cli.main import main
 from polysight.imaging import sub_bands
-from polysight.materials import METAL, Layer, parse_layer
+from polysight.materials import METAL_PERMITTIVITY, Layer, parse_layer
 from polysight.materials.layers import Bands, Spectrum, _Model, fit_layer, predict
 from polysight.materials.sub_bands import bands_of_row
 from polysight.results import NoResult, ScanMaterials
@@ -22,7 +22,7 @@ BANDS = Spectrum.from_chirp(CHIRP, 4)
 RANGE = (0.3e-3, 6e-3)
 NEAR = (1e-3, 2.4e-3)
 SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
-PLATE = Layer("plate", METAL)
+PLATE = Layer("plate", METAL_PERMITTIVITY)
 GLASS = Layer("glass", 5.5 - 0.05j, 2e-3)
 OWN = 3e-4
 COMMON = 3e-3
@@ -67,7 +67,7 @@ def test_permittivity_and_thickness_come_back(true, asked):
 
 
 def test_infinite_permittivity_is_metal_behind_a_layer():
-    r_s, r_p = multilayer([1.0, METAL], [1e-3], 77e9, THETA)
+    r_s, r_p = multilayer([1.0, METAL_PERMITTIVITY], [1e-3], 77e9, THETA)
     turned = np.exp(-2j * 2 * np.pi * 77e9 / 299792458.0 * 1e-3 * np.cos(THETA))
     np.testing.assert_allclose([r_s, r_p], -turned, rtol=1e-9)
 

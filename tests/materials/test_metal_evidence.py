@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from polysight.materials.analyse import most_like_metal
+from polysight.materials.analyse import find_most_like_metal
 from polysight.materials.inversion import RigPrior
 from polysight.materials.kinds import Kinds, PatchMeasurement, list_literature_kinds
 from polysight.materials.metal import MetalEvidence, log_evidence_of_dielectric, metal_evidence
@@ -112,13 +112,13 @@ def relative_to(label, bare, channel_ratio_db=-1.0, refused=()):
 def test_the_reference_is_the_best_shown_metal_of_those_that_may_be_one():
     brightest = relative_to(1, 5.0)
     bare = relative_to(2, 9.0)
-    assert most_like_metal([brightest, bare]).metal.label == 2
-    assert most_like_metal([bare, brightest]).metal.label == 2
-    assert most_like_metal([brightest, relative_to(2, 9.0, channel_ratio_db=-9.0)]).metal.label == 1
-    assert most_like_metal([brightest, relative_to(2, 9.0, refused=[2])]).metal.label == 1
-    assert most_like_metal([brightest, relative_to(2, 9.0, refused=[1])]).metal.label == 2
+    assert find_most_like_metal([brightest, bare]).metal.label == 2
+    assert find_most_like_metal([bare, brightest]).metal.label == 2
+    assert find_most_like_metal([brightest, relative_to(2, 9.0, channel_ratio_db=-9.0)]).metal.label == 1
+    assert find_most_like_metal([brightest, relative_to(2, 9.0, refused=[2])]).metal.label == 1
+    assert find_most_like_metal([brightest, relative_to(2, 9.0, refused=[1])]).metal.label == 2
     nothing_like_metal = [relative_to(1, 5.0, refused=[1, 2]), relative_to(2, 9.0, refused=[1, 2])]
-    assert most_like_metal(nothing_like_metal).metal.label == 1
+    assert find_most_like_metal(nothing_like_metal).metal.label == 1
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused
 
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, PaperKnn, Weights, _LeftOut, fit_weights
+from polysight.materials.classify import (
+    DISCRIMINANT_MODEL,
+    MODELS,
+    PAPER_MODEL,
+    PaperKnn,
+    Weights,
+    _LeftOut,
+    fit_weights,
+)
 from polysight.materials.library import CHANNELS, Model, Samples, feature_matrix, median_by_patch
 from polysight.materials.train import score, splits
 from polysight_shared.errors import ErrorCode
@@ -93,7 +101,7 @@ def test_scans_are_left_out_if_joined_ones_share_no_material():
     in_first = np.isin(data.groups, ["s0", "s1"])
     data = data.take(in_first == np.isin(data.names, ["m0", "m1"]))
     specimens = np.where(np.isin(data.groups, ["s0", "s1"]), "a", "b")
-    judged = score(replace(data, specimens=specimens), DISCRIMINANT)
+    judged = score(replace(data, specimens=specimens), DISCRIMINANT_MODEL)
     assert "4 scans" in judged.split
     assert np.isfinite([judged.pixels, judged.by_patch, judged.patches, judged.unknown]).all()
 
@@ -101,7 +109,7 @@ def test_scans_are_left_out_if_joined_ones_share_no_material():
 def test_the_split_by_pixel_does_straddle_and_says_so():
     data = samples(groups=5, pixels=7)
     assert all(set(data.patches[train]) & set(data.patches[test]) for train, test in splits(data, by_pixel=True))
-    assert "optimistic" in score(data, DISCRIMINANT, by_pixel=True).split
+    assert "optimistic" in score(data, DISCRIMINANT_MODEL, by_pixel=True).split
 
 
 def test_a_split_by_pixel_needs_two_pixels_of_a_material():
@@ -117,13 +125,13 @@ def test_a_split_by_pixel_needs_two_pixels_of_a_material():
 def test_a_split_by_pixel_flatters():
     """Common errors of a patch's pixels are memorised if its pixels are on both sides of the split."""
     data = samples(pixels=10, offset=0.03, noise=0.003)
-    assert score(data, PAPER, by_pixel=True).pixels > score(data, PAPER).pixels + 0.15
+    assert score(data, PAPER_MODEL, by_pixel=True).pixels > score(data, PAPER_MODEL).pixels + 0.15
 
 
 def test_order_does_not_matter():
     data = samples(groups=4, offset=0.02)
     shuffled = data.take(np.random.default_rng(5).permutation(data.names.size))
-    assert score(shuffled, DISCRIMINANT).pixels == pytest.approx(score(data, DISCRIMINANT).pixels, abs=1e-9)
+    assert score(shuffled, DISCRIMINANT_MODEL).pixels == pytest.approx(score(data, DISCRIMINANT_MODEL).pixels, abs=1e-9)
 
 
 def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
@@ -154,7 +162,7 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
 
 def test_a_second_angle_helps():
     """The KNN; the discriminant is in test_discriminant."""
-    model = PAPER
+    model = PAPER_MODEL
     first_angle = samples(groups=6, pixels=12, offset=0.02, seed=1)
     both_angles = first_angle.join(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
     assert both_angles.x.shape[1] == 2 * first_angle.x.shape[1]
@@ -182,8 +190,8 @@ def test_joining_angles_pairs_whole_patches():
 
 def test_channels_alone_know_less():
     data = samples(groups=4, offset=0.005)
-    together = score(data, DISCRIMINANT)
-    assert all(score(data, DISCRIMINANT, c).pixels <= together.pixels + 0.02 for c in CHANNELS)
+    together = score(data, DISCRIMINANT_MODEL)
+    assert all(score(data, DISCRIMINANT_MODEL, c).pixels <= together.pixels + 0.02 for c in CHANNELS)
     for table in (together.confusion, together.patch_confusion):
         assert table.shape == (6, 6)
         np.testing.assert_allclose(table.sum(axis=1), 1)
@@ -191,7 +199,7 @@ def test_channels_alone_know_less():
 
 def test_one_scan_is_refused():
     with refused(ErrorCode.NOT_ENOUGH_DATA):
-        score(samples(groups=1), PAPER)
+        score(samples(groups=1), PAPER_MODEL)
 
 
 def test_the_paper_s_distance_is_what_scikit_learn_votes_with():

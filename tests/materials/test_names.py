@@ -13,9 +13,9 @@ from polysight.materials.kinds import (
     Kinds,
     PatchDispersion,
     RatioEvidence,
+    compute_layer_odds,
     draw_sheets,
     inverse_ratio,
-    layer_odds,
     list_literature_kinds,
 )
 from polysight.materials.names import Odds, add_explanation, may_be_thin, name_patch, summarise_literature, weigh_kinds
@@ -162,22 +162,24 @@ def test_a_change_over_the_sweep_tells_layers_from_half_spaces():
         logs = [np.log(np.array(multilayer(*stack, centre_hz + part * width_hz, ANGLES[0]))) for part in (-0.05, 0.05)]
         of_s, of_p = (logs[1] - logs[0]) / 0.1
         change = np.array([of_s.real, (of_p - of_s).real, (of_p - of_s).imag])
-        layered.append(float(np.mean(layer_odds(dispersion(change), ANGLES[0]))))
+        layered.append(float(np.mean(compute_layer_odds(dispersion(change), ANGLES[0]))))
     assert np.median(layered) > 1e3
-    half_spaces = [float(np.mean(layer_odds(dispersion(x), ANGLES[0]))) for x in 0.01 * rng.standard_normal((100, 3))]
+    half_spaces = [
+        float(np.mean(compute_layer_odds(dispersion(x), ANGLES[0]))) for x in 0.01 * rng.standard_normal((100, 3))
+    ]
     assert np.median(half_spaces) < 0.1
     assert max(half_spaces) < 1
 
 
 def test_a_change_over_the_sweep_that_is_not_known_well_tells_nothing():
     for std in (30.0, 1e60):
-        unknown = layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
+        unknown = compute_layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
         assert np.median(unknown) == pytest.approx(1, abs=0.05)
 
 
 def test_a_change_of_any_size_has_finite_odds():
     for change in (0.0, 1.0, 1e3, 1e9):
-        odds = layer_odds(dispersion(np.full(3, change), std=0.006), ANGLES[0])
+        odds = compute_layer_odds(dispersion(np.full(3, change), std=0.006), ANGLES[0])
         assert np.isfinite(odds).all()
         assert (odds > 0).all()
 

@@ -10,9 +10,9 @@ from scipy import ndimage
 from polysight.imaging import Images
 from polysight.materials import common_change
 from polysight.materials.analyse import KnownScene, Optics, analyse
-from polysight.materials.common_change import _Explained, estimate_common_change
+from polysight.materials.common_change import _ExpectedFromSlopes, estimate_common_change
 from polysight.materials.measure import Scatter, median_ratio
-from polysight.materials.metal import find_halo, metal_by_label, metal_unevenness, to_metal
+from polysight.materials.metal import divide_by_reference, find_halo, metal_by_label, metal_unevenness
 from polysight.materials.segment import align, segment
 from polysight.polarimetry import calibrate as to_metal_by_paper
 
@@ -56,7 +56,7 @@ def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
     scene = dim_copper(*plates())
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     metal = metal_by_label(int(found.labels[30, 30]), found)
-    relative = to_metal(scene, metal, None)
+    relative = divide_by_reference(scene, metal, None)
     assert abs(median_ratio(relative.h[metal.mask], relative.v[metal.mask]) - 1) < 1e-4
     assert metal_unevenness(relative, metal.mask) > 0.01
     rms = to_metal_by_paper(scene, metal.mask)
@@ -70,7 +70,7 @@ def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
         known = KnownScene(segmentation=found, metal=int(found.labels[30, 30]))
         result = analyse(scene, Optics(np.radians(55.0)), known)
         errors.append(result.prior.reference_std)
-        uneven = metal_unevenness(to_metal(scene, result.metal, None), result.metal.mask)
+        uneven = metal_unevenness(divide_by_reference(scene, result.metal, None), result.metal.mask)
         assert errors[-1] >= 0.5 * uneven
     assert errors[1] > 1.5 * errors[0]
 
@@ -260,11 +260,11 @@ def test_a_plate_within_36_mm_of_the_metal_lies_in_its_halo_even_if_nothing_besi
     assert halo.around[2] == (halo.level if lies_in_halo else 0)
 
 
-def _explain_cases(mean: float, std: tuple[float, ...]) -> _Explained:
+def _explain_cases(mean: float, std: tuple[float, ...]) -> _ExpectedFromSlopes:
     """Return cases of one plate with this mean of drift and fringes, and these standard deviations."""
     square = np.array([[mean**2 + s**2] for s in std])
     mean_of_cases = np.full_like(square, mean)
-    return _Explained(
+    return _ExpectedFromSlopes(
         log_evidence=np.zeros(len(std)),
         mean=mean_of_cases,
         square=square,

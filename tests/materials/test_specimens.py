@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polysight.materials import MODELS, Classifier, Entry, Library, specimens
-from polysight.materials.classify import DISCRIMINANT
+from polysight.materials.classify import DISCRIMINANT_MODEL
 from polysight.materials.library import Samples, feature_matrix
 from polysight.materials.names import add_explanation
 from polysight.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative
@@ -53,7 +53,7 @@ def test_the_effect_of_a_specimen_is_what_eq_2_says():
 
 def test_the_spread_is_found():
     spreads = [
-        np.sqrt(MODELS[DISCRIMINANT]("H+V+P").fit(draw_pixels((0.03, 0.2), 40, seed)).spread) for seed in range(4)
+        np.sqrt(MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(draw_pixels((0.03, 0.2), 40, seed)).spread) for seed in range(4)
     ]
     assert np.mean([f[:, 0].mean() for f in spreads]) == pytest.approx(0.03, rel=0.15)
     assert np.mean([f[:, 1].mean() for f in spreads]) == pytest.approx(0.2, rel=0.2)
@@ -64,8 +64,8 @@ def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
     samples = draw_pixels((0.03, 0.2), 6)
     repeated = np.isin(samples.names, ["a", "b", "c"])
     once = ~repeated & (samples.groups == samples.groups[0])
-    alone = MODELS[DISCRIMINANT]("H+V+P").fit(samples.take(repeated))
-    beside = MODELS[DISCRIMINANT]("H+V+P").fit(samples.take(repeated | once))
+    alone = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples.take(repeated))
+    beside = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples.take(repeated | once))
     np.testing.assert_allclose(beside.spread[:3], alone.spread, rtol=1e-2)
     np.testing.assert_allclose(np.diag(beside.between), np.diag(alone.between), rtol=1e-2)
 
@@ -73,7 +73,7 @@ def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
 def test_without_specimens_apart_the_published_spread_stands():
     samples = draw_pixels((0.0, 0.0), 6, labelled=False)
     np.testing.assert_allclose(
-        MODELS[DISCRIMINANT]("H+V+P").fit(samples).spread, [np.square(PUBLISHED_SPREAD)] * len(KINDS)
+        MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples).spread, [np.square(PUBLISHED_SPREAD)] * len(KINDS)
     )
 
 
@@ -94,7 +94,7 @@ def test_the_order_of_patches_does_not_matter_to_the_spread():
 
 def test_probabilities_mean_what_they_say_of_specimens_never_seen():
     close = {"a": 4.0 - 0.4j, "b": 4.2 - 0.45j, "c": 4.45 - 0.6j, "d": 4.7 - 0.7j}
-    model = MODELS[DISCRIMINANT]("H+V+P").fit(draw_pixels((0.03, 0.15), 40, 1, kinds=close))
+    model = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(draw_pixels((0.03, 0.15), 40, 1, kinds=close))
     sure = []
     right = []
     for seed in range(40):
@@ -149,7 +149,7 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
     monkeypatch.setattr(specimens, "OWN_FREEDOM", own)
     liquids = groups()["liquids"].materials
     errors = Errors(0.00356, 0.022, spread=(0.05, 0.2))
-    model = MODELS[DISCRIMINANT]("H+V+P").fit(draw(liquids, 55.0, errors, 43, 8).samples())
+    model = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(draw(liquids, 55.0, errors, 43, 8).samples())
     test = draw(liquids, 55.0, errors, 500, 12).samples()
     rejected = []
     for scan in np.unique(test.groups):

@@ -84,9 +84,9 @@ def test_boxes_drawn_over_what_is_not_valid_count_only_where_it_is(scene, analys
     cut = replace(scene, h=np.where(valid, scene.h, 0), v=np.where(valid, scene.v, 0))
     label = analysis.metal.label
     full_result = scene.analyse(
-        metal=label, segmentation=analysis.segmentation, pair=scene.pair.within(np.ones_like(valid))
+        metal=label, segmentation=analysis.segmentation, pair=scene.pair.limit_to_area(np.ones_like(valid))
     )
-    part = cut.analyse(metal=label, segmentation=analysis.segmentation, pair=cut.pair.within(valid))
+    part = cut.analyse(metal=label, segmentation=analysis.segmentation, pair=cut.pair.limit_to_area(valid))
     for row_before, row_after in zip(full_result.rows(), part.rows(), strict=True):
         assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 

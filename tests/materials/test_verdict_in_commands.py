@@ -9,7 +9,7 @@ import pytest
 from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
 
 from polysight.cli.main import main
-from polysight.materials import PATCHES
+from polysight.materials import PATCHES_FILE
 from polysight.materials.result import PATCHES_FORMAT
 from polysight.results import NoResult
 from polysight.results.verdict import LEVELS
@@ -30,7 +30,7 @@ def with_pixels(folder: Path) -> Path:
         places_mm=places.astype(np.float32),
         features=features.astype(np.float32),
     )
-    (folder / PATCHES).write_bytes(out.getvalue())
+    (folder / PATCHES_FILE).write_bytes(out.getvalue())
     return folder
 
 

@@ -5,7 +5,7 @@ from msgspec import structs
 from tests.support.page.live_view import add_fact, begin_history
 from tests.support.store.facts import load_facts
 
-from polysight.page.history import seconds
+from polysight.page.history import parse_seconds
 from polysight.page.status import estimate_time_left
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, ScanFolder
@@ -77,17 +77,17 @@ def test_a_fault_told_twice_is_one(finished):
 
 def test_time_left_is_what_rows_took(begun):
     history, last = begun
-    now = seconds(UTC.format(2, 20))
+    now = parse_seconds(UTC.format(2, 20))
     assert estimate_time_left(history, now) == (40, "measured")
     add_fact(history, last | {"committed_utc": UTC.format(3, 0)})
-    assert estimate_time_left(history, seconds(UTC.format(9, 0))) == (0, "measured")
+    assert estimate_time_left(history, parse_seconds(UTC.format(9, 0))) == (0, "measured")
 
 
 def test_a_pause_is_no_time_of_a_row(begun):
     history, last = begun
     add_fact(history, {"fact": "scan_paused", "paused_utc": UTC.format(2, 0)})
     assert history.paused
-    assert estimate_time_left(history, seconds(UTC.format(30, 0))) == (60, "measured")
+    assert estimate_time_left(history, parse_seconds(UTC.format(30, 0))) == (60, "measured")
     add_fact(history, {"fact": "scan_continued", "continued_utc": UTC.format(40, 0)})
     assert not history.paused
     add_fact(history, last | {"committed_utc": UTC.format(41, 0)})

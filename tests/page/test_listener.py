@@ -13,7 +13,7 @@ from zmq.utils.monitor import recv_monitor_message
 from polysight.page.watch import PiListener
 from polysight_shared import messages as m
 from polysight_shared.raster import plan_raster
-from polysight_shared.sockets import EVENT_TOPIC, make_server_context, observer, publisher
+from polysight_shared.sockets import EVENT_TOPIC, create_observer, create_publisher, make_server_context
 
 RIG = published_rig()
 OF = {"scan_id": "mine", "t_mono_ns": 1}
@@ -23,7 +23,7 @@ OF = {"scan_id": "mine", "t_mono_ns": 1}
 def pi(tmp_path):
     """The events' socket of a Pi, and its listener."""
     context = make_server_context()
-    events = publisher(context, "tcp://127.0.0.1:*", tmp_path)
+    events = create_publisher(context, "tcp://127.0.0.1:*", tmp_path)
     address = events.getsockopt_string(zmq.LAST_ENDPOINT)
     # No Pi could answer there
     addresses = {"event_address": address, "command_address": "tcp://127.0.0.1:1"}
@@ -90,20 +90,20 @@ def test_words_of_strangers_are_named_and_survived(pi):
     tell, listener = pi
     state_before = listener.state
     listener._receive(b"\xc1 no message")
-    assert listener.state.deaf is not None
-    assert listener.state.deaf.do or listener.state.deaf.why
+    assert listener.state.receive_error is not None
+    assert listener.state.receive_error.do or listener.state.receive_error.why
     assert (listener.state.row, listener.state.state) == (state_before.row, state_before.state)
     tell(m.Heartbeat(**OF, seq=0, state="idle", period_ms=100))
     wait_for(lambda: listener.state.state == "idle", "the next event")
-    assert listener.state.deaf is None
+    assert listener.state.receive_error is None
 
 
 def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
     elsewhere = {"event_address": "tcp://192.0.2.1:5602", "key_dir": str(tmp_path)}
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **elsewhere))
     listener = PiListener(instrument, "mine")
-    wait_for(lambda: listener.state.deaf, "why nothing is heard")
-    assert str(tmp_path) in listener.state.deaf.do, "where they belong"
+    wait_for(lambda: listener.state.receive_error, "why nothing is heard")
+    assert str(tmp_path) in listener.state.receive_error.do, "where they belong"
     listener.close()
 
 
@@ -114,7 +114,7 @@ def test_the_pi_forgets_a_view_that_hangs(tmp_path):
     """The queue for that subscriber is limited. A relay passes the bytes until the view should hang."""
     server_context = make_server_context()
     view_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    events = publisher(server_context, "tcp://127.0.0.1:*", tmp_path)
+    events = create_publisher(server_context, "tcp://127.0.0.1:*", tmp_path)
     monitor = events.get_monitor_socket()
     port = int(events.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
@@ -125,7 +125,7 @@ def test_the_pi_forgets_a_view_that_hangs(tmp_path):
     try:
         with socket.create_server(("127.0.0.1", 0)) as listener:
             address = f"tcp://127.0.0.1:{listener.getsockname()[1]}"
-            view_socket = observer(view_context, address, tmp_path)
+            view_socket = create_observer(view_context, address, tmp_path)
             view, _ = listener.accept()
             with view, socket.create_connection(("127.0.0.1", port)) as pi:
                 received = b""

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.image import imread
 from tests.support.rigs import published_rig
 
-from polysight.catalogue import PHASE, colour_bar, draw
+from polysight.catalogue import PHASE_COLOURS, colour_bar, draw
 from polysight.imaging import Images
 from polysight.page.watch import range_profile_db
 from polysight.sync import SyncedRow
@@ -57,7 +57,7 @@ def test_phase_is_cyclic_and_comes_round(images):
     row = pixels(draw(replace(images, h=turned))["h_phase"].png)[0, :, :3]
     assert np.abs(row[0] - row[-1]).max() < 0.02
     assert np.abs(row[0] - row[NX // 2]).max() > 0.3
-    ends = pixels(colour_bar(PHASE))[0]
+    ends = pixels(colour_bar(PHASE_COLOURS))[0]
     assert np.abs(ends[0] - ends[-1]).max() < 0.02
 
 

@@ -9,9 +9,9 @@ from tests.support.page.live_view import add_fact, begin_history
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition import STATES
-from polysight.acquisition.control import Life
+from polysight.acquisition.control import SignOfLife
 from polysight.catalogue import Program
-from polysight.page.history import PiState, notice_of_fault
+from polysight.page.history import PiState, make_fault_notice
 from polysight.page.status import Inputs, LifeSigns, RowSync, ShownResults, judge, make_snapshot
 from polysight.results import Verdict
 from polysight_shared.faults import EXPLANATIONS, PiFault
@@ -19,7 +19,7 @@ from polysight_shared.findings import Finding
 from polysight_shared.messages import Fault
 
 FOLDER = Path("scans/one")
-LIVELY = LifeSigns(life=Life(), alive=True, killed=False, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
+LIVELY = LifeSigns(life=SignOfLife(), alive=True, killed=False, alive_s=0, pi_silent_s=0.3, pi_limit_s=6.0, now_s=1.8e9)
 RUNNING = PiState(heard_s=1.0, state="running", row=1, take=1)
 ROW = {"fact": "row_committed", "take": 2, "direction": 1, "pulses": 0, "boards": {}}
 REJECTED = {"fact": "row_rejected", "row": 1, "take": 1, "reasons": ["RV: no data"], "boards": {}}
@@ -40,7 +40,7 @@ def status(history, signs=LIVELY, heard=RUNNING, shown=ShownResults(), **more): 
 
 
 def make_signs(command, doing="rows"):
-    return replace(LIVELY, life=Life(asked=command, asker="the page", doing=doing))
+    return replace(LIVELY, life=SignOfLife(asked=command, asker="the page", doing=doing))
 
 
 def test_all_is_well_needs_nothing_done(history):
@@ -109,7 +109,7 @@ def test_trouble_says_why_and_what_to_do(history, signs, heard, word):
 
 @pytest.mark.parametrize("number", sorted(EXPLANATIONS))
 def test_every_fault_of_the_pi_has_words(history, number):
-    notice = notice_of_fault(
+    notice = make_fault_notice(
         Fault(scan_id="s", seq=1, t_mono_ns=1, number=number, problem=EXPLANATIONS[number].problem)
     )
     assert notice.what
@@ -160,7 +160,7 @@ def test_an_abort_is_no_fault(history):
     """There is no such notice in the row that it ends, at the Pi, or when the scan has ended."""
     aborted = REJECTED | {"faults": [{"kind": "on_request"}]}
     add_fact(history, aborted)
-    fault = notice_of_fault(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, problem="aborted"))
+    fault = make_fault_notice(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, problem="aborted"))
     history.notices.append(fault)
     stopped = replace(RUNNING, state="fault", faults=(fault,))
     assert status(history, make_signs("abort"), stopped).key == "aborting"

@@ -14,7 +14,7 @@ from tests.support.processes import wait_for
 from tests.support.products import REASON, judged_products
 from tests.support.store.facts import parse_fact
 
-from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
+from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, SignOfLife, read_start_ticks
 from polysight.page.watch import EventTail, ManifestTail, Motion, ProductsTail, Versioned, Watch, draw
 from polysight.pipeline import Pipeline
 from polysight.products import SCAN, write_json
@@ -89,7 +89,7 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     assert answer(watch)["status"]["level"] == "good"
     growing.grow_until("scan_ended")
     watch.wait_for(lambda s: s["status"]["key"] == "finishing")
-    shutil.rmtree(growing.path / CONTROL)
+    shutil.rmtree(growing.path / CONTROL_FOLDER)
     watch.wait_for(lambda s: s["status"]["level"] == "done")
 
 
@@ -97,26 +97,26 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
     watch = watching(growing.path, lapse_s=2.0)
     growing.grow_until("row_committed")
 
-    def lives() -> bool:
+    def is_alive() -> bool:
         growing.live()
         state = answer(watch)
         return state["status"]["level"] == "good" and state["running"]
 
-    wait_for(lives, "that it lives")
+    wait_for(is_alive, "that it lives")
     watch.wait_for(lambda s: s["status"]["key"] in ("frozen", "killed"))
     state = answer(watch)
     assert not state["running"]
     assert "polysight resume" in state["status"]["do"]
     wait_for(lambda: json.loads(watch.motion.data)["left_s"] is None, "that no time is left")
-    wait_for(lives, "that it lives again")
+    wait_for(is_alive, "that it lives again")
 
 
 def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, watching):
     growing.grow_until("row_committed")
     program = subprocess.Popen(["sleep", "600"])
-    life = Life(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
+    life = SignOfLife(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
     growing.live()
-    (growing.path / CONTROL / ALIVE).write_bytes(msgspec.json.encode(life))
+    (growing.path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(msgspec.json.encode(life))
     watch = watching(growing.path, lapse_s=1e6)
     watch.wait_for(lambda s: s["running"])
     program.kill()

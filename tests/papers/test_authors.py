@@ -111,7 +111,7 @@ def out(dataset, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         # Few pixels and weights: the page is tested, not the classifier
         patch.setattr(authors_items, "JUDGED_PIXELS", 240)
-        patch.setattr(classify, "GRID", (1.0,))
+        patch.setattr(classify, "WEIGHT_GRID", (1.0,))
         assert main(["reproduce", "--authors", str(dataset), "--out", str(folder)]) == 0
     return folder
 
@@ -283,7 +283,7 @@ def test_the_recipe_takes_out_only_leakage_that_is_there(dataset, source):
 
 
 def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(classify, "GRID", (1.0,))
+    monkeypatch.setattr(classify, "WEIGHT_GRID", (1.0,))
     out = tmp_path / "library.npz"
     assert main(["train", "--authors", str(dataset), "--out", str(out)]) == 0
     library = Library.load(out)
@@ -306,7 +306,7 @@ def test_a_library_is_made_of_both_sources_without_leakage(dataset, tmp_path, ca
 
 def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, capsys, monkeypatch):
     """Metal is the reference of both scans, so that its recognition is not a result."""
-    monkeypatch.setattr(classify, "GRID", (1.0,))
+    monkeypatch.setattr(classify, "WEIGHT_GRID", (1.0,))
     for k, material_index in enumerate((3, 12)):
         for number in (1, material_index):
             write_material(
@@ -341,7 +341,7 @@ def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, caps
 @pytest.mark.parametrize("make", [authors_items.authors_fig18, authors_fig20])
 def test_few_scans_of_few_pixels_give_figures_or_are_refused(tmp_path, monkeypatch, stand, make):
     monkeypatch.setattr(authors_items, "JUDGED_PIXELS", 240)
-    monkeypatch.setattr(classify, "GRID", (1.0,))
+    monkeypatch.setattr(classify, "WEIGHT_GRID", (1.0,))
     for seed in range(3):
         folder = tmp_path / f"{seed}" / "materials"
         for k, boxes in enumerate(stand):

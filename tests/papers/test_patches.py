@@ -5,7 +5,7 @@ import inspect
 import numpy as np
 import pytest
 
-from polysight.materials.classify import DISCRIMINANT, PAPER
+from polysight.materials.classify import DISCRIMINANT_MODEL, PAPER_MODEL
 from polysight.materials.train import score
 from polysight.polarimetry import fresnel, permittivity_from_ratio
 from polysight_papers.sensys2026 import patches
@@ -66,21 +66,21 @@ def test_the_phase_error_is_the_published_residual_and_only_h_is_used(monkeypatc
     monkeypatch.setattr(patches, "score", spy)
     errors = inspect.unwrap(calibrated_errors)("powders", 1)
     assert errors.phase_rad == 0.022
-    assert set(calls) == {(PAPER, "H", True)}
+    assert set(calls) == {(PAPER_MODEL, "H", True)}
 
 
 def test_v_and_p_add_to_what_h_tells():
     group = groups()["powders"]
     samples_drawn = draw(group.materials, group.angle_deg, calibrated_errors("powders", 1), seed=3).samples()
-    h = score(samples_drawn, PAPER, "H").pixels
-    all_three = score(samples_drawn, PAPER, "H+V+P").pixels
+    h = score(samples_drawn, PAPER_MODEL, "H").pixels
+    all_three = score(samples_drawn, PAPER_MODEL, "H+V+P").pixels
     assert all_three > h + 0.2
 
 
 def test_no_classifier_passes_the_bound_and_the_better_one_comes_near():
     group = groups()["powders"]
     errors = Errors(0.03, 0.06)
-    scores = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT) for seed in range(12)]
+    scores = [score(draw(group.materials, 60.0, errors, seed).samples(), DISCRIMINANT_MODEL) for seed in range(12)]
     alone = pixel_bound(group.materials, (60.0,), errors, True, 1)
     pixel_limit = pixel_bound(group.materials, (60.0,), errors, False, 1)
     patch = pixel_bound(group.materials, (60.0,), errors, False, 12)
@@ -106,7 +106,7 @@ def test_confusions_stand_in_the_order_of_table_2():
     from polysight_papers.sensys2026.classification import confusion_figure
 
     group = groups()["powders"]
-    scores = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT)
+    scores = score(draw(group.materials, 60.0, Errors(0.03, 0.06), 0).samples(), DISCRIMINANT_MODEL)
     figure = confusion_figure(group.materials, scores, scores)
     labels = [t.get_text() for t in figure.axes[0].get_xticklabels()]
     assert labels == [str(m.number) for m in group.materials]

@@ -13,14 +13,14 @@ from tests.support.pi.program import run
 from tests.support.refusals import refused
 
 from polysight_pi import checks, lines as pi_lines
-from polysight_pi.checks import attempt, check_lines, judge_widths, measure_clock
+from polysight_pi.checks import check_lines, judge_widths, measure_clock, run_check
 from polysight_pi.keys import make_keys
 from polysight_pi.lines import GpiodLines, find_chip, open_lines
 from polysight_pi.trigger import BurstSpec, send_burst
 from polysight_shared.config import Instrument, Pi
 from polysight_shared.errors import ErrorCode
 from polysight_shared.findings import Finding
-from polysight_shared.sockets import publisher, replier
+from polysight_shared.sockets import create_publisher, create_replier
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators import gpio
 
@@ -37,7 +37,7 @@ def rig_with(gpio_rig):
 @pytest.fixture
 def on_chip(write_config, stage, tmp_path):
     """Findings, by name, of the command on a stand-in chip with faults."""
-    if lacking := gpio.missing():
+    if lacking := gpio.list_missing_packages():
         pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}")
 
     def check(rig, *faults, port=None):
@@ -122,41 +122,41 @@ def test_one_pulse_too_long_refuses_a_line_without_a_one_shot():
 
 def test_spi_that_is_off_has_its_remedy(rig_with, tmp_path):
     rig_without_spi = rig_with(wiring="spi", sync_out=(10,), spi_device=str(tmp_path / "spidev0.0"))
-    finding = attempt("pulse width", measure_clock, rig_without_spi)
+    finding = run_check("pulse width", measure_clock, rig_without_spi)
     assert (finding.level, "dtparam=spi=on" in finding.do) == ("error", True)
 
 
 def test_journal_and_disk(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
-    assert attempt("journal", checks._check_journal, tmp_path / "file" / "journal", 0).level == "error"
+    assert run_check("journal", checks._check_journal, tmp_path / "file" / "journal", 0).level == "error"
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(100, 99, 1 << 20))
-    finding = attempt("journal", checks._check_journal, tmp_path, checks.JOURNAL_BYTES)
+    finding = run_check("journal", checks._check_journal, tmp_path, checks.JOURNAL_BYTES)
     assert (finding.level, "1 MiB" in finding.what, "100 MiB" in finding.what) == ("error", True, True)
 
 
 def test_keys(tmp_path):
     folder = tmp_path / "keys"
     addresses = ("tcp://127.0.0.1:1", "tcp://0.0.0.0:2")
-    assert attempt("keys", checks._check_keys, folder, addresses[:1]).level == "ok"
-    finding = attempt("keys", checks._check_keys, folder, addresses)
+    assert run_check("keys", checks._check_keys, folder, addresses[:1]).level == "ok"
+    finding = run_check("keys", checks._check_keys, folder, addresses)
     assert (finding.level, finding.do) == ("error", "polysight-pi keys")
     make_keys(folder)
-    assert attempt("keys", checks._check_keys, folder, addresses).level == "ok"
+    assert run_check("keys", checks._check_keys, folder, addresses).level == "ok"
     (folder / "pi.key_secret").chmod(0o644)
-    finding = attempt("keys", checks._check_keys, folder, addresses)
+    finding = run_check("keys", checks._check_keys, folder, addresses)
     assert (finding.level, "chmod 600" in finding.do) == ("warning", True)
 
 
 def test_addresses_and_bursts(tmp_path, gpio_rig):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        assert attempt("command address", checks._check_address, replier, address, tmp_path).level == "error"
-    finding = attempt("event address", checks._check_address, publisher, "tcp://0.0.0.0:*", tmp_path)
+        assert run_check("command address", checks._check_address, create_replier, address, tmp_path).level == "error"
+    finding = run_check("event address", checks._check_address, create_publisher, "tcp://0.0.0.0:*", tmp_path)
     assert (finding.level, "polysight-pi keys" in finding.do) == ("error", True)
-    assert attempt("event address", checks._check_address, publisher, "tcp//x", tmp_path).level == "error"
+    assert run_check("event address", checks._check_address, create_publisher, "tcp//x", tmp_path).level == "error"
     slow = replace(gpio_rig, burst=replace(gpio_rig.burst, pulses=100))
-    assert attempt("plan", checks._check_plan, slow).level == "error", "the burst does not end before the next point"
+    assert run_check("plan", checks._check_plan, slow).level == "error", "the burst does not end before the next point"
 
 
 # <linux/gpio.h>: _IOWR(0xB4, 0x0F, two 64-bit words)

@@ -21,7 +21,7 @@ from tests.support.pi.program import WiresLog, require_stand_in_chip, run
 from tests.support.processes import wait_for
 from tests.support.rigs import timed_by_spi
 
-from polysight_pi.system import OTHERS_PRIORITY, PRIORITY
+from polysight_pi.system import OTHERS_PRIORITY, TRIGGER_PRIORITY
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
 from polysight_shared.wires import WireEdge
@@ -131,7 +131,7 @@ def test_an_edge_during_a_burst_ends_the_row_alone(long_bursts, in_row, wires):
 def test_a_chip_that_vanishes_is_fault_107(long_bursts, in_row, wires):
     program, host = in_row(long_bursts)
     host.wait(m.Capture)
-    program.popen.send_signal(gpio.VANISH)
+    program.popen.send_signal(gpio.VANISH_SIGNAL)
     report = host.wait(m.RowFinished)
     assert (report.status, report.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
     assert "No such device" in host.until_state("fault").reason
@@ -339,9 +339,9 @@ def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig)
         pytest.skip("SCHED_FIFO is not permitted here: run as root, or with RLIMIT_RTPRIO")
     program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))
     # `ready` comes before the threads.
-    wait_for(lambda: PRIORITY in priorities(program.popen.pid), "the trigger thread")
+    wait_for(lambda: TRIGGER_PRIORITY in priorities(program.popen.pid), "the trigger thread")
     thread_priorities = priorities(program.popen.pid)
-    assert thread_priorities.count(PRIORITY) == 1
+    assert thread_priorities.count(TRIGGER_PRIORITY) == 1
     # Main, stage, executor
     assert thread_priorities.count(OTHERS_PRIORITY) >= 3
     assert "real-time" not in program.end()[2]

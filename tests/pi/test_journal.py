@@ -14,7 +14,7 @@ from polysight_pi import journal as journal_module
 from polysight_pi.client import replay_events
 from polysight_pi.journal import (
     CAPTURE_BYTES,
-    DAMAGED,
+    DAMAGED_SUFFIX,
     MAGIC,
     SPARE_BYTES,
     Journal,
@@ -184,7 +184,7 @@ def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
         raw[position] ^= 1
         path.write_bytes(raw)
         j = JournalFile(path)
-        copy = path.with_name(path.name + DAMAGED + number)
+        copy = path.with_name(path.name + DAMAGED_SUFFIX + number)
         assert (j.last_seq, j.read(1, 9), copy.read_bytes()) == (1, [b"one"], bytes(raw))
         assert str(copy) in j.damage
         j.close()
@@ -201,7 +201,7 @@ def test_a_torn_tail_is_not_damage(tmp_path_factory, records, data):
     j = JournalFile(path)
     assert j.damage == ""
     j.close()
-    assert not list(path.parent.glob("*" + DAMAGED + "*"))
+    assert not list(path.parent.glob("*" + DAMAGED_SUFFIX + "*"))
 
 
 def test_a_damaged_journal_is_logged(tmp_path):
@@ -215,7 +215,7 @@ def test_a_damaged_journal_is_logged(tmp_path):
     journal = Journal(tmp_path, warn=said.append)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
     assert len(said) == 1, "the log has a line of it"
-    assert DAMAGED in said[0]
+    assert DAMAGED_SUFFIX in said[0]
     journal.close()
 
 

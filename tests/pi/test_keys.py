@@ -15,15 +15,15 @@ from zmq.auth import load_certificate
 
 from polysight.acquisition.pi_client import PiClient
 from polysight_pi import checks
-from polysight_pi.checks import attempt
+from polysight_pi.checks import run_check
 from polysight_pi.cli import main
-from polysight_pi.keys import allow, make_keys, read_allowed, revoke
+from polysight_pi.keys import allow_client, make_keys, read_allowed, revoke_client
 from polysight_pi.service import Server
 from polysight_shared import messages as m
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.faults import PiFault
-from polysight_shared.sockets import HOST_KEYS, HandshakeMonitor, requester
+from polysight_shared.sockets import HOST_KEYS, HandshakeMonitor, create_requester
 from polysight_shared.tables import decode, to_builtins
 
 ELSEWHERE = "tcp://192.0.2.1:5601"
@@ -116,7 +116,7 @@ def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, which):
 def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi, make_client):
     """The client's next command is refused although it is connected, and it cannot connect again."""
     keys = tmp_path / "keys"
-    public, secret = allow(keys, "laptop")
+    public, secret = allow_client(keys, "laptop")
     assert secret.stat().st_mode & 0o077 == 0
     assert set(read_allowed(keys).values()) == {"host", "laptop"}
     clients = {
@@ -130,7 +130,7 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi
         return m.unpack_reply(clients[name][0].recv())
 
     assert [type(ask(name)) for name in clients] == [m.HelloReply, m.HelloReply]
-    revoke(keys, "laptop")
+    revoke_client(keys, "laptop")
     reply = ask("laptop")
     assert isinstance(reply, m.Refused)
     assert reply.number == PiFault.NOT_OWNER
@@ -139,9 +139,9 @@ def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi
     old_client.send(m.pack(m.Hello()))
     wait_for(refused, "the refusal")
     with expect_refused(ErrorCode.KEY_UNKNOWN, "laptop"):
-        revoke(keys, "laptop")
+        revoke_client(keys, "laptop")
     with expect_refused(ErrorCode.NAME_TAKEN, "host"):
-        allow(keys, "host")
+        allow_client(keys, "host")
     assert public.is_file()
 
 
@@ -199,7 +199,7 @@ def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served_pi, context)
         shutil.copy(tmp_path / "keys" / name, tmp_path / "host")
     port = served_pi.command_address.rpartition(":")[2]
     # The kernel takes any of this machine's own addresses; 0.0.0.0 is not one of the loopback addresses.
-    client = requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
+    client = create_requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
     client.send(m.pack(m.Hello()))
     assert client.poll(HANG_S * 1e3)
     client.close()
@@ -235,6 +235,6 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
     messages = capsys.readouterr().err
     assert "Permission denied" in messages
     assert "sudo -u polysight" in messages
-    finding = attempt("keys", checks._check_keys, config.parent / "keys", (ELSEWHERE,))
+    finding = run_check("keys", checks._check_keys, config.parent / "keys", (ELSEWHERE,))
     assert (finding.level, "sudo -u polysight" in finding.do) == ("error", True)
     assert "pi.key_secret: Permission denied" in finding.what

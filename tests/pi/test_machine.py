@@ -210,7 +210,7 @@ def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat
         t += watch.look_s
         if answers and answers[0] <= t:
             answers.pop(0)
-            watch.heard()
+            watch.note_answer()
         elif watch.silent_s(t):
             break
         if watch.is_due(t) and t + answer_s < dead_s:

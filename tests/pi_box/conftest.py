@@ -16,7 +16,7 @@ from tests.pi_box.uno import Uno
 from tests.support.pi.host_side import HostSide
 
 from polysight_shared.tables import to_builtins
-from polysight_simulators.uno import ENABLING_COMMAND, missing
+from polysight_simulators.uno import ENABLING_COMMAND, list_missing_packages
 
 HERE = Path(__file__).parent
 
@@ -26,7 +26,7 @@ def image(request: pytest.FixtureRequest) -> Path:
     """Folder with the card's image and the kernel."""
     if not request.config.getoption("--pi-box"):
         pytest.skip("not asked for: `make test-pi` builds a Debian for a Pi (10 minutes, once) and runs these too")
-    if lacking := missing():
+    if lacking := list_missing_packages():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
     if shutil.which("qemu-system-aarch64") is None:
         pytest.skip("no QEMU: `sudo apt-get install qemu-system-arm` runs these tests too")

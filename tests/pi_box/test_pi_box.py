@@ -18,7 +18,7 @@ from tests.support.rigs import at_stage_port, published_rig, timed_by_spi
 
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
-from polysight_shared.sockets import HandshakeMonitor, requester
+from polysight_shared.sockets import HandshakeMonitor, create_requester
 
 SYNC_OUT = 22
 INPUT = 0
@@ -93,7 +93,7 @@ def test_a_host_with_the_keys_is_answered_and_one_without_is_refused(pi: Install
     pi.box.run(f"sudo -u polysight {PROGRAM} keys --dir /etc/polysight/keys --client second")
     pi.fetch_keys(tmp_path / "second", "second")
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    second = requester(context, pi.addresses()[0], tmp_path / "second")
+    second = create_requester(context, pi.addresses()[0], tmp_path / "second")
     second.send(m.pack(m.Hello()))
     assert second.poll(60_000)
     assert isinstance(m.unpack_reply(second.recv()), m.HelloReply)
@@ -103,7 +103,7 @@ def test_a_host_with_the_keys_is_answered_and_one_without_is_refused(pi: Install
     refused = m.unpack_reply(second.recv())
     assert isinstance(refused, m.Refused)
     assert refused.number == PiFault.NOT_OWNER
-    stranger = requester(context, pi.addresses()[0], tmp_path / "second")
+    stranger = create_requester(context, pi.addresses()[0], tmp_path / "second")
     refusals = HandshakeMonitor(stranger)
     pi.box.wait(refusals.is_refused, "a revoked key is refused at the door", 60)
     refusals.close()

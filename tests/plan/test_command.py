@@ -13,7 +13,7 @@ from tests.support.scenes import EVERYWHERE, make_scene
 from tests.support.store.facts import load_facts
 
 from polysight.cli.main import main
-from polysight.planning import Changes, row_motion_s
+from polysight.planning import PlanChanges, row_motion_s
 from polysight.planning.forecast import tail_s, turn_s
 from polysight.planning.plan_command import measure_noise
 from polysight.store import manifest
@@ -136,7 +136,7 @@ def scan(rig, tmp_path_factory):
     """A scan of known noise, made without a Pi."""
     folder = tmp_path_factory.mktemp("like") / "scan"
     scene = decode_scene({"name": "quiet", "disturbances": {"ideal": True, "direct_snr_db": SNR_DB}}, "test")
-    return simulate(Changes(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig), scene, folder)
+    return simulate(PlanChanges(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig), scene, folder)
 
 
 def add_events_of_a_pi(scan, rig, gap_s: float) -> None:
@@ -148,7 +148,7 @@ def add_events_of_a_pi(scan, rig, gap_s: float) -> None:
     events = EventWriter(scan / EVENTS)
     t = 0.0
     seq = 0
-    for row in plan_raster(Changes(columns=COLUMNS, rows=ROWS).apply(rig).grid):
+    for row in plan_raster(PlanChanges(columns=COLUMNS, rows=ROWS).apply(rig).grid):
         for point in range(row.points):
             seq = seq + 1
             ns = round(t * 1e9)
@@ -182,7 +182,7 @@ def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, read_plan):
     assert "simulated scan quiet" in same_plan["noise_source"]
     assert abs(without["position_snr_db"] - same_plan["position_snr_db"]) > 5
     assert same_plan["time_s"]["standstill"] == without["time_s"]["standstill"]  # without a Pi there are no times
-    small = Changes(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig)
+    small = PlanChanges(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig)
     grid = small.grid
     stage = small.stage
     ramps_s = row_motion_s(grid, stage) - (COLUMNS - 1) * grid.step_x_mm / stage.speed_mm_s

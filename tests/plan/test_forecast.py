@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from tests.support.refusals import refused
 
-from polysight.imaging import ImageBuilder, PhaseSlope, backproject, field_limits
+from polysight.imaging import ImageBuilder, PhaseSlope, backproject, compute_field_limits
 from polysight.imaging.geometry import Antennas
-from polysight.imaging.resolution import board_facts
-from polysight.planning import Changes, Noise, forecast, propose
+from polysight.imaging.resolution import describe_board
+from polysight.planning import Noise, PlanChanges, forecast, propose
 from polysight.planning.forecast import (
     describe_aperture,
     fills_whole_packets,
@@ -24,16 +24,18 @@ from polysight_shared.geometry import specular_midpoint_m
 
 
 def test_without_changes_the_rig_file_stays(rig):
-    assert Changes().apply(rig) == rig
+    assert PlanChanges().apply(rig) == rig
 
 
 def test_a_new_step_keeps_the_aperture(rig):
-    changed = Changes(step_x_mm=6.0, step_y_mm=4.0).apply(rig).grid
+    changed = PlanChanges(step_x_mm=6.0, step_y_mm=4.0).apply(rig).grid
     assert (changed.columns - 1) * 6.0 == pytest.approx(698, abs=3)
     assert (changed.rows - 1) * 4.0 == pytest.approx(398, abs=2)
 
 
-@pytest.mark.parametrize("changes", [Changes(width_mm=900.0), Changes(speed_mm_s=100.0, pulses=2, width_mm=760.0)])
+@pytest.mark.parametrize(
+    "changes", [PlanChanges(width_mm=900.0), PlanChanges(speed_mm_s=100.0, pulses=2, width_mm=760.0)]
+)
 def test_a_plan_whose_rows_exceed_the_travel_is_refused_by_the_rig_file_s_rule(rig, changes):
     with refused(ErrorCode.VALUE_INVALID, "grid.columns", "stage.travel_x_mm", "polysight plan --help") as refusal:
         changes.apply(rig)
@@ -42,12 +44,12 @@ def test_a_plan_whose_rows_exceed_the_travel_is_refused_by_the_rig_file_s_rule(r
 
 
 def test_noise_falls_with_chirps_and_positions(rig):
-    noise_of_one = predict_noise(Changes(pulses=4).apply(rig), Noise(0.0, ""))
-    four = predict_noise(Changes(pulses=16).apply(rig), Noise(0.0, ""))
+    noise_of_one = predict_noise(PlanChanges(pulses=4).apply(rig), Noise(0.0, ""))
+    four = predict_noise(PlanChanges(pulses=16).apply(rig), Noise(0.0, ""))
     assert four.position_db - noise_of_one.position_db == pytest.approx(10 * np.log10(4))
     assert four.image_db - noise_of_one.image_db == pytest.approx(10 * np.log10(4))
     assert noise_of_one.direct_phase_rad / four.direct_phase_rad == pytest.approx(2.0)
-    half = predict_noise(Changes(step_y_mm=4.0).apply(rig), Noise(0.0, ""))
+    half = predict_noise(PlanChanges(step_y_mm=4.0).apply(rig), Noise(0.0, ""))
     assert predict_noise(rig, Noise(0.0, "")).image_db - half.image_db == pytest.approx(
         10 * np.log10(200 / 101), abs=0.05
     )
@@ -55,7 +57,7 @@ def test_noise_falls_with_chirps_and_positions(rig):
 
 def test_image_noise_is_that_of_a_weighted_sum(rig):
     """Noise through taper and window, summed as the imager sums, relative to a point's sum."""
-    small = Changes(columns=16, rows=12).apply(rig)
+    small = PlanChanges(columns=16, rows=12).apply(rig)
     aperture, taper = describe_aperture(small)
     rng = np.random.default_rng(1)
     rx = len(aperture.antennas.rx_m)
@@ -74,7 +76,7 @@ def test_image_noise_is_that_of_a_weighted_sum(rig):
 
 
 def test_the_loss_by_motion_is_that_of_the_sum_over_the_pulses(rig):
-    moving = Changes(speed_mm_s=100.0, period_us=1200.0).apply(rig)
+    moving = PlanChanges(speed_mm_s=100.0, period_us=1200.0).apply(rig)
     burst = predict_burst(moving)
     antennas = Antennas.from_rig(moving, moving.receivers[0])
     middle = np.array(specular_midpoint_m(moving, moving.receivers[0]))
@@ -94,8 +96,10 @@ def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
     """A point seen from a line of positions: the strongest response away from it is at the alias-free distance."""
     step = (16.0, 8.0)[axis]
     n = 30
-    changed = Changes(**({"step_x_mm": step, "columns": n} if axis == 0 else {"step_y_mm": step, "rows": n})).apply(rig)
-    free_m = field_limits(changed).alias_free_mm[axis] / 1e3
+    changed = PlanChanges(**({"step_x_mm": step, "columns": n} if axis == 0 else {"step_y_mm": step, "rows": n})).apply(
+        rig
+    )
+    free_m = compute_field_limits(changed).alias_free_mm[axis] / 1e3
     f = np.array([rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192])
     slope = PhaseSlope(rig, axis)
     a = Antennas.from_rig(rig, rig.receivers[0])
@@ -120,10 +124,10 @@ def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
 
 
 def test_the_predicted_resolution_is_that_of_quality_json(rig):
-    small = Changes(columns=60, rows=40, step_x_mm=8.0, step_y_mm=6.0).apply(rig)
+    small = PlanChanges(columns=60, rows=40, step_x_mm=8.0, step_y_mm=6.0).apply(rig)
     board = next(iter(ImageBuilder(small).boards.values()))
     board.valid[:] = True
-    measured = board_facts(board)
+    measured = describe_board(board)
     predicted = forecast(small).response
     assert measured.point_width_mm == pytest.approx(predicted.width_mm, abs=2e-3)
     assert measured.point_limit_mm == pytest.approx(predicted.limit_mm, abs=2e-3)
@@ -134,7 +138,7 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
     published = forecast(rig)
     assert published.possible
     assert {warning.where for warning in published.warnings} == {"idle", "card", "IF"}
-    assert not forecast(Changes(columns=20, rows=20, speed_mm_s=100.0).apply(rig)).possible
+    assert not forecast(PlanChanges(columns=20, rows=20, speed_mm_s=100.0).apply(rig)).possible
     assert published.time.minutes == pytest.approx(120, rel=0.06)
     assert published.raw_bytes == 2 * 200 * 350 * 16 * 4096
     assert published.noise.position_db == pytest.approx(17.5, abs=0.1)
@@ -143,17 +147,17 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
 @pytest.mark.parametrize(
     ("changes", "topic", "value", "refused"),
     [
-        (Changes(speed_mm_s=100.0), "burst", "20", True),  # 16 pulses of 1.5 ms in 20 ms
-        (Changes(speed_mm_s=120.0, pulses=2), "speed", "100 mm/s", True),
-        (Changes(step_x_mm=2.001, pulses=2), "step x", "2.001 mm", True),
-        (Changes(step_y_mm=8.0), "aliasing", "in y", False),
-        (Changes(height_mm=200.0), "aperture", "in y", False),
-        (Changes(speed_mm_s=40.0, step_x_mm=4.0, pulses=120, period_us=800.0), "motion", "wavelengths", False),
-        (Changes(speed_mm_s=40.0), "speed", "40 mm/s", False),
-        (Changes(period_us=500.0), "radar", "inter-frame time", False),
-        (Changes(), "IF", "start_offset_hz", False),
-        (Changes(), "card", "marks its end", False),
-        (Changes(pulses=13), "card", "no short packet", False),
+        (PlanChanges(speed_mm_s=100.0), "burst", "20", True),  # 16 pulses of 1.5 ms in 20 ms
+        (PlanChanges(speed_mm_s=120.0, pulses=2), "speed", "100 mm/s", True),
+        (PlanChanges(step_x_mm=2.001, pulses=2), "step x", "2.001 mm", True),
+        (PlanChanges(step_y_mm=8.0), "aliasing", "in y", False),
+        (PlanChanges(height_mm=200.0), "aperture", "in y", False),
+        (PlanChanges(speed_mm_s=40.0, step_x_mm=4.0, pulses=120, period_us=800.0), "motion", "wavelengths", False),
+        (PlanChanges(speed_mm_s=40.0), "speed", "40 mm/s", False),
+        (PlanChanges(period_us=500.0), "radar", "inter-frame time", False),
+        (PlanChanges(), "IF", "start_offset_hz", False),
+        (PlanChanges(), "card", "marks its end", False),
+        (PlanChanges(pulses=13), "card", "no short packet", False),
     ],
 )
 def test_a_plan_with_a_fault_has_one_warning_about_it(rig, changes, topic, value, refused):
@@ -185,7 +189,9 @@ def test_a_proposed_burst_of_several_frames_of_chirps_travels_at_most_half_a_wav
     assert max(plan.burst.travel_wavelengths for plan in plans) <= 0.5
 
 
-@pytest.mark.parametrize("changes", [Changes(pulses=13), Changes(columns=91), Changes(pulses=1, columns=91)])
+@pytest.mark.parametrize(
+    "changes", [PlanChanges(pulses=13), PlanChanges(columns=91), PlanChanges(pulses=1, columns=91)]
+)
 def test_a_row_of_whole_packets_is_advised_a_number_of_pulses_only_if_it_has_an_end_mark(rig, changes):
     rig = changes.apply(rig)
     (text,) = [w.what for w in find_warnings(rig, Noise()) if "no short packet" in w.what]
@@ -226,7 +232,7 @@ def test_a_burst_of_one_pulse_with_many_chirps_is_kept(rig):
 
 @pytest.mark.parametrize(
     ("changes", "unresolved"),
-    [(Changes(columns=2, rows=2), "xy"), (Changes(width_mm=5.0, step_x_mm=7.0), "x"), (Changes(), "")],
+    [(PlanChanges(columns=2, rows=2), "xy"), (PlanChanges(width_mm=5.0, step_x_mm=7.0), "x"), (PlanChanges(), "")],
 )
 def test_an_aperture_that_resolves_nothing_has_a_warning_instead_of_figures(rig, changes, unresolved):
     planned = forecast(changes.apply(rig))

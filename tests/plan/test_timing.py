@@ -4,7 +4,7 @@ import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from polysight.planning import Changes, row_motion_s, scan_time, straight_move_s
+from polysight.planning import PlanChanges, row_motion_s, scan_time, straight_move_s
 from polysight.planning.forecast import fills_whole_packets, tail_s, turn_s
 from polysight_pi.edges import RowMotion
 from polysight_shared.config import CARD_TAIL_S, Instrument
@@ -73,9 +73,9 @@ def time_scan(rig: Instrument) -> tuple[float, list[int]]:
     ],
 )
 def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, step_y, accel, backlash):
-    rig = Changes(speed_mm_s=speed, step_x_mm=step_x, step_y_mm=step_y, columns=30, rows=5, accel_mm_s2=accel).apply(
-        rig
-    )
+    rig = PlanChanges(
+        speed_mm_s=speed, step_x_mm=step_x, step_y_mm=step_y, columns=30, rows=5, accel_mm_s2=accel
+    ).apply(rig)
     rig = msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, backlash_mm=backlash))
     estimate = scan_time(rig, 0.0)
     total, edges = time_scan(rig)
@@ -88,8 +88,8 @@ def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, ste
 
 
 def test_one_more_row_adds_its_motion_turn_overhead_and_tail(rig):
-    ten = scan_time(Changes(rows=10).apply(rig), 0.25)
-    eleven = scan_time(Changes(rows=11).apply(rig), 0.25)
+    ten = scan_time(PlanChanges(rows=10).apply(rig), 0.25)
+    eleven = scan_time(PlanChanges(rows=11).apply(rig), 0.25)
     longer_duration = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
     # The first row is half a step nearer to the corner.
     assert eleven.total_s - ten.total_s == pytest.approx(longer_duration + eleven.approach_s - ten.approach_s)
@@ -106,8 +106,8 @@ def test_moves_take_no_less_than_at_full_speed_and_no_less_than_acceleration_all
 
 def test_a_row_of_whole_packets_has_no_wait_for_the_last_packet(rig):
     # 350 columns x 13 frames x 4096 bytes = 12,800 packets of 1456 bytes.
-    whole_rig = Changes(pulses=13).apply(rig)
-    short = Changes(pulses=16).apply(rig)
+    whole_rig = PlanChanges(pulses=13).apply(rig)
+    short = PlanChanges(pulses=16).apply(rig)
     assert fills_whole_packets(whole_rig)
     assert not fills_whole_packets(short)
     assert tail_s(whole_rig) == 0.0

@@ -9,7 +9,7 @@ from tests.support.refusals import refused
 from polysight.polarimetry import Leakage, leakage_from_images
 from polysight.polarimetry.calibrate import (
     PLATE,
-    Standard,
+    MetalStandard,
     common_direction,
     estimate_axial_ratio,
     estimate_leakage,
@@ -35,7 +35,7 @@ def measure_standard(truth, wave, rng, noise=0.0, pixels=400):
 
 
 def standard(truth, wave, rng, noise=0.0):
-    return Standard(common_direction(*measure_standard(truth, wave, rng, noise)), wave)
+    return MetalStandard(common_direction(*measure_standard(truth, wave, rng, noise)), wave)
 
 
 @given(leak, leak, gain, seeds, st.floats(0.0, 0.3))
@@ -69,7 +69,7 @@ def test_more_orientations_give_a_least_squares_solution_and_a_residual(a, b, g,
     assert remaining(exact, truth) == pytest.approx((0, 0), abs=1e-7)
     wrong = [standard(truth, w, rng) for w in waves]
     # Wrong orientation
-    wrong[3] = Standard(wrong[3].measured, strips_wave(np.radians(75), THETA))
+    wrong[3] = MetalStandard(wrong[3].measured, strips_wave(np.radians(75), THETA))
     assert estimate_leakage(wrong).residual > 0.02
 
 

@@ -7,13 +7,13 @@ import pytest
 
 from polysight.materials import SIMULATED_LIBRARY, Classifier, Library
 from polysight.materials.labels import read_labels
-from polysight.process import Inputs, boxes_as_patches
+from polysight.process import Inputs, convert_boxes_to_patches
 from polysight.settings import DEFAULT
 
 
 def again(scan, path):
     inputs = Inputs(labels=read_labels(path))
-    scene = boxes_as_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
+    scene = convert_boxes_to_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
     return scan.pipeline.find_materials(scan.images, scene, classifier), scene.names
 

@@ -17,9 +17,9 @@ from tests.support.scenes import COPPER, PET, make_scene
 from polysight.cli.main import main
 from polysight.jobs import process
 from polysight.jobs.process import LiveProcessing, make_products, process_rows, publish_images
-from polysight.materials import STEEP
+from polysight.materials import STEEP_FINDING
 from polysight.pipeline import Pipeline
-from polysight.products import QUALITY, folder, making_products, products_locked, read_products
+from polysight.products import QUALITY, folder, lock_products, read_products, replace_products
 from polysight.products.processed import FINISHED
 from polysight.settings import Settings
 from polysight.store import MANIFEST, ScanFolder
@@ -58,11 +58,11 @@ def test_an_image_appears_with_its_whole_quality(scan: Path, tmp_path: Path, mon
 
     @contextmanager
     def making(out: Path, scan_id: str) -> Iterator[Path]:
-        with making_products(out, scan_id) as new:
+        with replace_products(out, scan_id) as new:
             yield new
         first.append(read_json(out / QUALITY))
 
-    monkeypatch.setattr(process, "making_products", making)
+    monkeypatch.setattr(process, "replace_products", making)
     assert main(["image", str(scan), "--out", str(tmp_path)]) == 0
     assert first == [read_json(tmp_path / QUALITY)]
 
@@ -102,7 +102,7 @@ def test_a_scan_waits_at_its_end_for_a_program_that_is_writing_its_products(
     out = scan / "products"
     running = LiveProcessing(scan, Settings(model="none"))
     with ExitStack() as other:
-        other.enter_context(products_locked(out))
+        other.enter_context(lock_products(out))
         for row in range(11):
             running.add_row(row)
         assert not out.exists()
@@ -163,7 +163,7 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
     def examine_tilted(self: Pipeline, *words: object) -> object:
         findings = examine(self, *words)  # type: ignore[arg-type]
         first, *other_items = findings.analysis.patches
-        patches = (replace(first, refused=STEEP if is_steep else None), *other_items)
+        patches = (replace(first, refused=STEEP_FINDING if is_steep else None), *other_items)
         return replace(findings, analysis=replace(findings.analysis, patches=patches))
 
     monkeypatch.setattr(Pipeline, "examine", examine_tilted)

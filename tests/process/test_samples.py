@@ -19,7 +19,7 @@ from tests.support.refusals import refused
 from polysight.imaging import PLANE_REACH_M, Images
 from polysight.jobs.process import image, process
 from polysight.pipeline import Pipeline
-from polysight.process import Use, map_rows
+from polysight.process import SampleUse, map_rows
 from polysight.process.rows import KeptSamples
 from polysight.store import RowData, ScanFolder
 from polysight.store.manifest import encode_line
@@ -29,7 +29,7 @@ from polysight_shared.errors import DataError, ErrorCode
 PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
 
 
-def process_scan(folder: Path, samples: Use = "keep", **settings: Any) -> Pipeline:
+def process_scan(folder: Path, samples: SampleUse = "keep", **settings: Any) -> Pipeline:
     return make_pipeline(ScanFolder.load(folder), samples=samples, **settings)
 
 

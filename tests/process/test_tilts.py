@@ -8,7 +8,7 @@ from tests.support.pipelines import make_pipeline
 from polysight.imaging import Images, correct_tilt
 from polysight.imaging.images import Illumination
 from polysight.imaging.plane import find_plane
-from polysight.materials.result import SMEAR, STEEP, Tilts
+from polysight.materials.result import SMEAR, STEEP_FINDING, Tilts
 from polysight.materials.segment import Segmentation, box_mask, make_patch
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_simulators.scene import decode_scene
@@ -65,7 +65,7 @@ def _turn_polarisation():
 
 def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
     images = tilted_images[0]
-    rises = [images.illumination.rise(images.h, images.v, mask) for mask in _insides(images)]
+    rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in _insides(images)]
     assert np.degrees(rises) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
@@ -76,9 +76,9 @@ def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
     images = _images(rig, [(0.0, 0.0)] * 6, {"columns": columns, "rows": rows})
     insides = _insides(images)
     plates = [box_mask((x - 22.5, y - 22.5, x + 22.5, y + 22.5), images.x_m, images.y_m) for x, y in PLACES]
-    apparent_deg = np.degrees([images.illumination.rise(images.h, images.v, inside) for inside in insides])
+    apparent_deg = np.degrees([images.illumination.estimate_rise(images.h, images.v, inside) for inside in insides])
     pairs = zip(insides, plates, strict=True)
-    deg = np.degrees([images.illumination.rise(images.h, images.v, inside, plate) for inside, plate in pairs])
+    deg = np.degrees([images.illumination.estimate_rise(images.h, images.v, inside, plate) for inside, plate in pairs])
     assert np.abs(apparent_deg).max() > 0.25
     assert np.sqrt(np.mean(deg**2)) < 0.4 * np.sqrt(np.mean(apparent_deg**2))
 
@@ -95,7 +95,7 @@ def test_phases_of_four_plates_which_can_contradict_a_plane_decide_it(rig, plate
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted_images):
     images, level = tilted_images
     masks = _insides(images)
-    rises = [images.illumination.rise(images.h, images.v, mask) for mask in masks]
+    rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in masks]
     corrected = correct_tilt(images, masks, rises)
     h_turned, ratio_turned = _turn_polarisation()
     truth = _ratios(level.h, level.v, masks) * ratio_turned
@@ -113,8 +113,8 @@ def test_tilts_follow_a_transposed_image(tilted_images):
     turned = images.transpose()
     assert (images.illumination.across, turned.illumination.across) == (1, 0)
     for mask in _insides(images):
-        rise = images.illumination.rise(images.h, images.v, mask)
-        transposed_rise = turned.illumination.rise(turned.h, turned.v, mask.T)
+        rise = images.illumination.estimate_rise(images.h, images.v, mask)
+        transposed_rise = turned.illumination.estimate_rise(turned.h, turned.v, mask.T)
         assert transposed_rise[::-1] == pytest.approx(rise, abs=1e-9)
         factors = images.illumination.to_level(mask, rise)
         swapped = turned.illumination.to_level(mask.T, transposed_rise)
@@ -127,11 +127,11 @@ def test_noise_gives_no_tilt_and_steep_phases_are_told():
     lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
     mask = np.ones((40, 40), bool)
     noise = rng.standard_normal((40, 80)).view(np.complex128)
-    assert lit.rise(noise, noise, mask) == (0.0, 0.0)
+    assert lit.estimate_rise(noise, noise, mask) == (0.0, 0.0)
     for slope in (0.02, 0.08):
         along = np.exp(-1j * slope * 1900 * 2e-3 * np.arange(40))
         image = np.tile(along, (40, 1)).astype(np.complex128)
-        assert lit.rise(image, image, mask) == pytest.approx((slope, 0.0))
+        assert lit.estimate_rise(image, image, mask) == pytest.approx((slope, 0.0))
 
 
 def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
@@ -149,8 +149,8 @@ def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     [
         (0.05, 0.05, 70, SMEAR),
         (0.3, 0.002, 70, SMEAR),  # of H alone, as by a row that only H's board lacks
-        (0.05, 0.05, 40, STEEP),  # not at the end of what is illuminated: a curved object is as dim
-        (0.5, 0.2, 70, STEEP),
+        (0.05, 0.05, 40, STEEP_FINDING),  # not at the end of what is illuminated: a curved object is as dim
+        (0.5, 0.2, 70, STEEP_FINDING),
     ],
 )
 def test_a_dim_steep_patch_at_the_end_of_the_scan_is_a_smear(level_h, level_v, row, refused):
@@ -182,6 +182,6 @@ def test_the_curvature_of_a_patch_is_estimated_from_its_phase(radius_m):
     height_m = 0.01 * x_m + x_m**2 / (2 * radius_m)
     noise = np.random.default_rng(1).standard_normal((24, 48)).view(np.complex128)
     image = np.tile(np.exp(-1j * 1900.0 * height_m), (24, 1)) + 0.05 * noise
-    along_x, along_y = lit.bend(image, image, np.ones((24, 24), bool))
+    along_x, along_y = lit.estimate_bend(image, image, np.ones((24, 24), bool))
     assert along_x == pytest.approx(1 / radius_m, abs=0.2)
     assert along_y == pytest.approx(0.0, abs=0.2)

@@ -10,7 +10,7 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.products import folder as products_folder, write_json
-from polysight.products.folder import check_products_folder, making_products
+from polysight.products.folder import check_products_folder, replace_products
 from polysight_shared.errors import DataError, DeviceError, ErrorCode
 
 OLD = {"image.npz": b"old", "report.html": b"old page", "figures/h.png": b"old h", "figures/p.png": b"old p"}
@@ -28,7 +28,7 @@ def read(folder: Path) -> dict[str, bytes]:
 
 
 def replace(out: Path) -> None:
-    with making_products(out, "s") as new:
+    with replace_products(out, "s") as new:
         write(new, NEW)
 
 
@@ -61,7 +61,7 @@ def test_an_error_leaves_the_old_products(out, error):
         write(new, NEW)
         raise error
 
-    with pytest.raises(type(error)), making_products(out, "s") as new:
+    with pytest.raises(type(error)), replace_products(out, "s") as new:
         fail(new)
     assert read(out) == OLD
     assert list(out.parent.iterdir()) == [out]
@@ -94,7 +94,7 @@ def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, ex
     if exchange == "one step":
         assert read(out) in (OLD, NEW)
     collected = {}
-    with suppress(DataError), making_products(out, "s"):
+    with suppress(DataError), replace_products(out, "s"):
         collected = read(out)
         raise DataError("nothing")
     assert collected in (OLD, NEW)
@@ -111,7 +111,7 @@ def test_hidden_files_of_other_programs_are_kept(out):
 
 
 def test_a_second_program_is_refused(out):
-    with making_products(out, "s") as new:
+    with replace_products(out, "s") as new:
         write(new, NEW)
         with refused(ErrorCode.BUSY, out):
             replace(out)
@@ -145,10 +145,10 @@ def test_a_folder_that_must_not_be_replaced_is_refused(out, monkeypatch):
 def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
     write_json(out / "quality.json", {"raw_dropped": {"scan_id": "first", "dropped_utc": "2026-01-02T03:04:05"}})
     state_before = read(out)
-    with refused(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), making_products(out, "second"):
+    with refused(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), replace_products(out, "second"):
         pytest.fail("it began")
     assert read(out) == state_before
-    with making_products(out, "first") as new:  # from a copy that has its raw rows
+    with replace_products(out, "first") as new:  # from a copy that has its raw rows
         write(new, NEW)
     assert read(out) == NEW
 

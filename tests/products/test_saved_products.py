@@ -19,7 +19,7 @@ from polysight.imaging import Images, sub_bands
 from polysight.materials import parse_layer
 from polysight.materials.layers import Layer, Spectrum, predict
 from polysight.products import MATERIALS, ProcessedScan, read_products, rx_gains, write_json
-from polysight_shared.errors import DataError, ErrorCode, os_error
+from polysight_shared.errors import DataError, ErrorCode, convert_os_error
 from polysight_shared.files import write_atomically
 from polysight_shared.tables import to_builtins
 
@@ -124,7 +124,7 @@ def test_a_full_disk_is_reported_with_the_path(tmp_path, monkeypatch):
     with pytest.raises(OSError) as e:  # noqa: PT011
         write_atomically(tmp_path / "image.npz", b"1")
     assert e.value.errno == errno.ENOSPC
-    assert str(tmp_path) in str(os_error(e.value))
+    assert str(tmp_path) in str(convert_os_error(e.value))
 
 
 def test_gains_are_relative_to_each_boards_first_rx():

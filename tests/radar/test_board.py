@@ -15,7 +15,7 @@ from polysight.radar.commands import (
     Frame,
     FrameApply,
     FrameControl,
-    program,
+    make_program,
 )
 from polysight.radar.firmware import check_image
 from polysight.radar.link import NotReportedError
@@ -29,7 +29,7 @@ PERIOD_S = 1.5e-3
 
 @pytest.fixture
 def radar(rig, words, clock) -> RadarBoard:
-    return RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")))
+    return RadarBoard("LS", words, clock, make_program(rig, rig.by_name("LS")))
 
 
 def pulses(board: simulated.RadarBoard, clock, count: int, period_s: float = PERIOD_S) -> None:
@@ -44,7 +44,7 @@ def test_from_off_to_done(radar, board, clock):
     assert radar.state is State.CONFIGURED
     radar.arm(FRAMES)
     assert radar.state is State.ARMED
-    radar.pulses_begin()
+    radar.note_pulses()
     assert radar.state is State.RUNNING
     pulses(board, clock, FRAMES - 1)
     assert radar.poll() is State.RUNNING
@@ -55,7 +55,7 @@ def test_from_off_to_done(radar, board, clock):
 def test_frames_of_a_software_trigger_without_number_run_until_they_are_stopped(radar, board, clock):
     """None of these steps waits for SYNC_IN."""
     radar.configure()
-    for command in radar.program.frames(0, SOFTWARE_TRIGGER):
+    for command in radar.program.make_frame_commands(0, SOFTWARE_TRIGGER):
         radar.link.call(command)
     radar.link.call(FrameControl(START))
     clock.sleep(1.0)
@@ -80,7 +80,7 @@ def test_every_step_is_reported_once_in_order(radar, board):
 
 def test_only_the_transmitter_transmits(rig):
     for position in rig.boards:
-        messages = program(rig, position)
+        messages = make_program(rig, position)
         masks = [c.tx for c in (*messages.basic, *messages.waveform) if hasattr(c, "tx")]
         assert masks == ([0b010] * 2 if position.role == "transmit" else [0, 0])
 
@@ -147,7 +147,7 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
 def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, words_of_it, running):
     radar.arm(FRAMES)
     if running:
-        radar.pulses_begin()
+        radar.note_pulses()
     board.send_event(number, data)
     assert radar.poll() is State.FAULT
     assert words_of_it in radar.reason
@@ -221,7 +221,7 @@ def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
 
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=5000.0)
     many = msgspec.structs.replace(rig, burst=burst)
-    radar = RadarBoard("LS", words, clock, program(many, many.by_name("LS")))
+    radar = RadarBoard("LS", words, clock, make_program(many, many.by_name("LS")))
     radar.arm(FRAMES)
     loops, frames = struct.unpack_from("<2H", board.settings[0x0102], 6)
     chirps = struct.unpack_from("<I", board.settings[0x40C0])[0]
@@ -231,7 +231,7 @@ def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
 
 
 def test_the_main_core_s_fault_is_ignored_only_until_the_board_is_configured(rig, words, clock, board):
-    radar = RadarBoard("LS", words, clock, program(rig, rig.by_name("LS")))
+    radar = RadarBoard("LS", words, clock, make_program(rig, rig.by_name("LS")))
     radar.configure()
     assert any("main core fault" in line for line in radar.report()["events"])
     board.send_event(MAIN_CPU_FAULT, struct.pack("<BBH", 5, 0, 0) + bytes(32))
@@ -240,8 +240,8 @@ def test_the_main_core_s_fault_is_ignored_only_until_the_board_is_configured(rig
 
 def test_a_board_that_restarts_by_itself_is_a_fault_and_recovers(radar, board, clock):
     radar.arm(FRAMES)
-    board.power(False)
-    board.power(True)
+    board.switch_power(False)
+    board.switch_power(True)
     clock.sleep(0.1)
     assert radar.poll() is State.FAULT
     assert "restarted" in radar.reason
@@ -258,7 +258,7 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
     for state_after in range(1, commands + 1, step):
         board = simulated.RadarBoard(lambda: clock.time, flash=flash)
         words = Restarts(board, clock, state_after)
-        radar = RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), IMAGE)
+        radar = RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE)
         began = clock.time
         with refused(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
@@ -267,7 +267,7 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
         radar.arm(FRAMES)
         assert radar.state is State.ARMED
     words = Restarts(simulated.RadarBoard(lambda: clock.time, flash=flash), clock, 1000)
-    RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), IMAGE).arm(FRAMES)
+    RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE).arm(FRAMES)
     assert 1000 - words.left == commands
 
 

@@ -7,8 +7,14 @@ import pytest
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.calibration_data import ALL, RESTORED, CalibrationFiles, InitCalibrations, RestoreCalibration
-from polysight.radar.commands import program
+from polysight.radar.calibration_data import (
+    ALL_CALIBRATIONS,
+    RESTORED_CALIBRATIONS,
+    CalibrationFiles,
+    InitCalibrations,
+    RestoreCalibration,
+)
+from polysight.radar.commands import make_program
 from polysight_shared.errors import ErrorCode
 
 FRAMES = 4
@@ -17,7 +23,7 @@ FRAMES = 4
 @pytest.fixture
 def make_board(rig, words, clock):
     def make(calibration=None) -> RadarBoard:
-        return RadarBoard("RH", words, clock, program(rig, rig.by_name("RH")), calibration=calibration)
+        return RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), calibration=calibration)
 
     return make
 
@@ -45,8 +51,8 @@ def test_a_calibration_is_saved_and_restored_at_the_next_start(make_board, board
     assert restored_board.facts.calibration_restored is True
     assert board.executed.count(RestoreCalibration.ID) == 3
     mask = struct.unpack_from("<I", board.settings[InitCalibrations.ID])[0]
-    assert mask & RESTORED == 0
-    assert mask | RESTORED == ALL
+    assert mask & RESTORED_CALIBRATIONS == 0
+    assert mask | RESTORED_CALIBRATIONS == ALL_CALIBRATIONS
     assert restored_board.state is State.CONFIGURED
 
 
@@ -58,9 +64,9 @@ OF_TX = {8: "peak", 9: "TX power", 11: "TX phase"}
 @pytest.mark.parametrize(("bit", "text"), (NEEDED | OF_TX).items())
 def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp_path, name, bit, text):
     """Bits of ICD 217; those of the transmitters are needed by the board that transmits."""
-    board.cores.passes = 0x1FFE & ~(1 << bit)
+    board.cores.passing_calibrations = 0x1FFE & ~(1 << bit)
     files = CalibrationFiles(tmp_path / "kept", b"settings")
-    radar = RadarBoard(name, words, clock, program(rig, rig.by_name(name)), calibration=files)
+    radar = RadarBoard(name, words, clock, make_program(rig, rig.by_name(name)), calibration=files)
     if name == "RH" and bit in OF_TX:
         radar.configure()
         return
@@ -79,7 +85,7 @@ def test_a_calibration_folder_that_cannot_be_written_is_named(make_board, tmp_pa
 def test_other_settings_and_other_dies_have_their_own_calibration(make_board, board, tmp_path):
     make_board(CalibrationFiles(tmp_path, b"settings")).configure()
     make_board(CalibrationFiles(tmp_path, b"others")).configure()
-    board.cores.die = 7
+    board.cores.die_number = 7
     make_board(CalibrationFiles(tmp_path, b"settings")).configure()
     assert len(list(tmp_path.iterdir())) == 3
 

@@ -12,7 +12,7 @@ import tomli_w
 from tests.support.radar.boards import with_radar
 
 from polysight.cli.main import main
-from polysight.radar.commands import program
+from polysight.radar.commands import make_program
 from polysight.radar.diagnosis import ReplayedWords
 from polysight.radar.messages import decode
 from polysight_shared.errors import DeviceError
@@ -60,8 +60,8 @@ def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
     sent = [decode(bytes.fromhex(line.split()[-1])).blocks for line in out.splitlines() if "34122143" in line]
     expected = []
     for board in rig.boards:
-        messages = program(rig, board)
-        expected += [(c.block(),) for c in (*messages.basic, *messages.waveform, *messages.frames(5600))]
+        messages = make_program(rig, board)
+        expected += [(c.block(),) for c in (*messages.basic, *messages.waveform, *messages.make_frame_commands(5600))]
     assert sent == expected
 
 
@@ -78,7 +78,7 @@ def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
     ("spoil", "step", "text"),
     [
         (lambda board: setattr(board, "functional_jumpers", False), "reset", ("SOP0 set", "[ o=o ]", "5 V")),
-        (lambda board: board.power(False), "reset", ("no power",)),
+        (lambda board: board.switch_power(False), "reset", ("no power",)),
         (lambda board: setattr(board.cores, "flash", b""), "versions", ("no patch", "radar.firmware")),
         (lambda board: setattr(board.cores, "hardware_bits", 1 << 55), "firmware", ("memory not initialised",)),
         (lambda board: setattr(board, "plugged", False), "reset", ("unplugged",)),

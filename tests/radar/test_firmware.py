@@ -8,7 +8,7 @@ from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, nativ
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import program
+from polysight.radar.commands import make_program
 from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, read_image, split_into_chunks
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
@@ -97,12 +97,12 @@ class PowerCut(BoardWords):
         if words[0] == 0x1234:
             self.left -= 1
             if self.left == 0:
-                self.board.power(False)
+                self.board.switch_power(False)
         super().write(words)
 
 
 def make_board(board: Simulated, clock: VirtualClock, firmware=None, words=None) -> RadarBoard:
-    return RadarBoard("RH", words or BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")), firmware)
+    return RadarBoard("RH", words or BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("RH")), firmware)
 
 
 def ignore(sent: int, of: int) -> None: ...
@@ -177,7 +177,9 @@ def test_a_board_that_reports_a_hardware_fault_is_refused_after_any_download(clo
 @pytest.mark.parametrize("use", [lambda radar: radar.write_flash(IMAGE, ignore), lambda radar: radar.configure()])
 def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     board = Simulated(lambda: clock.time, flash=DATA)
-    radar = RadarBoard("LS", BoardWords(board, clock), clock, program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0")
+    radar = RadarBoard(
+        "LS", BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0"
+    )
     with refused(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
         use(radar)
     assert 0x0080 not in board.executed
@@ -185,7 +187,7 @@ def test_the_rf_part_of_another_board_is_not_configured(clock, use):
 
 @pytest.mark.parametrize(("tests", "text"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
 def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text):
-    board.cores.rf_tests = tests
+    board.cores.passing_rf_tests = tests
     radar = make_board(board, clock)
     result = []
     radar.configure(lambda step, came: result.append(came) if step.name == "RF power-up" else None)
@@ -249,7 +251,7 @@ def test_a_power_failure_at_any_part_is_recoverable(clock, part):
     radar = make_board(board, clock, words=PowerCut(board, clock, part + 1))
     with pytest.raises(DeviceError):
         radar.write_flash(IMAGE, ignore)
-    board.power(True)
+    board.switch_power(True)
     rescued = make_board(board, clock, IMAGE)
     rescued.configure()  # from RAM, with any content of the flash
     assert rescued.state is State.CONFIGURED

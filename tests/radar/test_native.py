@@ -53,7 +53,7 @@ class Usb:
     def __init__(self, rig: Instrument, clock) -> None:
         self.clock = clock
         self.boards = {
-            b.usb_serial: RadarBoard(lambda: clock.time, flash=make_image(), die=n)
+            b.usb_serial: RadarBoard(lambda: clock.time, flash=make_image(), die_number=n)
             for n, b in enumerate(rig.radar.native.values(), 1)
         }
         self.links: dict[str, list[Link]] = {serial: [] for serial in self.boards}
@@ -98,7 +98,7 @@ def test_each_board_is_identified_by_its_serial_number(rig, radars, usb):
 def test_a_row_is_done_when_every_board_reports_it(radars, usb):
     radars.arm(FRAMES)
     assert {s.state for s in radars.states().values()} == {RadarState.ARMED}
-    radars.row_begins()
+    radars.note_row_start()
     usb.pulses(FRAMES - 1)
     assert {s.state for s in radars.states().values()} == {RadarState.ARMED}
     usb.pulses(1)
@@ -119,7 +119,7 @@ def test_a_board_that_missed_a_pulse_is_not_done(radars, usb):
 
 
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
-    usb.boards["FTRV"].cores.die = 2
+    usb.boards["FTRV"].cores.die_number = 2
     with refused(ErrorCode.VALUES_CONFLICT, "RH and RV"):
         NativeRadars(rig, usb.open, clock)
 
@@ -132,7 +132,7 @@ def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock
         return lambda number, *rest: (6, b"", 0.0) if number == GET_DIE_ID.ID else execute(number, *rest)
 
     for board in usb.boards.values():
-        board.cores.die = 0
+        board.cores.die_number = 0
         if die == "not told":
             monkeypatch.setattr(board.cores, "execute", without_die(board.cores.execute))
     rig_with_calibration = with_radar(rig, calibration_dir=str(tmp_path))

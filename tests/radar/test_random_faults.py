@@ -16,7 +16,7 @@ import pytest
 from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import program
+from polysight.radar.commands import make_program
 from polysight.radar.firmware import Image, check_image
 from polysight_shared.errors import DeviceError
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
@@ -144,12 +144,14 @@ def draw(rng: random.Random) -> tuple[Case, int]:
         "event": lambda: _event(rng),
         "flood": lambda: _flood(rng),
         "unplug": lambda: Case("unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False)),
-        "power": lambda: Case("power lost", SILENT, lambda w: w.board.power(False)),
-        "brown-out": lambda: Case("brown-out", "restarted", lambda w: (w.board.power(False), w.board.power(True))),
+        "power": lambda: Case("power lost", SILENT, lambda w: w.board.switch_power(False)),
+        "brown-out": lambda: Case(
+            "brown-out", "restarted", lambda w: (w.board.switch_power(False), w.board.switch_power(True))
+        ),
         "ram brown-out": lambda: Case(
             "new board, brown-out",
             "restarted",
-            lambda w: (w.board.power(False), w.board.power(True)),
+            lambda w: (w.board.switch_power(False), w.board.switch_power(True)),
             b"",
             IMAGE,
         ),
@@ -201,21 +203,21 @@ class Outcome:
         self.board.cores.destroyed = False
         self.board.inject()
         if not self.board.powered:
-            self.board.power(True)
+            self.board.switch_power(True)
 
 
 def run(case: Case, at: int) -> Outcome:
     """Configure, arm, and run a row of pulses; check that all frames ended. Only DeviceError is caught."""
     clock = VirtualClock()
     board = Simulated(lambda: clock.time, flash=case.flash, functional_jumpers=case.jumpers)
-    board.power(case.supply)
+    board.switch_power(case.supply)
     words = FaultyWords(board, clock, at, case.act)
-    radar = RadarBoard("RH", words, clock, program(RIG, RIG.by_name("RH")), case.firmware, case.die_id)
+    radar = RadarBoard("RH", words, clock, make_program(RIG, RIG.by_name("RH")), case.firmware, case.die_id)
     error = None
     try:
         radar.configure()
         radar.arm(FRAMES)
-        radar.pulses_begin()
+        radar.note_pulses()
         for _ in range(FRAMES):
             board.trigger()
             clock.sleep(1.5e-3)

@@ -15,7 +15,7 @@ from polysight.radar import messages as m
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
 from polysight.radar.link import Link
 from polysight_shared.errors import ErrorCode
-from polysight_simulators.radars.cores import frame, ones_sum
+from polysight_simulators.radars.cores import compute_ones_sum, encode_message
 
 # AWR2243, refused 0x0105 (advanced frame) with error 62; the commands had a 32-bit CRC. E2E 1096533.
 AWR2243_ERROR = bytes.fromhex("badccdab1200180000a400000100d45b000008003e000501ad6a9e9b")
@@ -139,7 +139,7 @@ def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
 @pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
 def test_a_response_of_another_core_is_no_answer(direction, kind):
     line, _ = connect(
-        *[frame(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)] * 3
+        *[encode_message(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)] * 3
     )
     with refused(ErrorCode.NO_ANSWER):
         line.call(DEVICE_CONFIGURATION)
@@ -160,7 +160,7 @@ def test_a_refusal_of_another_sequence_is_late():
 def chunk(remaining: int, block: int, data: bytes) -> bytes:
     """One of an answer's chunks, from the simulated device's encoder."""
     raw = bytearray(
-        frame(
+        encode_message(
             direction=6,
             kind=1,
             number=0x207,
@@ -172,7 +172,7 @@ def chunk(remaining: int, block: int, data: bytes) -> bytes:
     )
     raw[10:12] = remaining.to_bytes(2, "little")
     raw[14:16] = b"\0\0"
-    raw[14:16] = (0xFFFF - ones_sum(bytes(raw[4:14]))).to_bytes(2, "little")
+    raw[14:16] = (0xFFFF - compute_ones_sum(bytes(raw[4:14]))).to_bytes(2, "little")
     return bytes(raw[:-4]) + zlib.crc32(bytes(raw[4:-4])).to_bytes(4, "little")
 
 

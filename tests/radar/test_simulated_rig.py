@@ -10,7 +10,7 @@ from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight.radar.board import RadarBoard, State
-from polysight.radar.commands import constraints, program
+from polysight.radar.commands import list_constraints, make_program
 from polysight.radar.control import open_board
 from polysight.radar.usb import SystemClock
 from polysight_shared.errors import ErrorCode
@@ -24,7 +24,7 @@ EMPTY = decode_scene({"name": "the direct path alone"}, "test")
 def test_the_derived_rig_keeps_all_constraints_and_has_every_address(tmp_path: Path):
     rig = derive(published_rig(), EMPTY, tmp_path, native=True)
     assert rig.radar.control == "native"
-    assert [c for c in constraints(rig, 5600) if not c.holds] == []
+    assert [c for c in list_constraints(rig, 5600) if not c.holds] == []
     assert len({b.usb_serial for b in rig.radar.native.values()}) == 3
     assert all(b.usb_serial.startswith("tcp://127.") for b in rig.radar.native.values())
 
@@ -57,7 +57,7 @@ class PatientClock(SystemClock):
 
 def test_a_board_unplugged_behind_its_socket_is_a_fault_with_its_address(rig, served_board):
     radar_socket, board = served_board
-    radar = RadarBoard("LS", open_board(radar_socket.address), PatientClock(), program(rig, rig.by_name("LS")))
+    radar = RadarBoard("LS", open_board(radar_socket.address), PatientClock(), make_program(rig, rig.by_name("LS")))
     radar.configure()
     board.plugged = False
     assert radar.poll() is State.FAULT

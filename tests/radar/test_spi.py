@@ -13,7 +13,7 @@ from polysight.radar.commands import (
     RF_POWER_UP,
     Chirp,
     LdoBypass,
-    program,
+    make_program,
 )
 from polysight.radar.link import ATTEMPTS, Link
 from polysight.radar.messages import CALIBRATION_REPORT, MAIN_POWER_UP, READY_TO_READ, RF_POWER_UP_DONE, decode
@@ -183,7 +183,7 @@ def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_o
     """Twice only if the answer was lost and its retry was damaged, because a NACK requires a new sequence number."""
     clock = VirtualClock()
     board = Simulated(lambda: clock.time, flash=make_image())
-    radar = RadarBoard("RH", BoardWords(board, clock), clock, program(RIG, RIG.by_name("RH")))
+    radar = RadarBoard("RH", BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("RH")))
     radar.configure()
     board.executed.clear()
     link: Link = radar.link

@@ -160,7 +160,7 @@ def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
 
 def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
     native = enumerate(rig.radar.native.values(), 1)
-    boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image(), die=k) for k, n in native}
+    boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image(), die_number=k) for k, n in native}
     chips = {place: chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
     for usb_chip in chips.values():
         bus.plug(usb_chip)

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings, strategies as st
 from tests.support.radar.boards import native_rig, with_radar
 from tests.support.refusals import refused
 
-from polysight.radar.commands import constraints, direct_if_hz, program, require
+from polysight.radar.commands import check_constraints, direct_if_hz, list_constraints, make_program
 from polysight_shared.config import Instrument, NativeRadar
 from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import direct_path_m
@@ -28,7 +28,7 @@ def change_rig(rig: Instrument, table: str, **values) -> Instrument:
 
 
 def broken(rig: Instrument, frames: int = FRAMES) -> set[str]:
-    return {c.name for c in constraints(rig, frames) if not c.holds}
+    return {c.name for c in list_constraints(rig, frames) if not c.holds}
 
 
 def change_receiver(rig: Instrument, **values) -> Instrument:
@@ -37,7 +37,7 @@ def change_receiver(rig: Instrument, **values) -> Instrument:
 
 
 def test_the_published_chirp_with_centred_receivers_holds(rig):
-    require(rig, FRAMES)
+    check_constraints(rig, FRAMES)
     assert broken(rig) == set()
 
 
@@ -76,8 +76,8 @@ def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name
     wrong = change_rig(rig, table, **values)
     assert name in broken(wrong)
     with pytest.raises(ConfigError) as caught:
-        require(wrong, FRAMES)
-    result = next(c for c in constraints(wrong, FRAMES) if c.name == name and not c.holds)
+        check_constraints(wrong, FRAMES)
+    result = next(c for c in list_constraints(wrong, FRAMES) if c.name == name and not c.holds)
     assert str(result) in str(caught.value)
     assert result.formula in str(result)
     assert f"{result.value:.12g}" in str(result)
@@ -125,13 +125,13 @@ def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, fram
     wrong = floats | ints
     for table in sorted({table for table, _ in wrong}):
         rig = change_rig(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
-    if all(c.holds for c in constraints(rig, frames)):
+    if all(c.holds for c in list_constraints(rig, frames)):
         for board in rig.boards:
-            for sent in program(rig, board).frames(frames):
+            for sent in make_program(rig, board).make_frame_commands(frames):
                 sent.block()
     else:
         with pytest.raises(ConfigError):
-            require(rig, frames)
+            check_constraints(rig, frames)
 
 
 @pytest.mark.parametrize(("frames", "holds"), [(0, False), (1, True), (65535, True), (65536, False)])
@@ -158,7 +158,7 @@ def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=chirp_us, period_us=6000.0)
     many = msgspec.structs.replace(rig, burst=burst)
     assert ("chirp spacing" not in broken(many)) is holds
-    result = next(c for c in constraints(many, FRAMES) if c.name == "chirp spacing")
+    result = next(c for c in list_constraints(many, FRAMES) if c.name == "chirp spacing")
     idle = float(result.remedy.split()[3].strip(","))
     mended = with_radar(many, idle_us=idle)
     assert "chirp spacing" not in broken(mended)
@@ -185,7 +185,7 @@ def test_ldo_bypass_needs_this_boards_serial(rig):
     assert broken(with_bypass("")) == broken(with_bypass("FTRV")) == {"LDO bypass of RH"}
     assert broken(with_bypass("FTRH")) == set()
     with refused(ErrorCode.VALUE_INVALID, "LDO bypass"):
-        require(with_bypass("yes"), FRAMES)
+        check_constraints(with_bypass("yes"), FRAMES)
 
 
 def test_expected_if_is_slope_times_path_plus_offset(rig):
@@ -208,7 +208,7 @@ def test_if_budget(rig, mode, offset, holds):
 
 def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
     wrong = change_receiver(rig, start_offset_hz=0.0)
-    result = next(c for c in constraints(wrong, FRAMES) if c.name == "IF budget of RH")
+    result = next(c for c in list_constraints(wrong, FRAMES) if c.name == "IF budget of RH")
     offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
     mended = change_receiver(rig, start_offset_hz=offset)
     assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
@@ -221,7 +221,7 @@ def test_every_constraint_is_tested(rig):
         for c, *_ in mark.args[1]
     }
     tested |= {"frames", "pulse gap", "LDO bypass of RH", "IF budget of RH"}
-    general = {c.name for c in constraints(rig, FRAMES) if not c.name.endswith((" of LS", " of RV"))}
+    general = {c.name for c in list_constraints(rig, FRAMES) if not c.name.endswith((" of LS", " of RV"))}
     assert general == tested
 
 
@@ -231,5 +231,5 @@ def test_a_number_that_no_radar_has_is_named_alone(rig, sign, size, is_usable):
     receiver = rig.receivers[0]
     strange = msgspec.structs.replace(receiver, start_offset_hz=sign * size)
     boards = tuple(strange if b is receiver else b for b in rig.boards)
-    names = [c.name for c in constraints(msgspec.structs.replace(rig, boards=boards), 4) if not c.holds]
+    names = [c.name for c in list_constraints(msgspec.structs.replace(rig, boards=boards), 4) if not c.holds]
     assert (names == [f"boards.{receiver.name}.start_offset_hz"]) == (not is_usable)

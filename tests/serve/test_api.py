@@ -22,9 +22,8 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.products import judged_products, name_check_plate
 
-from polysight.acquisition.control import ALIVE, CONTROL, Life, read_start_ticks
+from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, SignOfLife, read_start_ticks
 from polysight.products import SCAN, write_json
-from polysight.products.folder import making_products
 from polysight.results import ScanFacts, to_plain
 from polysight.serve import commands as control, site
 from polysight.serve.guard import TOKEN_HEADER
@@ -214,10 +213,10 @@ def test_of_two_live_views_that_are_opened_together_one_follows_the_scan(tmp_pat
     ("lives", "age_s", "state"), [(True, 0, "running"), (True, 60, "frozen"), (False, 0, "lost"), (False, 1e5, None)]
 )
 def test_every_page_knows_whether_a_scan_runs_was_killed_or_hangs(view, scans, lives, age_s, state):
-    alive = scans / "one" / CONTROL / ALIVE
+    alive = scans / "one" / CONTROL_FOLDER / ALIVE_FILE
     alive.parent.mkdir()
     pid = os.getpid() if lives else 1
-    alive.write_bytes(msgspec.json.encode(Life(pid, read_start_ticks(os.getpid()) or 0, socket.gethostname())))
+    alive.write_bytes(msgspec.json.encode(SignOfLife(pid, read_start_ticks(os.getpid()) or 0, socket.gethostname())))
     os.utime(alive, (time.time() - age_s,) * 2)
     running = get(view, "/api/running")
     assert [scan["state"] for scan in running] == ([state] if state else [])
@@ -268,7 +267,7 @@ def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(
 
     def replace_products() -> None:
         while not ended.is_set():
-            with making_products(out, "s") as new:
+            with replace_products(out, "s") as new:
                 judged_products(new, "none" if next(generations) % 2 else "good")
 
     worker = threading.Thread(target=replace_products)

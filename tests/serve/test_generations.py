@@ -7,7 +7,7 @@ from tests.support.page.chromium import DESK, Browser
 from tests.support.page.live_view import served_folder
 from tests.support.products import judged_products
 
-from polysight.products import making_products
+from polysight.products import replace_products
 
 RUNS = 2
 LONG_RUNS = 20
@@ -47,7 +47,7 @@ def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_p
 
         for run in range(1, runs + 1):
             level, seed = GENERATIONS[run % 2]
-            with making_products(products, "s") as new:
+            with replace_products(products, "s") as new:
                 judged_products(new, level, seed=seed)
             shown = json.dumps(parts[3])
             browser.wait(f"document.getElementById('scale').innerText !== {shown}", f"generation {run}")

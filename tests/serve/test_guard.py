@@ -20,7 +20,7 @@ from tests.support.processes import HANG_S
 from tests.support.products import judged_products
 from tests.support.refusals import refused
 
-from polysight.serve import Place, guard, server
+from polysight.serve import ServerAddress, guard, server
 from polysight.serve.front import ConnectionLimit, CountedConnection
 from polysight.serve.guard import TOKEN_HEADER, Access
 from polysight_shared.errors import ErrorCode
@@ -355,7 +355,7 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, t
 @pytest.mark.parametrize("given", ["certificate", "key"])
 def test_a_certificate_without_its_key_is_refused_before_the_files_are_read(tmp_path, given):
     with refused(ErrorCode.OTHER, "--certificate and --key"):
-        Place(**{given: tmp_path / "missing.pem"}).check()
+        ServerAddress(**{given: tmp_path / "missing.pem"}).check()
 
 
 def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
@@ -369,8 +369,8 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     # Two equal processes that are independent of each other
     for wrong in ("key.pem", "certificate.pem"):
         with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
-            Place("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
-    place = Place("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
+            ServerAddress("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
+    place = ServerAddress("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
     with served_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
         with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=HANG_S, context=trusted) as reply:

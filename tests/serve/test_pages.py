@@ -21,7 +21,7 @@ from tests.support.products import REASON, judged_products, name_check_plate
 from tests.support.scenes import COPPER, PET
 
 import polysight
-from polysight.catalogue import PROGRAM, Notes, ProgramRecord, find_program, read_notes, write_notes
+from polysight.catalogue import PROGRAM_FOLDER, Notes, ProgramRecord, find_program, read_notes, write_notes
 from polysight.doctor.checks import _format_finding
 from polysight.materials import Library, read_labels
 from polysight.products import ProcessedScan
@@ -288,7 +288,7 @@ def test_the_new_page_lists_the_checks_as_the_doctor_prints_them(page, scans):
         Finding("error", "no echo", "no power", "switch it on", where="radar south west 12"),
     ]
     record = ProgramRecord(pid=1, ticks=0, words=["polysight", "doctor"], started_utc="2026-01-01T00:00:00+00:00")
-    folder = scans / HIDDEN / PROGRAM
+    folder = scans / HIDDEN / PROGRAM_FOLDER
     folder.mkdir(parents=True)
     (folder / "doctor.json").write_bytes(msgspec.json.encode(record))
     (folder / "doctor.log").write_text("".join(map(_format_finding, findings)) + "1 ok\n", encoding="utf-8")
@@ -476,7 +476,7 @@ def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
 def test_a_scan_that_was_stopped_on_request_has_not_failed(page, scans):
     """Its program ends with the exit status of an incomplete scan."""
     record = ProgramRecord(pid=1, ticks=0, words=["polysight", "scan"], started_utc="2026-01-01T00:00:00+00:00")
-    folder = scans / "one" / PROGRAM
+    folder = scans / "one" / PROGRAM_FOLDER
     folder.mkdir()
     (folder / "scan.json").write_bytes(msgspec.json.encode(record))
     (folder / "scan.status").write_text("6\n", encoding="utf-8")

@@ -21,7 +21,7 @@ from tests.support.refusals import refused
 from polysight.serve import server
 from polysight.serve.door import MOST_SILENT, is_command
 from polysight.serve.guard import TOKEN_HEADER
-from polysight.serve.server import TOKEN_BYTES, Place, load_token, preview, serve
+from polysight.serve.server import TOKEN_BYTES, ServerAddress, load_token, preview, serve
 from polysight_shared.errors import ErrorCode
 
 
@@ -267,11 +267,11 @@ def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
     assert (tmp_path / "scans").is_dir()
     for folder, control in ((tmp_path / "drive" / "scans", True), (Path("only-shown"), False)):
         with refused(ErrorCode.FILE_MISSING, folder, "mkdir -p"):
-            serve(folder, Place(), None, control)
+            serve(folder, ServerAddress(), None, control)
         assert not folder.exists()
     (tmp_path / "scene.toml").touch()
     with refused(ErrorCode.FILE_FOREIGN, tmp_path / "scene.toml", "is not a folder"):
-        serve(tmp_path / "scene.toml", Place(), None, True)
+        serve(tmp_path / "scene.toml", ServerAddress(), None, True)
 
 
 @pytest.mark.parametrize("folder", ["scans", "pictures"])
@@ -279,7 +279,7 @@ def test_a_folder_of_something_else_than_a_scan_has_no_live_view(scans, folder):
     (scans.parent / "pictures").mkdir()
     (scans.parent / "pictures" / "one.jpg").touch()
     with refused(ErrorCode.FILE_FOREIGN, scans.parent / folder) as caught:
-        preview(scans.parent / folder, Place(port=0), control=False)
+        preview(scans.parent / folder, ServerAddress(port=0), control=False)
     assert (f"polysight preview {scans / 'one'}" in str(caught.value)) == (folder == "scans")
 
 
@@ -288,8 +288,8 @@ def test_the_live_view_of_no_scan_yet_says_so(scans, capsys, monkeypatch, folder
     """The scan may begin later, or the folder is mistyped."""
     monkeypatch.setattr(server, "_run", lambda *_: 0)
     (scans / "new").mkdir()
-    assert preview(scans / folder, Place(port=0), control=False) == 0
-    assert preview(scans / "one", Place(port=0), control=False) == 0
+    assert preview(scans / folder, ServerAddress(port=0), control=False) == 0
+    assert preview(scans / "one", ServerAddress(port=0), control=False) == 0
     message = capsys.readouterr().err
     assert words in message
     assert message.count("note: ") == 1

@@ -17,7 +17,7 @@ from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
-from polysight.catalogue import PROGRAM, find_program
+from polysight.catalogue import PROGRAM_FOLDER, find_program
 from polysight.jobs.live_scan import _check_new
 from polysight.serve.programs import Programs
 from polysight.store import validate
@@ -55,7 +55,7 @@ def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
 @pytest.fixture
 def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
     """A folder for which a program runs; it is killed after the test."""
-    pid = programs.launch(["/bin/sleep", "60"], tmp_path / PROGRAM / "scan")
+    pid = programs.launch(["/bin/sleep", "60"], tmp_path / PROGRAM_FOLDER / "scan")
     try:
         yield tmp_path
     finally:
@@ -67,7 +67,7 @@ def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
 
 def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
     assert find_program(sleeping, "scan").running
-    file = sleeping / PROGRAM / "scan.json"
+    file = sleeping / PROGRAM_FOLDER / "scan.json"
     answer = json.loads(file.read_text())
     file.write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
     # Another process has the number now
@@ -84,22 +84,22 @@ def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
     [b"", b"[]", b"{}", b'{"pid":1,"ticks":"x"}', b"\xff", b'{"pid":-1,"ticks":0,"words":[],"started_utc":""}'],
 )
 def test_a_made_up_number_is_no_program_that_runs(tmp_path, content):
-    (tmp_path / PROGRAM).mkdir()
-    (tmp_path / PROGRAM / "scan.json").write_bytes(content)
+    (tmp_path / PROGRAM_FOLDER).mkdir()
+    (tmp_path / PROGRAM_FOLDER / "scan.json").write_bytes(content)
     program = find_program(tmp_path, "scan")
     assert program is None or not program.running
 
 
 def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
-    (tmp_path / PROGRAM).mkdir()
+    (tmp_path / PROGRAM_FOLDER).mkdir()
     answer = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
-    (tmp_path / PROGRAM / "scan.json").write_text(json.dumps(answer))
-    (tmp_path / PROGRAM / "scan.log").write_bytes(b"--- t x\n\x1b[31mred\x1b[0m\x07 \xe2\x80\xaeback\xff\n")
+    (tmp_path / PROGRAM_FOLDER / "scan.json").write_text(json.dumps(answer))
+    (tmp_path / PROGRAM_FOLDER / "scan.log").write_bytes(b"--- t x\n\x1b[31mred\x1b[0m\x07 \xe2\x80\xaeback\xff\n")
     assert find_program(tmp_path, "scan").log == "red back\ufffd"
 
 
 def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
-    (tmp_path / PROGRAM).mkdir()
+    (tmp_path / PROGRAM_FOLDER).mkdir()
     (tmp_path / "operator.json").write_text("{}")
     _check_new(tmp_path)
     (tmp_path / "something").touch()
@@ -144,7 +144,7 @@ def test_a_scan_starts_with_its_plan_and_a_pi_that_refuses_it_says_why(refusing_
             post(view, "/api/start", {"name": "week/one", "plan": {"rows": 3}, "notes": "n", "tags": ["t"]})[0] == 200
         )
         folder = root / "week" / "one"
-        rig = tomllib.loads((folder / PROGRAM / "instrument.toml").read_text())
+        rig = tomllib.loads((folder / PROGRAM_FOLDER / "instrument.toml").read_text())
         assert rig["grid"]["rows"] == 3
         assert get(view, "/api/scan?scan=week/one")["state"] == "begun"
         assert post(view, "/api/start", {"name": "two"})[0] == 409  # there is one rig
@@ -169,8 +169,8 @@ def test_a_scan_starts_with_its_plan_and_a_pi_that_refuses_it_says_why(refusing_
 def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "one")
     state_before = validate(tmp_path / "one")
-    (tmp_path / "one" / PROGRAM).mkdir()
-    (tmp_path / "one" / PROGRAM / "scan.log").touch()
+    (tmp_path / "one" / PROGRAM_FOLDER).mkdir()
+    (tmp_path / "one" / PROGRAM_FOLDER / "scan.log").touch()
     (tmp_path / "one" / "operator.json").write_text('{"notes": "", "tags": []}')
     (tmp_path / "one" / "export").mkdir()
     assert validate(tmp_path / "one") == state_before
@@ -182,11 +182,11 @@ def test_nothing_is_written_through_a_link(programs, tmp_path, name):
     (tmp_path / "victim").mkdir()
     (tmp_path / "victim" / "file").write_text("as it was")
     if name:
-        (tmp_path / "scan" / PROGRAM).mkdir(parents=True)
-        (tmp_path / "scan" / PROGRAM / name).symlink_to(tmp_path / "victim" / "file")
+        (tmp_path / "scan" / PROGRAM_FOLDER).mkdir(parents=True)
+        (tmp_path / "scan" / PROGRAM_FOLDER / name).symlink_to(tmp_path / "victim" / "file")
     else:
         (tmp_path / "scan").mkdir()
-        (tmp_path / "scan" / PROGRAM).symlink_to(tmp_path / "victim")
+        (tmp_path / "scan" / PROGRAM_FOLDER).symlink_to(tmp_path / "victim")
     assert find_program(tmp_path / "scan", "scan") is None
     with pytest.raises(DeviceError):
         programs.start(tmp_path / "scan", "scan", ["--version"])

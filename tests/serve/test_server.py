@@ -22,7 +22,14 @@ from polysight.cli.main import build_parser
 from polysight.serve.commands import Format
 from polysight.serve.front import BACKLOG, STATIC, EndingServer
 from polysight.serve.guard import TOKEN_HEADER, Access
-from polysight.serve.server import ELSEWHERE, Place, describe_server, draw_code, find_addresses, make_access
+from polysight.serve.server import (
+    REMOTE_ADDRESS,
+    ServerAddress,
+    describe_server,
+    draw_code,
+    find_addresses,
+    make_access,
+)
 from polysight_shared.errors import ErrorCode
 
 
@@ -79,8 +86,8 @@ def test_nobody_to_ask_is_said(finished, watching):
 def test_loopback_is_the_default():
     args = build_parser().parse_args(["preview", "scans/one"])
     assert (args.host, args.port, args.control) == ("127.0.0.1", 8080, False)
-    assert all(Place(host).loopback for host in (args.host, "localhost", "::1", "127.3.2.1"))
-    assert not any(Place(host).loopback for host in ("0.0.0.0", "::", "192.168.33.30", "pi.lab"))
+    assert all(ServerAddress(host).loopback for host in (args.host, "localhost", "::1", "127.3.2.1"))
+    assert not any(ServerAddress(host).loopback for host in ("0.0.0.0", "::", "192.168.33.30", "pi.lab"))
 
 
 def test_the_page_needs_nothing_from_elsewhere():
@@ -188,11 +195,11 @@ def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_tex
 @pytest.mark.parametrize(
     ("place", "is_private"),
     [
-        (Place(), True),
-        (Place("localhost"), True),
-        (Place(hosts=("lab.example.org",)), False),
-        (Place("0.0.0.0"), False),
-        (Place("0.0.0.0", hosts=("lab.example.org",)), False),
+        (ServerAddress(), True),
+        (ServerAddress("localhost"), True),
+        (ServerAddress(hosts=("lab.example.org",)), False),
+        (ServerAddress("0.0.0.0"), False),
+        (ServerAddress("0.0.0.0", hosts=("lab.example.org",)), False),
     ],
     ids=str,
 )
@@ -215,7 +222,7 @@ def test_a_server_of_all_interfaces_names_each_address_of_this_machine():
         with socket.socket() as listener:
             listener.bind((address, 0))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-        probe.connect(ELSEWHERE)
+        probe.connect(REMOTE_ADDRESS)
         assert addresses[0] == probe.getsockname()[0]
 
 

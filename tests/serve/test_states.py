@@ -14,7 +14,7 @@ from tests.support.products import REASON
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition import STATES
-from polysight.acquisition.control import Life
+from polysight.acquisition.control import SignOfLife
 from polysight.catalogue import Scans
 from polysight.page.history import ScanHistory
 from polysight.page.status import Inputs, LifeSigns, Motion, ShownResults, make_snapshot, make_status
@@ -48,7 +48,7 @@ class StillWatch:
     def show(self, key: str, **words: str) -> None:
         """Publish a state of the table, with other texts than `WORDS`."""
         signs = LifeSigns(
-            life=Life(), alive=True, killed=False, alive_s=0.0, pi_silent_s=0.1, pi_limit_s=6.0, now_s=1.8e9
+            life=SignOfLife(), alive=True, killed=False, alive_s=0.0, pi_silent_s=0.1, pi_limit_s=6.0, now_s=1.8e9
         )
         history = None if key in WITHOUT_SCAN else self._history
         snapshot = make_snapshot(Inputs(self.folder, history, signs, control=True))

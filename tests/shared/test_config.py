@@ -10,7 +10,7 @@ from tests.support.refusals import refused
 
 from polysight_shared import geometry
 from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Section, load_instrument
-from polysight_shared.errors import ConfigError, ErrorCode, no_such
+from polysight_shared.errors import ConfigError, ErrorCode, make_missing_path_error
 from polysight_shared.tables import decode, read_toml, to_builtins
 
 
@@ -74,7 +74,7 @@ def test_a_mount_step_is_a_whole_shift_or_a_whole_turn(step):
 @pytest.mark.parametrize(("axis", "first", "second"), [("x", 1, 2), ("y", 2, 0), ("z", 0, 1)])
 def test_a_mount_turns_right_handed_about_each_axis(axis: str, first: int, second: int):
     mount = (MountStep(turn_deg=30.0, about=axis),)
-    images = [geometry.place(tuple(1000.0 * (i == k) for i in range(3)), mount) for k in range(3)]
+    images = [geometry.transform_to_rig(tuple(1000.0 * (i == k) for i in range(3)), mount) for k in range(3)]
     expected = [[float(i == k) for i in range(3)] for k in range(3)]
     for k, cosine_at, sine_at, sign in ((first, first, second, 1.0), (second, second, first, -1.0)):
         expected[k][cosine_at] = math.cos(math.pi / 6)
@@ -203,7 +203,7 @@ def test_an_unknown_key_is_refused_with_a_suggestion(line, wrong, suggestion, tm
 
 def test_a_missing_path_is_refused_with_a_similar_one(tmp_path):
     (tmp_path / "scan-7").mkdir()
-    assert "'scan-7'" in str(no_such(tmp_path / "scan-77"))
-    assert str(tmp_path / "away") in no_such(tmp_path / "away" / "scan-7").why
+    assert "'scan-7'" in str(make_missing_path_error(tmp_path / "scan-77"))
+    assert str(tmp_path / "away") in make_missing_path_error(tmp_path / "away" / "scan-7").why
     (tmp_path / "file").touch()
-    assert "is a file" in no_such(tmp_path / "file").what
+    assert "is a file" in make_missing_path_error(tmp_path / "file").what

@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 from polysight_shared.errors import DeviceError, ErrorCode
-from polysight_shared.sockets import replier
+from polysight_shared.sockets import create_replier
 
 
 @pytest.mark.parametrize(
@@ -29,7 +29,7 @@ def test_an_address_that_cannot_be_bound_is_refused_with_its_cause(
     socket = context.socket.return_value
     socket.bind.side_effect = zmq.ZMQError(number)
     with pytest.raises(DeviceError) as caught:
-        replier(context, "tcp://127.0.0.1:80", tmp_path)
+        create_replier(context, "tcp://127.0.0.1:80", tmp_path)
     assert caught.value.code == code
     assert zmq.strerror(number) in caught.value.what
     assert cause in caught.value.why

@@ -9,7 +9,14 @@ from tests.support.paths import REPO
 
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
-from polysight_simulators.scene.scene_file import OFF, Disturbances, Scene, apply_scene, decode_scene, load_scene
+from polysight_simulators.scene.scene_file import (
+    SWITCHED_OFF,
+    Disturbances,
+    Scene,
+    apply_scene,
+    decode_scene,
+    load_scene,
+)
 
 
 def scene(**tables: Any) -> Scene:
@@ -65,19 +72,19 @@ def test_a_wrong_key_or_value_is_refused_by_name(raw: dict[str, Any], named: str
 
 def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
     shaping = {"bend_us", "ripple_us"}
-    assert set(OFF) | shaping == set(Disturbances.__struct_fields__)
+    assert set(SWITCHED_OFF) | shaping == set(Disturbances.__struct_fields__)
     ideal = msgspec.to_builtins(scene(disturbances={"ideal": True}).disturbances)
-    expected = msgspec.to_builtins(msgspec.convert(OFF, Disturbances))
+    expected = msgspec.to_builtins(msgspec.convert(SWITCHED_OFF, Disturbances))
     assert ideal == expected
 
 
-@pytest.mark.parametrize("key", sorted(OFF))
+@pytest.mark.parametrize("key", sorted(SWITCHED_OFF))
 @pytest.mark.parametrize("word", ["off", False])
 def test_each_disturbance_can_be_switched_off_alone(key: str, word: object) -> None:
     disturbances = msgspec.to_builtins(scene(disturbances={key: word}).disturbances)
     expected = {
         **msgspec.to_builtins(Disturbances()),
-        key: msgspec.to_builtins(msgspec.convert(OFF, Disturbances))[key],
+        key: msgspec.to_builtins(msgspec.convert(SWITCHED_OFF, Disturbances))[key],
     }
     assert disturbances == expected
 

@@ -11,7 +11,7 @@ from polysight.store.scan_folder import ScanFolder
 from polysight.sync.decimate import flatten, fold
 from polysight_shared.errors import ConfigError
 from polysight_simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
-from polysight_simulators.scene.shapes import GROUP
+from polysight_simulators.scene.shapes import ENTRY_POINT_GROUP
 
 RIG = published_rig()
 GRID = {"columns": 9, "rows": 5, "step_x_mm": 6.0, "step_y_mm": 6.0}
@@ -28,7 +28,7 @@ def worlds_entry_point(tmp_path, monkeypatch):
     package = tmp_path / "offers_shapes-1.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Name: offers-shapes\nVersion: 1\n", encoding="utf-8")
-    entry = f"[{GROUP}]\naaa = polysight_worlds.scene_shapes:simulate_echoes\n"
+    entry = f"[{ENTRY_POINT_GROUP}]\naaa = polysight_worlds.scene_shapes:simulate_echoes\n"
     (package / "entry_points.txt").write_text(entry, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
 

@@ -12,7 +12,13 @@ from tests.support.stage.processes import StageProcess
 
 from polysight_shared.errors import DeviceError
 from polysight_simulators.builds import SKETCH_DIR, build_sketch, sketch_compiler
-from polysight_simulators.uno import ENABLING_COMMAND, EmulatedUno, emulator, firmware, missing
+from polysight_simulators.uno import (
+    ENABLING_COMMAND,
+    EmulatedUno,
+    compile_emulator,
+    compile_firmware,
+    list_missing_packages,
+)
 
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
 
@@ -45,7 +51,7 @@ def sanitized_program() -> Path:
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Output folder and stdout of `make firmware`."""
-    if lacking := [p for p in missing() if p not in ("libsimavr-dev", "libelf-dev")]:
+    if lacking := [p for p in list_missing_packages() if p not in ("libsimavr-dev", "libelf-dev")]:
         pytest.skip(f"no firmware without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
     folder = tmp_path_factory.mktemp("firmware")
     command = ["make", "-C", str(SKETCH_DIR), "firmware", f"AVR_B={folder}"]
@@ -57,9 +63,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="session")
 def uno_programs() -> tuple[Path, Path]:
     """The emulator and the machine code."""
-    if lacking := missing():
+    if lacking := list_missing_packages():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
-    return emulator(), firmware()
+    return compile_emulator(), compile_firmware()
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ COMMANDS = (
 def test_every_damaged_line_is_refused(talker):
     talker.ready()
     for verb, args in COMMANDS:
-        talker.rest()
+        talker.run_until_rest()
         talker.replies()
         at_rest = talker.status()
         talker.still()

@@ -88,7 +88,7 @@ def test_hold_resumes_on_the_exact_grid(stage, seed: int):
         hold_count += stage.status().fields["state"] == "hold"
         assert motions(stage.wires)[-1].vx_um_s == 0
         stage.rx(Immediate.RESUME.sent)
-    stage.rest()
+    stage.run_until_rest()
     (done,) = stage.replies()
     assert hold_count == 3
     assert (done.integer("points"), done.integer("pulses"), done.integer("held")) == (points, points, 1)
@@ -119,7 +119,7 @@ def test_stop_ends_the_triggers_and_keeps_the_position(stage):
     rising_edges = len([e for e in edges(stage.wires) if e.value])
     assert 0 < rising_edges < 50
     stage.rx(bytes([Immediate.STOP]))
-    stage.rest()
+    stage.run_until_rest()
     assert [r.kind for r in stage.replies()] == ["alarm"]
     status = stage.status()
     rising = [e for e in edges(stage.wires) if e.value]
@@ -156,7 +156,7 @@ def _act(rng: random.Random, sequence: int) -> tuple[str, object]:
     if kind == "run":
         return "run", rng.randint(1, 3_000_000)
     if kind == "rest":
-        return "rest", 40_000_000
+        return "run_until_rest", 40_000_000
     if kind == "press":
         return "press", rng.choice([0, 0, 0, 1, 2, 4])
     if kind == "slip":
@@ -171,7 +171,7 @@ def test_same_words_and_same_wires(both, seed: int):
     greetings = [
         ("rx", Command(n, v, a).encode()) for n, v, a in ((0, "HELLO", ()), (1, "ENABLE", (1,)), (2, "HOME", ()))
     ]
-    script = [*greetings, ("rest", 40_000_000)]
+    script = [*greetings, ("run_until_rest", 40_000_000)]
     sequence = 2
     for _ in range(120):
         sequence += rng.random() < 0.9

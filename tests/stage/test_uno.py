@@ -60,7 +60,7 @@ def test_random_rows(host, batch: int):
             host.uno.feed(bytes([Immediate.HOLD]))
             host.uno.run_ms(rng.uniform(0, 150))
             host.uno.feed(Immediate.RESUME.sent)
-        host.uno.rest()
+        host.uno.run_until_rest()
         (done,) = host.replies()
         x = done.integer("x")
         hold_count = done.integer("held")
@@ -120,7 +120,7 @@ def test_a_short_hold_is_told_and_costs_no_step(host):
     for _ in range(5):
         host.uno.run_ms(83)
         host.uno.feed(bytes([Immediate.HOLD]) + Immediate.RESUME.sent)
-    host.uno.rest()
+    host.uno.run_until_rest()
     (done,) = host.replies()
     assert [done.integer(k) for k in ("points", "pulses", "held")] == [60, 60, 1]
     assert [host.at(e) for e in host.uno.edges if e.value] == [(3000 + 100 * i, 0) for i in range(60)]
@@ -134,7 +134,7 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     gap = b"?\n" * 12 if chatty else b""
     host.uno.feed(b"".join(gap + line for line in lines))
     host.uno.settle()
-    host.uno.rest()
+    host.uno.run_until_rest()
     host.uno.run_ms(300)
     replies = host.replies()
     answered = {r.sequence for r in replies if r.kind in ("ok", "error") and r.sequence is not None}
@@ -153,7 +153,7 @@ def test_no_command_is_lost_silently(host, chatty: bool):
 
 def test_a_second_command_on_its_way_is_answered(host):
     host.uno.feed(host.line("MOVE", 400, 0, 4000) + host.line("MOVE", 0, 0, 4000) + host.line("CLEAR"))
-    host.uno.rest()
+    host.uno.run_until_rest()
     kinds = [(r.kind, r.number) for r in host.replies()]
     assert kinds == [("ok", 0), ("error", 7), ("error", 7), ("done", 0)]
     assert host.status().integer("x") == 400
@@ -164,7 +164,7 @@ def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest
     """A switch that closes at any time during a motion is an alarm, never `done`."""
     rng = random.Random(mask)
     host.must_obey("MOVE", 200, 200, 4000)
-    host.uno.rest()
+    host.uno.run_until_rest()
     host.replies()
     for _ in range(100 if request.config.getoption("--long") else 3):
         host.must_obey("MOVE", 900, 900, 2000)
@@ -193,7 +193,7 @@ def test_damaged_lines_do_not_disturb_a_row(host):
             continue
         host.uno.feed(bytes(damaged) + b"\n")
         host.uno.run_ms(10)
-    host.uno.rest()
+    host.uno.run_until_rest()
     replies = host.replies()
     assert replies[-1].kind == "done"
     assert all(r.kind == "error" and r.sequence is None for r in replies[:-1])

@@ -114,7 +114,7 @@ def test_a_program_that_works_is_never_reset(host):
             host.uno.feed(b"N1 SET 0 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9 1 2 3 4 5 6 7 8 9*0000\n" * 4)
             host.uno.feed(bytes([Immediate.STATUS]))
             host.uno.run_ms(25)
-        host.uno.rest()
+        host.uno.run_until_rest()
         host.replies()
     assert host.uno.troubles == []
 
@@ -136,7 +136,7 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
             host.uno.run(rng.choice([30, 60, 100]) * US)
             host.uno.press(0)
         glitches += 250
-        host.uno.rest()
+        host.uno.run_until_rest()
         (answer,) = host.replies()
         assert (answer.kind, answer.integer("points"), answer.integer("pulses")) == ("done", points, points)
     rising = [e for e in host.uno.edges if e.value]
@@ -171,7 +171,7 @@ def test_no_stray_byte_ends_a_hold(host):
     host.must_obey("ROW", 4000, 200, 60, 500, 4000)
     host.uno.run_ms(1200)
     host.uno.feed(bytes([Immediate.HOLD]))
-    host.uno.rest()
+    host.uno.run_until_rest()
     host.replies()
     host.uno.edges.clear()
     for byte in set(range(256)) - {Immediate.STOP}:
@@ -180,7 +180,7 @@ def test_no_stray_byte_ends_a_hold(host):
     host.uno.settle()
     assert host.uno.edges == []
     host.uno.feed(Immediate.RESUME.sent)
-    host.uno.rest()
+    host.uno.run_until_rest()
     assert host.replies()[-1].kind == "done"
 
 
@@ -192,7 +192,7 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
     host.uno.watch(X_PUL)
     host.uno.edges.clear()
     host.must_obey("HOME")
-    host.uno.rest()
+    host.uno.run_until_rest()
     host.replies()
     lowest = min(e.x for e in host.uno.edges)
     # Steps after the closing point, 200 of which are 1 mm.

@@ -9,7 +9,7 @@ from tests.support.paths import REPO
 from tests.support.stage.drivers import Host
 
 from polysight_shared.stage_line import Immediate, Parameter
-from polysight_simulators.uno import HZ, firmware
+from polysight_simulators.uno import HZ, compile_firmware
 
 SKETCH = REPO / "arduino_stage"
 US = HZ // 1_000_000
@@ -54,9 +54,9 @@ def busiest_step(host: Host) -> int:
             for byte in (Immediate.STATUS, Immediate.HOLD, Immediate.RESUME) * 12:
                 host.uno.feed(bytes([byte]) * 4)
                 host.uno.run_ms(30)
-            host.uno.rest()
+            host.uno.run_until_rest()
             assert host.replies()[-1].kind == "done"
-        cost = host.uno.cost()
+        cost = host.uno.read_cost()
         # 8 us: longest wait of a step
         assert max(v for k, v in cost.interrupts.items() if k != STEP_VECTOR) <= 128
         most = max(most, cost.interrupts[STEP_VECTOR])
@@ -77,7 +77,7 @@ def test_interrupt_cost_with_another_compiler(make_uno, folder: Path | None):
     """The same for the image that another avr-gcc makes."""
     if folder is None:
         pytest.skip("no other avr-gcc: the Arduino IDE's is looked for in ~/.arduino15, others in POLYSIGHT_AVR_GCC")
-    host = Host(make_uno(start=(300, 250), image=firmware(folder))).ready()
+    host = Host(make_uno(start=(300, 250), image=compile_firmware(folder))).ready()
     assert busiest_step(host) <= HZ // TOP_RATE - MARGIN
 
 
@@ -90,7 +90,7 @@ def test_top_rate_is_kept(host):
     for _ in range(120):
         host.uno.feed(bytes([Immediate.STATUS]))
         host.uno.run_ms(8)
-    host.uno.rest()
+    host.uno.run_until_rest()
     times = [e.cycle for e in host.uno.edges if e.value]
     assert len(times) == 20_000
     cruise = times[2000:18_000]
@@ -109,7 +109,7 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     host.uno.run_ms(900.7)
     host.uno.feed(bytes([byte]))
     sent = host.uno.cycle
-    host.uno.rest()
+    host.uno.run_until_rest()
     times = [e.cycle for e in host.uno.edges if e.value]
     # Steps in which the stage slows down
     ramp = -(-rate * rate // (2 * accel))
@@ -134,7 +134,7 @@ def test_half_a_second_of_silence_is_the_default(host):
     host.uno.watch(X_PUL)
     silent_from = host.uno.cycle
     host.must_obey("HOME")
-    host.uno.rest()
+    host.uno.run_until_rest()
     assert [(r.kind, r.number) for r in host.replies()] == [("alarm", 11)]
     steps = [e.cycle for e in host.uno.edges if e.value]
     assert silent_from + 500 * MS < steps[-1] <= silent_from + (500 + 100 + 15) * MS  # with the command's own time

@@ -12,7 +12,13 @@ from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import resume_scan
 from polysight.cli.main import main
-from polysight.store.scan_folder import ADDRESSES, ScanFolder, check_same_scan, extract_connection, with_connection
+from polysight.store.scan_folder import (
+    CHANGEABLE_BOARD_KEYS,
+    ScanFolder,
+    check_same_scan,
+    extract_connection,
+    with_connection,
+)
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.tables import decode, to_builtins
@@ -45,7 +51,7 @@ def other(value: Any) -> Any:
 
 
 def may_change(path: tuple[str | int, ...]) -> bool:
-    board = path[0] == "boards" and path[2] in ADDRESSES
+    board = path[0] == "boards" and path[2] in CHANGEABLE_BOARD_KEYS
     return board or path[0] in ("pi", "limits") or path[:2] == ("radar", "servers")
 
 

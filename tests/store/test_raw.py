@@ -21,7 +21,7 @@ from polysight.cli.main import main
 from polysight.jobs.live_scan import resume
 from polysight.jobs.process import make_products, process, process_rows
 from polysight.jobs.scans import drop_raw, find_processed_digests
-from polysight.products import REPORT, making_products, write_json
+from polysight.products import REPORT, replace_products, write_json
 from polysight.results import NoResult
 from polysight.settings import DEFAULT
 from polysight.store import lock_samples
@@ -124,7 +124,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             code = ErrorCode.FILE_MISSING
             named = REPORT
         elif what == "being made":
-            other_items.enter_context(making_products(scan / "products", ScanFolder.load(scan).scan_id))
+            other_items.enter_context(replace_products(scan / "products", ScanFolder.load(scan).scan_id))
         elif what == "being processed":
             other_items.enter_context(lock_samples(ScanFolder.load(scan)))
             named = "rows.jsonl"

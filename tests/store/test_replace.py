@@ -13,9 +13,9 @@ from tests.support.rigs import rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import errors
 
-from polysight.capture import PACKETS, Evidence, place_record, read_packets, write_index, write_packets
+from polysight.capture import PACKETS_SUFFIX, Evidence, place_record, read_packets, write_index, write_packets
 from polysight.capture.dca1000 import Counters
-from polysight.capture.placement import Past
+from polysight.capture.placement import EarlierRecords
 from polysight.jobs.recordings import inspect_placement, replace_folder
 from polysight.store import ManifestWriter, ScanFolder, describe_damage, replace_rows
 from polysight.store.logs import crc32
@@ -39,9 +39,9 @@ def scan_with(folder: Path, lost: int | Collection[int], wrong: bool = False) ->
         for board in rig.recorded:
             path = scan.row_path(board.name, 0)
             log = make_log(size, packets)
-            evidence = Evidence(size, frame, past=Past(Counters(5000, 7)))
+            evidence = Evidence(size, frame, past=EarlierRecords(Counters(5000, 7)))
             placed, out = place_record(log, frame, evidence.past)
-            packets_crc = write_packets(path.with_suffix(PACKETS), log, evidence, placed)
+            packets_crc = write_packets(path.with_suffix(PACKETS_SUFFIX), log, evidence, placed)
             path.write_bytes(out.tobytes())
             facts = {**placed.facts(), "missing": [(0, size)] if wrong else placed.missing}
             boards[board.name] = {
@@ -93,7 +93,7 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     counts = (board.packets, board.leftover, board.duplicates)
     assert counts == (placed, 1, 1), "the manifest counts as the new index does"
     names = {p.name for p in scan.path.rglob("raw/RH/*")}
-    assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS}"}
+    assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS_SUFFIX}"}
     assert inspect_placement(scan.path / "raw/RH/0000-1.idx", as_json=True) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["leftover"], report["duplicates"], report["missing"]) == (1, 1, [[9 * 1456, 10 * 1456]])
@@ -130,7 +130,7 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
     gc.collect()
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS])
+@pytest.mark.parametrize("suffix", [".bin", ".idx", PACKETS_SUFFIX])
 @pytest.mark.parametrize("other", [False, True])
 def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
     """One bit of the packet file is flipped, or it is another board's."""
@@ -166,7 +166,7 @@ def test_damage_of_a_row_is_that_of_its_own_file(tmp_path):
 
 def test_batches_that_take_packets_back_are_damage(tmp_path):
     scan, _ = scan_with(tmp_path / "scan", lost=9)
-    path = scan.path / f"raw/RH/0000{PACKETS}"
+    path = scan.path / f"raw/RH/0000{PACKETS_SUFFIX}"
     line, _, tail = path.read_bytes().partition(b"\n")
     batches = np.frombuffer(tail, dtype="<i8", count=4).copy()
     batches[1] += 1 << 40
@@ -177,7 +177,7 @@ def test_batches_that_take_packets_back_are_damage(tmp_path):
 
 def test_a_row_without_its_packets_is_left(tmp_path):
     scan, _ = scan_with(tmp_path / "scan", lost=9)
-    (scan.path / f"raw/RH/0000{PACKETS}").unlink()
-    (scan.path / f"raw/RV/0000{PACKETS}").write_bytes(b"no")
+    (scan.path / f"raw/RH/0000{PACKETS_SUFFIX}").unlink()
+    (scan.path / f"raw/RV/0000{PACKETS_SUFFIX}").write_bytes(b"no")
     assert [bool(r.why_unchanged) for r in replace_rows(scan)] == [True, True]
     assert len(errors(scan.path)) == 2

@@ -15,9 +15,9 @@ from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
 from tests.support.store.facts import load_facts
 
-from polysight.calibration import calibration_of_scan
+from polysight.calibration import load_scan_calibration
 from polysight.capture import read_index, read_packets
-from polysight.capture.row_files import PACKETS, RUN, write_durably
+from polysight.capture.row_files import PACKETS_SUFFIX, RUN, write_durably
 from polysight.cli.main import main
 from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library
@@ -25,7 +25,7 @@ from polysight.materials.result import read_patches
 from polysight.materials.train import read_material
 from polysight.products import ProcessedScan
 from polysight.products.exports import read_netcdf
-from polysight.products.folder import making_products
+from polysight.products.folder import replace_products
 from polysight.products.processed import read_image
 from polysight.store import manifest
 from polysight.store.published_rig import read_json as read_settings_json
@@ -142,7 +142,7 @@ def claims(runs: int, packets: int, size: int) -> np.ndarray:
 )
 def test_a_packet_log_that_claims_too_much_is_refused(scan, change):
     board = next(iter(scan.committed_rows()[0].boards.values()))
-    path = (scan.path / board.file).with_suffix(PACKETS)
+    path = (scan.path / board.file).with_suffix(PACKETS_SUFFIX)
     line, _, tail = path.read_bytes().partition(b"\n")
     head = json.loads(line)
     batches_end = 16 * head["batches"]
@@ -191,7 +191,7 @@ def test_the_target_of_a_link_is_not_emptied_for_new_products(tmp_path):
     out = tmp_path / "products"
     (victim / "folder").mkdir(parents=True)
     (tmp_path / ".products.new").symlink_to(victim)
-    with pytest.raises(PolysightError), making_products(out, "scan"):
+    with pytest.raises(PolysightError), replace_products(out, "scan"):
         pass
     assert (victim / "folder").is_dir()
 
@@ -219,13 +219,13 @@ def rewrite_first_line(scan: ScanFolder, **answer: object) -> Path:
 def test_calibration_outside_the_scan_is_not_read(scan, file):
     answer = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
     with refused(ErrorCode.PATH_OUTSIDE):
-        calibration_of_scan(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
+        load_scan_calibration(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
     rig = load_facts(scan)[0]["instrument"]
     with refused(ErrorCode.PATH_OUTSIDE):
-        calibration_of_scan(
+        load_scan_calibration(
             ScanFolder.load(
                 rewrite_first_line(scan, instrument={**rig, "calibration": {"hpf": "/etc/passwd"}}, calibration=None)
             )
@@ -235,7 +235,7 @@ def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
 @pytest.mark.parametrize("answer", ["text", ["a"], {"hpf": "a"}, {"hpf": {"file": 3}}])
 def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
     with refused(ErrorCode.FILE_DAMAGED, "manifest.jsonl"):
-        calibration_of_scan(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
+        load_scan_calibration(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
 
 
 def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):

@@ -3,12 +3,12 @@
 from typing import Any
 
 from polysight.pipeline import Pipeline
-from polysight.process import Use
+from polysight.process import SampleUse
 from polysight.settings import Settings
 from polysight.store import Source
 
 
-def make_pipeline(source: Source, live: bool = False, samples: Use = "none", **settings: Any) -> Pipeline:
+def make_pipeline(source: Source, live: bool = False, samples: SampleUse = "none", **settings: Any) -> Pipeline:
     """A pipeline to which all rows of a source were added; `settings` as of :class:`polysight.settings.Settings`."""
     pipeline = Pipeline(source, Settings(**settings), live=live, samples=samples)
     for row in source.rows():

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from polysight.imaging import Images
 from polysight.products import SCAN, ProcessedScan, read_products, write_image, write_json
-from polysight.products.processed import Computed
+from polysight.products.processed import ComputedContent
 from polysight.results import ScanFacts, ScanMaterials, ScanQuality
 from polysight_shared.config import CheckPlate
 
@@ -100,7 +100,7 @@ def make_result(images: Images, content: dict[str, Any] | None, quality: dict[st
 
 def changed(scan: ProcessedScan, **content: Any) -> ProcessedScan:
     """The same result with other contents."""
-    results = {name: value for name, value in vars(scan).items() if name in Computed.__annotations__}
+    results = {name: value for name, value in vars(scan).items() if name in ComputedContent.__annotations__}
     return ProcessedScan.from_results(scan.folder, **{**results, **content})
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from polysight.surfaces import Optics, Samples, Seen, aim_antenna, find_voltages, learn_gains, see_points
+from polysight.surfaces import Optics, Samples, SeenEchoes, aim_antenna, find_voltages, learn_gains, see_points
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import ShapeNuisances, reference_sphere, scan_offsets, scan_shapes
@@ -17,7 +17,7 @@ GATE_M = (1.5, 1.85)
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 9)
 COLUMNS = 80
 ROWS = 56
-See = Callable[..., Seen]
+See = Callable[..., SeenEchoes]
 
 
 def nominal_optics() -> Optics:
@@ -58,7 +58,7 @@ def optics() -> Optics:
 def see(optics) -> See:
     """`see(shapes, columns, rows, noise)`: the specular points that a scan of shapes shows."""
 
-    def see_shapes(shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0) -> Seen:
+    def see_shapes(shapes: Sequence[Shape], columns: int = COLUMNS, rows: int = ROWS, noise: float = 1.0) -> SeenEchoes:
         return see_points(*scan_on_grid(shapes, columns, rows, noise), optics, GATE_M)
 
     return see_shapes

@@ -9,11 +9,11 @@ from tests.surfaces.test_point_errors import UNIT_GAINS
 
 from polysight.data import find_packaged
 from polysight.imaging.samples import reduction
-from polysight.surfaces import Echoes, Optics, Seen, find_voltages, make_optics
-from polysight.surfaces.gains import receive, reflect_points
+from polysight.surfaces import Echoes, Optics, SeenEchoes, find_voltages, make_optics
+from polysight.surfaces.gains import predict_voltages, reflect_points
 from polysight.surfaces.measure import Shape
 from polysight.surfaces.permittivity import add_common_errors, fit_permittivity
-from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo, tangents
+from polysight.surfaces.points import compute_tangents, find_normals, find_offset_that_sees, predict_echo
 from polysight.surfaces.window import BoardFit, Samples, no_echoes
 from polysight_shared.config import load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -28,7 +28,7 @@ CENTRE_M = (-0.01, 0.104, 0.5 + RADIUS_M)
 OFFSETS_M = np.array([[0.0, 0, 0], [0.1, 0.05, 0], [-0.1, 0.05, 0], [0.05, -0.1, 0]])
 
 
-def see_exactly(solid: WorldShape, optics: Optics) -> tuple[Seen, Shape]:
+def see_exactly(solid: WorldShape, optics: Optics) -> tuple[SeenEchoes, Shape]:
     """Noiseless measurements of the specular points by both receivers, by the exact series at one frequency."""
     published = published_boards()
     boards = Boards(
@@ -42,7 +42,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[Seen, Shape]:
     normals = patch.normal.T
     # Tangents of the world as columns, and the rotation of the estimator's to them.
     own_tangents = np.einsum("ijn,jcn->nci", patch.tangents(), np.array([patch.d_a, patch.d_b]))
-    turned = np.swapaxes(tangents(normals), 1, 2) @ own_tangents
+    turned = np.swapaxes(compute_tangents(normals), 1, 2) @ own_tangents
     curvature = turned @ np.moveaxis(patch.curvature(), -1, 0) @ np.swapaxes(turned, 1, 2)
     _, cos = find_normals(points, OFFSETS_M, optics.tx.at_m, optics.h.at_m)
     seen_from = {
@@ -67,7 +67,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[Seen, Shape]:
             amplitude_std=np.zeros(len(path)),
             band_rise=np.zeros(len(path)),
         )
-    return Seen(echoes["h"], echoes["v"], np.zeros(len(points), int)), Shape(points, normals, cos, curvature)
+    return SeenEchoes(echoes["h"], echoes["v"], np.zeros(len(points), int)), Shape(points, normals, cos, curvature)
 
 
 @pytest.mark.parametrize("medium", [2.8 - 0.1j, 8 - 1j], ids=["2.8", "8"])
@@ -79,8 +79,8 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
         seen, shape = see_exactly(sphere("ball", stack, CENTRE_M, RADIUS_M), optics)
         voltages = find_voltages(seen, optics, shape)
         eps = np.inf if stack.is_metal else medium
-        expected = receive(voltages, reflect_points(eps, voltages, optics.wave_number))
-        h, v = (voltages.b / expected).T
+        expected = predict_voltages(voltages, reflect_points(eps, voltages, optics.wave_number))
+        h, v = (voltages.voltage / expected).T
         ratios[name] = h / v
         share_of_v = np.abs(expected[:, 1] / expected[:, 0])
     # The antennas' patterns are those of metal. V is small near Brewster's angle: its error counts over H.
@@ -113,7 +113,7 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
     at_v_m = find_offset_that_sees(shape.points, shape.normals, OFFSETS_M, tx.position, v_rx.position)
     gain_h = find_pattern(tx, shape.points, OFFSETS_M) * find_pattern(h, shape.points, OFFSETS_M)
     gain_v = find_pattern(tx, shape.points, at_v_m) * find_pattern(v_rx, shape.points, at_v_m)
-    v = replace(v, b=v.b / np.stack([gain_h, gain_v], axis=1), std=np.full(v.b.shape, 1e-4))
+    v = replace(v, voltage=v.voltage / np.stack([gain_h, gain_v], axis=1), std=np.full(v.voltage.shape, 1e-4))
     fit = fit_permittivity(v, UNIT_GAINS, optics.wave_number)
     covariance = add_common_errors(fit, v, UNIT_GAINS, [], optics.wave_number)["model"]
     std = np.sqrt(np.trace(covariance))
@@ -127,8 +127,8 @@ def test_the_level_of_metal_is_known_as_well_as_both_its_directions_are(behind_m
     x, y, z = CENTRE_M
     seen, shape = see_exactly(sphere("ball", METAL, (x, y, z + behind_m), RADIUS_M), optics)
     voltages = find_voltages(seen, optics, shape)
-    expected = receive(voltages, reflect_points(np.inf, voltages, optics.wave_number))
-    miss = np.log(np.abs(voltages.b[:, 0] / expected[:, 0])) - learnt.level(voltages)
+    expected = predict_voltages(voltages, reflect_points(np.inf, voltages, optics.wave_number))
+    miss = np.log(np.abs(voltages.voltage[:, 0] / expected[:, 0])) - learnt.level(voltages)
     std = learnt.estimate_level_std(voltages)
     assert np.all(np.abs(miss) < 2 * std + 0.02)
     assert np.all(std < most_std)

@@ -8,13 +8,13 @@ import pytest
 from polysight.surfaces import Samples
 from polysight.surfaces.paths import find_echoes, measure_echoes
 from polysight.surfaces.points import (
+    compute_spreading,
+    compute_unit_legs,
     find_curvature,
     find_normals,
     find_offset_that_sees,
     locate,
     predict_echo,
-    spreading,
-    unit_legs,
 )
 from polysight.surfaces.window import find_mirror_path
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
@@ -112,8 +112,8 @@ def test_a_mirror_spreads_as_its_path():
     share = (0.5 - scan.middle_m[2]) / (image[2] - scan.middle_m[2])
     point = (scan.middle_m + share * (image - scan.middle_m))[None]
     normals, _ = find_normals(point, at_m, scan.tx_m, scan.middle_m)
-    _, _, out_m, back_m = unit_legs(point, at_m, scan.tx_m, scan.middle_m)
-    factors = spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
+    _, _, out_m, back_m = compute_unit_legs(point, at_m, scan.tx_m, scan.middle_m)
+    factors = compute_spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(normals, [[0, 0, -1]], atol=1e-9)
     assert factors[0] == pytest.approx(1 / float(out_m[0] + back_m[0]), rel=1e-6)
 

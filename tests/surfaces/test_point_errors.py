@@ -49,9 +49,9 @@ def make_voltages(ripple: np.ndarray, at_m: np.ndarray, stated_noise: float) -> 
     rows[:, 0, 0] = 1
     rows[:, 1, 1] = 1
     return Voltages(
-        b=b,
+        voltage=b,
         std=std,
-        m=rows,
+        response=rows,
         theta=np.stack([theta, theta], axis=1),
         path_m=np.full((count, 2), np.inf),
         bend_inside=zero,
@@ -116,7 +116,7 @@ def test_a_region_is_as_wide_as_the_points_ripple(ripple, columns, rows):
         slow = np.lib.stride_tricks.sliding_window_view(white, (5, 5), axis=(1, 2)).mean(axis=(3, 4)) * 5
         noise = rng.standard_normal((2, len(at_m)))
         real, imaginary = ripple * slow.reshape(2, -1) + 0.001 * noise
-        v = replace(quiet, b=quiet.b * np.stack([np.ones(len(at_m)), 1 + real + 1j * imaginary], axis=1))
+        v = replace(quiet, voltage=quiet.voltage * np.stack([np.ones(len(at_m)), 1 + real + 1j * imaginary], axis=1))
         fit = fit_permittivity(v, UNIT_GAINS, WAVE_NUMBER)
         miss = fit.eps - EPS
         parts = np.array([miss.real, miss.imag])
@@ -129,9 +129,9 @@ def test_a_level_that_a_badly_known_rig_explains_does_not_refuse_a_segment():
     voltages = make_voltages(np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), 0.005)
     fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
     # H is 30 % too strong, as of a board that may stand so: the level of no half space of this permittivity.
-    loud = replace(voltages, b=voltages.b * np.array([1.3, 1.3]))
+    loud = replace(voltages, voltage=voltages.voltage * np.array([1.3, 1.3]))
     well_known, _ = judge_medium(fit, loud, UNIT_GAINS, [], WAVE_NUMBER)
-    moved = DisturbedScan("places", replace(loud, b=loud.b * np.array([1.2, 1.2])), UNIT_GAINS)
+    moved = DisturbedScan("places", replace(loud, voltage=loud.voltage * np.array([1.2, 1.2])), UNIT_GAINS)
     badly_known, _ = judge_medium(fit, loud, UNIT_GAINS, [moved], WAVE_NUMBER)
     assert well_known > 0.2
     assert badly_known == 0
@@ -141,8 +141,8 @@ def test_what_a_badly_known_rig_does_not_explain_refuses_a_segment():
     """Half a millimetre of plastic on a ceramic: a level 11 % off, of which the rig's errors explain 4."""
     voltages = make_voltages(np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), 0.005)
     fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
-    coated = replace(voltages, b=0.893 * voltages.b)
-    moved = DisturbedScan("places", replace(coated, b=1.037 * coated.b), UNIT_GAINS)
+    coated = replace(voltages, voltage=0.893 * voltages.voltage)
+    moved = DisturbedScan("places", replace(coated, voltage=1.037 * coated.voltage), UNIT_GAINS)
     level, _ = judge_medium(fit, coated, UNIT_GAINS, [moved], WAVE_NUMBER)
     assert MAX_LEVEL_MISS < level < 0.113
 
@@ -191,7 +191,7 @@ def test_noise_of_the_points_of_a_reference_is_no_property_of_its_gains(wave, le
     # Waves of 150 mm, 0.12 rad of direction, which no polynomial of second degree follows and a block half averages.
     phase = 2 * np.pi * at_m[:, 0] / 0.15
     gain = np.stack([np.exp(wave * (np.sin(phase) + 1j * np.cos(phase))), np.ones(len(at_m))], axis=1)
-    metal = replace(metal, b=-gain * (1 + 0.003 * noise), std=np.full((len(at_m), 2), 0.003), arrival=0.8 * at_m)
+    metal = replace(metal, voltage=-gain * (1 + 0.003 * noise), std=np.full((len(at_m), 2), 0.003), arrival=0.8 * at_m)
     gains = learn_gains(metal, WAVE_NUMBER)
     assert least <= gains.std < most
     # Both change the values of the polynomials.

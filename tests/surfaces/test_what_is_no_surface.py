@@ -9,7 +9,7 @@ import pytest
 
 from polysight.jobs.surface import check_is_metal
 from polysight.surfaces import (
-    Seen,
+    SeenEchoes,
     Segment,
     Uncertainty,
     analyse_surface,
@@ -18,13 +18,13 @@ from polysight.surfaces import (
     learn_gains,
     result,
 )
-from polysight.surfaces.gains import receive, reflect_points
+from polysight.surfaces.gains import predict_voltages, reflect_points
 from polysight.surfaces.measure import group_echoes
 from polysight.surfaces.paths import STRIDE_M
 from polysight.surfaces.permittivity import find_interior, find_reflecting, find_shares, fit_permittivity
 from polysight.surfaces.points import find_offset_that_sees, predict_echo
 from polysight.surfaces.result import (
-    BEHIND_ANOTHER,
+    BEHIND_ANOTHER_REASON,
     NO_SINGLE_MEDIUM,
     add_permittivity,
     describe_segment,
@@ -76,7 +76,7 @@ def test_an_edge_has_no_level_of_its_own(metal, gains, optics):
     assert find_reflecting(voltages, amplitude, number, learnt).mean() > 0.9
     angle = metal.h.slope[:, 0] - metal.h.slope[:, 0].min() + 0.02
     fall = 0.02 / angle
-    edge = replace(voltages, b=voltages.b * fall[:, None])
+    edge = replace(voltages, voltage=voltages.voltage * fall[:, None])
     assert not find_reflecting(edge, amplitude * fall, number, learnt).any()
 
 
@@ -84,8 +84,12 @@ def test_what_reflects_less_than_any_medium_is_no_surface(metal, gains, optics):
     voltages = find_voltages(metal, optics)
     amplitude = np.abs(metal.h.amplitude)
     number = np.zeros(len(metal), int)
-    of_foam = find_reflecting(replace(voltages, b=0.05 * voltages.b), 0.05 * amplitude, number, gains(optics))
-    of_edge = find_reflecting(replace(voltages, b=0.02 * voltages.b), 0.02 * amplitude, number, gains(optics))
+    of_foam = find_reflecting(
+        replace(voltages, voltage=0.05 * voltages.voltage), 0.05 * amplitude, number, gains(optics)
+    )
+    of_edge = find_reflecting(
+        replace(voltages, voltage=0.02 * voltages.voltage), 0.02 * amplitude, number, gains(optics)
+    )
     assert of_foam.mean() > 0.9
     assert not of_edge.any()
 
@@ -113,17 +117,17 @@ def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
     voltages = find_voltages(metal, optics)
     gain = np.exp(learnt.level(voltages))[:, None]
     gain = gain * np.stack([np.ones(len(metal)), 1 / learnt.ratio(voltages.arrival)], axis=1)
-    received = gain * receive(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
+    received = gain * predict_voltages(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     ball = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=30.0)
     for level, rise, reason in ((1.0, 0.0, "below 40 mm"), (1.0, 0.1, NO_SINGLE_MEDIUM), (1.2, 0.0, NO_SINGLE_MEDIUM)):
         band_rise = np.tile(learnt.band_rise + rise, (len(metal), 1))
-        changed = replace(voltages, b=level * received, band_rise=band_rise)
+        changed = replace(voltages, voltage=level * received, band_rise=band_rise)
         judged, fit = judge_segment(ball, changed, learnt, [], optics.wave_number)
         assert reason in judged.reason
         assert fit is None
     # Far from the directions of the reference, as beside a flat plate, the level of the gains is not known.
     elsewhere = replace(learnt, covered=tuple(border + 0.5 for border in learnt.covered))
-    brighter = replace(voltages, b=1.1 * received, band_rise=np.tile(learnt.band_rise, (len(metal), 1)))
+    brighter = replace(voltages, voltage=1.1 * received, band_rise=np.tile(learnt.band_rise, (len(metal), 1)))
     reasons = [judge_segment(ball, brighter, known, [], optics.wave_number)[0].reason for known in (learnt, elsewhere)]
     assert reasons[0] == NO_SINGLE_MEDIUM
     assert "below 40 mm" in reasons[1]
@@ -138,7 +142,7 @@ def receive_wall(voltages, wave_numbers, medium, wall_m):
     faces = np.stack([(cos - inner) / (cos + inner), (medium * cos - inner) / (medium * cos + inner)])
     r_s, r_p = faces * (1 - through) / (1 - faces**2 * through)
     # The host's p is that of metal, -1, as s is.
-    echoes = voltages.m[..., :1] * r_s - voltages.m[..., 1:2] * r_p
+    echoes = voltages.response[..., :1] * r_s - voltages.response[..., 1:2] * r_p
     paths_m = np.linspace(-0.02, 0.06, 161)
     matched = np.exp(1j * np.outer(paths_m, wave_numbers - wave_numbers.mean()))
     echoes = echoes * matched[np.abs(echoes[:, 0] @ matched.T).mean(axis=0).argmax()]
@@ -163,7 +167,7 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
     def judge(medium, wall_m):
         b, rise = receive_wall(voltages, wave_numbers, medium, wall_m)
         noise = 0.01 * (rng.standard_normal(b.shape) + 1j * rng.standard_normal(b.shape))
-        changed = replace(voltages, b=gain * b * (1 + noise), band_rise=rise + learnt.band_rise)
+        changed = replace(voltages, voltage=gain * b * (1 + noise), band_rise=rise + learnt.band_rise)
         judged, fit = judge_segment(plane, changed, learnt, [], optics.wave_number)
         if fit is None:
             return None
@@ -187,7 +191,7 @@ def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(met
         echoes = [{f.name: getattr(h, f.name) for f in fields(h)} for h in (metal.h, later)]
         h = replace(metal.h, **{name: np.concatenate([part[name] for part in echoes]) for name in echoes[0]})
         segment = np.repeat([0, 1], len(metal))
-        return Seen(h, h, segment), find_shape(h, optics)
+        return SeenEchoes(h, h, segment), find_shape(h, optics)
 
     # 53 degrees of incidence: an echo 1.2 times the depth later.
     assert find_depth_behind(*add_echo(0.2), 1) == pytest.approx(0.166, rel=0.05)
@@ -200,7 +204,7 @@ def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(met
     front, echo = (describe_segment(number, shape[echoes.segment == number]) for number in (0, 1))
     echo = replace(echo, radius_mm=18.0, reason="radius 18 mm: below 40 mm only the shape is reliable")
     judged, unknown_m = doubt_places([front, echo], echoes, shape, find_voltages(echoes, optics, shape), gains(optics))
-    assert [segment.reason for segment in judged] == ["", BEHIND_ANOTHER]
+    assert [segment.reason for segment in judged] == ["", BEHIND_ANOTHER_REASON]
     assert judged[1].radius_std_mm >= 18.0
     assert not unknown_m[: len(metal)].any()
     assert unknown_m[-1] == pytest.approx(0.166 / np.sqrt(3), rel=0.05)
@@ -229,14 +233,14 @@ def rippled_plane(metal, gains, optics):
     voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
     gain = np.exp(learnt.level(voltages))
     gain = np.stack([gain, gain / learnt.ratio(voltages.arrival)], axis=1)
-    b = gain * receive(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
+    b = gain * predict_voltages(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     low = voltages.at_m.min(axis=0)
     high = voltages.at_m.max(axis=0)
     from_edges_m = np.concatenate([voltages.at_m - low, high - voltages.at_m], axis=1) + 0.01
     ripple = 0.003 / from_edges_m * np.exp(-1j * optics.wave_number * from_edges_m**2 / 0.9)
     share = find_shares(voltages.at_m, np.zeros(len(metal), int), (low - 0.1, high + 0.1))
     band_rise = np.tile(learnt.band_rise, (len(metal), 1))
-    return replace(voltages, b=b, band_rise=band_rise), share, ripple.sum(axis=1)
+    return replace(voltages, voltage=b, band_rise=band_rise), share, ripple.sum(axis=1)
 
 
 # Phases of the ripple.
@@ -248,7 +252,7 @@ def test_ripples_of_edges_average_where_points_near_them_count_less(rippled_plan
     errors = []
     for turn in TURNS:
         of_both = np.stack([np.ones(len(ripple)), 1 + turn * ripple], axis=1)
-        rippled = replace(voltages, b=voltages.b * of_both)
+        rippled = replace(voltages, voltage=voltages.voltage * of_both)
         fits = [fit_permittivity(rippled, gains(optics), optics.wave_number, counted) for counted in (1.0, share)]
         errors.append([abs(fit.eps - MEDIUM) for fit in fits])
     alike, slowly = np.sqrt(np.mean(np.square(errors), axis=0))
@@ -260,7 +264,7 @@ def test_ripples_of_edges_do_not_make_a_plate_a_wall(rippled_plane, metal, gains
     plane = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=None)
     reasons = []
     for turn in TURNS:
-        rippled = replace(voltages, b=voltages.b * (1 + 1.5 * turn * ripple)[:, None])
+        rippled = replace(voltages, voltage=voltages.voltage * (1 + 1.5 * turn * ripple)[:, None])
         for counted in (1.0, share):
             judged, _ = judge_segment(plane, rippled, gains(optics), [], optics.wave_number, share=counted)
             reasons.append(judged.reason)
@@ -335,7 +339,7 @@ def test_a_place_is_doubted_for_a_wall_and_for_an_echo_behind_another_surface(
     )
     expected_m = {"surface": 0.0, "wall": estimate_wall_std(0.3, 0.1), "behind": 0.03 / np.sqrt(3)}[judged_as]
     np.testing.assert_allclose(unknown_m, [expected_m, expected_m, 0])
-    assert judged.reason == (BEHIND_ANOTHER if judged_as == "behind" else reason)
+    assert judged.reason == (BEHIND_ANOTHER_REASON if judged_as == "behind" else reason)
     assert (judged.radius_std_mm > 1) is (judged_as != "surface")
 
 
@@ -352,7 +356,7 @@ def test_a_radius_says_where_curvatures_and_normals_disagree(metal, optics):
     assert flat.radius_std_mm is None
 
 
-def see_sphere(optics, radius_m: float = 0.125) -> Seen:
+def see_sphere(optics, radius_m: float = 0.125) -> SeenEchoes:
     """Return noiseless echoes, of amplitude 1, of a sphere under the directions that a whole scan shows."""
     x, y = np.meshgrid(np.linspace(-0.25, 0.25, 24), np.linspace(-0.3, 0.3, 24))
     normals = np.stack([x.ravel(), y.ravel(), -np.sqrt(1 - x.ravel() ** 2 - y.ravel() ** 2)], axis=1)
@@ -378,7 +382,7 @@ def see_sphere(optics, radius_m: float = 0.125) -> Seen:
             band_rise=zero,
         )
         channels.append(echoes)
-    return Seen(channels[0], channels[1], np.zeros(len(points), int))
+    return SeenEchoes(channels[0], channels[1], np.zeros(len(points), int))
 
 
 @pytest.mark.parametrize("medium", [2.1 - 0.002j, 4.2 - 0.4j, 8.0 - 1.0j])
@@ -386,8 +390,8 @@ def test_a_sphere_that_is_not_of_metal_is_no_reference(medium, optics):
     voltages = find_voltages(see_sphere(optics), optics)
 
     def learn(eps):
-        received = receive(voltages, reflect_points(eps, voltages, optics.wave_number))
-        return learn_gains(replace(voltages, b=received), optics.wave_number)
+        received = predict_voltages(voltages, reflect_points(eps, voltages, optics.wave_number))
+        return learn_gains(replace(voltages, voltage=received), optics.wave_number)
 
     check_is_metal(Path("scan"), learn(np.inf))
     with pytest.raises(DataError, match="not of metal"):

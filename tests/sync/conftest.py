@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from polysight.capture.dca1000 import raw_words
+from polysight.capture.dca1000 import encode_row_words
 from polysight.sync.offsets import AlignedRow, align_row
 from polysight_shared.config import Board, Instrument
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
@@ -63,7 +63,7 @@ def counts() -> Callable[..., np.ndarray]:
 
     def make(frames: np.ndarray) -> np.ndarray:
         rx, positions, chirps, samples = frames.shape
-        return raw_words(1000 * frames.reshape(rx, -1, samples)).reshape(positions, chirps, samples, 2, rx)
+        return encode_row_words(1000 * frames.reshape(rx, -1, samples)).reshape(positions, chirps, samples, 2, rx)
 
     return make
 

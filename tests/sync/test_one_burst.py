@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from tests.support.rigs import published_rig
 
-from polysight.capture import row_words
+from polysight.capture import view_row_words
 from polysight.sync import BoardSetup, synchronise_row
 from polysight_shared.raster import Burst, plan_raster
 from polysight_simulators.scene import SimulatedRig, decode_scene
@@ -35,7 +35,7 @@ def synchronise_burst(burst: Burst, speed_mm_s: float):
     x, y = row_offsets_mm(radar, row)
     words = radar.chirps("RH", x, y, 0)
     payload = words.reshape(-1).view(np.uint8)
-    decoded, valid = row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
+    decoded, valid = view_row_words(payload, [], len(x), rig.chirp.samples, len(rig.antennas.rx_mm))
     return synchronise_row(decoded, valid, BoardSetup.from_rig(rig, rig.by_name("RH")))
 
 

@@ -20,7 +20,7 @@ from tests.support.rigs import published_rig, timed_by_the_program
 from polysight_shared.config import Instrument
 from polysight_shared.program import die_with_parent
 from polysight_shared.tables import to_builtins
-from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+from polysight_simulators.uno import ENABLING_COMMAND, compile_emulator, compile_firmware, list_missing_packages
 
 HERE = Path(__file__).parent
 # Longest time of a guest. Only one that hangs reaches it: a published row takes 4 minutes of a core, and a busy machine
@@ -33,10 +33,10 @@ def kernel(request: pytest.FixtureRequest) -> Path:
     """The kernel, with simulated GPIO chips."""
     if not request.config.getoption("--uml"):
         pytest.skip("not asked for: `make test-uml` builds a user-mode Linux (minutes, once) and runs these too")
-    if lacking := missing():
+    if lacking := list_missing_packages():
         pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
     # Compiled here, because in the guest everything is read-only.
-    emulator(), firmware()
+    compile_emulator(), compile_firmware()
     built = subprocess.run([str(HERE / "build_kernel.sh")], stdout=subprocess.PIPE, text=True, check=False)
     assert built.returncode == 0, "the kernel was not built: see above"
     return Path(built.stdout.splitlines()[-1])

@@ -53,7 +53,7 @@ class ImagePair:
         return complex(r_s / r_p)
 
     def label_boxes(self) -> dict:
-        """Boxes of the plates inside the picture as a label file: mm from the picture's middle, y up."""
+        """Return boxes of the plates inside the picture as a label file: mm from the picture's middle, y up."""
         middle_m = np.array([self.x_m.mean(), self.y_m.mean()] * 2)
         half_mm = 1000 * (self.x_m[-1] - self.x_m[0]) / 2
         boxes = {}
@@ -160,7 +160,7 @@ def disturb_rig(rig: Rig, nuisances: Nuisances) -> Rig:
 
 
 def draw_direction(rng: Generator) -> NDArray:
-    """Unit vector [3] in any direction."""
+    """Return the unit vector [3] in any direction."""
     vector = rng.standard_normal(3)
     return vector / np.linalg.norm(vector)
 
@@ -209,7 +209,7 @@ def disturb_data(
     channel: str,
     dark: NDArray,
 ) -> NDArray:
-    """Echoes relative to the direct path as the synchronisation sees it, complex64 [frequencies, rows, columns].
+    """Return echoes relative to the direct path as the synchronisation sees it, complex64 [frequencies, rows, columns].
 
     `echoes` have the same shape, `direct` [frequencies] is the undisturbed path; `channel` is "h" or "v", `dark` bool
     [rows, columns] marks positions without signal.
@@ -242,7 +242,7 @@ def _draw_noise(rng: Generator, shape: tuple[int, ...]) -> NDArray:
 
 
 def _draw_fringes(rng: Generator, rig: Rig) -> NDArray:
-    """Unit phasors [rows, columns] of a second path beside the direct one: curved fringes, 15 to 200 mm wide.
+    """Return unit phasors [rows, columns] of a second path beside the direct one: curved fringes, 15 to 200 mm wide.
 
     They curve by up to 15 turns at a metre from the middle. Ranges are chosen.
     """
@@ -284,7 +284,7 @@ def _clip(echoes: NDArray, direct: NDArray, share: float) -> tuple[NDArray, NDAr
 
 
 def pixel_centres(rig: Rig, pixels: int) -> tuple[NDArray, NDArray]:
-    """Coordinates of the picture's pixel centres in the rig frame, x and y [pixels], metres."""
+    """Return coordinates of the picture's pixel centres in the rig frame, x and y [pixels], metres."""
     along = (np.arange(pixels) - (pixels - 1) / 2) * rig.step_m
     return rig.centre_m[0] + along, rig.centre_m[1] + along
 

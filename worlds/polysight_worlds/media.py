@@ -35,7 +35,7 @@ METAL = Stack(below=COPPER)
 
 
 def reflect(stack: Stack, frequency_hz: ArrayLike, cos_incidence: ArrayLike) -> tuple[NDArray, NDArray]:
-    """Reflection coefficients (r_s, r_p) in air, complex128 of the broadcast shape of the two arguments.
+    """Return the reflection coefficients (r_s, r_p) in air, complex128 of the broadcast shape of the two arguments.
 
     Solves for the waves in all layers at once: tangential E and H are continuous at each boundary.
     """
@@ -57,7 +57,7 @@ def reflect(stack: Stack, frequency_hz: ArrayLike, cos_incidence: ArrayLike) -> 
 
 
 def _solve_waves(admittances: list[NDArray], delays: list[NDArray]) -> NDArray:
-    """Amplitude of the wave that comes back, for a unit wave that falls onto the first boundary.
+    """Return the amplitude of the wave that comes back, for a unit wave that falls onto the first boundary.
 
     Unknowns in order: r; of each layer the wave down (at its top) and up (at its bottom); the wave in the half space.
     """

@@ -58,7 +58,7 @@ class Antenna:
         return replace(self, polarisation=self.polarisation + leakage * cross_axis)
 
     def field(self, directions: NDArray) -> NDArray:
-        """Complex field vectors [3, ...] of unit distance in unit `directions` [3, ...]."""
+        """Return the complex field vectors [3, ...] of unit distance in unit `directions` [3, ...]."""
         cosine = _dot(self.boresight, directions)
         gain = np.maximum(np.maximum(cosine, 0) ** self.exponent, PATTERN_FLOOR)
         if self.is_dipole:
@@ -168,7 +168,7 @@ class Waves:
 
 
 def respond(waves: Waves, normals: NDArray) -> Response:
-    """Response of facets with unit `normals` [3, ...] or [3] towards the antennas."""
+    """Return the response of facets with unit `normals` [3, ...] or [3] towards the antennas."""
     incident = waves.incident
     scattered = waves.scattered
     normals = _make_column(normals, incident)
@@ -216,7 +216,7 @@ def integrate_steps(steps_m: tuple[NDArray, NDArray], frequency_hz: float) -> ND
 
 
 def turn_back(path_m: NDArray, frequency_hz: float) -> NDArray:
-    """exp(-j k path), complex64 [...]: less than a turn is left, which single precision holds to 4e-7 rad."""
+    """Return exp(-j k path), complex64 [...]: less than a turn is left, which single precision holds to 4e-7 rad."""
     turns = frequency_hz / LIGHT_M_PER_S * path_m
     angle = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
     phasors = np.empty(angle.shape, np.complex64)
@@ -226,7 +226,7 @@ def turn_back(path_m: NDArray, frequency_hz: float) -> NDArray:
 
 
 def receive_direct(tx: Antenna, rx: Antenna, frequencies_hz: NDArray) -> NDArray:
-    """Direct path from TX to RX, complex [frequencies]."""
+    """Return the direct path from TX to RX, complex [frequencies]."""
     way = rx.position - tx.position
     distance_m = np.linalg.norm(way)
     direction = way / distance_m
@@ -285,7 +285,7 @@ def rectangle(centre: NDArray, edge_a: NDArray, edge_b: NDArray, facet_m: float)
 
 
 def ellipsoid(centre: NDArray, radii: NDArray, facet_m: float, half_widths: NDArray | None = None) -> Facets:
-    """Facets of the half of an ellipsoid that faces the antennas (smaller z).
+    """Return facets of the half of an ellipsoid that faces the antennas (smaller z).
 
     A large radius in x or y makes a cylinder; `half_widths` in x and y then say where it ends.
     """

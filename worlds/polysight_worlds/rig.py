@@ -42,20 +42,20 @@ class Rig:
         return find_mirror_point(self.tx.position, self.h.position, self.plane_m)[:2]
 
     def incidence_deg(self, channel: str) -> float:
-        """Angle of incidence at the mirror point of receiver "h" or "v": the same wherever a plate lies."""
+        """Return the angle of incidence at the mirror point of receiver "h" or "v": the same wherever a plate lies."""
         mirror_point = find_mirror_point(self.tx.position, getattr(self, channel).position, self.plane_m)
         incident = mirror_point - self.tx.position
         return float(np.degrees(np.arccos(incident[2] / np.linalg.norm(incident))))
 
     def offsets_m(self) -> tuple[NDArray, NDArray]:
-        """Stage offsets in x [columns] and y [rows]."""
+        """Return the stage offsets in x [columns] and y [rows]."""
         x = (np.arange(self.columns) - (self.columns - 1) / 2) * self.step_m
         y = (np.arange(self.rows) - (self.rows - 1) / 2) * self.step_m
         return x, y
 
 
 def turn(axis: NDArray, angle_deg: float) -> NDArray:
-    """Rotation matrix [3, 3] about a unit axis [3] (Rodrigues)."""
+    """Return the rotation matrix [3, 3] about a unit axis [3] (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.radians(angle_deg)
@@ -63,7 +63,7 @@ def turn(axis: NDArray, angle_deg: float) -> NDArray:
 
 
 def find_mirror_point(tx: NDArray, rx: NDArray, plane_m: float) -> NDArray:
-    """Point of the plane z = `plane_m` in which RX sees TX as in a mirror, [3], metres."""
+    """Return the point of the plane z = `plane_m` in which RX sees TX as in a mirror, [3], metres."""
     # On the line to the other antenna, the mirror point divides as the two heights above the plane do.
     share = (plane_m - tx[2]) / (2 * plane_m - tx[2] - rx[2])
     return np.array([*(tx + share * (rx - tx))[:2], plane_m])

@@ -77,7 +77,7 @@ def make_surface(plate: Plate, step_m: float, rng: np.random.Generator) -> Surfa
 
 
 def _draw_surface(rng: np.random.Generator, shape: tuple[int, int], length_cells: float) -> NDArray:
-    """Gaussian random surface of this shape, of rms 1 and correlation exp(-(d / length)^2)."""
+    """Return a Gaussian random surface of this shape, of rms 1 and correlation exp(-(d / length)^2)."""
     # White noise filtered with sigma has the correlation exp(-d^2 / 4 sigma^2).
     sigma = length_cells / 2
     pad = int(np.ceil(4 * sigma))
@@ -88,7 +88,7 @@ def _draw_surface(rng: np.random.Generator, shape: tuple[int, int], length_cells
 
 
 def _compute_normal(slopes: tuple[float, float]) -> NDArray:
-    """Unit normal towards the antennas of a surface z = slope_x x + slope_y y."""
+    """Return the unit normal towards the antennas of a surface z = slope_x x + slope_y y."""
     normal = np.array([slopes[0], slopes[1], -1.0])
     return normal / np.linalg.norm(normal)
 
@@ -137,7 +137,7 @@ class PlateEchoes:
             term *= 2 * rms_phase / self._orders
 
     def _list_points(self, plate: Plate) -> NDArray:
-        """Cell minus offset for all circular lags, [3, lags_y, lags_x], and z of the plate's reference height.
+        """Return cell minus offset for all circular lags, [3, lags_y, lags_x], and z of the plate's reference height.
 
         A lag is the index of the offset minus that of the cell.
         """
@@ -150,7 +150,7 @@ class PlateEchoes:
         return np.stack(np.broadcast_arrays(x[None, :], y[:, None], z))
 
     def _find_edges(self) -> tuple[NDArray, NDArray]:
-        """Edges of a cell along x and y, [3] each."""
+        """Return edges of a cell along x and y, [3] each."""
         step = self._rig.step_m
         slope_x, slope_y = self._surface.mean_slopes
         return np.array([step, 0, slope_x * step]), np.array([0, step, slope_y * step])
@@ -195,7 +195,7 @@ class PlateEchoes:
 
 
 def fast_length(length: int) -> int:
-    """Length of at least `length` that an FFT does fast."""
+    """Return the length of at least `length` that an FFT does fast."""
     return int(fft.next_fast_len(length) or length)
 
 
@@ -207,12 +207,12 @@ def fft2(values: NDArray, shape: tuple[int, int] | None = None) -> NDArray:
 
 
 def ifft2(spectrum: NDArray) -> NDArray:
-    """Inverse of `fft2`."""
+    """Return the inverse of `fft2`."""
     return np.asarray(fft.ifft2(spectrum))
 
 
 def signed_lags(length: int, positive: int) -> NDArray:
-    """Lags [length] of a circular convolution: 0 .. positive - 1, then the negative ones."""
+    """Return lags [length] of a circular convolution: 0 .. positive - 1, then the negative ones."""
     lags = np.arange(length)
     return np.where(lags < positive, lags, lags - length)
 
@@ -228,7 +228,7 @@ class _PhaseSteps:
         self._index = 0
 
     def phases(self, index: int) -> NDArray:
-        """Phases of frequency `index`, of the path's shape; indices are asked for in rising order."""
+        """Return phases of frequency `index`, of the path's shape; indices are asked for in rising order."""
         while self._index < index:
             self._now = self._now * self._factor
             self._index += 1
@@ -236,7 +236,7 @@ class _PhaseSteps:
 
 
 def record(rig: Rig, rx: Antenna, world: World, seed: int = 0) -> NDArray:
-    """Echoes of a world at one receiver: complex64 [frequencies, rows, columns], fields as of `optics.scatter`.
+    """Return echoes of a world at one receiver: complex64 [frequencies, rows, columns], fields as of `optics.scatter`.
 
     Frequencies must be evenly spaced. `seed`: of rough surfaces, the same for both receivers.
     """

@@ -26,7 +26,7 @@ def simulate_echoes(
     centre_m: tuple[float, float, float],
     path_m: float,
 ) -> NDArray:
-    """Samples of shapes at one board, complex64 [rx, frequency, offset].
+    """Return samples of shapes at one board, complex64 [rx, frequency, offset].
 
     Phases rise with the path and have that of `path_m` removed. The mirror on the object plane has the amplitude
     1 / path in H and in V. `shapes` and `rig`: tables of the scene file and the rig file; `role`: "receive_h" or
@@ -50,7 +50,7 @@ def simulate_echoes(
 
 
 def _mirror_level(tx: Antenna, rx: Antenna, plane_m: float) -> float:
-    """Product of both antennas' fields towards their mirror point, in the polarisation of the receiver."""
+    """Return product of both antennas' fields towards their mirror point, in the polarisation of the receiver."""
     point = find_mirror_point(tx.position, rx.position, plane_m)
     rays = [(point - antenna.position) / np.linalg.norm(point - antenna.position) for antenna in (tx, rx)]
     fields = [antenna.field(ray[:, None])[:, 0] for antenna, ray in zip((tx, rx), rays, strict=True)]

@@ -230,7 +230,7 @@ class EndlessCylinder:
     with_inside: bool
 
     def coefficients(self, k: float, h: NDArray, orders: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Scattered waves for incident ones at axial wave numbers h [n]: three tables, complex [orders, n].
+        """Return the scattered waves for incident ones at axial wave numbers h [n]: three tables, complex [orders, n].
 
         They are M to M, N to N, and the coupling, which is the same from M to N as from N to M. Tangential E and H are
         continuous at the surface.
@@ -286,7 +286,7 @@ class EndlessCylinder:
 
 
 def _bessel(count: int, x: NDArray) -> tuple[NDArray, NDArray]:
-    """J_{n-1}(x) and J_n(x) for n = 0 .. count - 1, each [count, ...] for x [...], by Miller's recurrence.
+    """Return J_{n-1}(x) and J_n(x) for n = 0 .. count - 1, each [count, ...] for x [...], by Miller's recurrence.
 
     It is stable downwards but leaves a common factor open. That follows from J_0 + 2 (u J_1 + u^2 J_2 + ..) = exp(u x),
     with u = i or -i, whichever makes the sum large.
@@ -371,7 +371,7 @@ def scatter_cylinder(
     *,
     with_inside: bool = False,
 ) -> NDArray:
-    """Echo of an endless cylinder about local x, complex [n].
+    """Return the echo of an endless cylinder about local x, complex [n].
 
     `path_m`: specular path in the cross-section, [n]. Dyadic Green's function of the cylinder (Tai 1971, section 9-2):
     an integral over axial wave numbers h. Its integrand has the phase h along_m + sqrt(k^2 - h^2) path_m, stationary at

@@ -52,7 +52,7 @@ def record_shapes(
     frequencies_hz: NDArray,
     offsets_m: NDArray,
 ) -> dict[str, NDArray]:
-    """Echoes of shapes at both boards, as after synchronisation with the direct path removed.
+    """Return echoes of shapes at both boards, as after synchronisation with the direct path removed.
 
     `offsets_m` [..., 3] are stage offsets with z = 0, in any order. Returns complex64 [rx, frequency, ...] for "h" and
     "v". Phases rise with the path: an echo of path L is exp(+j 2 pi f (L - d) / c) / L for an ideal mirror, with d the
@@ -77,7 +77,7 @@ def record_shapes(
 def simulate_echo(
     shape: Shape, tx: Antenna, rx: Antenna, frequencies_hz: NDArray, offsets: NDArray, direct_m: float
 ) -> NDArray:
-    """Wave of one shape at one RX, complex64 [frequencies, offsets], with exp(-jk (path - direct_m)).
+    """Return the wave of one shape at one RX, complex64 [frequencies, offsets], with exp(-jk (path - direct_m)).
 
     `offsets` are stage offsets [offsets, 3] in metres.
     """
@@ -206,7 +206,7 @@ def _add_carrier(slow: NDArray, excess_m: NDArray, frequencies_hz: NDArray, expa
 
 
 def _make_lattice(offsets: NDArray, step_m: float) -> tuple[NDArray | None, NDArray]:
-    """Coarse lattice [rows, columns, 3] around the offsets, and their coordinates on it, row and column [2, n].
+    """Return coarse lattice [rows, columns, 3] around the offsets, and their coordinates on it, row and column [2, n].
 
     None where it had more nodes than there are offsets, or where these do not lie in one plane z.
     """

@@ -113,7 +113,7 @@ def scan_shapes(
     frequencies_hz: NDArray = FREQUENCIES_HZ,
     number: int = 0,
 ) -> dict[str, NDArray]:
-    """Samples of shapes, complex64 [rx, frequency, ...] for "h" and "v", as of `record_shapes`, disturbed.
+    """Return samples of shapes, complex64 [rx, frequency, ...] for "h" and "v", as of `record_shapes`, disturbed.
 
     `offsets_m` [..., 3]: stage offsets. `boards`: as the rig file has them, or None for the published rig.
     Scans of one rig, a reference and an object, have the same nuisances; `number` makes their noise differ.

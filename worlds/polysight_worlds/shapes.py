@@ -100,7 +100,7 @@ class Shape:
         raise NotImplementedError
 
     def scale_m(self) -> tuple[float, float]:
-        """Metres per unit of a and of b."""
+        """Return metres per unit of a and of b."""
         return 1.0, 1.0
 
     def evaluate(self, a: NDArray, b: NDArray) -> Patch:
@@ -128,7 +128,7 @@ class Shape:
         return a.ravel(), b.ravel()
 
     def project(self, points_m: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Nearest place of the surface to points [n, 3]: signed distances (positive in front), a, b; each [n].
+        """Return nearest place of the surface to points [n, 3]: signed distances (positive in front), a, b; each [n].
 
         The surface continues beyond the edges of the piece.
         """
@@ -203,11 +203,11 @@ class Revolved(Shape):
     bulge: float = 0.0
 
     def scale_m(self) -> tuple[float, float]:
-        """Metres per unit of a and of b, at a = 0."""
+        """Return metres per unit of a and of b, at a = 0."""
         return 1.0, self.radius_m
 
     def profile(self, a: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        """Radius at places along the axis and its first and second derivative, each of the shape of `a`."""
+        """Return radius at places along the axis and its first and second derivative, each of the shape of `a`."""
         radius = self.radius_m + self.slope * a - self.bulge / 2 * a**2
         first = self.slope - self.bulge * a
         second = -self.bulge + 0 * a
@@ -238,7 +238,7 @@ class Sphere(Shape):
     radius_m: float = 0.1
 
     def scale_m(self) -> tuple[float, float]:
-        """Metres per unit of a and of b."""
+        """Return metres per unit of a and of b."""
         return self.radius_m, self.radius_m
 
     def local(self, a: NDArray, b: NDArray) -> Patch:
@@ -391,7 +391,7 @@ def follow_path(patch: Patch, tx_m: NDArray, rx_m: NDArray) -> PathAt:
 
 
 def find_specular(shape: Shape, tx_m: NDArray, rx_m: NDArray) -> tuple[NDArray, NDArray]:
-    """Parameters (a, b), each [n], at which the path from TX to RX [3, n] is stationary.
+    """Return parameters (a, b), each [n], at which the path from TX to RX [3, n] is stationary.
 
     They can lie beyond the edges of the piece.
     """

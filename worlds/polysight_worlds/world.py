@@ -209,7 +209,7 @@ def draw_stack(rng: Generator, permittivity: complex) -> Stack:
 
 
 def nine_places(centre_m: tuple[float, float]) -> list[tuple[float, float]]:
-    """Centres of nine plates in three rows and columns, 64 mm apart as in the published picture."""
+    """Return centres of nine plates in three rows and columns, 64 mm apart as in the published picture."""
     steps = (-0.064, 0.0, 0.064)
     return [(centre_m[0] + dx, centre_m[1] + dy) for dy in steps for dx in steps]
 

@@ -35,12 +35,12 @@ GRAZING = 0.15
 
 
 def place_antennas(tx: Antenna, rx: Antenna, offsets: NDArray) -> tuple[NDArray, NDArray]:
-    """Places of TX and RX [3, offsets] at stage offsets [offsets, 3]."""
+    """Return places of TX and RX [3, offsets] at stage offsets [offsets, 3]."""
     return tx.position[:, None] + offsets.T, rx.position[:, None] + offsets.T
 
 
 def window_units() -> NDArray:
-    """Distances [sample] in Fresnel zones at which the window is sampled."""
+    """Return distances [sample] in Fresnel zones at which the window is sampled."""
     return np.arange(-np.floor(END / SPACING), np.floor(END / SPACING) + 1) * SPACING
 
 
@@ -59,7 +59,7 @@ def _fade_shadow(normals: NDArray, response: Response) -> NDArray:
 
 
 def spread_of_ray(patch: Patch, path: PathAt, tx_m: NDArray, rx_m: NDArray) -> NDArray:
-    """Amplitude of a ray at n specular points by geometrical optics, complex [n], of 1 at 1 m from TX.
+    """Return the amplitude of a ray at n specular points by geometrical optics, complex [n], of 1 at 1 m from TX.
 
     cos(incidence) / (r1 r2 sqrt(det path'')), with the path's second derivatives by the tangent plane's metres. After a
     focus it has the phase of that: a factor j for each negative curvature of the path.

@@ -11,8 +11,8 @@ from polysight.acquisition.capture_rig import CaptureRig
 from polysight.acquisition.control import (
     LAPSE_S,
     ControlFolder,
-    Life,
     ScanCommand,
+    SignOfLife,
     StopRequest,
     ignore_hangup,
     read_life,

@@ -1,6 +1,6 @@
 """Capture cards and receiver processes of all recorded boards.
 
-`CaptureRig` starts and stops the records of a row; `record_ended` decides if one board's record has ended.
+`CaptureRig` starts and stops the records of a row; `has_record_ended` decides if one board's record has ended.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from polysight.capture import (
     check_receive_buffer,
     receiver_cores,
 )
-from polysight.store import PART
+from polysight.store import PART_SUFFIX
 from polysight_shared.closing import Closing
 from polysight_shared.config import CARD_TAIL_S, Instrument
 from polysight_shared.errors import PolysightError
@@ -34,8 +34,8 @@ Chosen."""
 _COMPLETED_TIMEOUT_S = 0.2
 
 
-def record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
-    """Return True if one board's record has ended: all bytes are there, or nothing has come for long enough.
+def has_record_ended(progress: Progress, status: Status, since_ns: int, now_ns: int, silence_ns: int) -> bool:
+    """Return True if one board's record has ended: every byte has arrived, or none has arrived for long enough.
 
     That is `silence_ns`, or `GRACE_NS` if the card reported the end. `progress` is the receiver's latest report,
     `status` what the card reported since the record started. The silence counts from the last packet or from `since_ns`
@@ -87,24 +87,25 @@ class CaptureRig(Closing):
     def configure(self, names: Collection[str] = ()) -> dict[str, Version]:
         """Stop records and configure the named cards (default: all); return FPGA versions.
 
-        Raises DeviceError if a card does not obey. Only for all cards: also if a second card has the address of one.
+        Raises DeviceError if a card does not obey; if all cards are configured, also if two cards have the same
+        address.
         """
         versions = {}
         for name in names or self.cards:
             card = self.cards[name]
-            card.alive()
+            card.check_alive()
             if not names:
                 card.require_alone()
             card.record_stop()
             card.configure(self._instrument.card)
-            versions[name] = card.version()
+            versions[name] = card.read_version()
         return versions
 
     def begin_row(self, row: int, take: int, points: int, folder: Path) -> None:
         """Prepare the receivers for a row of `points` positions, then start the records. Raises DeviceError.
 
         `take` is the number of this attempt, `folder` the scan folder. A card whose counters are not known is reset and
-        configured first: it then counts from its first counters. During reception the file's suffix is `PART`.
+        configured first: it then counts from its first counters. During reception the file's suffix is `PART_SUFFIX`.
         """
         frame_bytes = self._instrument.frame_bytes
         expected_bytes = points * self._instrument.burst.pulses * frame_bytes
@@ -113,7 +114,7 @@ class CaptureRig(Closing):
             self.cards[name].reset_fpga()
             self.configure([name])
         for name, receiver in self.receivers.items():
-            path = folder / "raw" / name / f"{row:04d}{PART}"
+            path = folder / "raw" / name / f"{row:04d}{PART_SUFFIX}"
             receiver.begin_row(row, take, expected_bytes, frame_bytes, path, after_reset=name in cards_to_reset)
             # If the row is interrupted, the card's count stays unknown; `end_row` removes the name otherwise.
             self._start_lost.add(name)

@@ -28,8 +28,8 @@ from polysight_shared.closing import Closing
 from polysight_shared.errors import ErrorCode, ScanError, quote
 
 # Names of the folder in a scan folder, and of the file with the sign of life.
-CONTROL = "control"
-ALIVE = "alive"
+CONTROL_FOLDER = "control"
+ALIVE_FILE = "alive"
 # Time between two looks for command files (chosen).
 _POLL_S = 0.2
 # A sign of life that is unchanged is written again after this time, far below LAPSE_S.
@@ -138,7 +138,7 @@ class ScanCommand(StrEnum):
     ABORT = "abort"
 
 
-class Life(msgspec.Struct, frozen=True):
+class SignOfLife(msgspec.Struct, frozen=True):
     """Content of `alive`: the scan's process, its start time in `ticks` (:func:`read_start_ticks`), its machine `host`.
 
     It is `doing` "rows" as long as rows are taken, "materials" while they are searched for after the last row. `asked`
@@ -187,7 +187,7 @@ class ControlFolder(Closing):
     """
 
     def __init__(self, folder: Path, stop: StopRequest) -> None:
-        self._folder = folder / CONTROL
+        self._folder = folder / CONTROL_FOLDER
         self._stop = stop
         self._doing: Doing = "rows"
         self._closed = threading.Event()
@@ -205,7 +205,7 @@ class ControlFolder(Closing):
 
     def _serve(self) -> None:
         """Obey requests and write `alive`, until the folder is closed."""
-        written_life: Life | None = None
+        written_life: SignOfLife | None = None
         next_alive_s = 0.0
         cleared = False
         ticks = read_start_ticks(os.getpid()) or 0
@@ -223,7 +223,7 @@ class ControlFolder(Closing):
                 asker = ""
                 if pending:
                     asker = self._stop.asker
-                life = Life(os.getpid(), ticks, socket.gethostname(), self._doing, pending, asker)
+                life = SignOfLife(os.getpid(), ticks, socket.gethostname(), self._doing, pending, asker)
                 if life != written_life or time.monotonic() >= next_alive_s:
                     self._write(life)
                     written_life = life
@@ -232,16 +232,16 @@ class ControlFolder(Closing):
             self._clear()
             self._folder.rmdir()
 
-    def _write(self, life: Life) -> None:
+    def _write(self, life: SignOfLife) -> None:
         """Write `alive`, so that a reader sees the old content or the new one."""
-        # Not durably: nothing needs to survive a power loss.
-        part = self._folder / f".{ALIVE}.part"
+        # The file is not forced to the disk: after a power loss it is not needed.
+        part = self._folder / f".{ALIVE_FILE}.part"
         try:
             part.write_bytes(msgspec.json.encode(life))
-            part.replace(self._folder / ALIVE)
+            part.replace(self._folder / ALIVE_FILE)
         except OSError:
             # The disk is full: the old content with a new time is a sign of life, too.
-            (self._folder / ALIVE).touch()
+            (self._folder / ALIVE_FILE).touch()
 
     def _obey_command(self, command: ScanCommand) -> None:
         """Obey a command if its file exists.
@@ -295,7 +295,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
 
     Raises ScanError if no scan runs there, or it does not accept the command in time; the command is then withdrawn.
     """
-    path = folder / CONTROL / command
+    path = folder / CONTROL_FOLDER / command
     life = read_life(folder)
     if life is not None and life.killed:
         raise ScanError(
@@ -341,12 +341,12 @@ def _write_command(path: Path, asker: str) -> None:
     part.replace(path)
 
 
-def read_life(folder: Path) -> Life | None:
+def read_life(folder: Path) -> SignOfLife | None:
     """Return the scan program's last sign of life, with the file system's time of it; None if there is none.
 
     A file that another program or an earlier release touched is a sign of life without content.
     """
-    path = folder / CONTROL / ALIVE
+    path = folder / CONTROL_FOLDER / ALIVE_FILE
     try:
         with path.open("rb") as f:
             content = f.read(4096)
@@ -354,7 +354,7 @@ def read_life(folder: Path) -> Life | None:
     except OSError:
         return None
     try:
-        life = msgspec.json.decode(content, type=Life)
+        life = msgspec.json.decode(content, type=SignOfLife)
     except (msgspec.MsgspecError, UnicodeDecodeError):
-        life = Life()
+        life = SignOfLife()
     return msgspec.structs.replace(life, written_s=written_s)

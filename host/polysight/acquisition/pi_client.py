@@ -25,7 +25,7 @@ from polysight_shared.closing import Closing
 from polysight_shared.config import Instrument
 from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError, ScanError
 from polysight_shared.faults import PiFault
-from polysight_shared.sockets import HandshakeMonitor, requester, subscriber
+from polysight_shared.sockets import HandshakeMonitor, create_requester, create_subscriber
 
 # Number of times that a command is sent before the Pi counts as silent; chosen.
 ATTEMPTS = 3
@@ -59,7 +59,7 @@ class HostHeartbeat:
     def __init__(
         self, context: zmq.Context[Any], instrument: Instrument, scan_id: str, interval_s: float, owner: str = ""
     ) -> None:
-        self._socket = requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
+        self._socket = create_requester(context, instrument.pi.command_address, Path(instrument.pi.key_dir))
         self._alive = m.pack(m.Alive(scan_id=scan_id, owner=owner))
         self._interval_s = interval_s
         self._stop = threading.Event()
@@ -118,8 +118,8 @@ class PiClient(Closing):
         self._silence_s = max(10 * instrument.pi.heartbeat_ms / 1e3, instrument.limits.command_timeout_s)
         self._on_event: Callable[[m.AnyEvent], object] = lambda _: None
         keys = Path(instrument.pi.key_dir)
-        self._events = subscriber(context, self._event_address, keys)
-        self._commands = requester(context, self._address, keys)
+        self._events = create_subscriber(context, self._event_address, keys)
+        self._commands = create_requester(context, self._address, keys)
         self._handshake = HandshakeMonitor(self._commands)
         self._owner = owner or secrets.token_hex(16)
         self._scan_id = ""
@@ -155,7 +155,7 @@ class PiClient(Closing):
     def begin_run(self, run: m.BeginRun) -> None:
         """Begin or resume a run and send its heartbeat until the run's end. Safe to repeat.
 
-        Waits some heartbeats if the Pi still considers a killed program of the same scan alive. `owns_home`: nobody
+        Waits some heartbeats if the Pi still considers a killed program of the same scan alive. `owns_home`: no one
         else may home the stage in this run.
 
         Raises RefusedError, DeviceError.
@@ -351,7 +351,7 @@ class PiClient(Closing):
                 self.state = event.state
             if event.scan_id != self._scan_id or not self._scan_id:
                 continue
-            if isinstance(event, m.JOURNALLED) and event.seq == self._last_seq + 1:
+            if isinstance(event, m.JOURNALLED_EVENTS) and event.seq == self._last_seq + 1:
                 self._take(event)
             elif event.seq > self._last_seq:
                 # Some were lost: an event that is not journalled has the number of the last one that is.

@@ -32,12 +32,12 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.capture import (
-    PACKETS,
-    Placed,
+    PACKETS_SUFFIX,
+    PlacedRecord,
     RowCapture,
+    make_write_error,
     read_index,
     read_packets,
-    write_error,
     write_index,
     write_packets,
 )
@@ -55,38 +55,39 @@ Gap = tuple[int, int]
 # Silence between packets that begins a new train (chosen). A radar needs 150 us between two frames (AWR2243, hardware
 # trigger), and the first packet of a frame comes only when it is full.
 SILENCE_NS = 200_000
-# A train is at the time of a pulse if it comes at most _EARLY before the predicted arrival of that pulse's data, and at
-# most the duration of a frame plus _LATE after it. Both are shares of the pulse period, but at most the times in ns.
-# Chosen: wide enough for the jitter of network and machine, far less than half a period.
-_EARLY = 0.1
+# A train is at the time of a pulse if it comes at most _EARLY_SHARE before the predicted arrival of that pulse's data,
+# and at most the duration of a frame plus _LATE_SHARE after it. Both are shares of the pulse period, but at most the
+# times in ns. Chosen: wide enough for the jitter of network and machine, far less than half a period.
+_EARLY_SHARE = 0.1
 _EARLY_NS = 200_000
-_LATE = 0.15
+_LATE_SHARE = 0.15
 _LATE_NS = 200_000
 # If more than this share of the trains is not of a single frame at the time of a pulse, the machine or the network is
 # slow, and the arrival times of the row are not *sharp*; chosen.
-_BLURRED = 0.1
-# A whole row is contradicted by so many trains one after another that came at other pulses than theirs. It is also
-# contradicted by so many trains in all that came before their pulses; if times are sharp, by a single one. Chosen.
-_DISPLACED = 3
+_MAX_BLURRED_SHARE = 0.1
+# Number of successive trains at other pulses than their own that contradict the placement of a whole row. The same
+# number of trains before their pulses, successive or not, contradicts it too; if times are sharp, one is enough.
+# Chosen.
+_DISPLACED_TRAINS = 3
 # Bytes of one sample of all four antennas: a card drops whole ones of these (inferred).
 _SAMPLE_BYTES = 16
 # If the next train follows sooner than this share of the pulse period, a train was delayed, and the next one catches up
 # (chosen).
-_CATCHING_UP = 0.8
+_CATCH_UP_SHARE = 0.8
 # Smallest number of bursts whose delays from pulse to data must agree, and the largest difference between these delays:
 # a share of the pulse period, but at most the time in ns (chosen).
-_AGREEING = 3
-_AGREE = 0.3
-_AGREE_NS = 500_000
+_MIN_AGREEING_BURSTS = 3
+_AGREEMENT_SHARE = 0.3
+_AGREEMENT_NS = 500_000
 # Relative drift between the clocks of Pi and host: at most that of a clock which NTP slews, usually that of two
 # crystals of 50 ppm. From fewer bursts than _DRIFT_BURSTS (chosen) it is not estimated, and must be negligible.
 _MAX_DRIFT = 500e-6
 _USUAL_DRIFT = 100e-6
 _DRIFT_BURSTS = 8
 # Rate of the host's clock over that of the pulses; outside, the pulses are in simulated time (chosen).
-_RATES = 0.8, 1.25
+_CLOCK_RATES = 0.8, 1.25
 # Number of missed pulses that a message names; chosen.
-_SHOWN = 4
+_MAX_NAMED_PULSES = 4
 # Stands for no bound: beyond every time in nanoseconds, and every number of bytes.
 _NO_BOUND = 1 << 60
 
@@ -216,44 +217,44 @@ def _find_trains(
     first_stop = stop[heads]
 
     # Number of the latest pulse whose data was due when a train began and when it ended; -1 before the first.
-    early_ns = min(_EARLY * period_ns, _EARLY_NS)
+    early_ns = min(_EARLY_SHARE * period_ns, _EARLY_NS)
     pulse_of_head = np.searchsorted(expected, came_ns[heads] + early_ns, "right") - 1
     pulse_of_tail = np.searchsorted(expected, came_ns[tails] + early_ns, "right") - 1
     late_ns = came_ns[heads] - expected[np.maximum(pulse_of_head, 0)]
     is_single = stop[tails] - first_stop < frame_bytes
-    in_time = (pulse_of_head >= 0) & (late_ns <= frame_ns + min(_LATE * period_ns, _LATE_NS))
+    is_in_time = (pulse_of_head >= 0) & (late_ns <= frame_ns + min(_LATE_SHARE * period_ns, _LATE_NS))
     # A train that is late for every pulse of its burst is not of an earlier burst: no delay is as long as a pause. So
     # the first pulse of the burst is its bound.
     count = pulses_ns.shape[1]
-    first_pulse = np.where(in_time, pulse_of_head, pulse_of_head // count * count)
+    first_pulse = np.where(is_in_time, pulse_of_head, pulse_of_head // count * count)
     # When the first packet was full, the radar had sent all frames before that pulse's, and at least one sample of that
     # frame. The bytes of these that are beyond `first_stop` are missing.
     low = np.where(is_single, frame_bytes * first_pulse + _SAMPLE_BYTES - first_stop, -_NO_BOUND)
     # Frames that come faster than pulses are sent make up for a delay of any length.
     to_next_ns = np.diff(came_ns[heads], append=_NO_BOUND)
-    catches_up = (low > 0) & (to_next_ns < _CATCHING_UP * period_ns)
+    catches_up = (low > 0) & (to_next_ns < _CATCH_UP_SHARE * period_ns)
     low[catches_up] = -_NO_BOUND
-    in_time &= ~catches_up
+    is_in_time &= ~catches_up
     return _Trains(
         first_stop=first_stop,
         last_stop=stop[tails],
         low=low,
         high=frame_bytes * (pulse_of_tail + 1) - stop[tails],
-        punctual=is_single & in_time,
-        astray=is_single & ~in_time,
+        punctual=is_single & is_in_time,
+        astray=is_single & ~is_in_time,
     )
 
 
 def _check_whole_row(trains: _Trains, pulses: int, frame_bytes: int) -> PlacedFrames:
     """Compare the trains of a row that has as many frames as pulses with the pulses: every shift must be 0."""
-    is_sharp = (~trains.punctual).sum() <= _BLURRED * trains.punctual.size
+    is_sharp = (~trains.punctual).sum() <= _MAX_BLURRED_SHARE * trains.punctual.size
     is_early = (trains.high < 0) & trains.punctual
     is_displaced = is_early | (trains.low > 0)
     is_in_place = trains.punctual & ~is_displaced
-    max_early = 0 if is_sharp else _DISPLACED - 1
+    max_early = 0 if is_sharp else _DISPLACED_TRAINS - 1
     # One or two trains in sequence at later pulses contradict nothing: their packets came out of order, or the machine
     # stalled.
-    contradicted = is_early.sum() > max_early or _measure_longest_run(is_displaced) >= _DISPLACED
+    contradicted = is_early.sum() > max_early or _measure_longest_run(is_displaced) >= _DISPLACED_TRAINS
     trains = trains._replace(punctual=is_in_place, astray=trains.astray | is_displaced)
     slots = np.where(_select_seen(trains, frame_bytes, pulses), np.arange(pulses), -1)
     reason = ""
@@ -275,9 +276,9 @@ def _measure_longest_run(flags: Flags) -> int:
 def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: int) -> PlacedFrames:
     """Find the pulses of the frames of a row with fewer frames than pulses."""
     # The shift never falls along the row: lower bounds hold for all later trains, upper bounds for all earlier ones.
-    at_the_end = (pulses - received) * frame_bytes
+    missing_end_bytes = (pulses - received) * frame_bytes
     low = np.maximum.accumulate(np.append(0, trains.low))
-    high = np.minimum.accumulate(np.append(trains.high, at_the_end)[::-1])[::-1]
+    high = np.minimum.accumulate(np.append(trains.high, missing_end_bytes)[::-1])[::-1]
     slots = np.full(received, -1, dtype=np.int64)
     # A lower bound above the upper bound of a later train.
     if (low[1:] > high[:-1]).any():
@@ -285,10 +286,12 @@ def _place_short_row(trains: _Trains, received: int, pulses: int, frame_bytes: i
     # Bounds of each frame: the lower one of the last train whose first packet lies before it, the upper one of the
     # first train that reaches its end.
     begins = np.arange(received) * frame_bytes
-    least = low[np.searchsorted(trains.first_stop, begins, "right")]
-    most = high[np.searchsorted(trains.last_stop, begins + frame_bytes, "left")]
-    certain = (least == most) & (least % frame_bytes == 0) & _select_seen(trains, frame_bytes, received)
-    slots[certain] = (np.arange(received) + least // frame_bytes)[certain]
+    least_bytes = low[np.searchsorted(trains.first_stop, begins, "right")]
+    most_bytes = high[np.searchsorted(trains.last_stop, begins + frame_bytes, "left")]
+    is_certain = (
+        (least_bytes == most_bytes) & (least_bytes % frame_bytes == 0) & _select_seen(trains, frame_bytes, received)
+    )
+    slots[is_certain] = (np.arange(received) + least_bytes // frame_bytes)[is_certain]
     return PlacedFrames(slots, _find_missed(slots, pulses), pulses)
 
 
@@ -311,9 +314,9 @@ def _find_missed(slots: Times, pulses: int) -> list[int]:
     # The row's begin and end count as frames with certain pulses.
     number = np.concatenate([[-1], np.arange(slots.size), [slots.size]])
     slot = np.concatenate([[-1], slots, [pulses]])
-    sure = np.flatnonzero((slot >= 0) | (number < 0))
+    certain_trains = np.flatnonzero((slot >= 0) | (number < 0))
     missed: list[int] = []
-    for a, b in zip(sure[:-1].tolist(), sure[1:].tolist(), strict=True):
+    for a, b in zip(certain_trains[:-1].tolist(), certain_trains[1:].tolist(), strict=True):
         if b == a + 1:
             missed += range(int(slot[a]) + 1, int(slot[b]))
     return missed
@@ -338,7 +341,7 @@ def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
     if pause_ns < 2 * int(np.diff(pulses_ns[:, :2]).max(initial=0)):
         raise _UndeterminedError("the bursts follow each other without a pause")
     rate = (received_ns[-1] - received_ns[0]) / (last[-1] - last[0])
-    if not _RATES[0] < rate < _RATES[1]:
+    if not _CLOCK_RATES[0] < rate < _CLOCK_RATES[1]:
         raise _UndeterminedError(
             f"the pulses are in simulated time, {1 / max(rate, 1e-9):.3g} times as fast as the host's"
         )
@@ -367,41 +370,43 @@ def _predict_arrivals(
     Raises _DisturbedError if too few bursts agree, _UndeterminedError if the clocks cannot be compared.
     """
     bursts, count = pulses_ns.shape
-    if bursts < _AGREEING:
-        raise _UndeterminedError(f"the offset between the clocks needs {_AGREEING} bursts")
+    if bursts < _MIN_AGREEING_BURSTS:
+        raise _UndeterminedError(f"the offset between the clocks needs {_MIN_AGREEING_BURSTS} bursts")
     pauses = _find_pauses(pulses_ns, received_ns)
     came_ns = entries[:, 0]
     frame = (entries[:, 1] - 1) // frame_bytes
     edges = np.append(np.searchsorted(came_ns, pauses, "right"), came_ns.size)
-    sent: list[int] = []
+    points_sent: list[int] = []
     delays: list[int] = []
     burst_of_packet = np.searchsorted(pauses, came_ns, "left") - 1
     is_in_its_burst = is_whole and bool((burst_of_packet == frame // count).all())
-    for b in range(bursts):
-        packets = slice(int(edges[b]), int(edges[b + 1]))
-        # Of a burst without packets all of these arrays are empty.
-        first_frame = b * count if is_in_its_burst else frame[packets][:1]
+    for burst in range(bursts):
+        packets = slice(int(edges[burst]), int(edges[burst + 1]))
+        # For a burst without packets all of these arrays are empty.
+        first_frame = burst * count if is_in_its_burst else frame[packets][:1]
         pulse = frame[packets] - first_frame
-        of_burst = (pulse >= 0) & (pulse < count)
-        if of_burst.any() and (is_whole or pulse.max() == count - 1):
-            sent.append(int(pulses_ns[b, 0]))
-            delays.append(int((came_ns[packets] - pulses_ns[b][np.clip(pulse, 0, count - 1)])[of_burst].min()))
-    if len(sent) < _AGREEING:
-        raise _DisturbedError(f"data of {len(sent)} bursts came in time: too few for the offset between the clocks")
+        is_of_burst = (pulse >= 0) & (pulse < count)
+        if is_of_burst.any() and (is_whole or pulse.max() == count - 1):
+            points_sent.append(int(pulses_ns[burst, 0]))
+            delays.append(int((came_ns[packets] - pulses_ns[burst][np.clip(pulse, 0, count - 1)])[is_of_burst].min()))
+    if len(points_sent) < _MIN_AGREEING_BURSTS:
+        raise _DisturbedError(
+            f"data of {len(points_sent)} bursts came in time: too few for the offset between the clocks"
+        )
 
     # Delays relative to the first one, over the time since the first pulse.
     start_ns = int(pulses_ns[0, 0])
-    sent_at = np.array(sent, dtype=np.float64) - start_ns
+    sent_at = np.array(points_sent, dtype=np.float64) - start_ns
     delay = np.array(delays, dtype=np.float64) - delays[0]
     drift = _estimate_drift(sent_at, delay, pulses_ns)
     residual = np.sort(delay - drift * sent_at)
     # The shortest range of delays that half of the bursts share: others are delayed, or have a spurious edge.
-    sharing = max(_AGREEING, (residual.size + 1) // 2)
+    sharing = max(_MIN_AGREEING_BURSTS, (residual.size + 1) // 2)
     widths = residual[sharing - 1 :] - residual[: residual.size - sharing + 1]
     narrowest = int(np.argmin(widths))
-    if widths[narrowest] > min(_AGREE * _find_period_ns(pulses_ns), _AGREE_NS):
+    if widths[narrowest] > min(_AGREEMENT_SHARE * _find_period_ns(pulses_ns), _AGREEMENT_NS):
         raise _DisturbedError("the delays of the bursts differ too much to distinguish their pulses")
-    # Of the bursts that agree, the quickest one counts: slower ones were delayed.
+    # The quickest of the bursts that agree counts: slower ones were delayed.
     pulses = pulses_ns.reshape(-1)
     return pulses + float(delays[0]) + drift * (pulses - start_ns) + residual[narrowest]
 
@@ -416,7 +421,7 @@ def _estimate_drift(times: NDArray[np.float64], delay: NDArray[np.float64], puls
         # The ends of the 95 % interval.
         low, high = scipy.stats.theilslopes(delay, times)[2:]
         return float(np.clip(np.clip(0.0, low, high), -_MAX_DRIFT, _MAX_DRIFT))
-    if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY * _find_period_ns(pulses_ns):
+    if _USUAL_DRIFT * float(np.ptp(pulses_ns)) > _EARLY_SHARE * _find_period_ns(pulses_ns):
         raise _UndeterminedError(f"{times.size} bursts came in time: too few for the drift between the clocks")
     return 0.0
 
@@ -492,8 +497,8 @@ def describe(placed: PlacedFrames, pulses: int) -> str:
         return f"{placed.reason}: the pulses of {placed.uncertain} frames are unknown"
     if count == 0:
         return f"frames are not at their pulses: spurious edges on SYNC_IN; {placed.uncertain} frames are lost"
-    places = [f"position {s // pulses} pulse {s % pulses}" for s in placed.missed[:_SHOWN]]
-    if len(placed.missed) > _SHOWN:
+    places = [f"position {s // pulses} pulse {s % pulses}" for s in placed.missed[:_MAX_NAMED_PULSES]]
+    if len(placed.missed) > _MAX_NAMED_PULSES:
         places.append("...")
     text = f"missed {count} SYNC_IN pulses ({', '.join(places) or 'positions uncertain'})"
     if placed.uncertain:
@@ -509,7 +514,7 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
     """
     facts, arrivals = read_index(path.with_suffix(".idx"))
     received = np.fromfile(path, dtype=np.uint8)
-    packets_crc = _keep_payload(path.with_suffix(PACKETS), received)
+    packets_crc = _keep_payload(path.with_suffix(PACKETS_SUFFIX), received)
     payload, missing = move_frames(received, capture.holes, int(arrivals[-1, 1]), placed.slots, frame_bytes)
     try:
         with path.open("r+b") as f:
@@ -517,16 +522,16 @@ def rewrite_row(path: Path, capture: RowCapture, placed: PlacedFrames, frame_byt
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        raise write_error(path, "made durable", e) from None
+        raise make_write_error(path, "made durable", e) from None
     # Each frame is at its pulse now: the row is located, with no reason against it.
-    changed = {
+    new_fields = {
         "missing": missing,
         "located": True,
         "reason": "",
         "pulses_missed": placed.missed,
         "frames": _find_runs(placed.slots),
     }
-    index_crc = write_index(path.with_suffix(".idx"), {**facts, **changed}, arrivals)
+    index_crc = write_index(path.with_suffix(".idx"), {**facts, **new_fields}, arrivals)
     return msgspec.structs.replace(
         capture,
         missing=missing,
@@ -547,21 +552,21 @@ def move_frames(
     `received` has the size of a complete row; its first `extent` bytes are the record in the card's order, in which
     those in `holes` never came.
     """
-    moved = np.zeros_like(received)
+    moved_frames = np.zeros_like(received)
     present: list[Gap] = []
     for first, slot, count in _find_runs(slots):
         start = first * frame_bytes
         stop = min((first + count) * frame_bytes, extent)
         move = (slot - first) * frame_bytes
-        moved[start + move : stop + move] = received[start:stop]
+        moved_frames[start + move : stop + move] = received[start:stop]
         present += [(a + move, b + move) for a, b in _subtract_ranges(holes, start, stop)]
     missing = _subtract_ranges(present, 0, received.size)
     for start, stop in missing:
-        moved[start:stop] = 0
-    return moved, missing
+        moved_frames[start:stop] = 0
+    return moved_frames, missing
 
 
-def frames_to_move(capture: RowCapture | Placed, frames: PlacedFrames | None) -> PlacedFrames | None:
+def find_frames_to_move(capture: RowCapture | PlacedRecord, frames: PlacedFrames | None) -> PlacedFrames | None:
     """Return the frames with which a row is rewritten; None to keep the placement by its packets' counters.
 
     Without times a row is not changed, and the manifest says so. If the times contradict the row, no frame is kept.

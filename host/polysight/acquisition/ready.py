@@ -53,7 +53,7 @@ def make_ready(
     """Wait until a row may begin, and home the stage if that is safe; return False if asked to stop now.
 
     The stage is homed only before the first row (`first`), when the operator expects motion, and never after
-    `STAGE_FAULTS`: somebody pressed the emergency stop, or has an arm in the way. The Pi must have begun the run
+    `STAGE_FAULTS`: a person pressed the emergency stop, or has an arm in the way. The Pi must have begun the run
     `scan_id`; "" for any. `notify` gets phase and message.
 
     Raises ScanError if the stage is not ready and must not be homed, or homing fails.

@@ -19,13 +19,13 @@ import msgspec
 import zmq
 
 from polysight.acquisition import pulse_times
-from polysight.acquisition.capture_rig import CaptureRig, record_ended
+from polysight.acquisition.capture_rig import CaptureRig, has_record_ended
 from polysight.acquisition.control import StopRequest
 from polysight.acquisition.pi_client import PiClient
-from polysight.capture import PACKETS, RowCapture, silent_radar, valid_frames, write_error
+from polysight.capture import PACKETS_SUFFIX, RowCapture, explain_silent_radar, make_write_error, valid_frames
 from polysight.radar import BoardState, RadarControl, RadarState
 from polysight.store import (
-    PART,
+    PART_SUFFIX,
     BoardRow,
     LogDigest,
     ManifestWriter,
@@ -37,7 +37,7 @@ from polysight.store import (
     utc_now,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.errors import ErrorCode, ScanError, advice, quote
+from polysight_shared.errors import ErrorCode, ScanError, join_advice, quote
 from polysight_shared.faults import explain
 from polysight_shared.files import sync_folder
 from polysight_shared.messages import Capture, RowFinished
@@ -202,7 +202,8 @@ class Take:
                 kind = FaultKind.SLIPPED
             return TakeFault(kind, pulse_times.describe(displaced, pulses_per_point) + held_text, name)
         if not capture.located:
-            # Of several possible kinds, the one with the clearest remedy is chosen; the text lists all that is known.
+            # If several kinds are possible, the one with the clearest remedy is chosen; the text lists all that is
+            # known.
             frames = self.frames.get(name)
             if frames is not None:
                 unplaced = f"; missed pulses cannot be located: {frames.reason}"
@@ -243,7 +244,7 @@ class Take:
 
     @property
     def stopped_radars(self) -> dict[str, BoardState]:
-        """Radars that have stopped by themselves."""
+        """Radars that stopped without a command."""
         return {name: s for name, s in self.radars.items() if s.state is RadarState.FAULT}
 
     @property
@@ -269,27 +270,29 @@ def commit_row(
     `events` is the digest of the event log, which must be on the disk. `faults` are those of a row kept incomplete;
     empty for a complete row. Raises DeviceError if the disk fails.
     """
-    planned = take.row.points * scan.instrument.burst.pulses
+    planned_frames = take.row.points * scan.instrument.burst.pulses
     boards: dict[str, BoardRow] = {}
     for name, capture in take.captures.items():
         final = scan.row_path(name, take.row.index)
         frames = take.frames.get(name)
         # Frames that must be moved to the pulse at which they arrived; None if the record is already in order.
-        moved = pulse_times.frames_to_move(capture, frames)
+        frames_to_move = pulse_times.find_frames_to_move(capture, frames)
         # Frames whose pulse is known only from their number, because their times could not be compared.
-        untimed = 0
+        untimed_frames = 0
         if capture.located and (frames is None or not frames.is_timed):
-            untimed = planned
-        missed = None
+            untimed_frames = planned_frames
+        missed_pulses = None
         if capture.slipped and frames is not None:
-            missed = frames.pulses - frames.slots.size
-        if moved is not None:
-            capture = pulse_times.rewrite_row(final.with_suffix(PART), capture, moved, scan.instrument.frame_bytes)
+            missed_pulses = frames.pulses - frames.slots.size
+        if frames_to_move is not None:
+            capture = pulse_times.rewrite_row(
+                final.with_suffix(PART_SUFFIX), capture, frames_to_move, scan.instrument.frame_bytes
+            )
             take.captures[name] = capture
         try:
-            final.with_suffix(PART).rename(final)
+            final.with_suffix(PART_SUFFIX).rename(final)
         except OSError as e:
-            raise write_error(final, "renamed", e) from None
+            raise make_write_error(final, "renamed", e) from None
         sync_folder(final.parent)
         packets_crc32 = ""
         if capture.packets_crc32:
@@ -297,14 +300,14 @@ def commit_row(
         boards[name] = BoardRow(
             file=str(final.relative_to(scan.path)),
             bytes=capture.expected,
-            frames_expected=planned,
-            frames_received=int(valid_frames(capture.missing, planned, scan.instrument.frame_bytes).sum()),
+            frames_expected=planned_frames,
+            frames_received=int(valid_frames(capture.missing, planned_frames, scan.instrument.frame_bytes).sum()),
             missing_bytes=capture.missing_bytes,
             crc32=f"{capture.crc32:08x}",
             index_crc32=f"{capture.index_crc32:08x}",
             packets_crc32=packets_crc32,
-            pulses_missed=missed,
-            frames_untimed=untimed,
+            pulses_missed=missed_pulses,
+            frames_untimed=untimed_frames,
             **_describe_reception(capture),
         )
     pulses = 0
@@ -330,7 +333,7 @@ def reject_row(scan: ScanFolder, writer: ManifestWriter, take: Take, faults: lis
     """Delete the files of the take and add `row_rejected` with the faults to the manifest. Raises DeviceError."""
     for name in take.captures:
         path = scan.row_path(name, take.row.index)
-        for suffix in (PART, ".idx", PACKETS):
+        for suffix in (PART_SUFFIX, ".idx", PACKETS_SUFFIX):
             path.with_suffix(suffix).unlink(missing_ok=True)
     writer.append(
         RowRejected(
@@ -359,7 +362,9 @@ def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder
         cause = "a radar has stopped by itself, or the link to it is gone"
         remedy = "check its USB cable, its power and its SYNC_IN (docs/how-to/radar-bring-up.md)"
     elif take.silent_boards:
-        silent = [silent_radar(scan.instrument.by_name(name), take.captures[name]) for name in take.silent_boards]
+        silent = [
+            explain_silent_radar(scan.instrument.by_name(name), take.captures[name]) for name in take.silent_boards
+        ]
         states = [f"{n}'s radar was {take.radars[n].detail}" for n in take.silent_boards if n in take.radars]
         cause = "; ".join([f"{e.what}: {e.why}" for e in silent] + states)
         remedy = silent[0].remedy
@@ -370,7 +375,7 @@ def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder
     return ScanError(
         f"row {take.row.index} is not complete after {takes} takes: {join_faults(faults)}",
         cause,
-        advice(
+        join_advice(
             remedy, f"then `polysight resume {quote(scan.path)}`; with --keep-incomplete it keeps such rows, masked"
         ),
         code=ErrorCode.ROW_INCOMPLETE,
@@ -402,29 +407,32 @@ class RowState(StrEnum):
     WRITING = "writing"
     # The data is compared with the pulses.
     CHECKING = "checking"
-    # Final: complete; committed although incomplete; deleted; not begun, on request; ended by an error.
+    # The five states from here on are final. The row is complete and in the manifest.
     COMMITTED = "committed"
+    # The row is in the manifest although it is incomplete.
     KEPT = "kept"
+    # The files of the take were deleted.
     REJECTED = "rejected"
+    # A stop was requested before the row began.
     STOPPED = "stopped"
+    # An error ended the take.
     FAILED = "failed"
 
 
-S = RowState
 # States that may follow each state.
 TRANSITIONS: dict[RowState, frozenset[RowState]] = {
-    S.WAITING: frozenset({S.ARMING, S.STOPPED, S.FAILED}),
-    S.ARMING: frozenset({S.RUNNING, S.WRITING, S.FAILED}),
-    S.RUNNING: frozenset({S.COLLECTING, S.ABORTING, S.WRITING, S.FAILED}),
-    S.ABORTING: frozenset({S.COLLECTING, S.WRITING, S.FAILED}),
-    S.COLLECTING: frozenset({S.WRITING, S.FAILED}),
-    S.WRITING: frozenset({S.CHECKING, S.FAILED}),
-    S.CHECKING: frozenset({S.COMMITTED, S.KEPT, S.REJECTED, S.FAILED}),
-    S.COMMITTED: frozenset(),
-    S.KEPT: frozenset(),
-    S.REJECTED: frozenset(),
-    S.STOPPED: frozenset(),
-    S.FAILED: frozenset(),
+    RowState.WAITING: frozenset({RowState.ARMING, RowState.STOPPED, RowState.FAILED}),
+    RowState.ARMING: frozenset({RowState.RUNNING, RowState.WRITING, RowState.FAILED}),
+    RowState.RUNNING: frozenset({RowState.COLLECTING, RowState.ABORTING, RowState.WRITING, RowState.FAILED}),
+    RowState.ABORTING: frozenset({RowState.COLLECTING, RowState.WRITING, RowState.FAILED}),
+    RowState.COLLECTING: frozenset({RowState.WRITING, RowState.FAILED}),
+    RowState.WRITING: frozenset({RowState.CHECKING, RowState.FAILED}),
+    RowState.CHECKING: frozenset({RowState.COMMITTED, RowState.KEPT, RowState.REJECTED, RowState.FAILED}),
+    RowState.COMMITTED: frozenset(),
+    RowState.KEPT: frozenset(),
+    RowState.REJECTED: frozenset(),
+    RowState.STOPPED: frozenset(),
+    RowState.FAILED: frozenset(),
 }
 
 
@@ -497,7 +505,7 @@ class RowTaker:
             take.aborted = TakeFault(FaultKind.RADAR_STOPPED, "the row was not begun")
         else:
             transaction.change_state(RowState.RUNNING)
-            self._radars.row_begins()
+            self._radars.note_row_start()
             self._rig.discard_before(time.monotonic_ns())
             self._pi.run_row(self._scan_id, row.index, number)
             self._wait_for_row(take, transaction)
@@ -586,11 +594,11 @@ class RowTaker:
                 code=ErrorCode.STAGE_NOT_READY,
             )
         if take.finished is None:
-            e = explain(status.fault)
+            explanation = explain(status.fault)
             raise ScanError(
-                f"the Pi stopped in row {take.row.index}: {e.problem}: {status.reason}",
-                e.cause,
-                f"{e.remedy}, then `polysight resume {quote(self._folder)}`",
+                f"the Pi stopped in row {take.row.index}: {explanation.problem}: {status.reason}",
+                explanation.cause,
+                f"{explanation.remedy}, then `polysight resume {quote(self._folder)}`",
                 code=ErrorCode.STAGE_NOT_READY,
             )
 
@@ -620,7 +628,7 @@ class RowTaker:
             now = time.monotonic_ns()
             statuses = self._rig.statuses()
             reports = self._rig.reports()
-            if all(record_ended(r, statuses[n], finished_ns, now, limit_ns) for n, r in reports.items()):
+            if all(has_record_ended(r, statuses[n], finished_ns, now, limit_ns) for n, r in reports.items()):
                 return
 
     def _end_records(self, take: Take) -> None:
@@ -636,7 +644,7 @@ class RowTaker:
     def _time_frames(self, take: Take) -> None:
         """Compare frames and pulses of boards of which it is certain how many frames came; every pulse was sent."""
         for name, capture in take.captures.items():
-            path = self._folder / "raw" / name / f"{take.row.index:04d}{PART}"
+            path = self._folder / "raw" / name / f"{take.row.index:04d}{PART_SUFFIX}"
             if capture.located or capture.slipped:
                 take.frames[name] = pulse_times.find_frames(path, take.row, take.events, self._instrument)
                 if take.frames[name].contradicted:

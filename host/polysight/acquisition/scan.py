@@ -49,7 +49,7 @@ from polysight.acquisition.row import (
     join_faults,
     reject_row,
 )
-from polysight.radar import RadarControl, radar_control
+from polysight.radar import RadarControl, open_radar_control
 from polysight.store import (
     EVENTS,
     EventWriter,
@@ -70,7 +70,7 @@ from polysight.store import (
     utc_now,
 )
 from polysight_shared.config import Instrument
-from polysight_shared.errors import ErrorCode, PolysightError, ScanError, advice, quote
+from polysight_shared.errors import ErrorCode, PolysightError, ScanError, join_advice, quote
 from polysight_shared.messages import AnyEvent, HelloReply, RowStarted, RunStarted, is_simulated
 from polysight_shared.program import delay_interrupts
 from polysight_shared.raster import Row, check_burst_fits, plan_raster
@@ -111,7 +111,7 @@ class RunningScan:
         self._committed = set(scan.committed_rows())
         # Durations of the rows of this run.
         self._row_seconds: list[float] = []
-        # Start of the current row on the monotonic clock, moved on by pauses; None between rows.
+        # Start of the current row on the monotonic clock, later by the duration of each pause; None between rows.
         self._row_began: float | None = None
         # Index, take number and points of the current row.
         self._current = (-1, 0, 0)
@@ -133,13 +133,13 @@ class RunningScan:
         """
         for warning in self._rig.warnings + warnings:
             self._warn(warning)
-        begun = False
+        has_begun = False
         events = EventWriter(self._scan.path / EVENTS)
         try:
             with stop_on_interrupt(self._stop):
                 self._pi.follow(self._scan.scan_id, events.last_seq, events.append)
                 self._pi.begin_run(make_begin_run(self._instrument, self._scan.scan_id, self._plan, events.last_seq))
-                begun = True
+                has_begun = True
                 # Fetch the events of takes that an earlier program recorded.
                 self._pi.drain()
                 self._warn_of_lost_events(self._pi.events())
@@ -148,10 +148,10 @@ class RunningScan:
                 self._write_radar_report({})
                 self._record_rows(events)
                 self._check_lost_steps()
-                self._end_scan(begun)
+                self._end_scan(has_begun)
                 events.sync()
         except BaseException as e:
-            self._fail(e, begun)
+            self._fail(e, has_begun)
             raise
         finally:
             events.close()
@@ -168,11 +168,11 @@ class RunningScan:
             # Do not repeat the command if the remedy has it already.
             if f"polysight resume {quote(self._scan.path)}" in e.remedy:
                 resume = ""
-            e.remedy = advice(e.remedy, safe, resume)
+            e.remedy = join_advice(e.remedy, safe, resume)
             self._error = e
             self.result.reason = e.what
         else:
-            e.add_note(advice(safe, resume))
+            e.add_note(join_advice(safe, resume))
             self.result.reason = f"{type(e).__name__}: {e}"
         with stop_on_interrupt(self._stop):
             if begun:
@@ -309,7 +309,8 @@ class RunningScan:
     def _wait_while_paused(self) -> bool:
         """Wait for the end of a pause and record it in the manifest; return False if asked to stop.
 
-        Without a pause only a request to stop now counts: the caller asks whether the scan ends before a row.
+        Without a pause the result is False only after a request to stop immediately: the caller has already checked
+        whether the scan is to end before this row.
         """
         if not self._stop.paused:
             return not self._stop.now
@@ -454,11 +455,11 @@ class RunningScan:
 
 def find_last_takes(scan: ScanFolder) -> dict[int, int]:
     """Return the highest take number of every row that was begun, so that none is used twice."""
-    begun = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
+    begun_takes = [(f.row, f.take) for f in (*scan.facts(RowCommitted), *scan.facts(RowRejected))]
     events = read_events(scan.path / EVENTS).events
-    begun += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
+    begun_takes += [(e.row.index, e.take) for e in events if isinstance(e, RowStarted)]
     # Sorted by row and take: in the dictionary, the highest take of a row replaces its others.
-    return dict(sorted(begun))
+    return dict(sorted(begun_takes))
 
 
 def run_scan(
@@ -486,7 +487,8 @@ def run_scan(
     keep_incomplete
         Commit a row that is incomplete after all retakes, masked, instead of failing.
     stop
-        Requested once: stop after the current row; twice: now. In the main thread, Ctrl-C requests.
+        Request to stop: the first one ends the scan after the current row, the second one immediately. In the main
+        thread, Ctrl-C makes such a request.
     radars
         Arms the radars for each row; default: as the rig file says. Closed at the end.
 
@@ -517,7 +519,7 @@ def run_scan(
             # Report progress now, because the radars may take seconds: from now on the scan's folder exists, and the
             # caller can show it and request a stop.
             progress(ScanProgress("check", "making the radars ready", plan.rows, 0))
-        radars = stack.enter_context(radars or radar_control(instrument))
+        radars = stack.enter_context(radars or open_radar_control(instrument))
         stop = stop or StopRequest()
         return RunningScan(
             scan=scan,
@@ -587,7 +589,7 @@ def resume_scan(
             )
         )
         scan.reload()
-        radars = stack.enter_context(radar_control(scan.instrument))
+        radars = stack.enter_context(open_radar_control(scan.instrument))
         stop = stop or StopRequest()
         running = RunningScan(
             scan=scan,
@@ -620,15 +622,15 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
 
 def _check_cards(scan: ScanFolder, rig: CaptureRig) -> None:
     """Raise ScanError if a card sent another board's rows so far, by its MAC address: boards would be exchanged."""
-    sent: dict[str, set[str]] = {}
+    macs_of_board: dict[str, set[str]] = {}
     for row in scan.committed_rows().values():
         for name, board in row.boards.items():
-            sent.setdefault(name, set()).add(board.card_mac)
+            macs_of_board.setdefault(name, set()).add(board.card_mac)
     for name, card in rig.cards.items():
-        others = [other for other, macs in sent.items() if card.mac in macs]
-        if card.mac and others and name not in others:
+        boards_of_card = [other for other, macs in macs_of_board.items() if card.mac in macs]
+        if card.mac and boards_of_card and name not in boards_of_card:
             raise ScanError(
-                f"the card of {name} at {card.board.card_address} sent the rows of {others[0]} so far"
+                f"the card of {name} at {card.board.card_address} sent the rows of {boards_of_card[0]} so far"
                 f" (MAC address {card.mac})",
                 "cards or their addresses were exchanged: later rows would be another board's",
                 "exchange them back, or begin another scan",

@@ -14,10 +14,10 @@ import msgspec
 
 StateLevel = Literal["good", "done", "wait", "warn", "bad"]
 Button = Literal["pause", "continue", "stop", "abort", "resume", "again", "repeat", "process"]
-"""`again` starts a scan that could not start once more; `repeat` plans a new one with this one's numbers."""
+"""`again` repeats the start of a scan that could not start; `repeat` plans a new scan with the numbers of this one."""
 # Buttons of a scan that runs, and of one that ended before its last row.
-RUNNING: tuple[Button, ...] = ("pause", "stop", "abort")
-ENDED: tuple[Button, ...] = ("resume", "repeat")
+BUTTONS_WHILE_RUNNING: tuple[Button, ...] = ("pause", "stop", "abort")
+BUTTONS_AFTER_END: tuple[Button, ...] = ("resume", "repeat")
 
 
 class State(msgspec.Struct, frozen=True):
@@ -40,67 +40,69 @@ class State(msgspec.Struct, frozen=True):
 
 
 # Phrases of `never`, and a remedy that several states have.
-_WELL = "All is well"
+_ALL_IS_WELL = "All is well"
 _NO_FAULTS = "No faults"
-_FAILED = "has failed"
+_HAS_FAILED = "has failed"
 _RESULT = "Result:"
 _UNTIL_RESUMED = "`polysight resume {folder}`"
 
 _TABLE = (
     # --- before the first row ---
     State("empty", "wait", "No scan here yet", detail="{folder} holds no scan. This page shows it when one begins.",
-          do="`polysight scan --out {folder}`", never=(_WELL, _RESULT)),
+          do="`polysight scan --out {folder}`", never=(_ALL_IS_WELL, _RESULT)),
     State("starting", "wait", "The scan is starting",
-          detail="Its program connects to the rig; this takes some seconds.", never=(_WELL, _NO_FAULTS, _RESULT)),
+          detail="Its program connects to the rig; this takes some seconds.",
+          never=(_ALL_IS_WELL, _NO_FAULTS, _RESULT)),
     State("start_failed", "bad", "The scan could not start", detail="{what}", why="{why}", do="{do}", press=("again",),
-          never=(_WELL, _NO_FAULTS, "No scan here yet", _RESULT)),
-    State("homing", "good", "Homing the stage", detail="Rows begin when its position is known.", press=RUNNING,
+          never=(_ALL_IS_WELL, _NO_FAULTS, "No scan here yet", _RESULT)),
+    State("homing", "good", "Homing the stage", detail="Rows begin when its position is known.",
+          press=BUTTONS_WHILE_RUNNING,
           never=(_RESULT,)),
     # --- rows ---
-    State("rows", "good", _WELL, detail="{now}", press=RUNNING, never=(_RESULT, "starting")),
+    State("rows", "good", _ALL_IS_WELL, detail="{now}", press=BUTTONS_WHILE_RUNNING, never=(_RESULT, "starting")),
     State("retake", "warn", "Row {row} is retaken (take {take})", detail="{what}", why="{why}", do="{do}",
-          press=RUNNING, never=(_WELL, _NO_FAULTS, _RESULT)),
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _NO_FAULTS, _RESULT)),
     State("after_fault", "warn", "Scanning, after a fault in a row", detail="{what}", why="{why}", do="{do}",
-          press=RUNNING, never=(_WELL, _NO_FAULTS, _RESULT)),
-    State("poor", "warn", "Scanning, but the data is poor", detail="{what}", why="{why}", do="{do}", press=RUNNING,
-          never=(_WELL, _RESULT)),
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _NO_FAULTS, _RESULT)),
+    State("poor", "warn", "Scanning, but the data is poor", detail="{what}", why="{why}", do="{do}",
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _RESULT)),
     State("late", "warn", "No row has ended for a while", detail="None for {since}, though the scan program runs.",
-          why="It waits for the disk, for processing, or for the stage", do="See its terminal", press=RUNNING,
-          never=(_WELL, _RESULT)),
+          why="It waits for the disk, for processing, or for the stage", do="See its terminal",
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _RESULT)),
     State("held", "warn", "The stage is held", detail="Within a row. Held for more than 2 s, the row is retaken.",
           why="A program other than polysight sent the Pi `Hold`", do="That program sends `Resume`; or abort the scan",
-          press=RUNNING, never=(_WELL, _RESULT)),
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _RESULT)),
     State("pi_silent", "bad", "The Pi is silent", detail="No heartbeat for {since}. The stage stops by itself.",
           why="Network or power of the Pi, or its program ended", do="On the Pi: `systemctl status polysight-pi`",
-          press=RUNNING, never=(_WELL, _RESULT)),
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _RESULT)),
     State("rig_fault", "bad", "The rig has stopped with a fault", detail="{what}", why="{why}", do="{do}",
-          press=RUNNING, never=(_WELL, _NO_FAULTS, _RESULT)),
+          press=BUTTONS_WHILE_RUNNING, never=(_ALL_IS_WELL, _NO_FAULTS, _RESULT)),
     # --- requests ---
     State("pausing", "wait", "Pausing after this row", detail="Asked by {asker}. The stage stands still then.",
-          press=("continue", "stop", "abort"), never=(_WELL, _RESULT)),
+          press=("continue", "stop", "abort"), never=(_ALL_IS_WELL, _RESULT)),
     State("paused", "wait", "Paused", detail="Asked by {asker}. {safe} Nothing moves.",
           do="Continue with the button, or `polysight ask {folder} continue`", press=("continue", "stop", "abort"),
-          never=(_WELL, _RESULT)),
+          never=(_ALL_IS_WELL, _RESULT)),
     State("stopping", "wait", "Stopping after this row", detail="Asked by {asker}. The scan can be resumed later.",
-          press=("abort",), never=(_WELL, _RESULT)),
+          press=("abort",), never=(_ALL_IS_WELL, _RESULT)),
     State("aborting", "wait", "Stopping now", detail="Asked by {asker}. The stage stops; the running row is lost.",
-          never=(_WELL, "fault", _RESULT)),
+          never=(_ALL_IS_WELL, "fault", _RESULT)),
     State("stopped", "wait", "Stopped on request", detail="By {asker}, after a row. {safe}", do=_UNTIL_RESUMED,
-          press=ENDED, never=(_WELL, _FAILED, "fault in a row", "exit status", _RESULT)),
-    State("aborted", "wait", "Aborted on request", detail="By {asker}. {safe}", do=_UNTIL_RESUMED, press=ENDED,
-          never=(_WELL, _FAILED, "fault in a row", "exit status", _RESULT)),
+          press=BUTTONS_AFTER_END, never=(_ALL_IS_WELL, _HAS_FAILED, "fault in a row", "exit status", _RESULT)),
+    State("aborted", "wait", "Aborted on request", detail="By {asker}. {safe}", do=_UNTIL_RESUMED,
+          press=BUTTONS_AFTER_END, never=(_ALL_IS_WELL, _HAS_FAILED, "fault in a row", "exit status", _RESULT)),
     # --- ends without being asked ---
-    State("failed", "bad", "The scan has failed", detail="{what} {safe}", why="{why}", do="{do}", press=ENDED,
-          never=(_WELL, _RESULT)),
+    State("failed", "bad", "The scan has failed", detail="{what} {safe}", why="{why}", do="{do}",
+          press=BUTTONS_AFTER_END, never=(_ALL_IS_WELL, _RESULT)),
     State("killed", "bad", "The scan program was killed", detail="{safe} The stage stops by itself.",
           why="Its process is gone, and it did not say why: memory ran out, or somebody killed it", do=_UNTIL_RESUMED,
-          press=ENDED, never=(_WELL, _RESULT)),
+          press=BUTTONS_AFTER_END, never=(_ALL_IS_WELL, _RESULT)),
     State("frozen", "bad", "The scan program does not respond", detail="No sign of life for {since}; {safe}",
           why="It hangs, its machine is switched off, or its drive is gone",
           do="Look at its machine; if the program is gone, `polysight resume {folder}`", press=("abort", "resume"),
-          never=(_WELL, _RESULT)),
+          never=(_ALL_IS_WELL, _RESULT)),
     State("resuming", "wait", "The scan is being resumed", detail="{safe} Its program connects to the rig.",
-          never=(_WELL, _FAILED, _RESULT)),
+          never=(_ALL_IS_WELL, _HAS_FAILED, _RESULT)),
     # --- the end ---
     State("homing_again", "good", "Homing the stage again", detail="Every row is recorded; this measures lost steps.",
           press=("abort",), never=("Rows begin", _RESULT)),
@@ -110,7 +112,7 @@ _TABLE = (
     State("finished", "done", "The scan is finished", detail="{all_safe} It was not processed.",
           press=("process", "repeat"), never=(_RESULT,)),
     State("unprocessed", "bad", "Every row is safe, but processing failed", detail="{what}", why="{why}", do="{do}",
-          press=("process", "repeat"), never=(_WELL, _RESULT)),
+          press=("process", "repeat"), never=(_ALL_IS_WELL, _RESULT)),
     State("result_good", "done", "The scan is finished", detail="{all_safe}", press=("repeat",),
           never=("not processed",)),
     State("result_care", "warn", "Finished: use the result with care", detail="{all_safe}", press=("repeat",),
@@ -122,19 +124,19 @@ _TABLE = (
     # --- what cannot be read ---
     State("unreadable", "bad", "This scan cannot be shown", detail="{what}",
           why="It was written by another release, or is damaged", do="`polysight validate {folder}`",
-          never=(_WELL, _RESULT)),
+          never=(_ALL_IS_WELL, _RESULT)),
     State("folder_gone", "bad", "The scan's folder is gone", detail="{folder} was there before.",
           why="It was moved, renamed or deleted, or its drive is gone", do="Look for it in the list of scans",
-          never=(_WELL, "disk is full")),
+          never=(_ALL_IS_WELL, "disk is full")),
     # --- the page itself, which keeps these words for when it is alone ---
     State("offline", "wait", "No connection to the server", detail="Reconnecting. The scan goes on without this page.",
           why="`polysight serve` was ended, or the network is gone",
           do="In a shell on the host: `polysight ask {folder} abort`; the emergency stop stops the stage",
-          never=(_WELL,)),
+          never=(_ALL_IS_WELL,)),
     State("server_frozen", "wait", "The server does not respond", detail="The scan goes on without it.",
           why="Its machine is very busy, or its drive is gone",
           do="In a shell on the host: `polysight ask {folder} abort`; the emergency stop stops the stage",
-          never=(_WELL,)),
+          never=(_ALL_IS_WELL,)),
 )  # fmt: skip
 STATES = {state.key: state for state in _TABLE}
 

@@ -19,7 +19,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from polysight.api.scan import find_rig_file
 from polysight.jobs.train import train_from_scans
 from polysight.materials import (
-    SHORT,
+    MODEL_OF_OPTION,
     ErrorDiscriminant,
     Library,
     PaperKNeighborsClassifier,
@@ -107,9 +107,9 @@ class Classifier(ClassifierMixin, BaseEstimator):
             of another length.
         """
         pixels, names = _validate(self, X, y, ensure_min_samples=2)
-        # `SHORT`: name of a model in options to that in library files.
-        if self.model not in SHORT:
-            raise ValueError(f"model is {self.model!r}: one of {', '.join(SHORT)}")
+        # `MODEL_OF_OPTION`: name of a model in options to that in library files.
+        if self.model not in MODEL_OF_OPTION:
+            raise ValueError(f"model is {self.model!r}: one of {', '.join(MODEL_OF_OPTION)}")
         check_classification_targets(names)
         self.classes_ = np.unique(names)
         if self.model == "knn":
@@ -146,7 +146,7 @@ class Classifier(ClassifierMixin, BaseEstimator):
         DataError
             if no material is in two scans.
         """
-        return score(Samples.from_library(library), SHORT[self.model])
+        return score(Samples.from_library(library), MODEL_OF_OPTION[self.model])
 
 
 def _collect_samples(X: Columns, y: Names, groups: npt.ArrayLike | None) -> Samples:

@@ -22,8 +22,8 @@ from polysight.catalogue import Pixels, compare_pixels
 from polysight.data import find_packaged
 from polysight.jobs.demo import simulate_scene
 from polysight.jobs.scans import check_scan, check_scans
-from polysight.planning import Changes, Forecast, describe, find_scene_warnings, forecast_scene
-from polysight.products import PLANE, ProcessedScan, image_dataset
+from polysight.planning import Forecast, PlanChanges, describe, find_scene_warnings, forecast_scene
+from polysight.products import PLANE_DIMENSIONS, ProcessedScan, image_dataset
 from polysight.results import CheckResult
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, ErrorCode, expand_paths
@@ -79,12 +79,12 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
     ConfigError
         if the rig file or a value is wrong, or a change has another name than these.
     """
-    known = [field.name for field in fields(Changes)]
-    unknown = [name for name in changes if name not in known]
+    known_options = [field.name for field in fields(PlanChanges)]
+    unknown = [name for name in changes if name not in known_options]
     if unknown:
         raise ConfigError(
             f"{', '.join(unknown)}: no change of a plan",
-            f"the changes are {', '.join(known)}",
+            f"the changes are {', '.join(known_options)}",
             "see help(polysight.plan)",
             code=ErrorCode.VALUE_INVALID,
         )
@@ -98,7 +98,7 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
         )
     instrument = rig if isinstance(rig, Instrument) else load_instrument(find_rig_file(rig))
     with _open_scene_file(scene) as path:
-        return Plan(forecast_scene(instrument, Changes(**changes), path))  # type: ignore[arg-type]
+        return Plan(forecast_scene(instrument, PlanChanges(**changes), path))  # type: ignore[arg-type]
 
 
 def simulate(scene: Scene, out: PathText, *, rig: PathText | None = None, seed: int | None = None) -> Scan:
@@ -172,9 +172,17 @@ def compare(first: Scan | PathText, second: Scan | PathText) -> xarray.Dataset:
     unknown = complex(np.nan, np.nan)
     values = [unknown if d is None else complex(d.real, d.imag) for d in differences]
     table: dict[str, Any] = {
-        "p_difference": (PLANE, comparison.p, {"units": "1", "long_name": "difference of P"}),
-        "permittivity_difference": (PLANE, comparison.permittivity, {"units": "1", "long_name": "difference"}),
-        "sigmas": (PLANE, comparison.sigmas, {"units": "1", "long_name": "difference of P in standard deviations"}),
+        "p_difference": (PLANE_DIMENSIONS, comparison.p, {"units": "1", "long_name": "difference of P"}),
+        "permittivity_difference": (
+            PLANE_DIMENSIONS,
+            comparison.permittivity,
+            {"units": "1", "long_name": "difference"},
+        ),
+        "sigmas": (
+            PLANE_DIMENSIONS,
+            comparison.sigmas,
+            {"units": "1", "long_name": "difference of P in standard deviations"},
+        ),
         "pair_x_mm": ("pair", [pair.place_mm[0] for pair in pairs], {"units": "mm", "long_name": "x from the centre"}),
         "pair_y_mm": ("pair", [pair.place_mm[1] for pair in pairs], {"units": "mm", "long_name": "y from the centre"}),
         "first_name": (
@@ -230,8 +238,8 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
     """
     import xarray
 
-    checked = _check_all(scans)
-    results = [result for _, result in checked]
+    checked_scans = _check_all(scans)
+    results = [result for _, result in checked_scans]
     unknown = (np.nan, np.nan)
     measured = np.array([result.measured or unknown for result in results])
     errors = np.array([result.measured_std or unknown for result in results])
@@ -246,7 +254,7 @@ def check(*scans: Scan | PathText) -> xarray.Dataset:
         "level": ([result.level for result in results], "level of the control chart"),
     }
     variables = {name: ("scan", value, {"units": "1", "long_name": about}) for name, (value, about) in table.items()}
-    names = ("scan", [scan.scan_id for scan, _ in checked], {"units": "", "long_name": "name of the scan"})
+    names = ("scan", [scan.scan_id for scan, _ in checked_scans], {"units": "", "long_name": "name of the scan"})
     return xarray.Dataset(variables, {"scan": names}, {"plate": results[-1].name})
 
 
@@ -262,18 +270,18 @@ def plot_check(*scans: Scan | PathText) -> Figure:
 
 def _check_all(scans: Sequence[Scan | PathText]) -> list[tuple[ProcessedScan, CheckResult]]:
     """Return each scan, processed if necessary, with the result of its check."""
-    checked: list[tuple[ProcessedScan, CheckResult]] = []
+    checked_scans: list[tuple[ProcessedScan, CheckResult]] = []
     for scan in scans:
         if isinstance(scan, Scan):
             processed = scan.read_or_process()
-            checked.append((processed, check_scan(processed)))
+            checked_scans.append((processed, check_scan(processed)))
         else:
-            checked += check_scans([Path(scan)])
-    if not checked:
+            checked_scans += check_scans([Path(scan)])
+    if not checked_scans:
         raise ConfigError(
             "no scan was given", "nothing can be compared with the known value", "see help(polysight.check)"
         )
-    return checked
+    return checked_scans
 
 
 @contextmanager

@@ -52,9 +52,9 @@ def plot_scan(scan: ProcessedScan) -> Figure:
     return fig
 
 
-def plot_control_chart(checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> Figure:
+def plot_control_chart(checked_scans: Sequence[tuple[ProcessedScan, CheckResult]]) -> Figure:
     """Control chart of the check plates of scans."""
     fig = NotebookFigure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
     FigureCanvasAgg(fig)
-    draw_control_chart(fig, checked)
+    draw_control_chart(fig, checked_scans)
     return fig

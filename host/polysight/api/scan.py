@@ -20,7 +20,7 @@ from polysight.catalogue import Pixels
 from polysight.data import find_packaged
 from polysight.imaging import Images
 from polysight.jobs.label import save_labels
-from polysight.materials import MODELS, SHORT, Labels, find_truth, format_permittivity
+from polysight.materials import MODEL_OF_OPTION, MODELS, Labels, find_truth, format_permittivity
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import Incidence
 from polysight.products import (
@@ -48,10 +48,10 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
-RIG = Path("instrument.toml")
+RIG_FILE = Path("instrument.toml")
 Box = tuple[float, float, float, float]
 # The form of a box, for errors.
-_BOX = "a box is (x0, y0, x1, y1) in mm from the image's centre, x0 < x1 and y0 < y1"
+_BOX_FORM = "a box is (x0, y0, x1, y1) in mm from the image's centre, x0 < x1 and y0 < y1"
 # Variables of each patch's permittivity, in the order of the dataset.
 _PERMITTIVITY = (
     "permittivity", "permittivity_real_standard_error", "permittivity_loss_standard_error",
@@ -142,9 +142,9 @@ def _check_arguments(
     elif not isinstance(bands, int) or bands < 1:
         problem = f"bands is {bands!r}: a whole number, 1 or more"
     elif box is not None and not _is_box(box):
-        problem = f"metal_box_mm is {box!r}: {_BOX}"
-    elif model is not None and model not in (*MODELS, *SHORT, "none"):
-        problem = f"model is {model!r}: one of {', '.join((*SHORT, 'none'))}"
+        problem = f"metal_box_mm is {box!r}: {_BOX_FORM}"
+    elif model is not None and model not in (*MODELS, *MODEL_OF_OPTION, "none"):
+        problem = f"model is {model!r}: one of {', '.join((*MODEL_OF_OPTION, 'none'))}"
     elif not isinstance(library, str | os.PathLike | None):
         problem = f"library is {library!r}: the path of a file that Library.save wrote"
     elif library is not None and not Path(library).is_file():
@@ -155,7 +155,7 @@ def _check_arguments(
 
 def find_rig_file(rig: str | os.PathLike[str] | None) -> Path:
     """Return the path of the rig file: the given one, that of the current folder, or the packaged one."""
-    return find_packaged(RIG) if rig is None else Path(rig)
+    return find_packaged(RIG_FILE) if rig is None else Path(rig)
 
 
 def _is_box(box: object) -> bool:
@@ -194,7 +194,7 @@ def _open_products_only(path: Path, settings: Settings, process_again: bool) -> 
 def _open_source(path: Path, rig: str | os.PathLike[str] | Instrument | None) -> Source:
     """Open recorded data, also without raw rows; without `rig`, with the rig file in its folder or the packaged one."""
     if rig is None:
-        rig = path / RIG if (path / RIG).exists() else find_packaged(RIG)
+        rig = path / RIG_FILE if (path / RIG_FILE).exists() else find_packaged(RIG_FILE)
     return open_source(path, rig if isinstance(rig, Instrument) else Path(rig), dropped=True)
 
 
@@ -376,10 +376,10 @@ class Scan:
         patches = self.patches()
         maps = [self.image(), self.permittivity_map(), patches[["label"]]]
         merged = xarray.merge(maps, compat="override", join="exact", combine_attrs="override")
-        place = merged.sel(x_mm=x_mm, y_mm=y_mm, method="nearest")
+        pixel = merged.sel(x_mm=x_mm, y_mm=y_mm, method="nearest")
         names = dict(zip(patches["patch"].values, patches["name"].values, strict=True))
-        name = str(names.get(place["label"].item(), ""))
-        return place.assign(name=((), name, patches["name"].attrs))
+        name = str(names.get(pixel["label"].item(), ""))
+        return pixel.assign(name=((), name, patches["name"].attrs))
 
     def columns(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]:
         """Pixels inside the patches for a classifier, and the number of the patch of each.
@@ -432,12 +432,15 @@ class Scan:
         for name, box in boxes.items():
             if not _is_box(box):
                 raise ConfigError(
-                    f"box of {name!r} is {box!r}", _BOX, "see help(polysight.Scan.label)", code=ErrorCode.VALUE_INVALID
+                    f"box of {name!r} is {box!r}",
+                    _BOX_FORM,
+                    "see help(polysight.Scan.label)",
+                    code=ErrorCode.VALUE_INVALID,
                 )
         # Images of another program are one file: its folder takes the labels.
-        place = label_folder(self.folder if self.folder.is_dir() else self.folder.parent)
-        save_labels(place, self.read_or_process(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
-        return place / LABELS
+        labels_folder = label_folder(self.folder if self.folder.is_dir() else self.folder.parent)
+        save_labels(labels_folder, self.read_or_process(), Labels(dict(boxes), "mm", metal, dict(specimens or {})))
+        return labels_folder / LABELS
 
     def materials(self) -> xarray.Dataset:
         """Name of each patch, and its permittivity with errors.
@@ -666,7 +669,7 @@ class Processing:
             when no metal is found, a row is damaged, or library or metal reference do not fit the scan.
         """
         pipeline = self.pipeline
-        unnamed = process.why_unnamed(self.settings, pipeline.rig)
+        unnamed = process.explain_unnamed(self.settings, pipeline.rig)
         plates, note = find_truth(self.folder)
         if note:
             warnings.warn(note, stacklevel=2)

@@ -2,8 +2,8 @@
 
 `polysight calibrate` estimates one kind at a time (`fit_places`, `fit_filter`, `fit_start`, `write_metal`) and writes a
 dated calibration file. The rig file names the files that apply; a new scan gets copies (`copy_into_scan`).
-`calibration_of_scan` loads the active calibration of a scan: its `Calibration` corrects the rig, and gives the measured
-filters and the metal reference.
+`load_scan_calibration` loads the active calibration of a scan: its `Calibration` corrects the rig, and gives the
+measured filters and the metal reference.
 """
 
 from polysight.calibration.direct_signal import (
@@ -23,15 +23,15 @@ from polysight.calibration.files import (
     MetalFile,
     SphereFile,
     StartFile,
-    board_rows,
-    calibration_of_rig,
-    calibration_of_scan,
     copy_into_scan,
     load_checked_calibration,
+    load_rig_calibration,
+    load_scan_calibration,
     make_header,
+    make_source_entry,
     open_raw,
+    read_board_rows,
     read_calibration,
-    source_scan,
     write_calibration,
     write_metal,
 )

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight import sync
-from polysight.calibration.files import BoardFilter, BoardStart, board_rows, places_crc32
+from polysight.calibration.files import BoardFilter, BoardStart, places_crc32, read_board_rows
 from polysight.radar import direct_if_hz
 from polysight.store import RawSource
 from polysight_shared.config import Board, Instrument
@@ -35,7 +35,7 @@ FULL_SCALE = 32767
 # Share of the sample rate that the receiver's filter passes (TI).
 PASSBAND = 0.9
 # Rows of a scan used by `fit_start`, and by `fit_filter`, which spreads their chirps over many bins of the IF; chosen.
-ROWS = 4
+START_ROWS = 4
 FILTER_ROWS = 6
 # Smallest share of chirps with a direct path that a start offset is estimated from. Chosen.
 MIN_FOUND = 0.25
@@ -148,12 +148,12 @@ def find_direct(
     drift = sync.reference(aligned, setup.path, chirp).drift
     time = np.arange(aligned.halves.shape[-1]) * float(sync.FOLD)
     time -= time.mean()
-    without_drift = aligned._replace(halves=aligned.halves * sync.cis(-0.5 * drift * time**2))
-    referenced = sync.reference(without_drift, setup.path, chirp)
+    drift_free = aligned._replace(halves=aligned.halves * sync.cis(-0.5 * drift * time**2))
+    referenced = sync.reference(drift_free, setup.path, chirp)
     has_direct_path = aligned.good & referenced.found[:, None]
     cycles = (referenced.frequency[:, None] + aligned.frequency)[has_direct_path]
     power = _measure_power(words[has_direct_path.ravel()], cycles, setup, drift + referenced.drift)
-    # The amplitude is a weighted sum of means of `FOLD` samples: so much of a sample's noise remains in it. Row 0
+    # The amplitude is a weighted sum of means of `FOLD` samples: this share of a sample's noise remains in it. Row 0
     # of the estimator has the weights of the amplitude.
     share_of_noise = (np.abs(setup.path.estimator[0]) ** 2).sum() / sync.FOLD
     noise = _estimate_recorded_noise(aligned, referenced.noise) * share_of_noise
@@ -173,7 +173,7 @@ def find_direct(
         drift_hz_per_s=drift_hz_per_s,
         chirps=int(valid.sum()),
         rx_order=sync.find_rx_order(
-            without_drift, referenced, setup.path, lambda row, path: sync.reference(row, path, chirp)
+            drift_free, referenced, setup.path, lambda row, path: sync.reference(row, path, chirp)
         ),
     )
 
@@ -223,7 +223,9 @@ def fit_start(source: RawSource, board_name: str) -> BoardStart:
     rig = source.instrument
     board = rig.by_name(board_name)
     setup = sync.BoardSetup.from_rig(rig, board)
-    signals = [find_direct(rig, board, words, ok, setup) for _, words, ok in board_rows(source, board_name, ROWS)]
+    signals = [
+        find_direct(rig, board, words, ok, setup) for _, words, ok in read_board_rows(source, board_name, START_ROWS)
+    ]
     if_hz = np.concatenate([s.if_hz for s in signals])
     chirps = sum(s.chirps for s in signals)
     expected = direct_if_hz(rig, board)
@@ -308,7 +310,8 @@ def _measure_power_of_scan(
     if key not in setups:
         setups[key] = sync.BoardSetup.from_rig(rig, board)
     signals = [
-        find_direct(rig, board, words, ok, setups[key]) for _, words, ok in board_rows(scan, board.name, FILTER_ROWS)
+        find_direct(rig, board, words, ok, setups[key])
+        for _, words, ok in read_board_rows(scan, board.name, FILTER_ROWS)
     ]
     return (
         np.concatenate([s.if_hz for s in signals]),
@@ -328,13 +331,13 @@ def average_in_bins(if_hz: Real, power: Real, noise_power: Real) -> tuple[Real, 
     mean_if_hz = []
     signal_power = []
     for bin_number in np.unique(bin_of_chirp):
-        in_bin = (bin_of_chirp == bin_number) & (if_hz > 0)
-        if in_bin.sum() < MIN_CHIRPS:
+        is_in_bin = (bin_of_chirp == bin_number) & (if_hz > 0)
+        if is_in_bin.sum() < MIN_CHIRPS:
             continue
-        total = np.median(power[in_bin])
-        noise = noise_power[in_bin].mean()
+        total = np.median(power[is_in_bin])
+        noise = noise_power[is_in_bin].mean()
         if total > MIN_SNR * noise:
-            mean_if_hz.append(if_hz[in_bin].mean())
+            mean_if_hz.append(if_hz[is_in_bin].mean())
             signal_power.append(total - noise)
     return np.array(mean_if_hz), np.sqrt(signal_power)
 

@@ -22,7 +22,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from polysight.capture import row_words
+from polysight.capture import view_row_words
 from polysight.imaging import ImagedWith, SubBand, image_grid
 from polysight.polarimetry import PlaneReference
 from polysight.results import CalibrationSource
@@ -45,11 +45,11 @@ from polysight_shared.tables import decode, read_toml, to_builtins
 
 FORMAT = 1
 """Latest format of calibration files; files of later ones are refused."""
-IMAGES = ("h", "v", "valid")
+IMAGE_ARRAYS = ("h", "v", "valid")
 """Arrays of a `PlaneReference` in the .npz file."""
 MIN_METAL_LEVEL = 0.02
 """Smallest echo of a mirror relative to the direct path; antenna patterns may take some 20 dB; chosen."""
-FOLDER = "calibration"
+COPIES_FOLDER = "calibration"
 """Folder of the copies in a scan's folder."""
 # x, y, z.
 Vector = tuple[float, float, float]
@@ -91,13 +91,13 @@ class BoardPlace(msgspec.Struct, frozen=True):
     shift_mm: Vector
     """In the rig frame, added after the board's mount."""
     standard_error_mm: Vector
-    """Of each part of the shift."""
+    """Standard error of each component of the shift."""
     direct_path_mm: float
     """Length of the direct path from the transmitter to the board's RX1."""
     direct_path_was_mm: float
-    """That length by the rig file."""
+    """Length of the direct path according to the rig file."""
     direct_path_standard_error_mm: float
-    """Of the length."""
+    """Standard error of the length."""
 
 
 class PlacesFile(CalibrationFile, frozen=True, kw_only=True):
@@ -207,7 +207,7 @@ class BoardStart(msgspec.Struct, frozen=True):
     expected_if_hz: float
     # Middle of the IF band.
     middle_hz: float
-    # By how many sample rates the direct path was aliased.
+    # Number of sample rates by which the direct path was aliased.
     alias: int
     # Number of chirps with a direct path.
     chirps: int
@@ -323,9 +323,9 @@ def write_metal(reference: PlaneReference, sources: list[SourceScan], out: Path,
     path = write_calibration(file, out)
     images = path.with_suffix(".npz")
     try:
-        arrays = {name: getattr(reference, name) for name in IMAGES}
+        arrays = {name: getattr(reference, name) for name in IMAGE_ARRAYS}
         if reference.bands:
-            arrays |= {f"band_{n}": np.stack([getattr(part, n) for part in reference.bands]) for n in IMAGES}
+            arrays |= {f"band_{n}": np.stack([getattr(part, n) for part in reference.bands]) for n in IMAGE_ARRAYS}
         if reference.dispersion is not None:
             arrays["dispersion"] = np.array(reference.dispersion)
         np.savez_compressed(images, x_m=reference.x_m, y_m=reference.y_m, **arrays)
@@ -365,7 +365,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         dispersion_h, dispersion_v = arrays["dispersion"].tolist()
         dispersion = (dispersion_h, dispersion_v)
     reference = PlaneReference(
-        *(arrays[name] for name in IMAGES),
+        *(arrays[name] for name in IMAGE_ARRAYS),
         x_m=arrays["x_m"],
         y_m=arrays["y_m"],
         spread=file.spread,
@@ -375,7 +375,7 @@ def read_metal(file: MetalFile, images: Path) -> PlaneReference:
         rise=(float(np.radians(file.tilt_deg[0])), float(np.radians(file.tilt_deg[1]))),
     )
     band_references = (
-        replace(reference, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGES})
+        replace(reference, spread=band.spread, how=band.how, **{n: arrays[f"band_{n}"][k] for n in IMAGE_ARRAYS})
         for k, band in enumerate(file.bands)
     )
     return replace(reference, bands=tuple(band_references))
@@ -520,20 +520,20 @@ def load_calibration(paths: dict[str, Path]) -> Calibration:
     )
 
 
-def calibration_of_rig(rig: Instrument) -> Calibration:
+def load_rig_calibration(rig: Instrument) -> Calibration:
     """Load the calibration files that a rig file names. Raises ConfigError or DataError for an invalid file."""
     return load_calibration({kind: Path(name) for kind, name in to_builtins(rig.calibration).items() if name})
 
 
-def calibration_of_scan(scan: Source) -> Calibration:
+def load_scan_calibration(scan: Source) -> Calibration:
     """Load the calibration of a scan: the copies in its folder, or without copies the files that its rig file names.
 
-    In a scan folder the latter have to lie in it.
+    If the scan is a scan folder, those files have to lie in it.
 
     Raises ConfigError or DataError if a file is invalid, or a copy is missing or was changed.
     """
     if not isinstance(scan, ScanFolder):
-        return calibration_of_rig(scan.instrument)
+        return load_rig_calibration(scan.instrument)
     recorded = scan.started.calibration
     if recorded is None:
         names_by_kind = {kind: name for kind, name in to_builtins(scan.instrument.calibration).items() if name}
@@ -571,12 +571,12 @@ def load_checked_calibration(rig: Instrument, simulated: bool) -> Calibration:
     Raises ConfigError or DataError if a file is invalid, belongs to another rig, or comes from simulated data while the
     scan is not `simulated`.
     """
-    calibration = calibration_of_rig(rig)
-    placed = calibration.rig(rig)
+    calibration = load_rig_calibration(rig)
+    measured_rig = calibration.rig(rig)
     reference = calibration.reference()
     if reference is not None:
-        reference.check_rig(calibration.describe_imaging(placed), str(calibration.path("metal")))
-        grid = image_grid(placed)
+        reference.check_rig(calibration.describe_imaging(measured_rig), str(calibration.path("metal")))
+        grid = image_grid(measured_rig)
         reference.check_axes(grid.x_m, grid.y_m)
     for kind, file in calibration.files().items():
         if file.simulated and not simulated:
@@ -602,14 +602,14 @@ def copy_into_scan(rig: Instrument, folder: Path, simulated: bool) -> dict[str, 
     entries = {}
     for kind, path in paths.items():
         name = path.name if names.count(path.name) == 1 else f"{kind}-{path.name}"
-        copy = folder / FOLDER / name
+        copy = folder / COPIES_FOLDER / name
         if not holds_scan:
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(path, copy)
             if kind == "metal" and calibration.metal is not None:
                 shutil.copyfile(path.parent / calibration.metal.images, copy.parent / calibration.metal.images)
         entries[kind] = {
-            "file": f"{FOLDER}/{name}",
+            "file": f"{COPIES_FOLDER}/{name}",
             "crc32": _compute_crc32(path),
             "copied_from": str(path),
         }
@@ -632,17 +632,17 @@ def open_raw(folder: Path, rig: Instrument | None = None) -> RawSource:
     return source
 
 
-def source_scan(source: RawSource, folder: Path) -> SourceScan:
+def make_source_entry(source: RawSource, folder: Path) -> SourceScan:
     """Return the entry of a scan in the `sources` of a calibration file."""
     return SourceScan(source.scan_id, str(folder), source.simulated, len(list(source.rows())))
 
 
-def board_rows(
+def read_board_rows(
     source: RawSource, board: str, limit: int | None = None
 ) -> Iterator[tuple[int, NDArray[np.int16], NDArray[np.bool_]]]:
     """Yield index, words int16 [chirp, sample, 2, rx] (I before Q) and valid bool [chirp] of a board's rows.
 
-    With a `limit`, only as many rows, evenly spaced.
+    With a `limit`, at most this number of rows is read, evenly spaced.
     """
     rows = list(source.rows())
     if limit is not None and len(rows) > limit:
@@ -652,4 +652,4 @@ def board_rows(
         recorded = source.read_row(board, row)
         samples = source.instrument.chirp.samples
         rx = len(source.instrument.antennas.rx_mm)
-        yield row, *row_words(recorded.payload, recorded.missing, recorded.frames_expected, samples, rx)
+        yield row, *view_row_words(recorded.payload, recorded.missing, recorded.frames_expected, samples, rx)

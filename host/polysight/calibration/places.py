@@ -163,8 +163,8 @@ def fit_places(
             _subtract_echoes(b, unknown[3 * i : 3 * i + 3], _place_points(centre, points_mm, unknown))
             for i, b in enumerate(boards)
         ]
-        flat = np.concatenate([p.ravel() for p in parts]) / sigma
-        return np.concatenate([flat.real, flat.imag, unknown / scale])
+        residuals = np.concatenate([p.ravel() for p in parts]) / sigma
+        return np.concatenate([residuals.real, residuals.imag, unknown / scale])
 
     # In the order of `Prior.scale`: shift of each board, distance of the plane, x, y and rotation of the target.
     start = np.zeros(scale.size)
@@ -199,9 +199,9 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     reduced = []
     direct = []
     offsets = []
-    # Every so many-th row, and position in it.
+    # One row in `stride` rows is used, and one position in `stride` positions of it.
     stride = max(1, int(np.ceil(np.sqrt(plan.positions / POSITIONS))))
-    for row, words, valid in files.board_rows(source, name):
+    for row, words, valid in files.read_board_rows(source, name):
         if row % stride:
             continue
         synced = synchronise_row(words, valid, setup)
@@ -225,8 +225,8 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     has_noise = power > _MIN_NOISE * power[-1]
     whitening = directions[:, has_noise].conj().T / np.sqrt(power[has_noise])[:, None]
     samples = (samples / gains[:, None, None]) @ whitening.T
-    flat = np.concatenate(offsets)
-    places = np.column_stack([flat, np.zeros(len(flat))])
+    all_offsets = np.concatenate(offsets)
+    places = np.column_stack([all_offsets, np.zeros(len(all_offsets))])
     return BoardEchoes(Antennas.from_rig(rig, board), samples, whitening @ maps.model, places, maps.frequencies_hz)
 
 
@@ -238,8 +238,8 @@ def _place_points(centre: Real, points_mm: Real, unknown: Real) -> Real:
     depth, x, y, turn = unknown[-4:]
     c = np.cos(np.radians(turn))
     s = np.sin(np.radians(turn))
-    flat = points_mm @ np.array([[c, s], [-s, c]]) + [x, y]
-    return centre + np.column_stack([flat, np.full(len(points_mm), depth)]) / 1e3
+    placed_xy = points_mm @ np.array([[c, s], [-s, c]]) + [x, y]
+    return centre + np.column_stack([placed_xy, np.full(len(points_mm), depth)]) / 1e3
 
 
 def _model_echoes(board: BoardEchoes, shift_mm: Real, places_m: Real) -> NDArray[np.complex128]:
@@ -322,13 +322,15 @@ def places_file(rig: Instrument, fit: PlacesFit, points: int, sources: list[file
         antennas = Antennas.from_rig(rig, rig.by_name(name))
         vector_before = antennas.rx_m[0] - antennas.tx_m
         vector_after = vector_before + fit.values[board_values] / 1e3
-        along = vector_after / np.linalg.norm(vector_after)
+        unit_vector = vector_after / np.linalg.norm(vector_after)
         boards[name] = files.BoardPlace(
             shift_mm=_make_vector(fit.values[board_values]),
             standard_error_mm=_make_vector(errors[board_values]),
             direct_path_mm=float(np.linalg.norm(vector_after) * 1e3),
             direct_path_was_mm=float(np.linalg.norm(vector_before) * 1e3),
-            direct_path_standard_error_mm=float(np.sqrt(along @ fit.covariance[board_values, board_values] @ along)),
+            direct_path_standard_error_mm=float(
+                np.sqrt(unit_vector @ fit.covariance[board_values, board_values] @ unit_vector)
+            ),
         )
     depth, x, y, turn = (float(v) for v in fit.values[-4:])
     return files.PlacesFile(

@@ -4,7 +4,8 @@
 * Reception: `ReceiverProcess` drives one process per card (`receiver`, `receiver_process`), which logs packets and
   writes a row's files (`row_files`); `RowCapture` lists missing bytes and counts dropped packets.
 * Placement: `placement` decides which packets (`packet_log`) are the row, and where each byte belongs.
-* Formats: `dca1000` has those of the card, `row_words` converts payload to samples; `inspect_bin` and `inspect_pcap`
+* Formats: `dca1000` has those of the card, `view_row_words` converts payload to samples; `inspect_bin` and
+  `inspect_pcap`
   examine a recording.
 """
 
@@ -17,9 +18,9 @@ from polysight.capture.dca1000 import (
     Status,
     Version,
     decode_row,
-    raw_words,
-    row_words,
+    encode_row_words,
     valid_frames,
+    view_row_words,
 )
 from polysight.capture.inspect import (
     SILENT_SHARE,
@@ -31,8 +32,8 @@ from polysight.capture.inspect import (
     is_pcap,
     recognise_format,
 )
-from polysight.capture.network import check_receive_buffer, route_interface, silent_radar
-from polysight.capture.placement import Evidence, Placed, place_record
+from polysight.capture.network import check_receive_buffer, explain_silent_radar, route_interface
+from polysight.capture.placement import Evidence, PlacedRecord, place_record
 from polysight.capture.receiver import (
     PRIORITY_REMEDY,
     Progress,
@@ -42,11 +43,11 @@ from polysight.capture.receiver import (
     take_priority,
 )
 from polysight.capture.row_files import (
-    PACKETS,
+    PACKETS_SUFFIX,
+    make_write_error,
     read_index,
     read_packets,
     write_durably,
-    write_error,
     write_index,
     write_packets,
 )

@@ -25,12 +25,12 @@ from polysight.capture.network import (
     Hop,
     bind_udp,
     check_receive_buffer,
+    explain_missing_route,
+    explain_silent_card,
+    explain_silent_radar,
+    find_silent_hop,
     neighbour_mac,
-    no_route,
     route_interface,
-    silent_card,
-    silent_hop,
-    silent_radar,
 )
 from polysight.capture.receiver import PRIORITY_REMEDY, Core, ReceiverProcess, RowCapture, receiver_cores
 from polysight_shared.closing import Closing
@@ -40,11 +40,11 @@ from polysight_shared.findings import Finding
 
 # Times that a command is sent before the card counts as silent (chosen); they share the timeout.
 ATTEMPTS = 3
-# How long a second answer to one request is awaited: a second card answers as soon as the first (chosen).
+# Time to wait for a second answer to a request: a second card answers as soon as the first (chosen).
 _TWIN_S = 0.05
 # Datagrams that may wait in the command socket when the time is over: Linux's usual 212,992 bytes hold 280 short ones.
 SOCKET_DATAGRAMS = 1000
-# How long the card's report of a failed write is awaited after its reply (chosen: no card has been measured).
+# Time to wait for the card's report of a failed write after its reply (chosen: no card has been measured).
 EEPROM_REPORT_S = 0.5
 # Command and data port, as the EEPROM holds them.
 _PORTS = struct.Struct("<HH")
@@ -89,11 +89,11 @@ class CardClient(Closing):
         """MAC address of the card; "" if the kernel does not know it."""
         return next(iter(self._macs), "")
 
-    def alive(self) -> None:
+    def check_alive(self) -> None:
         """Check that the card replies; otherwise raise DeviceError with the first hop that does not work."""
         self._send_command(Code.ALIVE)
 
-    def version(self) -> Version:
+    def read_version(self) -> Version:
         """Return the card's FPGA version. Raises DeviceError."""
         return dca1000.decode_version(self._exchange(Code.VERSION, b"", ATTEMPTS).status)
 
@@ -132,9 +132,9 @@ class CardClient(Closing):
         if len(self._macs) > 1:
             raise self._twin_error(*answers, f"MAC addresses {' and '.join(sorted(self._macs))}")
 
-    def _twin_error(self, *seen: str) -> DeviceError:
+    def _twin_error(self, *addresses_seen: str) -> DeviceError:
         return DeviceError(
-            f"{self._name()}: {', '.join(seen)}",
+            f"{self._name()}: {', '.join(addresses_seen)}",
             "two cards have this address or were exchanged, or the network doubles packets: rows of either look like"
             " the other's",
             "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
@@ -144,9 +144,9 @@ class CardClient(Closing):
 
     def configure(self, card: Card, lanes: int = 4) -> None:
         """Configure raw 16-bit capture of `lanes` LVDS lanes to Ethernet, and the packet delay. Raises DeviceError."""
-        self._send_command(Code.CONFIGURE_FPGA, dca1000.configure_fpga_data(lanes))
+        self._send_command(Code.CONFIGURE_FPGA, dca1000.encode_fpga_configuration(lanes))
         self._send_command(
-            Code.CONFIGURE_PACKET, dca1000.configure_packet_data(card.packet_bytes, card.packet_delay_us)
+            Code.CONFIGURE_PACKET, dca1000.encode_packet_configuration(card.packet_bytes, card.packet_delay_us)
         )
 
     def reset_fpga(self) -> None:
@@ -243,9 +243,11 @@ class CardClient(Closing):
             self._socket.sendto(dca1000.encode_request(code, data), self._address)
         except OSError as e:
             if e.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
-                raise no_route(self.board, f"no way to {self._name()} from {self.board.host_address}") from None
+                raise explain_missing_route(
+                    self.board, f"no way to {self._name()} from {self.board.host_address}"
+                ) from None
             problem = f"sending to {self._name()} failed: {e.strerror}"
-            raise silent_card(self.board, problem) from e
+            raise explain_silent_card(self.board, problem) from e
         return next((reply for reply in self._replies(limit_s) if reply.code == code), None)
 
     def _receive(self, limit_s: float) -> Reply | None:
@@ -259,11 +261,11 @@ class CardClient(Closing):
         program meanwhile: at most as many as a socket holds, for a flood of them has no end.
         """
         deadline = time.monotonic() + limit_s
-        late = 0
-        while late < SOCKET_DATAGRAMS:
+        late_replies = 0
+        while late_replies < SOCKET_DATAGRAMS:
             remaining_s = deadline - time.monotonic()
             if remaining_s <= 0:
-                late += 1
+                late_replies += 1
             if not select.select([self._socket], [], [], max(0.0, remaining_s))[0]:
                 return
             try:
@@ -293,7 +295,7 @@ class CardClient(Closing):
         if attempts > 1:
             attempts_text = f"{attempts} attempts"
         problem = f"{self._name()} did not answer {code.name} within {self._timeout_s:g} s ({attempts_text})"
-        return silent_card(self.board, problem)
+        return explain_silent_card(self.board, problem)
 
 
 @dataclass(frozen=True)
@@ -315,26 +317,28 @@ class EepromSettings:
     data_port: int = 4098
 
     def __post_init__(self) -> None:
-        host = self._address(self.host_address)
-        card = self._address(self.card_address)
+        host = self._parse_address(self.host_address)
+        card = self._parse_address(self.card_address)
         if host == card:
-            raise self._wrong(f"host and card both have the address {card}")
+            raise self._make_error(f"host and card both have the address {card}")
         if int(host) >> 8 != int(card) >> 8:
-            raise self._wrong(f"host {host} and card {card} are in different /24 subnets")
+            raise self._make_error(f"host {host} and card {card} are in different /24 subnets")
         for address in (host, card):
             if address.is_multicast or int(address) & 0xFF in (0, 0xFF):
-                raise self._wrong(f"{address} is not the address of one machine")
+                raise self._make_error(f"{address} is not the address of one machine")
         try:
             mac = self._parse_mac()
         except ValueError:
-            raise self._wrong(f"{self.card_mac!r} is not a MAC address such as {DEFAULT_MAC}", _MAC_REMEDY) from None
+            raise self._make_error(
+                f"{self.card_mac!r} is not a MAC address such as {DEFAULT_MAC}", _MAC_REMEDY
+            ) from None
         if len(mac) != 6 or mac[0] & 1 or not any(mac):
-            raise self._wrong(f"{self.card_mac} is not the MAC address of one machine", _MAC_REMEDY)
+            raise self._make_error(f"{self.card_mac} is not the MAC address of one machine", _MAC_REMEDY)
         for port in (self.command_port, self.data_port):
             if not 1024 < port <= 0xFFFF:
-                raise self._wrong(f"port {port} is outside 1025..65535")
+                raise self._make_error(f"port {port} is outside 1025..65535")
         if self.command_port == self.data_port:
-            raise self._wrong(f"commands and data both use port {self.data_port}")
+            raise self._make_error(f"commands and data both use port {self.data_port}")
 
     @staticmethod
     def of_board(board: Board, card_mac: str = DEFAULT_MAC) -> EepromSettings:
@@ -348,7 +352,11 @@ class EepromSettings:
 
     def encode(self) -> bytes:
         """Return the 18 bytes of the command: host, card and MAC address with reversed bytes, and the ports."""
-        parts = (self._address(self.host_address).packed, self._address(self.card_address).packed, self._parse_mac())
+        parts = (
+            self._parse_address(self.host_address).packed,
+            self._parse_address(self.card_address).packed,
+            self._parse_mac(),
+        )
         return b"".join(part[::-1] for part in parts) + _PORTS.pack(self.command_port, self.data_port)
 
     def text(self) -> str:
@@ -362,14 +370,14 @@ class EepromSettings:
         """Return the bytes of the MAC address. Raises ValueError if it is not hexadecimal."""
         return bytes.fromhex(self.card_mac.replace(":", "").replace("-", ""))
 
-    def _address(self, text: str) -> ipaddress.IPv4Address:
+    def _parse_address(self, text: str) -> ipaddress.IPv4Address:
         try:
             return ipaddress.IPv4Address(text)
         except ValueError:
-            raise self._wrong(f"{text!r} is not an IPv4 address") from None
+            raise self._make_error(f"{text!r} is not an IPv4 address") from None
 
     @staticmethod
-    def _wrong(what: str, remedy: str = "correct the board in instrument.toml") -> ConfigError:
+    def _make_error(what: str, remedy: str = "correct the board in instrument.toml") -> ConfigError:
         cause = "a card with them could not be reached"
         return ConfigError(f"EEPROM settings refused: {what}", cause, remedy, code=ErrorCode.VALUE_INVALID)
 
@@ -400,7 +408,7 @@ def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -
             f"repeat the card's new address, {settings.confirmation}, to write it",
             code=ErrorCode.VALUE_INVALID,
         )
-    card.alive()
+    card.check_alive()
     status = card.write_eeprom(settings.encode())
     if Status.EEPROM_FAILURE in status:
         raise DeviceError(
@@ -414,7 +422,7 @@ def program_eeprom(card: CardClient, settings: EepromSettings, confirmed: str) -
 HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
 """The host's address and ports, the interface, its cable, the card; then the receiver process, its buffer, data."""
 # Remedy in the note on a radar whose data was not recorded.
-PULSES = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
+PULSES_REMEDY = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
 # The hops of a silent card that are not the card itself.
 _FAULTY_HOP = {Hop.ROUTE: "route", Hop.LINK: "link"}
 # Time between two queries for data of a radar (chosen).
@@ -484,8 +492,8 @@ def _check_way(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
     address = card.board.card_address
     error = None
     try:
-        card.alive()
-        survey.version = str(card.version())
+        card.check_alive()
+        survey.version = str(card.read_version())
         card.require_alone()
     except DeviceError as e:
         error = e
@@ -493,7 +501,7 @@ def _check_way(survey: CardSurvey, card: CardClient) -> Iterator[Finding]:
     if error is not None:
         faulty = "card"
         if not survey.version:
-            faulty = _FAULTY_HOP.get(silent_hop(address), "card")
+            faulty = _FAULTY_HOP.get(find_silent_hop(address), "card")
     if address.startswith("127."):
         interface = "loopback"
     else:
@@ -533,7 +541,7 @@ def _check_reception(card: CardClient, instrument: Instrument, core: Core | None
         if listen_s > 0:
             yield _listen(card, receiver, instrument, listen_s)
         else:
-            yield Finding("note", "it sends data only when it is triggered", do=PULSES, where="radar")
+            yield Finding("note", "it sends data only when it is triggered", do=PULSES_REMEDY, where="radar")
 
 
 def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument, listen_s: float) -> Finding:
@@ -541,11 +549,11 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
     try:
         with tempfile.TemporaryDirectory(prefix="polysight-card-") as folder:
             card.record_stop()
-            # Where the last record ended is not known. The reset makes the counters begin again at zero.
+            # The end of the last record is not known. The reset makes the counters begin again at zero.
             card.reset_fpga()
             card.configure(instrument.card)
             listened = Path(folder) / "listened.bin"
-            # As row 0, take 1.
+            # The receiver needs a row and a take: 0 and 1.
             receiver.begin_row(0, 1, instrument.row_bytes, instrument.frame_bytes, listened, after_reset=True)
             card.record_start()
             deadline = time.monotonic() + listen_s
@@ -558,7 +566,7 @@ def _listen(card: CardClient, receiver: ReceiverProcess, instrument: Instrument,
     except DeviceError as e:
         return Finding.of_error(e, where="radar")
     if row_capture.counts.placed == 0:
-        return Finding.of_error(silent_radar(card.board, row_capture), where="radar")
+        return Finding.of_error(explain_silent_radar(card.board, row_capture), where="radar")
     return _report_stream(row_capture)
 
 

@@ -134,7 +134,7 @@ def decode_reply(raw: bytes) -> Reply:
     raise ProtocolError(problem, code=ErrorCode.MESSAGE_INVALID)
 
 
-def configure_fpga_data(lanes: int = 4) -> bytes:
+def encode_fpga_configuration(lanes: int = 4) -> bytes:
     """Encode the body of 0x03: raw mode, LVDS lanes (4: AWR2243, 2: xWR16xx/18xx/68xx), Ethernet, 16 bit, timer.
 
     Raises ProtocolError for another number of lanes.
@@ -146,7 +146,7 @@ def configure_fpga_data(lanes: int = 4) -> bytes:
     return bytes([1, lane_mode, 1, 2, 3, 30])
 
 
-def configure_packet_data(packet_bytes: int, delay_us: float) -> bytes:
+def encode_packet_configuration(packet_bytes: int, delay_us: float) -> bytes:
     """Encode the body of 0x0B: packet size, delay in 8 ns ticks, zero. 1470 and 25 us gives `be 05 35 0c 00 00`.
 
     Raises ProtocolError for a size or delay that the card does not take.
@@ -178,14 +178,14 @@ def decode_packet_header(packet: bytes | memoryview) -> tuple[int, int]:
 Gaps = Sequence[tuple[int, int]]
 
 
-def row_words(
+def view_row_words(
     payload: bytes | memoryview | NDArray[np.uint8],
     missing: Gaps,
     frames: int,
     samples: int,
     rx: int,
 ) -> tuple[NDArray[np.int16], NDArray[np.bool_]]:
-    """Return the words of a 4-lane recording in their own order, without a copy, as `polysight.sync` takes them.
+    """Return the 16-bit words of a 4-lane recording in recorded order, without a copy, for `polysight.sync`.
 
     Parameters, `valid` and errors as of :func:`decode_row`; the words are int16 [frame, sample, 2, rx], I before Q,
     undefined for invalid frames.
@@ -194,7 +194,7 @@ def row_words(
     return words, valid_frames(missing, frames, samples * rx * 4)
 
 
-def raw_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
+def encode_row_words(frames: NDArray[np.complex64]) -> NDArray[np.int16]:
     """Encode complex frames [rx, frame, sample] in ADC counts as words: int16 [frame, sample, 2, rx], I before Q."""
     rx, count, samples = frames.shape
     words = np.empty((count, samples, 2, rx), np.int16)
@@ -236,7 +236,7 @@ def decode_row(
     DataError
         if the payload is shorter than the shape requires.
     """
-    words, valid = row_words(payload, missing, frames, samples, rx)
+    words, valid = view_row_words(payload, missing, frames, samples, rx)
     out = _join_iq(words.transpose(2, 3, 0, 1), swap_iq)
     out[:, ~valid] = 0
     return out, valid
@@ -296,7 +296,7 @@ Counts = NDArray[np.int64]
 
 # Room for packets of an earlier record that arrive late: their payload lies outside the row; chosen.
 _SPARE_BYTES = 1 << 20
-# The payload of so many rows is kept at most. Duplicates from two network paths already make two rows of one; chosen.
+# Largest payload that is kept, in rows. Duplicates from two network paths already double a row's payload; chosen.
 _MAX_ROWS = 4
 
 
@@ -379,12 +379,12 @@ class PacketLog:
             target[:] = packets[first:end, PACKET_HEADER_BYTES : PACKET_HEADER_BYTES + size]
             self._filled += target.size
 
-    def _make_room(self, more: int) -> bool:
-        """Make room for `more` bytes of payload; False if that would be more than is kept."""
-        if self._filled + more <= self.payload.size:
+    def _make_room(self, added_bytes: int) -> bool:
+        """Make room for `added_bytes` bytes of payload; False if that would be more than is kept."""
+        if self._filled + added_bytes <= self.payload.size:
             return True
-        size = min(2 * self.payload.size + more, self.max_kept_bytes(self.expected))
-        if self._filled + more > size:
+        size = min(2 * self.payload.size + added_bytes, self.max_kept_bytes(self.expected))
+        if self._filled + added_bytes > size:
             return False
         grown = np.empty(size, dtype=np.uint8)
         grown[: self._filled] = self.payload[: self._filled]
@@ -450,6 +450,6 @@ class PacketLog:
         return log
 
 
-def _double_capacity(array: NDArray[Any], more: int) -> NDArray[Any]:
-    """Return a copy of the array with room for twice its entries plus `more`, filled with zeros."""
-    return np.concatenate([array, np.zeros((len(array) + more, *array.shape[1:]), dtype=array.dtype)])
+def _double_capacity(array: NDArray[Any], added_entries: int) -> NDArray[Any]:
+    """Return a copy of the array with room for twice its entries plus `added_entries`, filled with zeros."""
+    return np.concatenate([array, np.zeros((len(array) + added_entries, *array.shape[1:]), dtype=array.dtype)])

@@ -29,7 +29,7 @@ from polysight.capture.dca1000 import (
     decode_row,
     decode_two_lane,
 )
-from polysight.capture.placement import Past, Placed, counter_differences, place_record
+from polysight.capture.placement import EarlierRecords, PlacedRecord, counter_differences, place_record
 from polysight_shared.errors import DataError, ErrorCode, ProtocolError
 from polysight_shared.files import read_bounded
 
@@ -52,7 +52,7 @@ _MAX_RECORD_BYTES = 1 << 34
 # high-pass filter does not let through, and the share of the loudest antenna's level below which one counts as off
 # (-23 dB, as in synchronisation).
 _CLEAR_PEAK_DB = 10.0
-_MUCH_DC = 0.05 * _FULL_SCALE
+_HIGH_DC = 0.05 * _FULL_SCALE
 SILENT_SHARE = 0.07
 # First bytes of other kinds of files, and what `recognise_format` calls them.
 MAGIC = {
@@ -107,7 +107,7 @@ class CardReport:
     replies: list[tuple[str, int]]
     version: str
     status: Status
-    record: Placed | None
+    record: PlacedRecord | None
     tail_bytes: int
     tail_after_s: float
 
@@ -160,16 +160,16 @@ def read_packets(payload: NDArray[np.uint8]) -> list[bytes]:
     return [piece for piece in pieces if len(piece) > dca1000.PACKET_HEADER_BYTES]
 
 
-def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
+def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], PlacedRecord]:
     """Place a record of unknown length, from the lowest to the highest byte count.
 
     Returns its bytes, uint8 [n], and the result. Raises DataError if the packets are not of one record.
     """
     counts = np.array([dca1000.decode_packet_header(p)[1] for p in packets])
     # Bytes from the first packet in the file to each, negative for one that was sent before it.
-    ahead = counter_differences(counts, int(counts[0]), dca1000.BYTE_COUNT_BITS)
+    offsets = counter_differences(counts, int(counts[0]), dca1000.BYTE_COUNT_BITS)
     sizes = np.array([len(p) for p in packets]) - dca1000.PACKET_HEADER_BYTES
-    size = int((ahead + sizes).max() - ahead.min())
+    size = int((offsets + sizes).max() - offsets.min())
     if size > _MAX_RECORD_BYTES:
         problem = f"byte counts span {size} bytes"
         cause = "the file holds more than one record, or corrupted packets"
@@ -179,8 +179,8 @@ def place_packets(packets: list[bytes]) -> tuple[NDArray[np.uint8], Placed]:
         # All with the arrival time 0.
         log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), 0)
     # The record begins with the packet of the lowest byte count.
-    sequence, byte_count = dca1000.decode_packet_header(packets[int(np.argmin(ahead))])
-    placed, out = place_record(log, past=Past(Counters(byte_count, sequence)))
+    sequence, byte_count = dca1000.decode_packet_header(packets[int(np.argmin(offsets))])
+    placed, out = place_record(log, past=EarlierRecords(Counters(byte_count, sequence)))
     return out, placed
 
 
@@ -278,25 +278,25 @@ def is_mirrored(power: NDArray[np.float64]) -> bool:
     return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
 
 
-def _collect_remarks(r: Report, mirrored: bool) -> list[str]:
+def _collect_remarks(report: Report, mirrored: bool) -> list[str]:
     """List suspicious properties of a recording; `mirrored`: most power is at negative frequencies."""
     remarks = []
-    if max(r.rx_rms) == 0:
+    if max(report.rx_rms) == 0:
         return ["every sample is zero: nothing was recorded"]
     if mirrored:
         remarks.append("most power is at negative frequencies: I and Q seem to be swapped (--q-first)")
     # Counted as on the board's silk screen.
-    if silent := [f"RX{k}" for k, v in enumerate(r.rx_rms, 1) if v < SILENT_SHARE * max(r.rx_rms)]:
+    if silent := [f"RX{k}" for k, v in enumerate(report.rx_rms, 1) if v < SILENT_SHARE * max(report.rx_rms)]:
         remarks.append(f"no signal on {', '.join(silent)}: antennas off, or another lane layout")
-    if r.clipped:
-        remarks.append(f"{r.clipped} values are at full scale: the receiver clips, lower its gain")
-    if r.left_over_bytes:
-        remarks.append(f"{r.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
-    if max(r.rx_dc) > _MUCH_DC:
+    if report.clipped:
+        remarks.append(f"{report.clipped} values are at full scale: the receiver clips, lower its gain")
+    if report.left_over_bytes:
+        remarks.append(f"{report.left_over_bytes} bytes after the last complete chirp: truncated, or another layout")
+    if max(report.rx_dc) > _HIGH_DC:
         remarks.append(
-            f"constant offset of {max(r.rx_dc):.0f} counts, which this radar's high-pass filter would remove"
+            f"constant offset of {max(report.rx_dc):.0f} counts, which this radar's high-pass filter would remove"
         )
-    if r.peak_db < _CLEAR_PEAK_DB:
+    if report.peak_db < _CLEAR_PEAK_DB:
         remarks.append("no clear peak in the range profile: noise, or a wrong layout (--lanes, --samples)")
     return remarks
 
@@ -390,9 +390,9 @@ def inspect_pcap(path: Path, layout: Layout = Layout(), card_address: str = "") 
     data = [d for d in packets if len(d.payload) > dca1000.PACKET_HEADER_BYTES]
     if not data:
         if not card.replies:
-            place = f" at {card_address}" if card_address else ""
+            address_text = f" at {card_address}" if card_address else ""
             raise DataError(
-                f"{path}: contains nothing from a DCA1000{place}",
+                f"{path}: contains nothing from a DCA1000{address_text}",
                 "another capture, or another card",
                 "record on the card's interface",
                 code=ErrorCode.NO_DATA,

@@ -2,8 +2,9 @@
 
 `bind_udp` and `enlarge_receive_buffer` make the socket; the kernel may grant a smaller buffer than requested.
 `BatchReceiver` fetches many packets with one `recvmmsg` call into one block of memory, so that a packet costs one copy.
-`silent_hop` finds the first hop that does not work (route, link, address, card), for `silent_card`, which returns the
-error for a card without replies; `silent_radar` returns that for a card that replies but sends no data.
+`find_silent_hop` finds the first hop that does not work (route, link, address, card), for `explain_silent_card`, which
+returns the error for a card without replies; `explain_silent_radar` returns that for a card that replies but sends no
+data.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ KERNEL_BYTES_A_PACKET = 2304
 # Index of the dropped packets among the words of SO_MEMINFO.
 _MEMINFO_DROPS = 8
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
-# A larger jump between two reads means that somebody set the clock: NTP moves it by far less.
+# A larger jump between two reads means that the clock was set: NTP moves it by far less.
 _CLOCK_WAS_SET_NS = 1_000_000
 # Readings of two clocks this close are of one time: a tenth of the 200 us that `acquisition/pulse_times.py` lets an
 # arrival be early at most.
 _CLOSE_READINGS_NS = 20_000
 # Readings at most, of which the closest is used (chosen).
 _CLOCK_READINGS = 5
-# What the kernel counts for a packet beyond its bytes, at least: `struct sk_buff` and `skb_shared_info` of Linux 6.
+# Least memory that the kernel counts for a packet besides its bytes: `struct sk_buff`, `skb_shared_info` of Linux 6.
 _PACKET_OVERHEAD_BYTES = 512
 # Memory of one packet, bytes: more than the largest of 1466, to detect longer ones.
 _STRIDE = 1536
@@ -173,7 +174,7 @@ class BatchReceiver:
         self.is_drained = True
         # Memory of the last packets in the kernel, from any sender: at least this many bytes.
         self._kernel_bytes = 0
-        # Wall clock minus monotonic clock at the last reception: a jump of it says that somebody set the wall clock.
+        # Wall clock minus monotonic clock at the last reception: a jump means that the wall clock was set.
         self._clocks_differ_ns = measure_clock_difference()
         # `struct sockaddr_in` of each packet, 16 bytes; bytes 4 to 7 are its address.
         self._names = np.zeros((batch, 16), dtype=np.uint8)
@@ -226,7 +227,7 @@ class BatchReceiver:
     def receive_all(self) -> Iterator[int]:
         """Fetch every packet that came before this call, in batches; yield the number in each, as :meth:`receive`."""
         # Packets may come without end, and they come in order: after a full buffer all that waited are fetched. Their
-        # times are less certain: they are wrong after somebody set the wall clock, and by the error of its reading.
+        # times are less certain: they are wrong after the wall clock was set, and by the error of its reading.
         buffer_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self.is_drained = False
         while not self.is_drained and buffer_bytes >= 0:
@@ -236,7 +237,7 @@ class BatchReceiver:
     def _read_times(self, n: int) -> NDArray[np.int64]:
         """Return the arrival times of the last `n` packets on the monotonic clock, int64 [n], ns.
 
-        The kernel gives them on the wall clock; if somebody has set that clock since the last call, all are now. Times
+        The kernel gives them on the wall clock; if that clock was set since the last call, all are now. Times
         do not decrease and do not lie in the future.
         """
         differ_ns = measure_clock_difference()
@@ -261,11 +262,11 @@ def measure_clock_difference() -> int:
     difference_ns = 0
     for _ in range(_CLOCK_READINGS):
         before_ns = time.monotonic_ns()
-        of_day_ns = time.time_ns()
+        wall_clock_ns = time.time_ns()
         width_ns = time.monotonic_ns() - before_ns
         if width_ns < narrowest_ns:
             narrowest_ns = width_ns
-            difference_ns = of_day_ns - before_ns - width_ns // 2
+            difference_ns = wall_clock_ns - before_ns - width_ns // 2
         if narrowest_ns < _CLOSE_READINGS_NS:
             break
     return difference_ns
@@ -325,7 +326,7 @@ class Hop(Enum):
     ROUTE = "no route"
     # The interface has no carrier.
     LINK = "no link"
-    # Nobody answers for the card's address (ARP).
+    # No device answers for the card's address (ARP).
     NEIGHBOUR = "no device at the address"
     # A device has the address but does not answer commands.
     CARD = "the card is mute"
@@ -333,7 +334,7 @@ class Hop(Enum):
     UNKNOWN = "unknown"
 
 
-def silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
+def find_silent_hop(card_address: str, root: Path = _ROOT) -> Hop:
     """Find the first hop to a card (IPv4 address) that does not work.
 
     `root` is the folder with `proc/net/route`, `proc/net/arp` and `sys/class/net`; a hop whose file cannot be read is
@@ -415,12 +416,12 @@ def neighbour_mac(address: str, root: Path = _ROOT) -> str | None:
     return None
 
 
-def silent_card(board: Board, problem: str, root: Path = _ROOT) -> DeviceError:
+def explain_silent_card(board: Board, problem: str, root: Path = _ROOT) -> DeviceError:
     """Return the error for a card that does not answer: the `problem`, and the hop that does not work, if known."""
-    hop = silent_hop(board.card_address, root)
+    hop = find_silent_hop(board.card_address, root)
     interface = route_interface(board.card_address, root)
     if hop is Hop.ROUTE:
-        return no_route(board, problem)
+        return explain_missing_route(board, problem)
     cause = "the card is off, or listens at another address or port"
     remedy = (
         f"the card answers to the host address and ports in its EEPROM: it must send to {board.host_address}"
@@ -446,7 +447,7 @@ def silent_card(board: Board, problem: str, root: Path = _ROOT) -> DeviceError:
     return DeviceError(problem, cause, remedy, code=ErrorCode.NO_ANSWER)
 
 
-def no_route(board: Board, problem: str) -> DeviceError:
+def explain_missing_route(board: Board, problem: str) -> DeviceError:
     """Return the error for a card that is in no subnet of this machine."""
     return DeviceError(
         problem,
@@ -457,7 +458,7 @@ def no_route(board: Board, problem: str) -> DeviceError:
     )
 
 
-def silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
+def explain_silent_radar(board: Board, row: RowCapture | None = None) -> DeviceError:
     """Return the error for a card that replies but sends no data, with the likeliest cause from the capture `row`."""
     problem = f"no data from {board.name} (card {board.card_address} to {board.host_address}:{board.data_port})"
     remedy = "arm the radar, check the SYNC_IN wire (`polysight doctor` sends pulses), the data port in the EEPROM"

@@ -9,8 +9,8 @@ A card may drop bytes before it numbers them, and a radar may miss or add a fram
 that. So a row is *located* if its start is known and its record ends where it must. A row that is not located is masked
 as a whole. Every byte of a row is original or masked, never guessed.
 
-The start of a record is known after one whose start and end are certain, and after a reset by the host (`Past`). After
-any other record the host has to reset the card.
+The start of a record is known after one whose start and end are certain, and after a reset by the host
+(`EarlierRecords`). After any other record the host has to reset the card.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ Flags = NDArray[np.bool_]
 # A gap is a range of bytes of the row: its first, and the one after its last.
 Gap = tuple[int, int]
 
-SWITCHED_ON = Counters(0, 1)
+COUNTERS_AFTER_RESET = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
-# Fewer packets that seem to be of another record, or of a second card, are taken for damaged ones; chosen.
+# If fewer packets seem to be of another record, or of a second card, they count as damaged; chosen.
 MIN_PACKETS_OF_A_RECORD = 3
-# A packet that comes after one so many packets further on was not delayed by the network: the card restarted, and gave
-# the same counters twice. Chosen: far more than a switch or the kernel reorders.
+# Packets by which the network can delay one packet at most. If a packet arrives later than that, the card restarted and
+# used the same counters twice. Chosen: far more than a switch or the kernel reorders.
 _FAR_BEHIND = 64
-# A size seen in fewer packets is not taken for that of full packets: the last packet of a record is short.
+# A size of fewer packets does not count as the size of full packets: the last packet of a record is short.
 _MIN_PACKETS_OF_A_SIZE = 3
 
 
 @dataclass(frozen=True)
-class Past:
+class EarlierRecords:
     """Start of the next record, known from the records before it."""
 
     # Counters of the next record's first byte. None: they are unknown, and the card has to be reset.
@@ -54,9 +54,9 @@ class Past:
         return self.start is None
 
     @staticmethod
-    def after_reset() -> Past:
+    def after_reset() -> EarlierRecords:
         """Return the start after a reset by the host: the card's memory is empty, and its counters start again."""
-        return Past(start=SWITCHED_ON)
+        return EarlierRecords(start=COUNTERS_AFTER_RESET)
 
 
 @dataclass
@@ -102,7 +102,7 @@ class Losses:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedRecord:
     """Result of placing one record."""
 
     # Bytes of the whole row, and those that are in place.
@@ -118,7 +118,7 @@ class Placed:
     # Missing bytes by kind; for a record that is not located, by its counters only.
     losses: Losses
     # Knowledge for placing the next record.
-    past: Past
+    past: EarlierRecords
     # int64 [packet]: offset of the packet's payload in the row, -1 outside the row.
     offsets: Counts
     # int64 [n, 2]: time (host's monotonic clock, ns), and end of the furthest packet that had come by then, bytes.
@@ -167,12 +167,16 @@ class Evidence(msgspec.Struct, frozen=True):
     frame_bytes: int
     not_before_ns: int = 0
     dropped_by_card: str = ""
-    past: Past = Past()
+    past: EarlierRecords = EarlierRecords()
 
 
 def place_record(
-    log: PacketLog, frame_bytes: int = 1, past: Past | None = None, not_before_ns: int = 0, dropped_by_card: str = ""
-) -> tuple[Placed, Bytes]:
+    log: PacketLog,
+    frame_bytes: int = 1,
+    past: EarlierRecords | None = None,
+    not_before_ns: int = 0,
+    dropped_by_card: str = "",
+) -> tuple[PlacedRecord, Bytes]:
     """Place one row's packets; return the result and the row: uint8 [expected], zero at the holes.
 
     Parameters
@@ -190,7 +194,7 @@ def place_record(
         Names of the status bits by which the card reported data dropped before the packets were numbered: bytes are
         missing without a gap in the counters, so that no byte's place is certain.
     """
-    past = past or Past.after_reset()
+    past = past or EarlierRecords.after_reset()
     record = _find_record(log, past, not_before_ns)
     row = _Row(log, record)
     cause = _find_doubt(record, row, log, frame_bytes)
@@ -206,7 +210,7 @@ def place_record(
     else:
         out = row.fill_row(missing)
         masked = missing
-    placed = Placed(
+    placed = PlacedRecord(
         expected=log.expected,
         received=row.received,
         missing=masked,
@@ -223,7 +227,7 @@ def place_record(
     return placed, out
 
 
-def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
+def preview(log: PacketLog, past: EarlierRecords, not_before_ns: int) -> Preview:
     """Return the progress of a row from its packets so far, without comparing or copying payload."""
     record = _find_record(log, past, not_before_ns)
     if not record.of_row.any():
@@ -236,8 +240,8 @@ def preview(log: PacketLog, past: Past, not_before_ns: int) -> Preview:
     reached = np.maximum.accumulate(ends[order])
     fresh = reached - np.maximum(np.append(0, reached[:-1]), starts[order])
     received = int(np.maximum(fresh, 0).sum())
-    complete = not past.lost and record.ends_as_planned and received == log.expected
-    return Preview(received, complete, record.ended)
+    is_complete = not past.lost and record.ends_as_planned and received == log.expected
+    return Preview(received, is_complete, record.ended)
 
 
 # ---- evidence -----------------------------------------------------------------------------------------------------
@@ -276,11 +280,11 @@ class _Record:
     ends_as_planned: bool
 
 
-def _find_record(log: PacketLog, past: Past, not_before_ns: int) -> _Record:
+def _find_record(log: PacketLog, past: EarlierRecords, not_before_ns: int) -> _Record:
     """Select the packets of the record that begins at `past.start`; unknown: as after a reset."""
     full_payload = find_full_payload(log)
     is_early = log.arrivals_ns < not_before_ns
-    start = past.start or SWITCHED_ON
+    start = past.start or COUNTERS_AFTER_RESET
     sizes = log.sizes
     expected = log.expected
     offsets = counter_differences(log.byte_counts, start.byte_count, BYTE_COUNT_BITS)
@@ -379,7 +383,7 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
     # the row began with them, too, the same counters come twice.
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
     counted_again = row.counts.restarted > 0 and not record.ends_as_planned
-    if counted_again or (record.start == SWITCHED_ON and counted_twice):
+    if counted_again or (record.start == COUNTERS_AFTER_RESET and counted_twice):
         return _Doubt("the card restarted within it")
     # A second card may also send packets at places that are missing of the first, so no packet is certain.
     if row.counts.conflicting >= MIN_PACKETS_OF_A_RECORD:
@@ -405,16 +409,16 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
         return _Doubt(f"the record ended {missing} bytes early: the card dropped data before numbering it")
     text = f"the record ended {missing // frame_bytes} frames early: missed SYNC_IN pulses"
     # Frames are moved by their arrival only in a record about which nothing else is unclear.
-    clean = row.counts.late == 0 and not row.conflicts and not record.later.any()
-    return _Doubt(text, frames_missing=clean)
+    is_undisturbed = row.counts.late == 0 and not row.conflicts and not record.later.any()
+    return _Doubt(text, frames_missing=is_undisturbed)
 
 
-def _continue_past(record: _Record, doubt: _Doubt) -> Past:
+def _continue_past(record: _Record, doubt: _Doubt) -> EarlierRecords:
     """Return the start of the next record; unknown if start or end of this one are not certain."""
     is_certain = not doubt.text or doubt.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
-        return Past()
-    return Past(start=record.start.advance(record.length, -(-record.length // record.full)))
+        return EarlierRecords()
+    return EarlierRecords(start=record.start.advance(record.length, -(-record.length // record.full)))
 
 
 def _count_packets(
@@ -425,8 +429,8 @@ def _count_packets(
     leftover = is_unplaced & (record.early | ((record.offsets < 0) & (record.steps < 0) & ~record.after_restart))
     restarted = is_unplaced & record.after_restart & ~leftover
     is_unplaced &= ~(leftover | restarted)
-    after_the_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
-    is_outside = is_unplaced & (record.of_row | record.beyond | after_the_row)
+    is_after_row = (record.offsets >= log.expected) & (record.steps > 0) & (record.offsets < 2 * log.expected)
+    is_outside = is_unplaced & (record.of_row | record.beyond | is_after_row)
     return PacketCounts(
         placed=int(placed.sum()),
         duplicates=int(duplicate.sum()),
@@ -450,7 +454,7 @@ class _Row:
         self._log = log
         self._record = record
         self._sizes = log.sizes
-        # Where each packet's payload begins in the log.
+        # Offset of each packet's payload in the log.
         self._log_starts = np.cumsum(log.sizes) - log.sizes
         is_kept = np.arange(log.count) < log.kept
         self._of_row = record.of_row & is_kept
@@ -592,7 +596,7 @@ def _find_gaps(covered: list[Gap], extent: int) -> list[Gap]:
 
 
 def _merge(gaps: list[Gap]) -> list[Gap]:
-    """Return the same bytes as sorted ranges that do not touch."""
+    """Return the bytes as sorted ranges that do not touch."""
     merged: list[Gap] = []
     for start, stop in sorted(gap for gap in gaps if gap[0] < gap[1]):
         if merged and start <= merged[-1][1]:

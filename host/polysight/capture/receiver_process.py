@@ -22,17 +22,17 @@ from numpy.typing import NDArray
 from polysight.capture import receiver as messages
 from polysight.capture.dca1000 import LOST_BEFORE_PACKETS, PacketLog, Status
 from polysight.capture.network import BatchReceiver, bind_udp, count_kernel_drops, enlarge_receive_buffer
-from polysight.capture.placement import Evidence, Past, Preview, place_record, preview
+from polysight.capture.placement import EarlierRecords, Evidence, Preview, place_record, preview
 from polysight.capture.receiver import take_core, take_priority
-from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
+from polysight.capture.row_files import PACKETS_SUFFIX, Segment, write_index, write_packets
 from polysight_shared.errors import DeviceError, PolysightError
 
-# Batches fetched before requests are checked again (chosen): so many hold more packets than a receive buffer of 8 MiB.
+# Batches fetched before requests are checked again (chosen): they hold more packets than a receive buffer of 8 MiB.
 _MAX_BATCHES = 64
-# A preview is followed by a pause of so many times its own duration: previews take a twentieth of the time at most.
+# Pause after a preview, in durations of that preview: previews take a twentieth of the time at most.
 _PREVIEW_SHARE = 20
 # Remedy where requests came in a wrong order: that is an error of this program, not of the user.
-_RESTART = "start the scan again"
+_RESTART_REMEDY = "start the scan again"
 # Pause after each reception in which packets gather in the kernel's buffer: fewer, larger batches (chosen).
 _GATHER_MS = 1
 
@@ -40,7 +40,7 @@ _GATHER_MS = 1
 class _Row:
     """A row during reception."""
 
-    def __init__(self, request: messages.BeginRow, segment: Segment, log: PacketLog, past: Past) -> None:
+    def __init__(self, request: messages.BeginRow, segment: Segment, log: PacketLog, past: EarlierRecords) -> None:
         self.request = request
         self.segment = segment
         self.log = log
@@ -52,7 +52,7 @@ class _Row:
         self.drops = 0
         # Time before the first pulse of the row, monotonic clock; 0 while it is unknown.
         self.not_before_ns = 0
-        # What the last report said of the preview: all frames complete, the record ended.
+        # Content of the last report on the preview: whether all frames were complete, and whether the record had ended.
         self._reported = (False, False)
         # Number of packets at the last preview.
         self._previewed = 0
@@ -105,7 +105,7 @@ class Receiver:
         self._batches: BatchReceiver | None = None
         self._row: _Row | None = None
         # Knowledge of the card from earlier records.
-        self._past = Past()
+        self._past = EarlierRecords()
         # Memory of the previous row, which the next one reuses.
         self._memory: NDArray[np.uint8] | None = None
 
@@ -173,7 +173,9 @@ class Receiver:
         Raises DeviceError if no socket is open, or the row is larger than memory.
         """
         if self._socket is None or self._batches is None:
-            raise DeviceError("the receiver has no socket yet", "a row began before the cards were opened", _RESTART)
+            raise DeviceError(
+                "the receiver has no socket yet", "a row began before the cards were opened", _RESTART_REMEDY
+            )
         if self._row is not None:
             self._discard()
         segment = Segment(Path(request.path), request.expected_bytes)
@@ -188,7 +190,7 @@ class Receiver:
         for n in self._batches.receive_all():
             strays.add(self._batches.packets[:n], self._batches.lengths[:n], 0)
         if request.after_reset:
-            self._past = Past.after_reset()
+            self._past = EarlierRecords.after_reset()
         self._row = row = _Row(request, segment, log, self._past)
         row.stale = strays.count + strays.malformed
         row.strangers = self._batches.strangers
@@ -200,7 +202,7 @@ class Receiver:
         if self._row is not None:
             self._row.segment.discard()
         self._row = None
-        self._past = Past()
+        self._past = EarlierRecords()
 
     def _receive(self) -> None:
         """Log the packets that wait at the socket, at most `_MAX_BATCHES` batches; send progress if there is news."""
@@ -224,7 +226,7 @@ class Receiver:
         """End the row: place its packets, and write payload, index and packets. Raises DeviceError without a row."""
         row = self._row
         if row is None or self._socket is None or self._batches is None:
-            raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART)
+            raise DeviceError("no row is being received", "a row ended that had not begun", _RESTART_REMEDY)
         for n in self._batches.receive_all():
             self._log(row, self._batches, n)
         self._row = None
@@ -269,7 +271,7 @@ class Receiver:
             last_arrival_ns=last_arrival_ns,
             crc32=crc,
             index_crc32=index_crc,
-            packets_crc32=write_packets(path.with_suffix(PACKETS), log, evidence, placed),
+            packets_crc32=write_packets(path.with_suffix(PACKETS_SUFFIX), log, evidence, placed),
             card_status=request.card_status,
             holes=placed.holes,
             slipped=placed.slipped,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.capture.dca1000 import PacketLog
-from polysight.capture.placement import Evidence, Placed
+from polysight.capture.placement import Evidence, PlacedRecord
 from polysight_shared.errors import DataError, DeviceError, ErrorCode, quote
 from polysight_shared.files import open_to_write, read_bounded
 
@@ -38,12 +38,12 @@ def _find_scan(path: Path) -> Path:
     return path.parent
 
 
-def write_error(path: Path, done: str, e: OSError) -> DeviceError:
-    """Return the error for a file of a scan that cannot be `done`: "written", "opened", "renamed"."""
+def make_write_error(path: Path, action: str, e: OSError) -> DeviceError:
+    """Return the error for a file of a scan that cannot be `action`: "written", "opened", "renamed"."""
     is_full = e.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     code = ErrorCode.DISK_FULL if is_full else ErrorCode.FILE_UNWRITABLE
     return DeviceError(
-        f"{path}: cannot be {done}: {e.strerror}",
+        f"{path}: cannot be {action}: {e.strerror}",
         "the disk is full, read-only or fails",
         f"free space, then `polysight resume {quote(_find_scan(path))}` continues after the last committed row",
         code=code,
@@ -83,7 +83,7 @@ class Segment:
                     os.posix_fallocate(self._file.fileno(), 0, size)
                 stack.pop_all()
         except OSError as e:
-            raise write_error(path, f"reserved ({size} bytes)", e) from None
+            raise make_write_error(path, f"reserved ({size} bytes)", e) from None
 
     def finish(self, data: NDArray[np.uint8]) -> int:
         """Write uint8 [byte] durably, close the file, and return the CRC-32. Raises DeviceError if the disk fails."""
@@ -94,7 +94,7 @@ class Segment:
                 remaining = remaining[self._file.write(remaining) :]
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise write_error(self.path, "made durable", e) from None
+            raise make_write_error(self.path, "made durable", e) from None
         finally:
             self.close()
         return crc
@@ -124,7 +124,7 @@ def write_durably(path: Path, raw: bytes) -> int:
             f.flush()
             os.fsync(f.fileno())
     except OSError as e:
-        raise write_error(path, "written", e) from None
+        raise make_write_error(path, "written", e) from None
     return zlib.crc32(raw)
 
 
@@ -143,7 +143,7 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
 
 
 # Suffix of the packet file, which lies next to the row's file.
-PACKETS = ".pkt"
+PACKETS_SUFFIX = ".pkt"
 FORMAT = 2
 """Files of format 1 are read, but not what they say of earlier records of the card: a row that is placed again from one
 has an unknown start and is masked as a whole."""
@@ -158,7 +158,7 @@ BATCH = np.dtype("<i8")
 _MAX_RUN_BYTES = 256 << 20
 
 
-def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: Placed | None) -> int:
+def write_packets(path: Path, log: PacketLog, evidence: Evidence, placed: PlacedRecord | None) -> int:
     """Write a row's packets durably and return the file's CRC-32; without `placed`, with all of the payload.
 
     Of packets beyond the first `log.kept` only their arrival is written. Raises DeviceError if the disk fails.
@@ -254,7 +254,7 @@ def read_packets(path: Path, row: Bytes) -> tuple[Evidence, PacketLog]:
     return evidence, log
 
 
-def _find_offsets_in_row(placed: Placed, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+def _find_offsets_in_row(placed: PlacedRecord, sizes: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the offset of each packet's unchanged payload in the row's file, int64 [packet]; -1 if it is not there."""
     offsets = placed.offsets[: sizes.size].copy()
     offsets[offsets + sizes > placed.expected] = -1
@@ -279,13 +279,13 @@ def _restore_log(
     index_in_run = np.arange(packets.sum()) - np.repeat(np.cumsum(packets) - packets, packets)
     size_of_each = np.repeat(sizes, packets)
     parts = []
-    for n, size, place in zip(packets.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
-        if place >= 0:
+    for n, size, offset in zip(packets.tolist(), sizes.tolist(), runs["place"].tolist(), strict=True):
+        if offset >= 0:
             source = row
-            start = place
+            start = offset
         else:
             source = stored_payload
-            start = -1 - place
+            start = -1 - offset
         parts.append(source[start : start + n * size])
         if parts[-1].size != n * size:
             raise ValueError("payload is missing")

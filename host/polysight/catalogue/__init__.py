@@ -5,11 +5,28 @@ tags of a scan. Of a processed scan, `read_result` gives the results for a page,
 `probe` reads one place; `compare` takes two scans. They share `Pixels`: images with permittivity and errors.
 """
 
-from polysight.catalogue.notes import NOTES, Notes, change_notes, is_plain, printable, read_notes, write_notes
-from polysight.catalogue.pictures import AMPLITUDE, PHASE, Picture, Pixels, colour_bar, draw, draw_products, thumbnail
+from polysight.catalogue.notes import (
+    NOTES_FILE,
+    Notes,
+    change_notes,
+    is_plain,
+    read_notes,
+    remove_unprintable,
+    write_notes,
+)
+from polysight.catalogue.pictures import (
+    AMPLITUDE_COLOURS,
+    PHASE_COLOURS,
+    Picture,
+    Pixels,
+    colour_bar,
+    draw,
+    draw_products,
+    thumbnail,
+)
 from polysight.catalogue.results import (
-    DIFFERENCE,
-    EXPORT,
+    DIFFERENCE_COLOURS,
+    EXPORT_FOLDER,
     Comparison,
     PermittivityDifference,
     compare,
@@ -20,7 +37,7 @@ from polysight.catalogue.results import (
     read_result,
 )
 from polysight.catalogue.scans import (
-    PROGRAM,
+    PROGRAM_FOLDER,
     Program,
     ProgramRecord,
     Scans,

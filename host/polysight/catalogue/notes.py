@@ -15,9 +15,9 @@ from pathlib import Path
 import msgspec
 
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
-from polysight_shared.files import folder_held, write_atomically
+from polysight_shared.files import hold_folder, write_atomically
 
-NOTES = "operator.json"
+NOTES_FILE = "operator.json"
 # Characters of the notes and of a tag, and tags of a scan: more would make the list of scans unreadable; chosen.
 MAX_NOTES = 10_000
 MAX_TAG = 40
@@ -41,7 +41,7 @@ def read_notes(folder: Path) -> Notes:
     DataError
         if the file is damaged.
     """
-    path = folder / NOTES
+    path = folder / NOTES_FILE
     if not is_plain(path):
         return Notes()
     try:
@@ -82,7 +82,7 @@ def write_notes(folder: Path, notes: Notes, base: Notes | None = None) -> Notes:
 
     if base is not None:
         return change_notes(folder, check_base)
-    with folder_held(folder):
+    with hold_folder(folder):
         return _write_checked(folder, notes)
 
 
@@ -96,15 +96,15 @@ def change_notes(folder: Path, change: Callable[[Notes], Notes]) -> Notes:
     DataError
         if the present notes are damaged.
     """
-    with folder_held(folder):
+    with hold_folder(folder):
         return _write_checked(folder, change(read_notes(folder)))
 
 
 def _write_checked(folder: Path, notes: Notes) -> Notes:
     """Check and write the notes of a folder that is held; return them as written. Raises ConfigError."""
-    text = printable(notes.notes, keep="\n")
+    text = remove_unprintable(notes.notes, keep="\n")
     # A dictionary drops tags that are given twice, and keeps the order.
-    tags = dict.fromkeys(printable(tag).strip() for tag in notes.tags)
+    tags = dict.fromkeys(remove_unprintable(tag).strip() for tag in notes.tags)
     tags.pop("", None)
     longest = max(tags, key=len, default="")
     fault = ""
@@ -121,7 +121,7 @@ def _write_checked(folder: Path, notes: Notes) -> Notes:
         )  # fmt: skip
     written = Notes(text, tuple(tags))
     content = json.dumps(msgspec.to_builtins(written), indent=1, ensure_ascii=False)
-    write_atomically(folder / NOTES, f"{content}\n".encode())
+    write_atomically(folder / NOTES_FILE, f"{content}\n".encode())
     return written
 
 
@@ -133,7 +133,7 @@ def is_plain(path: Path) -> bool:
         return False
 
 
-def printable(text: str, keep: str = "") -> str:
+def remove_unprintable(text: str, keep: str = "") -> str:
     """Return the text without control, direction and surrogate characters, for lists and terminals."""
     hidden = ("Cc", "Cf", "Cs", "Zl", "Zp")
     return "".join(c for c in unicodedata.normalize("NFC", text) if c in keep or unicodedata.category(c) not in hidden)

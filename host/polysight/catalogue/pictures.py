@@ -21,10 +21,10 @@ from polysight_shared.errors import DataError, ErrorCode
 
 Real = NDArray[np.float64]
 # Colour maps of matplotlib: one that colour-blind people read, and a cyclic one.
-AMPLITUDE = "cividis"
-PHASE = "twilight"
+AMPLITUDE_COLOURS = "cividis"
+PHASE_COLOURS = "twilight"
 UNITS = {"amplitude": "dB", "phase": "°"}
-COLOURS = {"amplitude": AMPLITUDE, "phase": PHASE}
+COLOURS = {"amplitude": AMPLITUDE_COLOURS, "phase": PHASE_COLOURS}
 # Largest side of a thumbnail; chosen.
 THUMBNAIL_PIXELS = 96
 
@@ -40,7 +40,7 @@ class Pixels(products.ProcessedScan):
     def from_scan(cls, scan: products.ProcessedScan) -> Self:
         """Return the pixels of a result, saved or just computed."""
         pixels = cls(scan.folder)
-        # What was read or computed of the scan is in its `__dict__` (cached properties).
+        # Everything read or computed for the scan is in its `__dict__` (cached properties).
         vars(pixels).update(vars(scan))
         return pixels
 
@@ -105,7 +105,7 @@ class Picture:
     low: float
     high: float
     unit: str
-    colours: str = AMPLITUDE
+    colours: str = AMPLITUDE_COLOURS
 
 
 class Map(msgspec.Struct, frozen=True):
@@ -113,7 +113,7 @@ class Map(msgspec.Struct, frozen=True):
 
     name: str
     title: str
-    colours: str = AMPLITUDE
+    colours: str = AMPLITUDE_COLOURS
     needs_metal: bool = False
 
 
@@ -123,9 +123,9 @@ MAPS = {
         Map("h_amplitude", "|H|, s-polarised"),
         Map("v_amplitude", "|V|, p-polarised"),
         Map("p_amplitude", "|P| = |H / V|"),
-        Map("h_phase", "phase of H", PHASE),
-        Map("v_phase", "phase of V", PHASE),
-        Map("p_phase", "phase of P", PHASE),
+        Map("h_phase", "phase of H", PHASE_COLOURS),
+        Map("v_phase", "phase of V", PHASE_COLOURS),
+        Map("p_phase", "phase of P", PHASE_COLOURS),
         Map("p_sigma", "standard deviation of P", needs_metal=True),
         Map("permittivity", "permittivity, real part", needs_metal=True),
         Map("loss", "permittivity, loss", needs_metal=True),
@@ -187,18 +187,18 @@ def _derive_values(pixels: Pixels, name: str) -> products.MapValues:
         )  # fmt: skip
     if name == "p_sigma":
         values = pixels.p_std
-        visible = pixels.clear & np.isfinite(values)
+        is_visible = pixels.clear & np.isfinite(values)
     else:
         eps = pixels.permittivity
         values = eps.value.real if name == "permittivity" else -eps.value.imag
-        visible = eps.mask
+        is_visible = eps.mask
     # Edges of plates have any value: the colours end at 1.3 times the 85th percentile (chosen).
-    high = products.percentile(values, visible, 85, 1.0)
+    high = products.percentile(values, is_visible, 85, 1.0)
     low = 1.0 if name == "permittivity" else 0.0
-    return products.MapValues(values, visible, (low, max(1.3 * high, low + 1e-3)))
+    return products.MapValues(values, is_visible, (low, max(1.3 * high, low + 1e-3)))
 
 
-def draw_values(values: products.MapValues, unit: str = "", colours: str = AMPLITUDE) -> Picture:
+def draw_values(values: products.MapValues, unit: str = "", colours: str = AMPLITUDE_COLOURS) -> Picture:
     """Draw numbers as a PNG with one pixel each; pixels without a number must be transparent."""
     # Imported here: it loads for half a second, and lists need no picture.
     import matplotlib

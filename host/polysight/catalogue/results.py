@@ -1,4 +1,4 @@
-"""What a processed scan says: all of it for a page, one place of it, and two scans compared."""
+"""Results of a processed scan: all of them for a page, those at one place, and the comparison of two scans."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 import skimage
 from numpy.typing import NDArray
 
-from polysight.catalogue.pictures import AMPLITUDE, MAPS, Map, Picture, Pixels, draw_values
+from polysight.catalogue.pictures import AMPLITUDE_COLOURS, MAPS, Map, Picture, Pixels, draw_values
 from polysight.catalogue.scans import read_generation
-from polysight.materials import PATCHES, SIMULATED_LIBRARY, Library, is_metal
+from polysight.materials import PATCHES_FILE, SIMULATED_LIBRARY, Library, is_metal
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import permittivity_from_ratio
 from polysight.products import (
@@ -36,9 +36,9 @@ from polysight.surfaces import POINTS, SURFACE
 from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
 Real = NDArray[np.float64]
-EXPORT = "export"
+EXPORT_FOLDER = "export"
 """Folder of a scan that a page has exports written into."""
-FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES, SURFACE, POINTS)
+FILES = (REPORT, IMAGE, MATERIALS, QUALITY, SCAN, PATCHES_FILE, SURFACE, POINTS)
 EXPORTS = (".mat", ".csv", ".nc")
 # Materials of the library that a probe lists; chosen.
 MAX_NEAREST = 5
@@ -49,8 +49,8 @@ PROFILE_FLOOR_DB = -50.0
 # Smallest spread of a material's ratio between its patches, each part; chosen, since a material of one patch has none.
 LEAST_SPREAD = 5e-3
 # Colour map of matplotlib for differences: white at zero.
-DIFFERENCE = "RdBu"
-SIGNIFICANT = 3.0
+DIFFERENCE_COLOURS = "RdBu"
+SIGNIFICANT_STDS = 3.0
 """Standard deviations above which a difference is significant."""
 # Smallest scatter of two scans in their stated errors: a copy has none at all; chosen.
 LEAST_SCATTER = 0.1
@@ -111,7 +111,7 @@ def read_result(folder: Path) -> Result:
         generation=read_generation(pixels.folder),
         processed_utc=pixels.facts.processed_utc or "",
         extent_mm=pixels.extent_mm,
-        pictures=[drawn for drawn in MAPS.values() if pixels.referenced or not drawn.needs_metal],
+        pictures=[picture for picture in MAPS.values() if pixels.referenced or not picture.needs_metal],
         metal=metal_how,
         verdict=pixels.verdict,
         patches=pixels.segments,
@@ -127,7 +127,7 @@ def _load_labels(folder: Path, pixels: Pixels) -> DrawnLabels | None:
         if labelled is None:
             return None
         _, labels = labelled
-        labels = labels.in_mm(pixels.x_m, pixels.y_m)
+        labels = labels.convert_to_mm(pixels.x_m, pixels.y_m)
     except PolysightError as e:
         return DrawnLabels(problem=f"{label_folder(folder)}: {e.what}")
     return DrawnLabels(dict(labels.boxes), labels.metal, dict(labels.specimens))
@@ -137,10 +137,10 @@ def list_files(folder: Path) -> list[File]:
     """Return the downloadable files of a scan's products and exports."""
     products = read_products(folder).folder
     files = []
-    for group, place in (("products", products), (EXPORT, folder / EXPORT)):
-        if place.is_symlink() or not place.is_dir():
+    for group, group_folder in (("products", products), (EXPORT_FOLDER, folder / EXPORT_FOLDER)):
+        if group_folder.is_symlink() or not group_folder.is_dir():
             continue
-        for path in sorted(place.iterdir()):
+        for path in sorted(group_folder.iterdir()):
             is_listed = path.name in FILES or path.suffix in EXPORTS
             if is_listed and path.is_file() and not path.is_symlink():
                 files.append(File(group, path.name, path.stat().st_size))
@@ -215,7 +215,7 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
     """
     pixels = Pixels(read_products(folder).folder)
     row, column = pixels.nearest(x_mm, y_mm)
-    place = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
+    pixel_mm = (float(pixels.x_mm[column]), float(pixels.y_mm[row]))
     reason = _explain_no_permittivity(pixels, row, column)
     eps = None
     real_std = None
@@ -224,11 +224,11 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         eps = _split_parts(complex(pixels.permittivity.value[row, column]))
         real_std = _number(pixels.permittivity.real_std[row, column])
         loss_std = _number(pixels.permittivity.loss_std[row, column])
-    nearest = _rank_materials(pixels, row, column, library) if eps else []
-    patch = _find_patch(pixels.segments, place) if pixels.referenced else None
+    nearest_materials = _rank_materials(pixels, row, column, library) if eps else []
+    patch = _find_patch(pixels.segments, pixel_mm) if pixels.referenced else None
     profile, profile_why = _focus_profile(folder, float(pixels.x_m[column]), float(pixels.y_m[row]))
     return Probe(
-        place_mm=(round(place[0], 2), round(place[1], 2)),
+        place_mm=(round(pixel_mm[0], 2), round(pixel_mm[1], 2)),
         lit=bool(pixels.valid[row, column]),
         h_db=_convert_to_db(complex(pixels.h[row, column])),
         v_db=_convert_to_db(complex(pixels.v[row, column])),
@@ -240,7 +240,7 @@ def probe(folder: Path, x_mm: float, y_mm: float, library: Path | None = None) -
         permittivity_loss_std=loss_std,
         why=reason,
         patch=patch,
-        nearest=nearest,
+        nearest=nearest_materials,
         profile=profile,
         profile_why=profile_why,
     )
@@ -422,7 +422,7 @@ class ComparisonFigures(msgspec.Struct, frozen=True, kw_only=True):
     compared: int
     significant_share: float | None
     scatter: float | None
-    significant_sigmas: float = SIGNIFICANT
+    significant_sigmas: float = SIGNIFICANT_STDS
 
 
 @dataclass(frozen=True)
@@ -467,14 +467,14 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
     rows, row_inside = _match_axes(a.y_mm, b.y_mm)
     columns, column_inside = _match_axes(a.x_mm, b.x_mm)
     same_place = np.ix_(rows, columns)
-    in_both = row_inside[:, None] & column_inside[None, :] & a.clear & b.clear[same_place]
-    if not in_both.any():
+    is_in_both = row_inside[:, None] & column_inside[None, :] & a.clear & b.clear[same_place]
+    if not is_in_both.any():
         raise DataError(
             "the two scans have no place in common", "their images lie apart, or one of them is dark",
             "take other scans", code=ErrorCode.MISMATCH,
         )  # fmt: skip
-    p = np.where(in_both, a.p - b.p[same_place], np.nan).astype(np.complex128)
-    known_in_both = in_both & a.permittivity.mask & b.permittivity.mask[same_place]
+    p = np.where(is_in_both, a.p - b.p[same_place], np.nan).astype(np.complex128)
+    known_in_both = is_in_both & a.permittivity.mask & b.permittivity.mask[same_place]
     eps = np.where(known_in_both, a.permittivity.value - b.permittivity.value[same_place], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         stated = np.abs(p) / np.hypot(a.p_std, b.p_std[same_place])
@@ -483,7 +483,7 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
     judged = sigmas[np.isfinite(sigmas)]
     significant_share = None
     if judged.size:
-        significant_share = float((judged > SIGNIFICANT).mean())
+        significant_share = float((judged > SIGNIFICANT_STDS).mean())
     figures = ComparisonFigures(
         patches=_pair_patches(a.segments, b.segments),
         notes=_collect_notes(a, b, scatter),
@@ -510,10 +510,10 @@ def measure_scatter(differences: Real) -> float:
 
 def _match_axes(first: Real, second: Real) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return the index of the nearest of `second` for each of `first` (mm), and True if it is within half a pixel."""
-    nearest = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
+    nearest_index = np.abs(first[:, None] - second[None, :]).argmin(axis=1)
     pixel = max(abs(second[1] - second[0]), abs(first[1] - first[0]))
     # A hundredth allows for rounding.
-    return nearest, np.abs(first - second[nearest]) <= pixel * 0.51
+    return nearest_index, np.abs(first - second[nearest_index]) <= pixel * 0.51
 
 
 def _collect_notes(a: Pixels, b: Pixels, scatter: float) -> list[str]:
@@ -543,9 +543,9 @@ def _pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list
     for patch in first:
         if patch.metal_reference or not candidates:
             continue
-        nearest = min(candidates, key=lambda other, patch=patch: _measure_distance_mm(patch, other))
-        if _measure_distance_mm(patch, nearest) <= NEAR_MM:
-            pairs.append(_describe_pair(patch, nearest))
+        nearest_patch = min(candidates, key=lambda other, patch=patch: _measure_distance_mm(patch, other))
+        if _measure_distance_mm(patch, nearest_patch) <= NEAR_MM:
+            pairs.append(_describe_pair(patch, nearest_patch))
     return pairs
 
 
@@ -609,6 +609,8 @@ def draw_comparison(comparison: Comparison, name: str) -> Picture:
     percent = 95 if is_signed else 98
     reach = max(percentile(np.abs(values), visible, percent, default=1.0), 1e-3)
     if name == "sigmas":
-        reach = max(reach, 2 * SIGNIFICANT)
+        reach = max(reach, 2 * SIGNIFICANT_STDS)
     limits = (-reach, reach) if is_signed else (0.0, reach)
-    return draw_values(MapValues(values, visible, limits), colours=DIFFERENCE if is_signed else AMPLITUDE)
+    return draw_values(
+        MapValues(values, visible, limits), colours=DIFFERENCE_COLOURS if is_signed else AMPLITUDE_COLOURS
+    )

@@ -21,8 +21,8 @@ from pathlib import Path, PurePosixPath
 import msgspec
 from msgspec.structs import replace
 
-from polysight.acquisition import LAPSE_S, Life, read_life, read_start_ticks
-from polysight.catalogue.notes import NOTES, Notes, is_plain, printable, read_notes
+from polysight.acquisition import LAPSE_S, SignOfLife, read_life, read_start_ticks
+from polysight.catalogue.notes import NOTES_FILE, Notes, is_plain, read_notes, remove_unprintable
 from polysight.products import IMAGE, LABELS, MATERIALS, QUALITY, SCAN, ProcessedScan, find_labels
 from polysight.results import NoResult
 from polysight.store import MANIFEST, Manifest, manifest
@@ -34,7 +34,7 @@ READ_S = 3.0
 """Time limit for reading one folder of the list; it is then listed as `silent` until the read returns; chosen."""
 PART_S = 0.1
 """Length of the parts in which a list is read before it is asked for, and of the pauses between them; chosen."""
-PROGRAM = "program"
+PROGRAM_FOLDER = "program"
 """Folder of a scan in which programs that a page started keep their process number and log."""
 # The deepest level of folders that scans are searched in, and the most scans that are listed below one folder of the
 # root; chosen.
@@ -54,9 +54,9 @@ MAX_NAMES = 12
 CONTROL_SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 # Time that a program may take from the last line of a manifest to its first sign of life; chosen.
 GRACE_S = 20.0
-# Files of a scan that its summary is made from; products lie in a folder of their own, or alone.
+# Files of a scan that its summary is made from; products are in a folder of the scan, or alone.
 _PRODUCTS = (IMAGE, MATERIALS, QUALITY)
-SUMMARISED = (MANIFEST, NOTES, *(f"{place}{name}" for place in ("", "products/") for name in (LABELS, *_PRODUCTS)))
+SUMMARISED = (MANIFEST, NOTES_FILE, *(f"{place}{name}" for place in ("", "products/") for name in (LABELS, *_PRODUCTS)))
 Stamp = tuple[tuple[int, int], ...]
 """Time of the last change (ns) and size of each of the `SUMMARISED`; (0, -1) for a file that is not there."""
 
@@ -138,12 +138,12 @@ def read_generation(products: Path) -> str:
 
 def _read_stamp(folder: Path) -> Stamp:
     """Return the times and sizes of the files that a summary is made from."""
-    # As text: making paths takes as long as asking for the files.
-    place = str(folder)
+    # The path is text, because making `Path` objects takes as long as querying the files.
+    folder_text = str(folder)
     stamps = []
     for name in SUMMARISED:
         try:
-            status = os.stat(f"{place}/{name}")  # noqa: PTH116 - see above
+            status = os.stat(f"{folder_text}/{name}")  # noqa: PTH116 - see above
             stamps.append((status.st_mtime_ns, status.st_size))
         except OSError:
             stamps.append((0, -1))
@@ -159,9 +159,9 @@ def summarise(folder: Path, name: str) -> Summary:
         notes = Notes(e.what)
     summary = Summary(name, "begun", notes=notes.notes, tags=notes.tags, seconds=_read_modified_s(folder))
     with suppress(PolysightError):
-        drawn = find_labels(folder)
-        if drawn is not None:
-            _, labels = drawn
+        label_file = find_labels(folder)
+        if label_file is not None:
+            _, labels = label_file
             summary = replace(summary, labelled=tuple(labels.boxes)[:MAX_NAMES])
     summary = _add_products(folder, summary)
     content = _read_manifest(folder)
@@ -258,9 +258,9 @@ def find_programs(folder: Path) -> list[Program]:
 
 def find_program(folder: Path, kind: str) -> Program | None:
     """Return the program of a kind that was started last for a folder; None if there is none."""
-    base = folder / PROGRAM / kind
+    base = folder / PROGRAM_FOLDER / kind
     path = base.with_suffix(".json")
-    if (folder / PROGRAM).is_symlink() or not is_plain(path):
+    if (folder / PROGRAM_FOLDER).is_symlink() or not is_plain(path):
         return None
     try:
         with path.open("rb") as f:
@@ -320,7 +320,7 @@ def read_log_tail(path: Path) -> str:
         return ""
     # Each start writes a line that begins with dashes.
     *_, text = re.split(r"(?m)^--- .*$", text.replace("\r\n", "\n"))
-    return printable(CONTROL_SEQUENCE.sub("", text), keep="\n\t").strip()
+    return remove_unprintable(CONTROL_SEQUENCE.sub("", text), keep="\n\t").strip()
 
 
 def add_signs_of_life(folder: Path, summary: Summary) -> Summary:
@@ -460,8 +460,8 @@ class Scans:
                 entries = [self.only]
             else:
                 entries = [name for name, _ in _list_folders(self.root)]
-            # What is not listed yet comes first, by falling names, of which many begin with a date. Only the threads
-            # that read may ask a folder for its time: its drive may be gone.
+            # Scans that are not listed yet come first, by descending names, because many names begin with a date. Only
+            # the threads that read may query a folder's time, because its drive may be missing.
             waiting = [entry for entry in reversed(entries) if entry not in self._reading]
             waiting.sort(key=self._listed.__contains__)
             self._read_all(deque(waiting), time.monotonic() + within_s)
@@ -475,8 +475,8 @@ class Scans:
                 scans += listed
             names = {s.name for s in scans}
             self._summaries = {
-                name: stored
-                for name, stored in list(self._summaries.items())
+                name: stored_summary
+                for name, stored_summary in list(self._summaries.items())
                 if name in names or name.partition("/")[0] in unread
             }
             if not unread:
@@ -532,7 +532,7 @@ class Scans:
             return iter([entry])
         return _find_scan_names(self.root / entry, f"{entry}/", 2)
 
-    def lives(self) -> Iterator[tuple[str, Life]]:
+    def iterate_signs_of_life(self) -> Iterator[tuple[str, SignOfLife]]:
         """Yield name and last sign of life of each scan that runs, or was killed; no scan is read."""
         places = _find_scans(self.root, "", 1)
         if self.only is not None:
@@ -542,13 +542,15 @@ class Scans:
             if life is not None:
                 yield name, life
 
-    def left_out(self) -> Sequence[str]:
+    def list_left_out(self) -> Sequence[str]:
         """Return the names (ASCII) of scans that are not listed: links, and names that cannot be shown."""
         if self.only is not None:
             return []
         with suppress(OSError), os.scandir(self.root) as entries:
-            odd = [e for e in entries if not e.name.startswith(".") and (e.is_symlink() or not _is_name(e.name))]
-            return sorted(ascii(e.name)[1:-1] for e in odd if is_scan(Path(e.path)))
+            odd_entries = [
+                e for e in entries if not e.name.startswith(".") and (e.is_symlink() or not _is_name(e.name))
+            ]
+            return sorted(ascii(e.name)[1:-1] for e in odd_entries if is_scan(Path(e.path)))
         return []
 
     def summary(self, name: str) -> Summary:
@@ -608,21 +610,21 @@ class Scans:
         """Return the present summary of a scan, made again if its files have changed."""
         folder = self.root / name
         stamp = _read_stamp(folder)
-        stored = self._summaries.get(name)
-        if stored is None or stored[0] != stamp:
-            stored = (stamp, summarise(folder, name))
-            self._summaries[name] = stored
-        return add_signs_of_life(folder, stored[1])
+        stored_summary = self._summaries.get(name)
+        if stored_summary is None or stored_summary[0] != stamp:
+            stored_summary = (stamp, summarise(folder, name))
+            self._summaries[name] = stored_summary
+        return add_signs_of_life(folder, stored_summary[1])
 
 
 def folder_bytes(folder: Path) -> int:
     """Return the bytes of all files in a folder; links are not followed."""
     total = 0
-    for place, _, files in os.walk(folder):
+    for subfolder, _, files in os.walk(folder):
         for name in files:
             # A file may be deleted meanwhile.
             with suppress(OSError):
-                total += (Path(place) / name).lstat().st_size
+                total += (Path(subfolder) / name).lstat().st_size
     return total
 
 
@@ -662,6 +664,6 @@ def _is_name(part: str) -> bool:
 
 def is_scan(path: Path) -> bool:
     """True if a folder holds a scan, products, or programs that a page started; False if it cannot be looked into."""
-    # As text: thousands of folders are asked, and making paths takes as long as asking for the files.
-    place = str(path)
-    return any(os.path.exists(f"{place}/{name}") for name in (MANIFEST, IMAGE, PROGRAM))  # noqa: PTH110
+    # The path is text: thousands of folders are queried, and making `Path` objects takes as long as querying the files.
+    path_text = str(path)
+    return any(os.path.exists(f"{path_text}/{name}") for name in (MANIFEST, IMAGE, PROGRAM_FOLDER))  # noqa: PTH110

@@ -100,10 +100,10 @@ def _run_safely(argv: Sequence[str]) -> int:
         close_standard_output()
         return 0
     except Exception as e:
-        from polysight_shared.errors import PolysightError, os_error
+        from polysight_shared.errors import PolysightError, convert_os_error
 
         if isinstance(e, OSError):
-            error = os_error(e)
+            error = convert_os_error(e)
         else:
             error = e
         if not isinstance(error, PolysightError):

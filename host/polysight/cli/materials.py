@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from polysight.cli.options import (
-    Add,
+    AddCommand,
     add_config_option,
     add_json_option,
     add_model_option,
@@ -90,7 +90,7 @@ _percent = number(float, "a percentage from 0 to 100", lambda value: 0 <= value 
 _share = number(float, "a share from 0.5 to below 1", lambda value: 0.5 <= value < 1)
 
 
-def add_commands(add: Add) -> None:
+def add_commands(add: AddCommand) -> None:
     """Register the commands. The last argument of `add` names the options that the help shows first."""
     _add_results(add)
     _add_permittivity(add)
@@ -101,7 +101,7 @@ def add_commands(add: Add) -> None:
     _add_label(add)
 
 
-def _add_results(add: Add) -> None:
+def _add_results(add: AddCommand) -> None:
     """Add `polysight materials` and `polysight report`."""
     sub = add(
         "materials",
@@ -122,7 +122,7 @@ def _add_results(add: Add) -> None:
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder, or a folder of products")
 
 
-def _add_permittivity(add: Add) -> None:
+def _add_permittivity(add: AddCommand) -> None:
     """Add `polysight permittivity` and its options."""
     sub = add(
         "permittivity",
@@ -156,7 +156,7 @@ def _add_permittivity(add: Add) -> None:
     group.add_argument("--config", type=Path, metavar="FILE", help="rig file of the chirp (default: the products')")
 
 
-def _add_concentration(add: Add) -> None:
+def _add_concentration(add: AddCommand) -> None:
     """Add `polysight concentration` and its options."""
     sub = add(
         "concentration",
@@ -178,7 +178,7 @@ def _add_concentration(add: Add) -> None:
     add_json_option(sub)
 
 
-def _add_classify(add: Add) -> None:
+def _add_classify(add: AddCommand) -> None:
     """Add `polysight classify` and its options."""
     sub = add(
         "classify",
@@ -225,7 +225,7 @@ def _train(args: argparse.Namespace) -> int:
     return train(scenes, args.data, args.config, args.out, args.times)
 
 
-def _add_train(add: Add) -> None:
+def _add_train(add: AddCommand) -> None:
     """Add `polysight train` and its options."""
     sub = add(
         "train",
@@ -259,7 +259,7 @@ def _export(args: argparse.Namespace) -> int:
     return export(args.products, [name for name in _FORMATS if getattr(args, name)], args.out)
 
 
-def _add_export(add: Add) -> None:
+def _add_export(add: AddCommand) -> None:
     """Add `polysight export` and its options."""
     sub = add(
         "export",
@@ -306,7 +306,7 @@ def _parse_pair(text: str) -> str:
     return readable_text(text)
 
 
-def _add_label(add: Add) -> None:
+def _add_label(add: AddCommand) -> None:
     """Add `polysight label` and its options."""
     sub = add(
         "label",

@@ -17,9 +17,9 @@ from polysight.settings import Settings, path_text
 from polysight_shared.errors import ConfigError, ErrorCode
 
 # Name of the rig file, the settings of the whole instrument, in a folder.
-RIG = Path("instrument.toml")
+RIG_FILE = Path("instrument.toml")
 # Number of options that help shows before "more options"; chosen.
-_FIRST = 3
+_OPTIONS_SHOWN = 3
 # Largest coordinate of a box: far beyond any image, so that a unit mixed up is noticed.
 _FARTHEST_MM = 10_000
 # Names in a parsed command line that are not options.
@@ -54,8 +54,8 @@ class CommandParser(argparse.ArgumentParser):
         # False sorts first: the required ones, the most used, the others, --help.
         options.sort(key=lambda a: (not a.required, not set(self.most_used) & set(a.option_strings), a.dest == "help"))
         # A section with --help alone is left out.
-        first = _FIRST
-        if len(options) <= _FIRST + 1:
+        first = _OPTIONS_SHOWN
+        if len(options) <= _OPTIONS_SHOWN + 1:
             first = len(options)
         formatter = self._get_formatter()
         formatter.add_text(self.description)
@@ -81,8 +81,8 @@ def describe(sub: argparse.ArgumentParser, text: str, example: str) -> None:
 
 
 Run = Callable[[argparse.Namespace], int] | str
-"""What a command runs: a function, or the name of one in `polysight.jobs`, such as "scans.note". The options of the
-command then have the names of its parameters."""
+"""Action of a command: a function, or the name of one in `polysight.jobs`, such as "scans.note". In the second case the
+options of the command have the names of the function's parameters."""
 
 
 def set_run(sub: argparse.ArgumentParser, run: Run) -> None:
@@ -99,7 +99,7 @@ def _run_job(name: str, args: argparse.Namespace) -> int:
     return getattr(import_module(f"polysight.jobs.{module}"), function)(**options)
 
 
-class Add(Protocol):
+class AddCommand(Protocol):
     """Adds a command to `polysight`, and returns its parser."""
 
     def __call__(
@@ -128,7 +128,7 @@ def add_action(
     return sub
 
 
-def shipped(text: str) -> Path:
+def parse_shipped_path(text: str) -> Path:
     """Parse the path of a scene or rig file, which may be one that comes with the program."""
     return find_packaged(Path(text))
 
@@ -170,13 +170,13 @@ def rig_file(config: Path | None, data: Path) -> Path | None:
 
     For published data, which lacks the rig's geometry, the packaged one comes last: it is the published rig's.
     """
-    found = config or next((rig for rig in (data / RIG, RIG) if rig.exists()), None)
-    if found is not None:
-        return found
+    given_file = config or next((rig for rig in (data / RIG_FILE, RIG_FILE) if rig.exists()), None)
+    if given_file is not None:
+        return given_file
     from polysight.store import MANIFEST, is_source
 
     if is_source(data) and not (data / MANIFEST).exists():
-        return find_packaged(RIG)
+        return find_packaged(RIG_FILE)
     return None
 
 
@@ -226,7 +226,7 @@ def file_ending(ending: str) -> Callable[[str], Path]:
 
 
 def readable_text(text: str) -> str:
-    """Check a text that is stored: bytes that are not UTF-8 would be lost without a word."""
+    """Check a text that will be stored: bytes that are not UTF-8 would be lost without a message."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -259,11 +259,11 @@ def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
 
 
 def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> None:
-    """Add `--config`; with `shipped` the packaged rig file is used where the current folder has none."""
-    default = RIG
+    """Add `--config`; with `parse_shipped_path` the packaged rig file is used where the current folder has none."""
+    default = RIG_FILE
     text = "instrument.toml"
     if shipped:
-        default = find_packaged(RIG)
+        default = find_packaged(RIG_FILE)
         text = "instrument.toml here, or the packaged one"
     sub.add_argument("--config", type=Path, default=default, metavar="FILE", help=f"rig file (default: {text})")
 

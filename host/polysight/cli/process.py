@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from polysight.cli.options import (
-    Add,
+    AddCommand,
     CommandParser,
     add_action,
     add_json_option,
@@ -129,7 +129,7 @@ def _run_sync_report(args: argparse.Namespace) -> int:
     return sync_report(args.data, args.out, rig_file(args.config, args.data))
 
 
-def _add_surface(add: Add) -> None:
+def _add_surface(add: AddCommand) -> None:
     """Add `polysight surface` and its options."""
     sub = add(
         "surface",
@@ -160,7 +160,7 @@ def _add_surface(add: Add) -> None:
     add_json_option(sub)
 
 
-def add_commands(add: Add) -> None:
+def add_commands(add: AddCommand) -> None:
     """Register the commands. The last argument of `add` names the options that the help shows first."""
     sub = add(
         "process",
@@ -185,7 +185,10 @@ def add_commands(add: Add) -> None:
         help="shift of the imaged plane, away from the rig (default: 0)",
     )
     sub.add_argument(
-        "--grid", type=grid, metavar="COLUMNSxROWS@MM", help="number and distance of pixels (default: the rig file's)"
+        "--grid",
+        type=parse_grid,
+        metavar="COLUMNSxROWS@MM",
+        help="number and distance of pixels (default: the rig file's)",
     )
     _add_sparse(sub)
     sub = add(
@@ -252,7 +255,7 @@ def _add_several_options(sub: argparse.ArgumentParser) -> None:
     )
 
 
-def grid(text: str) -> tuple[int, int, float]:
+def parse_grid(text: str) -> tuple[int, int, float]:
     """Parse `COLUMNSxROWS@MM`: pixels and their distance."""
     words = re.fullmatch(r"(\d{1,4})x(\d{1,4})@(\d+(?:\.\d+)?)", text)
     if words is None:
@@ -289,7 +292,7 @@ def _add_polarimetry_options(sub: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_calibrate(add: Add) -> None:
+def _add_calibrate(add: AddCommand) -> None:
     """Add `polysight calibrate` and its actions."""
     sub = add(
         "calibrate",
@@ -381,7 +384,7 @@ def _add_outputs(sub: argparse.ArgumentParser, more: str = "") -> None:
     add_json_option(sub)
 
 
-def _add_leakage(add: Add) -> None:
+def _add_leakage(add: AddCommand) -> None:
     """Add `polysight leakage` and its options."""
     sub = add(
         "leakage",

@@ -12,8 +12,8 @@ import sys
 from pathlib import Path
 
 from polysight.cli.options import (
-    RIG,
-    Add,
+    RIG_FILE,
+    AddCommand,
     add_action,
     add_config_option,
     add_json_option,
@@ -23,8 +23,8 @@ from polysight.cli.options import (
     file_ending,
     material_settings,
     number,
+    parse_shipped_path,
     positive,
-    shipped,
 )
 from polysight.data import find_packaged
 from polysight_shared.config import load_instrument
@@ -41,7 +41,7 @@ _jog_mm = number(float, "a distance of -100 to 100 mm", lambda value: 0 < abs(va
 _scene_side = number(float, "a length above 0, at most 10000 mm", lambda value: 0 < value <= 10_000)
 
 
-def add_commands(add: Add) -> None:
+def add_commands(add: AddCommand) -> None:
     """Register the commands."""
     _add_simulated(add)
     _add_plan(add)
@@ -72,7 +72,7 @@ _NUMBERS = (
 
 def _plan(args: argparse.Namespace) -> int:
     """Run `polysight plan`."""
-    from polysight.planning import Changes, PlanOptions, run_plan
+    from polysight.planning import PlanChanges, PlanOptions, run_plan
 
     names = [flag[2:].replace("-", "_") for flag, _, _ in _NUMBERS]
     options = PlanOptions(
@@ -85,7 +85,7 @@ def _plan(args: argparse.Namespace) -> int:
         scene=args.scene,
         as_json=args.as_json,
     )
-    return run_plan(args.config, Changes(**{name: getattr(args, name) for name in names}), options)
+    return run_plan(args.config, PlanChanges(**{name: getattr(args, name) for name in names}), options)
 
 
 def _parse_size(text: str) -> tuple[float, float]:
@@ -98,7 +98,7 @@ def _parse_size(text: str) -> tuple[float, float]:
     return width, height
 
 
-def _add_plan(add: Add) -> None:
+def _add_plan(add: AddCommand) -> None:
     """Add `polysight plan` and its options."""
     sub = add(
         "plan",
@@ -111,7 +111,9 @@ def _add_plan(add: Add) -> None:
     sub.add_argument("--minutes", type=_minutes, metavar="M", help="propose the best plans within this time")
     sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
     sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
-    sub.add_argument("--scene", type=shipped, metavar="FILE", help="scene file whose plates are checked, with its grid")
+    sub.add_argument(
+        "--scene", type=parse_shipped_path, metavar="FILE", help="scene file whose plates are checked, with its grid"
+    )
     sub.add_argument("--scene-mm", type=_parse_size, metavar="W,H", help="size of the scene (default: the image's)")
     sub.add_argument(
         "--snr-db",
@@ -147,7 +149,7 @@ def _run_doctor(args: argparse.Namespace) -> int:
     return run_doctor(options, args.as_json, bundle=args.bundle)
 
 
-def _add_doctor(add: Add) -> None:
+def _add_doctor(add: AddCommand) -> None:
     """Add `polysight doctor` and its options."""
     sub = add(
         "doctor",
@@ -201,7 +203,7 @@ def _add_own_config(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--config", type=Path, default=argparse.SUPPRESS, metavar="FILE", help="rig file")
 
 
-def _add_card(add: Add) -> None:
+def _add_card(add: AddCommand) -> None:
     """Add `polysight card` and its actions."""
     card = add(
         "card",
@@ -261,7 +263,7 @@ def _inspect(args: argparse.Namespace) -> int:
     return inspect_file(args.file, args.config, args.plot, args.card, args.as_json, given_options)
 
 
-def _add_inspect(add: Add) -> None:
+def _add_inspect(add: AddCommand) -> None:
     """Add `polysight inspect` and its options."""
     sub = add(
         "inspect", _inspect, "describe a recording of a capture card", "polysight inspect scans/one/raw/RH/0000.bin"
@@ -293,7 +295,7 @@ def _add_link(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--slow", action="store_true", help="send words one by one at 1 MHz, for doubtful wiring")
 
 
-def _add_radar(add: Add) -> None:
+def _add_radar(add: AddCommand) -> None:
     """Add `polysight radar` and its actions."""
     radar = add(
         "radar",
@@ -352,7 +354,7 @@ def _add_radar(add: Add) -> None:
 # --- jog ---
 
 
-def _add_jog(add: Add) -> None:
+def _add_jog(add: AddCommand) -> None:
     """Add `polysight jog` and its options."""
     sub = add(
         "jog",
@@ -403,7 +405,7 @@ def _add_recording_options(sub: argparse.ArgumentParser) -> None:
     add_material_options(sub)
 
 
-def _add_scans(add: Add) -> None:
+def _add_scans(add: AddCommand) -> None:
     """Add `polysight scan`, `resume`, `validate` and `drop-raw`."""
     sub = add(
         "scan",
@@ -464,7 +466,7 @@ def _run_reproduce(args: argparse.Namespace) -> int:
     """Run `polysight reproduce`. Raises ConfigError for a wrong rig file, or options without an effect."""
     from polysight.jobs.demo import require_package
 
-    if args.config != find_packaged(RIG):
+    if args.config != find_packaged(RIG_FILE):
         # Refuse a wrong one now, not with the first item that needs it.
         load_instrument(args.config)
     require_package("polysight_papers", "papers")
@@ -486,7 +488,7 @@ def _run_reproduce(args: argparse.Namespace) -> int:
     return reproduce(args.out, args.items, Run(args.quick, args.config))
 
 
-def _add_simulated(add: Add) -> None:
+def _add_simulated(add: AddCommand) -> None:
     """Add `polysight demo`, `simulate` and `reproduce`."""
     sub = add(
         "demo",
@@ -504,7 +506,7 @@ def _add_simulated(add: Add) -> None:
     )
     sub.add_argument(
         "--scene",
-        type=shipped,
+        type=parse_shipped_path,
         default=find_packaged(Path("examples/demo.toml")),
         metavar="FILE",
         help="scene file (default: nine plates on a table, as in a lab)",
@@ -518,7 +520,9 @@ def _add_simulated(add: Add) -> None:
         "write the raw data of a scene, with truth.json",
         "polysight simulate examples/point-targets.toml --out out/points",
     )
-    sub.add_argument("scene", type=shipped, metavar="SCENE.toml", help="scene file, e.g. examples/metal-plate.toml")
+    sub.add_argument(
+        "scene", type=parse_shipped_path, metavar="SCENE.toml", help="scene file, e.g. examples/metal-plate.toml"
+    )
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write")
     sub.add_argument(
         "--layout",

@@ -8,16 +8,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from polysight.cli.options import RIG, Add, add_json_option, file_ending, readable_text
+from polysight.cli.options import RIG_FILE, AddCommand, add_json_option, file_ending, readable_text
 from polysight_shared.errors import ConfigError
 
 if TYPE_CHECKING:
-    from polysight.serve import Place
+    from polysight.serve import ServerAddress
 
 SCAN_COMMANDS = ("pause", "continue", "stop", "abort")
 
 
-def add_commands(add: Add) -> None:
+def add_commands(add: AddCommand) -> None:
     """Register the commands: name, function (`module.function`: loaded when it is run), help, example, main options."""
     _add_serve(add)
     _add_lists(add)
@@ -30,13 +30,13 @@ def _serve(args: argparse.Namespace) -> int:
     Raises ConfigError if the rig file or a package is missing.
     """
     _check_extra()
-    # What it shows takes seconds to load.
+    # The modules of the server take seconds to load.
     sys.stderr.write("polysight serve: starting\n")
     from polysight.serve import serve
 
     config = args.config
-    if config is None and RIG.exists():
-        config = RIG
+    if config is None and RIG_FILE.exists():
+        config = RIG_FILE
     if config is not None and not config.is_file():
         raise ConfigError(
             f"{config}: no such file", "--config names a rig file", "correct the path, or leave --config out"
@@ -67,11 +67,11 @@ def _check_extra() -> None:
         )
 
 
-def _make_place(args: argparse.Namespace) -> Place:
+def _make_place(args: argparse.Namespace) -> ServerAddress:
     """Return the address of the server from the options of `_add_place`."""
-    from polysight.serve import Place
+    from polysight.serve import ServerAddress
 
-    return Place(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
+    return ServerAddress(args.host, args.port, tuple(args.allow_host), args.certificate, args.key)
 
 
 def _parse_port(text: str) -> int:
@@ -81,7 +81,7 @@ def _parse_port(text: str) -> int:
     return int(text)
 
 
-def _add_serve(add: Add) -> None:
+def _add_serve(add: AddCommand) -> None:
     """Add `polysight serve` and `polysight preview`."""
     sub = add(
         "serve",
@@ -104,7 +104,7 @@ def _add_serve(add: Add) -> None:
     )
     sub.add_argument("folder", type=Path, metavar="SCAN", help="scan folder; it may not exist yet")
     sub.add_argument(
-        "--control", action="store_true", help="let whoever has the printed address pause and stop the scan"
+        "--control", action="store_true", help="let everyone who has the printed address pause and stop the scan"
     )
     _add_place(sub)
 
@@ -128,7 +128,7 @@ def _add_place(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--key", type=Path, metavar="FILE", help="its private key (PEM)")
 
 
-def _add_lists(add: Add) -> None:
+def _add_lists(add: AddCommand) -> None:
     """Add `polysight scans`, `note` and `ask`."""
     sub = add("scans", "scans.scans", "list the scans under a folder", "polysight scans scans")
     _add_folder(sub)
@@ -169,7 +169,7 @@ def _parse_point(text: str) -> tuple[float, float]:
     return x, y
 
 
-def _add_results(add: Add) -> None:
+def _add_results(add: AddCommand) -> None:
     """Add `polysight probe`, `compare` and `check`."""
     sub = add(
         "probe",

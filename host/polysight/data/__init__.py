@@ -17,7 +17,7 @@ def find_packaged(path: Path) -> Path:
     So `instrument.toml` and `examples/demo.toml` are found from any folder, and a file of one's own comes
     first.
     """
-    from_package = FOLDER / path
-    if path.is_absolute() or path.exists() or not from_package.exists():
+    packaged_path = FOLDER / path
+    if path.is_absolute() or path.exists() or not packaged_path.exists():
         return path
-    return from_package
+    return packaged_path

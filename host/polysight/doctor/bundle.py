@@ -40,12 +40,12 @@ Not included: raw data, images, labels, keys. Words from files in pi.key_dir, an
 `secret`, are replaced by {hidden}. Read the files before you send them: they contain paths, addresses and names of
 this computer.
 """
-HIDDEN = "[removed]"
+REDACTION = "[removed]"
 # Limits of the archive: lines of a manifest, numbers of scans, logs and traces, and bytes of a file; chosen.
-_LINES = 60
-_SCANS = 3
-_LOGS = 20
-_TRACES = 6
+_MAX_LINES = 60
+_MAX_SCANS = 3
+_MAX_LOGS = 20
+_MAX_TRACES = 6
 _TAIL_BYTES = 64 << 10
 _TRACE_BYTES = 4 << 20
 _KEY_BYTES = 64 << 10
@@ -54,7 +54,7 @@ _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
 # Values that a name like `token` or `password`, or the word "bearer", announces: the first group is the name, which
 # stays, the second is the value in quotes or as a word.
-_NAMED = re.compile(
+_NAMED_SECRET = re.compile(
     r"""(?ix)((?:[\w-]*(?:secret|token|password|passwd|passphrase|psk)[\w-]*|(?:private|public|curve|api)[_-]?key
     |authorization)["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)
     ((?<=")[^"\n]+|(?<=')[^'\n]+|[^\s"',}]{2,})"""
@@ -83,13 +83,13 @@ class Redactor:
         self._words = sorted(words, key=len, reverse=True)
 
     def __call__(self, text: str) -> str:
-        """Return the text with keys replaced by `HIDDEN`."""
+        """Return the text with keys replaced by `REDACTION`."""
         for word in self._words:
-            text = text.replace(word, HIDDEN)
-        text = _PEM.sub(HIDDEN, text)
-        for pattern in (_NAMED, _IN_URL):
-            text = pattern.sub(rf"\1{HIDDEN}", text)
-        return _TOKENS.sub(HIDDEN, text)
+            text = text.replace(word, REDACTION)
+        text = _PEM.sub(REDACTION, text)
+        for pattern in (_NAMED_SECRET, _IN_URL):
+            text = pattern.sub(rf"\1{REDACTION}", text)
+        return _TOKENS.sub(REDACTION, text)
 
 
 def write_bundle(
@@ -126,8 +126,14 @@ def _collect_contents(
     options: DoctorOptions, rig: Instrument | None, findings: Sequence[Finding], text: str, root: Path
 ) -> Iterator[tuple[str, str]]:
     """Yield name and text of every file."""
-    limits = {"utc": utc_now(), "lines": _LINES, "scans": _SCANS, "kilobytes": _TAIL_BYTES >> 10, "traces": _TRACES}
-    yield "README.txt", README.format(hidden=HIDDEN, **limits)
+    limits = {
+        "utc": utc_now(),
+        "lines": _MAX_LINES,
+        "scans": _MAX_SCANS,
+        "kilobytes": _TAIL_BYTES >> 10,
+        "traces": _MAX_TRACES,
+    }
+    yield "README.txt", README.format(hidden=REDACTION, **limits)
     yield "findings.txt", text
     yield "findings.json", json.dumps([finding_to_json(f) for f in findings], indent=1)
     yield "versions.json", json.dumps(_list_versions(), indent=1)
@@ -136,17 +142,17 @@ def _collect_contents(
     if (config := _read_tail(options.config, _TAIL_BYTES)) is not None:
         # Comments are private, and the addresses that are notified of a scan's end may be secret.
         config = re.sub(r"(?m)(^|[ \t])#.*$", "", config)
-        yield "rig.toml", re.sub(r"(?m)^(\s*(?:url|command)\s*=\s*).+$", rf'\1"{HIDDEN}"', config)
+        yield "rig.toml", re.sub(r"(?m)^(\s*(?:url|command)\s*=\s*).+$", rf'\1"{REDACTION}"', config)
     scan_folders = [options.out, *(path for path in options.out.glob("*") if path.is_dir())]
-    for newest_manifest in _find_newest(scan_folders, MANIFEST, _SCANS):
+    for newest_manifest in _find_newest(scan_folders, MANIFEST, _MAX_SCANS):
         folder = newest_manifest.parent
         with suppress(OSError, DataError):
             lines = read_bounded(folder / MANIFEST, _MANIFEST_BYTES).decode("utf-8", "replace").splitlines()
-            yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_LINES:]) + "\n"
+            yield f"scans/{folder.resolve().name}.jsonl", "\n".join(lines[-_MAX_LINES:]) + "\n"
     log_folders = [options.config.parent, options.config.parent / "logs", options.out, options.out / "logs"]
-    yield from _collect_files("logs", _find_newest(log_folders, "*.log", _LOGS), _TAIL_BYTES)
+    yield from _collect_files("logs", _find_newest(log_folders, "*.log", _MAX_LOGS), _TAIL_BYTES)
     if rig is not None and rig.radar.trace_dir:
-        yield from _collect_files("traces", _find_newest([Path(rig.radar.trace_dir)], "*", _TRACES), _TRACE_BYTES)
+        yield from _collect_files("traces", _find_newest([Path(rig.radar.trace_dir)], "*", _MAX_TRACES), _TRACE_BYTES)
 
 
 def _collect_files(folder: str, paths: Sequence[Path], max_bytes: int) -> Iterator[tuple[str, str]]:

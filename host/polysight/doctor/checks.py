@@ -14,7 +14,7 @@ from polysight.doctor import rig_checks, signal_checks
 from polysight.doctor.bundle import write_bundle
 from polysight.doctor.context import CheckContext, DoctorOptions, System, finding_to_json, not_checked, verdict
 from polysight_shared.config import Board
-from polysight_shared.errors import PolysightError, no_such, os_error
+from polysight_shared.errors import PolysightError, convert_os_error, make_missing_path_error
 from polysight_shared.files import require_writable
 from polysight_shared.findings import Finding
 from polysight_shared.messages import is_simulated
@@ -111,7 +111,7 @@ def _run_check(check: Check, context: CheckContext, board: Board | None) -> Find
     except PolysightError as e:
         return Finding.of_error(e)
     except OSError as e:
-        return Finding.of_error(os_error(e))
+        return Finding.of_error(convert_os_error(e))
 
 
 def run_doctor(
@@ -122,21 +122,21 @@ def run_doctor(
 ) -> int:
     """Run and print all checks; return 1 if a check failed, otherwise 0.
 
-    `bundle` is an archive to write as well, for somebody who is asked for help.
+    `bundle` is the path of an archive that is written in addition, for a person who helps.
 
     Raises
     ------
     DataError
         if the bundle's folder is missing.
     DeviceError
-        if the bundle cannot be written.
+        if writing the bundle fails after the checks.
     OSError
-        the same, before any check.
+        if the bundle cannot be written, before any check.
     """
     findings: list[Finding] = []
     if bundle is not None:
         if not bundle.resolve().parent.is_dir():
-            raise no_such(bundle.parent)
+            raise make_missing_path_error(bundle.parent)
         require_writable(bundle)
     with CheckContext(options, system) as context:
         for finding in run_checks(context):
@@ -148,7 +148,7 @@ def run_doctor(
     simulated = context.hello is not None and is_simulated(context.hello.backend)
     summary = _count_verdicts(findings, failed)
     if simulated:
-        summary += f" ({rig_checks.SIMULATED})"
+        summary += f" ({rig_checks.SIMULATED_NOTE})"
     if as_json:
         document = {"ok": not failed, "simulated": simulated, "findings": [finding_to_json(f) for f in findings]}
         sys.stdout.write(json.dumps(document, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""What the checks look at: this machine, the options and the rig file, the Pi, card surveys, captured frames.
+"""Objects that the checks examine: this machine, the options and the rig file, the Pi, card surveys, captured frames.
 
 First the measurements of this machine: clock, network interfaces, disk, and receivers over loopback with every core
 busy. Then the findings of checks and `CheckContext`, which is shared by all of them.
@@ -38,11 +38,11 @@ from polysight.capture import (
     ReceiverProcess,
     RowCapture,
     receiver_cores,
-    row_words,
     survey_cards,
+    view_row_words,
 )
-from polysight.radar import BoardState, radar_control
-from polysight.store import PART
+from polysight.radar import BoardState, open_radar_control
+from polysight.store import PART_SUFFIX
 from polysight_shared.config import Instrument
 from polysight_shared.findings import Finding
 from polysight_shared.messages import HelloReply, Pulsed
@@ -60,7 +60,7 @@ _RX_MAX_WORD = 1
 _RX_WORD = 5
 # Files of sysfs that count packets which an interface dropped.
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
-# The probe of a disk ends after so many bytes, or so many seconds on a slow disk; chosen.
+# Bytes after which the probe of a disk ends, and seconds after which it ends on a slow disk; chosen.
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
@@ -153,7 +153,7 @@ def write_speed(folder: Path) -> float:
 _RATE_S = 1.5
 # Time for a receiver that was late to read the packets that wait in its socket; chosen.
 _DRAIN_S = 5.0
-_SENDER = Path(__file__).with_name("send_packets.py")
+_SENDER_PROGRAM = Path(__file__).with_name("send_packets.py")
 _BUSY_LOOP = "while True: sum(range(100_000))"
 
 
@@ -221,7 +221,7 @@ def _measure_rate(rate: float, packets: int, receivers: list[ReceiverProcess], f
         card = (receiver.board.card_address, CARD_SOURCE_PORT)
         host = (receiver.board.host_address, receiver.board.data_port)
         words = map(str, (*card, *host, packets, rate, MAX_PAYLOAD_BYTES))
-        command = [sys.executable, "-I", str(_SENDER), *words]
+        command = [sys.executable, "-I", str(_SENDER_PROGRAM), *words]
         senders.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
     # A sender prints the seconds that it took; one that failed prints nothing.
     sending_s = [float(sender.communicate()[0] or "inf") for sender in senders]
@@ -252,7 +252,7 @@ def error(what: str, why: str, do: str, **facts: Any) -> Finding:
 
 
 def verdict(finding: Finding) -> str:
-    """Return the word of a finding for people and for `--json`: a check that was skipped is a note here."""
+    """Return the verdict on a finding, for people and for `--json`: a check that was skipped is a note here."""
     if finding.level == "note":
         return "not checked"
     return finding.level
@@ -388,15 +388,15 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         tempfile.TemporaryDirectory(prefix="polysight-doctor-") as folder,
         # The cards come first: they fail if a scan uses their ports, before a radar is configured.
         CaptureRig(rig) as cards,
-        radar_control(rig) as radars,
+        open_radar_control(rig) as radars,
     ):
         for board in rig.recorded:
             (Path(folder) / "raw" / board.name).mkdir(parents=True)
         cards.configure()
         radars.arm(frames)
         cards.begin_row(0, 1, bursts, Path(folder))
-        radars.row_begins()
-        sent = pi.pulse(frames, rig.burst.period_us, rig.burst.width_us)
+        radars.note_row_start()
+        pulses_sent = pi.pulse(frames, rig.burst.period_us, rig.burst.width_us)
         deadline = time.monotonic() + _LAST_PACKET_S + rig.limits.end_of_record_s
         while not cards.complete and time.monotonic() < deadline:
             cards.statuses()
@@ -406,11 +406,11 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         captured = {}
         for name, row in rows.items():
             # The recording of row 0 keeps the name of an unfinished one: nothing commits it.
-            payload = np.fromfile(Path(folder) / "raw" / name / f"0000{PART}", np.uint8)
+            payload = np.fromfile(Path(folder) / "raw" / name / f"0000{PART_SUFFIX}", np.uint8)
             chirps = frames * rig.burst.chirps
-            words, valid = row_words(payload, row.missing, chirps, rig.chirp.samples, len(rig.antennas.rx_mm))
+            words, valid = view_row_words(payload, row.missing, chirps, rig.chirp.samples, len(rig.antennas.rx_mm))
             captured[name] = CapturedFrames(words, valid, row, states.get(name))
-        return captured, sent
+        return captured, pulses_sent
 
 
 def select_boards(rig: Instrument, names: set[str]) -> Instrument:

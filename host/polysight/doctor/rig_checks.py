@@ -19,7 +19,7 @@ import msgspec
 
 from polysight.acquisition import RefusedError, StopRequest, list_stage_differences, make_begin_run, make_ready
 from polysight.calibration import load_checked_calibration
-from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, RowCapture, route_interface, silent_radar
+from polysight.capture import PACKET_TIME_US, PRIORITY_REMEDY, RowCapture, explain_silent_radar, route_interface
 from polysight.doctor.context import (
     CheckContext,
     NetworkInterface,
@@ -34,8 +34,8 @@ from polysight.doctor.context import (
 )
 from polysight.materials import SIMULATED_LIBRARY, Library
 from polysight.planning import scan_time
-from polysight.process import why_unnamed
-from polysight.radar import RadarState, require
+from polysight.process import explain_unnamed
+from polysight.radar import RadarState, check_constraints
 from polysight.settings import DEFAULT
 from polysight.store import new_scan_id
 from polysight_shared import __version__
@@ -53,10 +53,10 @@ _SPEED_MARGIN = 2.0
 # Differences of the clocks of host and Pi that are a warning and an error (this, too, against our files' time); chosen.
 _MAX_CLOCK_OFFSET_S = 1.0
 _CLOCK_LOST_S = 60.0
-_SET_CLOCK = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
+_CLOCK_REMEDY = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
 # Hops of the network survey that concern a card.
 _CARD_HOPS = ("host", "route", "link", "card")
-# Of the interface to a card: a card's frames, its speed, and receive descriptors (chosen).
+# Least values of the interface to a card: MTU for a card's frames, its speed, and its receive descriptors (chosen).
 _MIN_MTU = 1500
 _MIN_SPEED_MBIT = 1000
 _MIN_RING = 512
@@ -68,7 +68,7 @@ def check_config(context: CheckContext) -> Finding:
     rig = load_instrument(options.config)
     check_burst_fits(rig.grid, rig.burst, rig.stage)
     if rig.radar.control == "native":
-        require(rig, rig.grid.columns * rig.burst.pulses)
+        check_constraints(rig, rig.grid.columns * rig.burst.pulses)
     context.loaded_rig = rig
     boards = ", ".join(b.name for b in rig.recorded)
     return ok(
@@ -82,9 +82,9 @@ def check_host_clock(context: CheckContext) -> Finding:
     now_s = context.system.wall_ns() * 1e-9
     observed = f"{datetime.fromtimestamp(now_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
     if now_s < Path(__file__).stat().st_mtime - _CLOCK_LOST_S:
-        return error(f"{observed}: earlier than this program's installation", "the clock lost its time", _SET_CLOCK)
+        return error(f"{observed}: earlier than this program's installation", "the clock lost its time", _CLOCK_REMEDY)
     if context.system.clock_is_synchronised() is False:
-        return warning(f"{observed}, not synchronised", "no time server is reachable", _SET_CLOCK)
+        return warning(f"{observed}, not synchronised", "no time server is reachable", _CLOCK_REMEDY)
     return ok(observed)
 
 
@@ -97,9 +97,9 @@ def check_pi_clock(context: CheckContext) -> Finding:
     observed = f"the Pi's clock minus this machine's: {offset_s:+z.3f} s (+- {uncertainty_s:.3f} s)"
     facts = {"offset_s": offset_s, "uncertainty_s": uncertainty_s}
     if abs(offset_s) - uncertainty_s > _CLOCK_LOST_S:
-        return error(observed, "one clock is wrong: times in logs and scans cannot be compared", _SET_CLOCK, **facts)
+        return error(observed, "one clock is wrong: times in logs and scans cannot be compared", _CLOCK_REMEDY, **facts)
     if abs(offset_s) - uncertainty_s > _MAX_CLOCK_OFFSET_S:
-        return warning(observed, "one of the two clocks is not synchronised", _SET_CLOCK, **facts)
+        return warning(observed, "one of the two clocks is not synchronised", _CLOCK_REMEDY, **facts)
     return ok(observed, **facts)
 
 
@@ -120,7 +120,7 @@ def check_library(context: CheckContext) -> Finding:
     library_angles = " and ".join(f"{a:g}" for a in angles)
     facts = {"incidence_deg": angle, "library_deg": list(angles)}
     observed = f"incidence angle of the rig {angle:.1f} degrees, of {SIMULATED_LIBRARY.name} {library_angles} degrees"
-    if not why_unnamed(DEFAULT, context.rig):
+    if not explain_unnamed(DEFAULT, context.rig):
         return ok(observed, **facts)
     return warning(
         observed,
@@ -135,17 +135,17 @@ def check_receivers(context: CheckContext) -> Finding:
     rates = card_rates(context.rig)
     results, scheduling = context.system.measure_receivers(context.rig, rates)
     losses = []
-    for r in results:
+    for result in results:
         loss = "no loss"
-        if r.lost:
-            loss = f"{100 * r.lost / r.sent:.1f} % lost"
-        losses.append(f"{r.mbit_s:.0f} Mbit/s a card: {loss}")
+        if result.lost:
+            loss = f"{100 * result.lost / result.sent:.1f} % lost"
+        losses.append(f"{result.mbit_s:.0f} Mbit/s a card: {loss}")
     observed = f"receivers ({scheduling}) with all cores busy: {'; '.join(losses)}"
-    facts = {"held": [vars(r) for r in results], "scheduling": scheduling}
+    facts = {"held": [vars(result) for result in results], "scheduling": scheduling}
     # Packets/s, one of the ascending `rates`. Those above that of this rig's cards are for information.
     card_rate = 1e6 / (context.rig.card.packet_delay_us + PACKET_TIME_US)
     rates_of_cards = results[: rates.index(card_rate) + 1]
-    if any(r.lost for r in rates_of_cards):
+    if any(result.lost for result in rates_of_cards):
         remedy = PRIORITY_REMEDY
         if "real-time" in scheduling:
             remedy = "use a faster machine"
@@ -159,12 +159,12 @@ def check_disk(context: CheckContext) -> Finding:
     folder = _find_existing_parent(context.options.out)
     need = rig.scan_bytes
     reserve = rig.limits.free_disk_bytes
-    free = shutil.disk_usage(folder).free
+    free_bytes = shutil.disk_usage(folder).free
     observed = (
-        f"{folder}: {free / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
+        f"{folder}: {free_bytes / 1e9:.1f} GB free, a scan needs {need / 1e9:.2f} GB and {reserve / 1e9:.1f} GB reserve"
     )
-    facts: dict[str, float] = {"free_bytes": free, "need_bytes": need}
-    if free < need + reserve:
+    facts: dict[str, float] = {"free_bytes": free_bytes, "need_bytes": need}
+    if free_bytes < need + reserve:
         return error(observed, "the disk is too full for a scan", "free space, or give another --out", **facts)
     speed = context.system.write_speed(folder)
     rate = need / scan_time(rig).total_s
@@ -203,7 +203,7 @@ def check_time(context: CheckContext) -> Finding:
     )
 
 
-SIMULATED = "simulated wires: no hardware is driven"
+SIMULATED_NOTE = "simulated wires: no hardware is driven"
 # Points of the row that checks the trigger line; chosen.
 _POINTS = 8
 _ROW_TIMEOUT_S = 120.0
@@ -244,7 +244,7 @@ def check_pi(context: CheckContext) -> Finding:
     context.hello_took_ns = answered_ns - sent_ns
     backend = f"GPIO backend {hello.backend}"
     if is_simulated(hello.backend):
-        backend = SIMULATED
+        backend = SIMULATED_NOTE
     observed = f"{context.rig.pi.command_address} answers: release {hello.pi_release}, {backend}, state {hello.state}"
     facts = {"release": hello.pi_release, "backend": hello.backend, "state": hello.state}
     if hello.pi_release != __version__:
@@ -301,9 +301,12 @@ def check_trigger(context: CheckContext) -> Finding:
             **facts,
         )
     if row.status != "done" or row.edges != _POINTS or row.pulses != expected:
-        e = explain(row.fault)
+        explanation = explain(row.fault)
         return error(
-            f"{observed}, {_POINTS} and {expected} expected: {row.reason or e.problem}", e.cause, e.remedy, **facts
+            f"{observed}, {_POINTS} and {expected} expected: {row.reason or explanation.problem}",
+            explanation.cause,
+            explanation.remedy,
+            **facts,
         )
     if row.fault or row.reason:
         return warning(f"{observed}; {row.reason}", "", "watch the stage during a row", **facts)
@@ -346,11 +349,11 @@ def check_stage(context: CheckContext) -> Finding:
     """Check that no fault is latched and that the sketch has this release."""
     status = context.pi.status()
     if status.fault and status.state == "fault":
-        e = explain(status.fault)
+        explanation = explain(status.fault)
         return error(
-            f"fault {status.fault}: {e.problem}; {status.reason}",
-            e.cause,
-            f"{e.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
+            f"fault {status.fault}: {explanation.problem}; {status.reason}",
+            explanation.cause,
+            f"{explanation.remedy}; on the Pi, with its service stopped, run `polysight-pi check` for port and board",
             fault=status.fault,
         )
     firmware = "" if context.hello is None else context.hello.firmware
@@ -367,9 +370,12 @@ def check_stage(context: CheckContext) -> Finding:
             **facts,
         )
     if status.fault:
-        e = explain(status.fault)
+        explanation = explain(status.fault)
         return warning(
-            f"{observed}; its last row ended with fault {status.fault}: {e.problem}", e.cause, e.remedy, **facts
+            f"{observed}; its last row ended with fault {status.fault}: {explanation.problem}",
+            explanation.cause,
+            explanation.remedy,
+            **facts,
         )
     return ok(observed, **facts)
 
@@ -437,11 +443,11 @@ def check_buffer(context: CheckContext, board: Board) -> Finding:
     hops = {h.where: h for h in context.surveys[board.name].hops}
     receiver = hops["receiver"]
     buffer = hops["buffer"]
-    worst = max((buffer, receiver), key=lambda hop: LEVELS.index(hop.level))
-    if worst.level != "error":
+    worst_finding = max((buffer, receiver), key=lambda hop: LEVELS.index(hop.level))
+    if worst_finding.level != "error":
         context.usable_cards.add(board.name)
-    if worst.level in ("error", "warning"):
-        return worst
+    if worst_finding.level in ("error", "warning"):
+        return worst_finding
     return ok(f"{buffer.what}; {receiver.what}")
 
 
@@ -462,10 +468,12 @@ def check_pulses(context: CheckContext) -> Finding:
         )
     try:
         context.captured, sent_pulses = capture_frames(rig, context.pi, bursts)
-    except RefusedError as e:
-        if e.number != PiFault.BAD_REQUEST:
+    except RefusedError as explanation:
+        if explanation.number != PiFault.BAD_REQUEST:
             raise
-        return error(e.what, "the Pi's release does not know this command", "install the same release on both")
+        return error(
+            explanation.what, "the Pi's release does not know this command", "install the same release on both"
+        )
     counted = "seen" if sent_pulses.pulses_seen else "sent, not seen,"
     observed = (
         f"{sent_pulses.pulses} {counted} at rest, at most {sent_pulses.width_max_ns / 1e3:.2f} us long,"
@@ -473,8 +481,8 @@ def check_pulses(context: CheckContext) -> Finding:
     )
     facts = {k: getattr(sent_pulses, k) for k in ("pulses", "pulses_seen", "width_max_ns", "jitter_ns", "fault")}
     if sent_pulses.fault:
-        e = explain(sent_pulses.fault)
-        return error(f"{observed}: {e.problem}", e.cause, e.remedy, **facts)
+        explanation = explain(sent_pulses.fault)
+        return error(f"{observed}: {explanation.problem}", explanation.cause, explanation.remedy, **facts)
     return ok(f"{observed} ({context.rig.pi.pulse_source})", **facts)
 
 
@@ -497,7 +505,7 @@ def check_radar(context: CheckContext, board: Board) -> Finding:
 def _judge_frames(board: Board, row: RowCapture, observed: str) -> Finding:
     """Judge if a row's frames came to this machine, by the first fault; `slipped`: only whole frames are missing."""
     if row.counts.placed == 0:
-        e = silent_radar(board, row)
+        e = explain_silent_radar(board, row)
         return error(e.what, e.why, e.remedy)
     if row.slipped or (row.bytes < row.expected and not row.losses.gap_bytes):
         return error(

@@ -25,8 +25,8 @@ def main(card: str, card_port: int, host: str, port: int, packets: int, rate: fl
             sock.sendto(struct.pack("<IIH", k + 1, count & 0xFFFFFFFF, count >> 32) + bytes(size), (host, port))
             due = max(due + period_s, time.perf_counter() - _MAX_LAG_S)
             # Shorter sleeps take longer than asked for: several packets are sent together instead.
-            if (ahead := due - time.perf_counter()) > 0.0005:
-                time.sleep(ahead)
+            if (early_s := due - time.perf_counter()) > 0.0005:
+                time.sleep(early_s)
         sys.stdout.write(f"{time.perf_counter() - began}\n")
 
 

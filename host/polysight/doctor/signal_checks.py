@@ -72,8 +72,8 @@ def judge_direct_path(rig: Instrument, board: Board, signal: DirectSignal) -> Fi
     predicted = f"{expected / 1e3:.0f} kHz expected from the rig file"
     facts = {"expected_hz": expected, "band_hz": [low, high], "chirps": signal.chirps, "heard": signal.if_hz.size}
     if not signal.found and not signal.rx_order:
-        missed = signal.chirps - signal.if_hz.size
-        observed = f"no direct path in {missed} of {signal.chirps} chirps; {predicted}"
+        missed_chirps = signal.chirps - signal.if_hz.size
+        observed = f"no direct path in {missed_chirps} of {signal.chirps} chirps; {predicted}"
         if is_outside:
             cause = "its IF is outside the receiver's band, so it is filtered out or aliased"
             return error(observed, cause, _suggest_start_offset(rig, board, expected), **facts)

@@ -4,8 +4,8 @@
 footprint (the image of a mirror); `SubBandImages` does the same for parts of the sweep. The three imagers have one
 interface (`samples.Imager`): direct sum (`backproject` and its adjoint `project`), spectral, and incremental row by
 row. `move_to_plane` estimates the plane of the plates and images on it, `focus_sweep` finds the plane by sharpness,
-`correct_tilt` removes the effect of tilted plates, `imaging_facts` measures the point response. `ImagedWith` lists the
-settings that the gains of an image depend on.
+`correct_tilt` removes the effect of tilted plates, `describe_imaging` measures the point response. `ImagedWith` lists
+the settings that the gains of an image depend on.
 """
 
 from polysight.imaging.direct import (
@@ -56,9 +56,9 @@ from polysight.imaging.resolution import (
     FieldLimits as FieldLimits,
     PhaseSlope as PhaseSlope,
     PointResponse as PointResponse,
-    field_limits as field_limits,
-    imaging_facts as imaging_facts,
-    point_response as point_response,
+    compute_field_limits as compute_field_limits,
+    compute_point_response as compute_point_response,
+    describe_imaging as describe_imaging,
 )
 from polysight.imaging.samples import (
     BoardSamples as BoardSamples,

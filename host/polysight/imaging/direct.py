@@ -18,7 +18,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _CHUNK = 1 << 20
 
 
-class Shaped(Protocol):
+class ApiArray(Protocol):
     """An array of any array API library."""
 
     @property
@@ -27,24 +27,29 @@ class Shaped(Protocol):
         ...
 
 
-Array = TypeVar("Array", bound=Shaped)
+Array = TypeVar("Array", bound=ApiArray)
 
 
 @overload
 def backproject(
-    samples: npt.NDArray[Any], frequencies_hz: Shaped, tx_m: Shaped, rx_m: Shaped, voxels_m: Shaped, reference_m: Shaped
+    samples: npt.NDArray[Any],
+    frequencies_hz: ApiArray,
+    tx_m: ApiArray,
+    rx_m: ApiArray,
+    voxels_m: ApiArray,
+    reference_m: ApiArray,
 ) -> npt.NDArray[np.complex128]: ...
 @overload
 def backproject(
-    samples: Array, frequencies_hz: Shaped, tx_m: Shaped, rx_m: Shaped, voxels_m: Shaped, reference_m: Shaped
+    samples: Array, frequencies_hz: ApiArray, tx_m: ApiArray, rx_m: ApiArray, voxels_m: ApiArray, reference_m: ApiArray
 ) -> Array: ...
 def backproject(
     samples: Array | npt.NDArray[Any],
-    frequencies_hz: Shaped,
-    tx_m: Shaped,
-    rx_m: Shaped,
-    voxels_m: Shaped,
-    reference_m: Shaped,
+    frequencies_hz: ApiArray,
+    tx_m: ApiArray,
+    rx_m: ApiArray,
+    voxels_m: ApiArray,
+    reference_m: ApiArray,
 ) -> Array | npt.NDArray[np.complex128]:
     """Backproject samples (POLySIGHT paper, Eq. 6, with the exponent's sign of the conjugate of the received phase).
 
@@ -152,14 +157,14 @@ class _Scene:
         v = self.voxels
         size = max(1, _CHUNK // max(1, v.shape[0]))
         for first in range(0, self.tx.shape[0], size):
-            part = slice(first, min(first + size, self.tx.shape[0]))
-            tx = self.tx[part, None, :]
-            rx = self.rx[part, None, :]
-            reference = self.reference[part, None]
+            positions = slice(first, min(first + size, self.tx.shape[0]))
+            tx = self.tx[positions, None, :]
+            rx = self.rx[positions, None, :]
+            reference = self.reference[positions, None]
             d = excess_path_m(
                 xp=self.xp, x=v[None, :, 0], y=v[None, :, 1], z=v[None, :, 2], tx_m=tx, rx_m=rx, reference_m=reference
             )
-            yield part, d / SPEED_OF_LIGHT_M_S
+            yield positions, d / SPEED_OF_LIGHT_M_S
 
 
 class DirectImager:
@@ -174,11 +179,11 @@ class DirectImager:
         rx, m, rows, columns = self.aperture.shape
         total = 0
         for r in range(rx):
-            by_position = xp.permute_dims(xp.reshape(samples[r, ...], (m, rows * columns)), (1, 0))
-            total = total + backproject(by_position, *self._list_geometry(r))
+            samples_by_position = xp.permute_dims(xp.reshape(samples[r, ...], (m, rows * columns)), (1, 0))
+            total = total + backproject(samples_by_position, *self._list_geometry(r))
         return xp.reshape(total, self.aperture.grid.shape)
 
-    def constant(self, echo: Any, weights: Any) -> Any:
+    def image_constant_echo(self, echo: Any, weights: Any) -> Any:
         """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
         xp = namespace(echo)
         return self.image(echo[:, :, None, None] * xp.astype(weights, echo.dtype)[None, None, :, :])

@@ -20,7 +20,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.imaging.images import ImageBuilder
-from polysight.imaging.resolution import limit_m
+from polysight.imaging.resolution import compute_limit_m
 
 # Largest tilt of the plane along x and along y that `focus_sweep` searches; a result near this limit is not certain;
 # chosen.
@@ -139,7 +139,7 @@ def _compute_cell_areas(builder: ImageBuilder, depths: NDArray[np.float64]) -> N
     for index in np.ndindex(area.shape):
         pz, py, px = (axis[i] for axis, i in zip(axes, index, strict=True))
         point = np.array([px, py, pz])
-        area[index] = limit_m(aperture, point, 0) * limit_m(aperture, point, 1)
+        area[index] = compute_limit_m(aperture, point, 0) * compute_limit_m(aperture, point, 1)
     interpolate = scipy.interpolate.RegularGridInterpolator(axes, area, method="linear")
     return interpolate(tuple(np.meshgrid(z, grid.y_m, grid.x_m, indexing="ij")))
 

@@ -35,11 +35,11 @@ SAME_END_PX = 5.0
 # Tolerance of positions: at a wavelength of 4 mm a path longer by this has 2e-3 rad more phase, far below the noise.
 _SAME_M = 1e-6
 # The lattice in y (of rows and pixels, `pitch_y_m`) may be finer than the pixels by this factor at most (chosen).
-_FINER = 4
+_MAX_REFINEMENT = 4
 # Taps of the filter against the motion in a burst: positions to either side (chosen).
 REACH = 4
 # Largest frequency of the filter, cycles per position; chosen, 0.5 is the limit of the sampling.
-_BAND = 0.45
+_FILTER_BAND = 0.45
 Window = str | tuple[Any, ...]
 """Window as for scipy.signal.get_window; "boxcar" for none."""
 
@@ -157,9 +157,11 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     plan = plan_raster(rig.grid)
     offsets = np.zeros((plan.rows, plan.columns, 3))
     # Rows run to and fro: the first two give x of either direction.
-    along = {row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)}
+    offsets_by_direction = {
+        row.direction: row_offsets_m(rig, row)[:: row.direction, 0] for row in itertools.islice(plan, 2)
+    }
     rows = list(plan)
-    offsets[..., 0] = [along[row.direction] for row in rows]
+    offsets[..., 0] = [offsets_by_direction[row.direction] for row in rows]
     offsets[..., 1] = [[row.y_mm / 1e3] for row in rows]
     return offsets
 
@@ -250,7 +252,7 @@ def row_starts_m(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
 def pitch_y_m(aperture: Aperture) -> float | None:
     """Return the largest common divisor of row spacing and pixel of at least a quarter pixel, metres; None without."""
     y = aperture.offsets_m[:, 0, 1]
-    for finer in range(1, _FINER + 1):
+    for finer in range(1, _MAX_REFINEMENT + 1):
         pitch = aperture.grid.pixel_m / finer
         cells = (y - y[0]) / pitch
         if np.abs(cells - np.round(cells)).max() * pitch < _SAME_M:
@@ -266,7 +268,7 @@ def burst_filters(rig: Instrument) -> NDArray[np.float32]:
     times_s = np.array(rig.burst.chirp_times_s)
     # Motion of the stage from the middle of the burst to each chirp, in positions.
     shift_positions = (times_s - times_s.mean()) * rig.stage.speed_mm_s / rig.grid.step_x_mm
-    frequencies = np.linspace(0, _BAND, 91)
+    frequencies = np.linspace(0, _FILTER_BAND, 91)
     loss = np.cos(2 * np.pi * np.outer(frequencies, shift_positions)).mean(axis=1)
     filters = np.zeros((REACH + 1, REACH + 1))
     filters[0, 0] = 1
@@ -293,7 +295,7 @@ def undo_burst_motion(
     turn
         float64 [position]: centre of the filter's band, radians per position.
     filters
-        From :func:`burst_filters`.
+        Filters that :func:`burst_filters` returned.
     """
     count = valid.size
     reach = np.zeros(valid.size, int)
@@ -386,8 +388,8 @@ class StageWindow:
         Unless the plate is in the middle of the scan, the part of its spectrum that the scan sees is not symmetric, so
         that its phase rises (Fresnel integrals over the plate).
         """
-        from_specular = (ends_px[:, None] - self.places_px) * np.sqrt(2 * self.bend_px / np.pi)
-        sine, cosine = scipy.special.fresnel(from_specular)
+        distance_from_specular = (ends_px[:, None] - self.places_px) * np.sqrt(2 * self.bend_px / np.pi)
+        sine, cosine = scipy.special.fresnel(distance_from_specular)
         # Echo of the plate at each position; that of an endless mirror is 1 + j.
         echo = (cosine[1] - cosine[0]) + 1j * (sine[1] - sine[0])
         distance = columns_px[:, None] - self.places_px
@@ -426,17 +428,17 @@ class StageWindow:
         step_rad = slope / slope_per_rad
         columns_px = np.arange(profile.size, dtype=np.float64)
         seen_px = find_ends(profile, lit, inside_px)
-        # Where plates touch, |H| does not fall to half between them, or does so elsewhere: there the end is that of the
+        # Between plates that touch, |H| does not fall to half, or does so elsewhere: there the end is that of the
         # segmentation. A plate that is segmented up to the end of the illuminated part continues: it has no end.
         touching = np.abs(seen_px - mask_ends_px) > SAME_END_PX
         light_ends_px = np.flatnonzero(lit)[[0, -1]]
-        in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX
-        ends_px = np.where(touching, np.where(in_light, mask_ends_px, [-np.inf, np.inf]), seen_px)
+        is_end_in_light = np.abs(light_ends_px - mask_ends_px) > SAME_END_PX
+        ends_px = np.where(touching, np.where(is_end_in_light, mask_ends_px, [-np.inf, np.inf]), seen_px)
         for _ in range(ROUNDS):
             # A rising plate reflects towards the antennas at other stage positions than a level one: as a level one
-            # that lies `at_level_px` further along. There its image is computed.
-            at_level_px = moved_px * slope
-            image = self.level_image(ends_px + at_level_px, columns_px + at_level_px)
+            # that lies `level_offset_px` further along. There its image is computed.
+            level_offset_px = moved_px * slope
+            image = self.level_image(ends_px + level_offset_px, columns_px + level_offset_px)
             # Its angle is the mean phase step between pixels that the level plate seems to have.
             product = np.vdot(image[inside_px[:-1]], image[inside_px[1:]])
             slope = slope_per_rad * (step_rad - float(np.angle(product)))
@@ -458,9 +460,9 @@ def find_ends(profile: NDArray[np.float64], lit: NDArray[np.bool_], inside_px: N
     ends = []
     for outwards, start in ((-1, int(inside_px[0])), (1, int(inside_px[-1]))):
         end = outwards * np.inf
-        below_half = np.flatnonzero((profile < half)[start::outwards])
-        if below_half.size and below_half[0] > 0 and lit[start + outwards * below_half[0]]:
-            dark = start + outwards * int(below_half[0])
+        below_half_indices = np.flatnonzero((profile < half)[start::outwards])
+        if below_half_indices.size and below_half_indices[0] > 0 and lit[start + outwards * below_half_indices[0]]:
+            dark = start + outwards * int(below_half_indices[0])
             bright = dark - outwards
             end = bright + outwards * (profile[bright] - half) / (profile[bright] - profile[dark])
         ends.append(float(end))

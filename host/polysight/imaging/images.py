@@ -45,7 +45,7 @@ from polysight.imaging.samples import BoardSamples, reduction
 from polysight.sync import HighPass, SyncedRow, high_pass
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
-from polysight_shared.geometry import Vector, place
+from polysight_shared.geometry import Vector, transform_to_rig
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -54,14 +54,14 @@ Mask = NDArray[np.bool_]
 Rise = tuple[float, float]
 """Slope of a plate, dz/dx and dz/dy (about radians); z points away from the antennas."""
 MAX_RISE = 0.06
-"""Largest rise that is taken for a tilt (3.4 degrees); a steeper phase has another cause; chosen."""
+"""Largest rise that counts as a tilt (3.4 degrees); a steeper phase has another cause; chosen."""
 MIN_RISE = 2e-3
 """Smallest rise that is corrected (0.11 degrees); smaller ones may come from sidelobes of neighbours; chosen."""
-_FEEBLE = 0.12
+_FEEBLE_RATIO = 0.12
 """|V| over |H| of a patch below which V's phase is not used: permittivities below 2.8 at 55 degrees."""
 _LEAST_LINES = 6
 """Columns or rows of pixels in a patch from which a curvature is estimated; chosen."""
-_COHERENT = 0.5
+_LEAST_COHERENCE = 0.5
 """Smallest coherence of the phase steps between pixels (1: all equal); chosen."""
 _MAX_CHANGE = 2.0
 """Largest factor of the footprint over the distance `d` that is used; chosen: larger ones occur at the edge alone."""
@@ -76,7 +76,7 @@ ARM_MM = 100.0
 """Distance of two points, along a board's x and y, that are compared to see its rotation; antennas are in one line."""
 
 # Smallest footprint of a valid pixel, relative to the strongest; chosen: weaker pixels are mostly noise.
-_VISIBLE = 0.15
+_LEAST_FOOTPRINT = 0.15
 # Width of the majority filter, pixels; chosen.
 _NEIGHBOURS = 15
 TAPERS: dict[str, Window] = {"none": "boxcar", "kaiser": ("kaiser", 4.0), "taylor": ("taylor", 4, 30)}
@@ -125,11 +125,11 @@ class Illumination:
             windows=None if self.windows is None else self.windows[::-1],
         )
 
-    def rise(self, h: Image, v: Image, mask: Mask, plate: Mask | None = None) -> Rise:
+    def estimate_rise(self, h: Image, v: Image, mask: Mask, plate: Mask | None = None) -> Rise:
         """Estimate the rise of a patch along x and y from its phase; 0 along an axis where it is undetermined.
 
         `h`, `v` complex [ny, nx] are reflectivities (conjugates of the samples), `mask` bool [ny, nx] is the inside of
-        the patch. V is left out where it nearly vanishes (`_FEEBLE`), for its phase is of neighbours' sidelobes.
+        the patch. V is left out where it nearly vanishes (`_FEEBLE_RATIO`), for its phase is of neighbours' sidelobes.
         `plate` [ny, nx] is the whole patch. With it, the rise that a level plate seems to have is subtracted
         (`StageWindow` in :mod:`polysight.imaging.geometry`); None: it is not.
         """
@@ -137,23 +137,27 @@ class Illumination:
             return 0.0, 0.0
         level_h = float(np.nanmedian(np.abs(h[mask])))
         level_v = float(np.nanmedian(np.abs(v[mask])))
-        channels = [h] if level_v < _FEEBLE * level_h else [h, v]
+        channels = [h] if level_v < _FEEBLE_RATIO * level_h else [h, v]
         slopes = []
         for along in (0, 1):
             # The phase of the conjugate falls where the plate rises.
             step = sum(np.conj(_step(channel, mask, 1 - along)) for channel in channels) / len(channels)
-            slope = self._estimate_slope(float(np.angle(step)), h, along, mask, plate) if abs(step) > _COHERENT else 0.0
+            slope = (
+                self._estimate_slope(float(np.angle(step)), h, along, mask, plate)
+                if abs(step) > _LEAST_COHERENCE
+                else 0.0
+            )
             slopes.append(slope)
         return slopes[0], slopes[1]
 
     def _estimate_slope(self, step_rad: float, h: Image, along: int, mask: Mask, plate: Mask | None) -> float:
-        """Return a plate's rise along x (`along` 0) or y (1), see :meth:`rise`, from its mean phase step per pixel."""
+        """Return a plate's rise along x (`along` 0) or y (1) from its mean phase step per pixel."""
         slope_per_rad = 1 / (self.pixel_m[along] * float(self.steepness_rad_m.mean()))
         slope = slope_per_rad * step_rad
         inside_px = np.flatnonzero(mask.any(axis=along))
         if self.windows is None or plate is None or inside_px.size < 2:
             return slope
-        is_lit = np.abs(self.footprints).min(axis=0) >= _VISIBLE * np.abs(self.footprints).max()
+        is_lit = np.abs(self.footprints).min(axis=0) >= _LEAST_FOOTPRINT * np.abs(self.footprints).max()
         level = np.where(is_lit & np.isfinite(h), np.abs(h), np.nan)
         if along == 1:
             level = level.T
@@ -173,7 +177,7 @@ class Illumination:
             moved_px=float(self.moved_m.mean(axis=0)[along, along]) / self.pixel_m[along],
         )
 
-    def bend(self, h: Image, v: Image, mask: Mask) -> tuple[float, float]:
+    def estimate_bend(self, h: Image, v: Image, mask: Mask) -> tuple[float, float]:
         """Estimate a patch's curvature along x and y from its phase, 1 / m, positive where it bends away; 0 if unknown.
 
         The phase from pixel to pixel, summed over 3 or more lines, grows evenly on a surface of one curvature.
@@ -296,26 +300,26 @@ class Images:
         """Pixels that are valid and finite in both channels, bool [ny, nx]."""
         return self.valid & np.isfinite(self.h) & np.isfinite(self.v)
 
-    def within(self, area: Mask) -> Images:
+    def limit_to_area(self, area: Mask) -> Images:
         """Return the images, valid only inside `area`, bool [ny, nx]."""
         return replace(self, valid=self.valid & area)
 
     def transpose(self) -> Images:
         """Return the images with x and y swapped."""
-        turned = {
+        transposed = {
             f.name: np.ascontiguousarray(value.T)
             for f in fields(self)
             if isinstance(value := getattr(self, f.name), np.ndarray) and value.ndim == 2
         }
         illumination = None if self.illumination is None else self.illumination.transpose()
         dispersion = None if self.dispersion is None else self.dispersion.transpose()
-        return replace(self, **turned, x_m=self.y_m, y_m=self.x_m, illumination=illumination, dispersion=dispersion)
+        return replace(self, **transposed, x_m=self.y_m, y_m=self.x_m, illumination=illumination, dispersion=dispersion)
 
     def level(self, plate: Mask) -> Images:
         """Return the images with the tilt of one plate, bool [ny, nx], corrected if it is at most `MAX_RISE`."""
         if self.illumination is None:
             return self
-        rise = self.illumination.rise(self.h, self.v, plate)
+        rise = self.illumination.estimate_rise(self.h, self.v, plate)
         if max(map(abs, rise)) <= MAX_RISE:
             return correct_tilt(self, [plate], [rise])
         return self
@@ -339,10 +343,10 @@ def illumination_geometry(antennas: Antennas, z_m: float, frequency_hz: float) -
     cosines = 0.0
     for antenna in (tx, rx):
         leg = point - antenna
-        r = float(np.linalg.norm(leg))
-        e = leg / r
-        hessian += (np.eye(2) - np.outer(e[:2], e[:2])) / r
-        cosines += float(e[2])
+        distance_m = float(np.linalg.norm(leg))
+        direction = leg / distance_m
+        hessian += (np.eye(2) - np.outer(direction[:2], direction[:2])) / distance_m
+        cosines += float(direction[2])
     wave = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
     return np.asarray(np.linalg.inv(hessian) * cosines, np.float64), wave * cosines
 
@@ -366,9 +370,9 @@ def correct_tilt(images: Images, masks: Sequence[Mask], rises: Sequence[Rise]) -
 def _step(image: Image, mask: Mask, axis: int) -> complex:
     """Return exp(j mean phase step between pixels of a patch) times the coherence of the steps."""
     masked_image = np.where(mask & np.isfinite(image), image, 0).astype(np.complex128)
-    ahead = np.take(masked_image, range(1, masked_image.shape[axis]), axis)
-    behind = np.take(masked_image, range(masked_image.shape[axis] - 1), axis)
-    product = ahead * np.conj(behind)
+    next_pixels = np.take(masked_image, range(1, masked_image.shape[axis]), axis)
+    previous_pixels = np.take(masked_image, range(masked_image.shape[axis] - 1), axis)
+    product = next_pixels * np.conj(previous_pixels)
     return complex(product.sum()) / max(float(np.abs(product).sum()), 1e-300)
 
 
@@ -473,7 +477,7 @@ class ImageBuilder:
         grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
         return self._make_channels({name: board.image(grid) for name, board in self.boards.items()}, offset_m)
 
-    def disperse(self, offset_m: float = 0.0) -> Dispersion:
+    def form_dispersion(self, offset_m: float = 0.0) -> Dispersion:
         """Form the dispersion from the rows so far; `offset_m` as of :meth:`finish`."""
         grid = replace(self.grid, z_m=self.grid.z_m + offset_m) if offset_m else None
         h, v = (board.dispersion(grid).conj() for board in self.boards.values())
@@ -481,21 +485,21 @@ class ImageBuilder:
 
     def current(self) -> Images:
         """Return the images from running sums, within 1e-6 of the peak; fast if the builder is `live`."""
-        return self._make_channels({name: board.current() for name, board in self.boards.items()})
+        return self._make_channels({name: board.image_current_sums() for name, board in self.boards.items()})
 
     def _make_channels(self, channels: dict[str, tuple[Image, Image, str | None]], offset_m: float = 0.0) -> Images:
         """Divide the images by their footprints; `channels`: board name to image, footprint and notice (None: none)."""
         h, v = channels.values()
         visible = np.ones(self.grid.shape, bool)
         for _, footprint, _ in (h, v):
-            strong = np.abs(footprint) >= _VISIBLE * np.abs(footprint).max()
+            strong = np.abs(footprint) >= _LEAST_FOOTPRINT * np.abs(footprint).max()
             # The rim of the footprint ripples with the row spacing; a majority filter avoids stripes.
             share = scipy.ndimage.uniform_filter(strong.astype(np.float32), size=_NEIGHBOURS, mode="nearest")
             visible &= (share > 0.5) & (footprint != 0)
-        flat = [np.divide(raw, foot, out=np.zeros_like(raw), where=visible).conj() for raw, foot, _ in (h, v)]
+        divided = [np.divide(raw, foot, out=np.zeros_like(raw), where=visible).conj() for raw, foot, _ in (h, v)]
         return Images(
-            h=flat[0],
-            v=flat[1],
+            h=divided[0],
+            v=divided[1],
             x_m=self.grid.x_m,
             y_m=self.grid.y_m,
             valid=visible,
@@ -550,11 +554,11 @@ def sub_bands(chirp: Chirp, count: int) -> tuple[SubBand, ...]:
     first, last = chirp.linear_samples
     length = 2 * (last - first) / (count + 1) if count > 0 else 0.0
     if length < MIN_SAMPLES:
-        most = 2 * (last - first) // MIN_SAMPLES - 1
+        max_bands = 2 * (last - first) // MIN_SAMPLES - 1
         raise ConfigError(
             f"{count} sub-bands of {last - first} linear samples",
             f"each needs {MIN_SAMPLES} samples to separate the object from the direct path",
-            f"use 1 to {most}",
+            f"use 1 to {max_bands}",
             code=ErrorCode.VALUE_INVALID,
         )
     bands = []
@@ -673,8 +677,8 @@ class ImagedWith(msgspec.Struct, frozen=True, kw_only=True):
         for name in self.high_pass_khz.keys() & now.high_pass_khz.keys():
             old_khz = self.high_pass_khz[name]
             corners = now.high_pass_khz[name]
-            same = len(old_khz) == len(corners)
-            if not same or any(abs(a - b) > SAME_CORNER_KHZ for a, b in zip(old_khz, corners, strict=True)):
+            is_equal = len(old_khz) == len(corners)
+            if not is_equal or any(abs(a - b) > SAME_CORNER_KHZ for a, b in zip(old_khz, corners, strict=True)):
                 yield f"{name}'s high-pass corners are {_describe_corners(corners)}, not {_describe_corners(old_khz)}"
 
 
@@ -683,7 +687,7 @@ def _list_places_mm(rig: Instrument, board: Board) -> Iterator[Vector]:
     antennas = rig.antennas
     antennas_mm = (antennas.tx_mm[board.tx_antenna],) if board.role == "transmit" else antennas.rx_mm
     for point in (*antennas_mm, (ARM_MM, 0.0, 0.0), (0.0, ARM_MM, 0.0)):
-        x, y, z = (round(1e3 * v, 6) for v in place(point, board.mount))
+        x, y, z = (round(1e3 * v, 6) for v in transform_to_rig(point, board.mount))
         yield (x, y, z)
 
 

@@ -44,7 +44,7 @@ _WORTH_M = 5e-4
 than an error of MOUNT_STD_M does."""
 _STEP_M = 2e-4
 """Step of height for the numerical derivatives of range and phase; chosen."""
-_COHERENT = 0.7
+_LEAST_COHERENCE = 0.7
 """Smallest coherence of a plate's pixels, |sum| / sum of magnitudes, if its phase is used (1: equal phases); chosen."""
 _TILT_PRIOR_RAD = 0.02
 """Prior standard deviation of the tilt along x and along y: about one degree (chosen)."""
@@ -64,7 +64,7 @@ _MAX_RANGE_STD_M = 0.05
 """Largest standard deviation of a height by range that is used (chosen)."""
 # Footprint over its largest value above which a pixel is lit; pixels around a plate's inside that may still show it;
 # and share of a square beside the plates that has to be free of them. All chosen.
-_LIT = 0.1
+_LIT_FOOTPRINT = 0.1
 _AROUND_PX = 5
 _MOST_OF_SQUARE = 0.6
 _PHASE_FITS_RAD = 0.5
@@ -189,19 +189,19 @@ class PlaneEstimate:
         return msgspec.structs.replace(rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=distance))
 
     def form_images(self, builder: ImageBuilder) -> Images:
-        """Form the images on this plane, and those of each raised plate on its own, around it."""
+        """Form the images on this plane, and those of each raised plate on the plate's own plane."""
         images = builder.finish(self.moved_m)
         for plate in self.raised:
             images = _replace_region(images, builder.finish(plate.height_m), plate, self.moved_m)
         return images
 
     def form_dispersion(self, builder: ImageBuilder) -> Dispersion:
-        """Form the dispersion on this plane, and that of each raised plate on its own, around it."""
-        dispersion = builder.disperse(self.moved_m)
+        """Form the dispersion on this plane, and that of each raised plate on the plate's own plane."""
+        dispersion = builder.form_dispersion(self.moved_m)
         for plate in self.raised:
-            own = builder.disperse(plate.height_m)
-            h = np.where(plate.region, own.h, dispersion.h)
-            dispersion = replace(dispersion, h=h, v=np.where(plate.region, own.v, dispersion.v))
+            plate_dispersion = builder.form_dispersion(plate.height_m)
+            h = np.where(plate.region, plate_dispersion.h, dispersion.h)
+            dispersion = replace(dispersion, h=h, v=np.where(plate.region, plate_dispersion.v, dispersion.v))
         return dispersion
 
     def incidence_std_rad(self, rig: Instrument) -> float:
@@ -287,11 +287,11 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
         off_most = heights[is_precise] - _fit_most(places[is_precise], heights[is_precise], level_stds, tilt)
         is_level[is_precise] = np.abs(off_most) <= _LEVEL_STDS * level_stds
     plane, covariance = _fit_plane(places[is_level], heights[is_level], np.hypot(stds[is_level], _MIN_STD_M), tilt)
-    by_phase = False
-    from_phases = _fit_plane_by_phase(builder, masks, places, is_level, (plane, covariance, tilt))
-    if from_phases is not None:
-        by_phase = True
-        plane, covariance, phase_heights = from_phases
+    is_by_phase = False
+    phase_fit = _fit_plane_by_phase(builder, masks, places, is_level, (plane, covariance, tilt))
+    if phase_fit is not None:
+        is_by_phase = True
+        plane, covariance, phase_heights = phase_fit
         heights = np.where(is_level & np.isfinite(phase_heights), phase_heights, heights)
     apart_m = np.abs(heights - _evaluate_plane(plane, places))
     apart_of_boards_m = np.ptp([of_board for of_board, _ in ranges], axis=0)
@@ -304,7 +304,7 @@ def find_plane(builder: ImageBuilder, masks: Sequence[NDArray[np.bool_]], rises:
         tilt_rad=(float(np.arctan(plane[1])), float(np.arctan(plane[2]))),
         tilt_std_rad=(float(std[1]), float(std[2])),
         heights_m=np.asarray(heights, np.float64),
-        by_phase=by_phase,
+        by_phase=is_by_phase,
         plates=int(determined.sum()),
         raised=_mark_raised(masks, heights, is_raised, grid.pixel_m),
     )
@@ -319,24 +319,25 @@ def _mark_raised(
     numbers = np.zeros(masks[0].shape, np.intp)
     for i, mask in enumerate(masks):
         numbers[mask] = i + 1
-    distance_px, nearest = scipy.ndimage.distance_transform_edt(numbers == 0, return_indices=True)
-    owner = np.where(distance_px * pixel_m <= _RAISED_REACH_M, numbers[tuple(nearest)], 0)
+    distance_px, nearest_plate = scipy.ndimage.distance_transform_edt(numbers == 0, return_indices=True)
+    owner = np.where(distance_px * pixel_m <= _RAISED_REACH_M, numbers[tuple(nearest_plate)], 0)
     return tuple(RaisedPlate(float(heights[i]), owner == i + 1) for i in np.flatnonzero(is_raised))
 
 
-def _replace_region(images: Images, own: Images, plate: RaisedPlate, plane_m: float) -> Images:
+def _replace_region(images: Images, plate_images: Images, plate: RaisedPlate, plane_m: float) -> Images:
     """Return the images with those of a raised plate's own plane in its region; `plane_m`: height of the others."""
     region = plate.region
     replaced = {
-        name: np.where(region, getattr(own, name), getattr(images, name)) for name in ("h", "v", "h_raw", "v_raw")
+        name: np.where(region, getattr(plate_images, name), getattr(images, name))
+        for name in ("h", "v", "h_raw", "v_raw")
     }
     illumination = images.illumination
-    if illumination is not None and own.illumination is not None:
-        footprints = np.where(region, own.illumination.footprints, illumination.footprints)
+    if illumination is not None and plate_images.illumination is not None:
+        footprints = np.where(region, plate_images.illumination.footprints, illumination.footprints)
         illumination = replace(illumination, footprints=footprints)
     raised_m = np.zeros(region.shape) if images.raised_m is None else images.raised_m
     raised_m = np.where(region, plate.height_m - plane_m, raised_m)
-    valid = np.where(region, own.valid, images.valid)
+    valid = np.where(region, plate_images.valid, images.valid)
     return replace(images, **replaced, valid=valid, illumination=illumination, raised_m=raised_m)
 
 
@@ -361,7 +362,7 @@ def move_to_plane(
     """
     rises: list[Rise] = []
     if images.illumination is not None:
-        rises = [images.illumination.rise(images.h, images.v, mask) for mask in masks]
+        rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in masks]
     if transposed:
         rises = [(y, x) for x, y in rises]
     plane = find_plane(builder, [mask.T if transposed else mask for mask in masks], rises)
@@ -391,7 +392,7 @@ def _estimate_heights_by_range(
     moved_slope = board.mirror_slope(_STEP_M)
     heights = np.full(len(masks), np.nan)
     stds = np.full(len(masks), np.inf)
-    from_behind = _measure_slope_behind(image, footprint, slope, mirror_slope, masks)
+    slope_from_behind = _measure_slope_behind(image, footprint, slope, mirror_slope, masks)
     for i, mask in enumerate(masks):
         power = np.abs(image[mask].astype(np.complex128)) ** 2
         if not power.sum() > 0:
@@ -401,15 +402,15 @@ def _estimate_heights_by_range(
         # height.
         with np.errstate(invalid="ignore", divide="ignore"):
             path_slope = np.real(slope[mask] / image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
-            by_height = (
+            heights_of_slopes = (
                 np.real(moved_slope[mask] / moved_image[mask]) - np.real(mirror_slope[mask] / footprint[mask])
             ) / _STEP_M
-        per_metre = float(np.nansum(weight * by_height))
+        per_metre = float(np.nansum(weight * heights_of_slopes))
         path_slope = np.where(np.isfinite(path_slope), path_slope, 0.0)
         mean = float(np.sum(weight * path_slope))
         path_std = float(np.sqrt(np.sum(weight * (path_slope - mean) ** 2)))
         height = mean / per_metre
-        std = float(np.hypot(path_std, from_behind / np.sqrt(power.mean()))) / abs(per_metre)
+        std = float(np.hypot(path_std, slope_from_behind / np.sqrt(power.mean()))) / abs(per_metre)
         if std < _MAX_RANGE_STD_M:
             heights[i] = height
             stds[i] = max(std, _MIN_STD_M)
@@ -429,21 +430,21 @@ def _measure_slope_behind(
     minus that of an echo as strong on the plane; 0 without such squares. Over a plate's |image| it is the error of the
     relative slope.
     """
-    lit = np.abs(footprint) > _LIT * np.abs(footprint).max()
+    lit = np.abs(footprint) > _LIT_FOOTPRINT * np.abs(footprint).max()
     plates = np.logical_or.reduce([*masks, np.zeros(image.shape, bool)])
     sizes = [mask.sum() for mask in masks if mask.any()]
     if not sizes:
         return 0.0
     width_px = max(1, round(float(np.sqrt(np.median(sizes)))))
-    beside = lit & ~scipy.ndimage.binary_dilation(plates, iterations=_AROUND_PX)
+    is_beside_plates = lit & ~scipy.ndimage.binary_dilation(plates, iterations=_AROUND_PX)
     with np.errstate(invalid="ignore", divide="ignore"):
-        rest = np.where(beside, slope - image * (mirror_slope / footprint), 0)
-    share = scipy.ndimage.uniform_filter(beside.astype(np.float64), width_px, mode="constant")
-    mean = scipy.ndimage.uniform_filter(rest.astype(np.complex128), width_px, mode="constant")
-    whole = share > _MOST_OF_SQUARE
-    if not whole.any():
+        background_slope = np.where(is_beside_plates, slope - image * (mirror_slope / footprint), 0)
+    share = scipy.ndimage.uniform_filter(is_beside_plates.astype(np.float64), width_px, mode="constant")
+    mean = scipy.ndimage.uniform_filter(background_slope.astype(np.complex128), width_px, mode="constant")
+    is_whole_square = share > _MOST_OF_SQUARE
+    if not is_whole_square.any():
         return 0.0
-    return float(np.sqrt(np.mean(np.abs(mean[whole] / share[whole]) ** 2) / 2))
+    return float(np.sqrt(np.mean(np.abs(mean[is_whole_square] / share[is_whole_square]) ** 2) / 2))
 
 
 def _estimate_heights_by_phase(
@@ -468,24 +469,24 @@ def _estimate_heights_by_phase(
     rates = []
     for i, mask in enumerate(masks):
         # The reflection r_s of a plate is nearly real and negative: the minus turns its phase to about zero.
-        against_mirror = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
-        coherence = abs(against_mirror.sum()) / max(float(np.abs(against_mirror).sum()), 1e-300)
-        if chosen[i] and mask.any() and coherence > _COHERENT:
-            phases[i] = np.angle(against_mirror.sum())
+        relative_to_mirror = -image[mask].astype(np.complex128) * np.conj(footprint[mask])
+        coherence = abs(relative_to_mirror.sum()) / max(float(np.abs(relative_to_mirror).sum()), 1e-300)
+        if chosen[i] and mask.any() and coherence > _LEAST_COHERENCE:
+            phases[i] = np.angle(relative_to_mirror.sum())
             # Change of a mirror's phase with its height, radians per metre.
             rates.append(float(np.angle(np.vdot(footprint[mask], moved_image[mask]))) / _STEP_M)
     if not rates:
         return phases, 1.0
     rad_per_m = float(np.median(rates))
     ambiguity_m = 2 * np.pi / abs(rad_per_m)
-    with_phase = np.flatnonzero(np.isfinite(phases))
-    design = np.column_stack([np.ones(with_phase.size), places[with_phase]])
+    plates_with_phase = np.flatnonzero(np.isfinite(phases))
+    design = np.column_stack([np.ones(plates_with_phase.size), places[plates_with_phase]])
     # Ranges leave an ambiguity of some turns. It is common to all plates if the tilt is right: 17 tilts along each axis
     # are tried, within one standard deviation of the prior.
     tilts = np.linspace(-1, 1, 17) * _TILT_PRIOR_RAD
     trial_planes = plane + np.array([(0.0, tilt_x, tilt_y) for tilt_x in tilts for tilt_y in tilts])
     guesses = trial_planes @ design.T
-    heights = phases[with_phase] / rad_per_m
+    heights = phases[plates_with_phase] / rad_per_m
     phasors = np.exp(2j * np.pi * (heights - guesses) / ambiguity_m)
     common_height = np.angle(np.mean(phasors, axis=1)) / (2 * np.pi) * ambiguity_m
     # First onto one plane near that of the ranges, then together by as many whole turns as bring them nearest to it.
@@ -499,7 +500,7 @@ def _estimate_heights_by_phase(
     chi2 = ((lifted - planes @ design.T) ** 2).sum(axis=1) / _PHASE_STD_M**2
     chi2 += (precision * (planes - mean) ** 2).sum(axis=1)
     best_heights = np.full(len(masks), np.nan)
-    best_heights[with_phase] = lifted[int(np.argmin(chi2))]
+    best_heights[plates_with_phase] = lifted[int(np.argmin(chi2))]
     return best_heights, rad_per_m
 
 
@@ -519,13 +520,13 @@ def _fit_plane_by_phase(
     # H: its reflection r_s has nearly the same phase for all plates.
     board_h = next(iter(builder.boards.values()))
     phase_heights, rad_per_m = _estimate_heights_by_phase(board_h, masks, places, (plane, prior), is_level)
-    with_phase = np.isfinite(phase_heights)
+    has_phase = np.isfinite(phase_heights)
     # A plane has three unknowns: only with four plates can their phases contradict it.
-    if with_phase.sum() < 4:
+    if has_phase.sum() < 4:
         return None
-    phase_stds = np.full(int(with_phase.sum()), _PHASE_STD_M)
-    phase_plane, phase_covariance = _fit_plane(places[with_phase], phase_heights[with_phase], phase_stds, prior)
-    residual = phase_heights[with_phase] - _evaluate_plane(phase_plane, places[with_phase])
+    phase_stds = np.full(int(has_phase.sum()), _PHASE_STD_M)
+    phase_plane, phase_covariance = _fit_plane(places[has_phase], phase_heights[has_phase], phase_stds, prior)
+    residual = phase_heights[has_phase] - _evaluate_plane(phase_plane, places[has_phase])
     on_one_plane = float(np.sqrt(np.mean((residual * rad_per_m) ** 2))) < _PHASE_FITS_RAD
     # Thin sheets have a phase of reflection of their own: the plane is accepted only if it agrees with the ranges.
     tolerance = 3 * np.sqrt(np.diag(covariance)) + [_MIN_STD_M, _TILT_TOLERANCE, _TILT_TOLERANCE]

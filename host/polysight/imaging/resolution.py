@@ -1,7 +1,8 @@
 """Point response of an aperture (measured, by the POLySIGHT paper's formula, the geometry's limit), and field of view.
 
-`point_response` images a point in the middle of the scene with the aperture's taper and mask; `imaging_facts` gives the
-entry `imaging` of quality.json. `field_limits` gives the field without ghosts, and the margin around flat plates.
+`compute_point_response` images a point in the middle of the scene with the aperture's taper and mask;
+`describe_imaging` gives the entry `imaging` of quality.json. `compute_field_limits` gives the field without ghosts, and
+the margin around flat plates.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _BLOCKS_ALONG = 24
 _BLOCKS_ACROSS = 8
 # Number of resolution cells that are evaluated to either side of the peak, and of points per cell (chosen).
-_CELLS = 6.0
-_POINTS = 20
+_CELLS_EACH_SIDE = 6.0
+_POINTS_PER_CELL = 20
 # Step of the numerical derivative of the phase slope, for the mirror zone; chosen.
 _STEP_M = 1e-4
-# Nearest ghosts: reach and precision of the search, number of places that are tried; chosen.
+# Search for the nearest ghosts: largest distance, precision, and number of places that are tried; chosen.
 _MAX_DISTANCE_M = 20.0
 _PRECISION_M = 1e-6
 _PLACES = 5
-# As an amplitude.
+# Amplitude at half of the power.
 _HALF_POWER = np.sqrt(0.5)
 
 
@@ -70,7 +71,7 @@ class PointResponse:
     sidelobe_db: tuple[float, float]
 
 
-def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointResponse:
+def compute_point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointResponse:
     """Return the point response of an aperture with weights [row, column], 0 where a position is missing.
 
     Positions are combined into blocks at their mean positions (errors: see `_BLOCKS_ALONG`). The images of the RX are
@@ -86,10 +87,10 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
     paper_mm = [math.inf, math.inf]
     sidelobe_db = [math.inf, math.inf]
     for axis, pixels_m in enumerate((grid.x_m, grid.y_m)):
-        cell_m = limit_m(aperture, point, axis)
+        cell_m = compute_limit_m(aperture, point, axis)
         if cell_m > len(pixels_m) * grid.pixel_m:
             continue
-        cut, step_m = _cut(aperture, weights, point, axis, cell_m)
+        cut, step_m = _compute_cut(aperture, weights, point, axis, cell_m)
         width_mm[axis] = 1e3 * _measure_width(cut) * step_m
         limit_mm[axis] = 1e3 * cell_m
         paper_mm[axis] = float(1e3 * distance * wavelength_m / lengths_m[axis])
@@ -103,26 +104,26 @@ def point_response(aperture: Aperture, weights: NDArray[np.floating]) -> PointRe
 
 
 def _combine_positions(
-    aperture: Aperture, weights: NDArray[np.floating], most: tuple[int, int]
+    aperture: Aperture, weights: NDArray[np.floating], max_blocks: tuple[int, int]
 ) -> tuple[Aperture, NDArray[np.float64]]:
-    """Return the aperture with neighbours combined into at most so many (rows, columns), and their weights."""
-    at_rows, at_columns = (
+    """Return the aperture with neighbours combined into at most this many (rows, columns), and their weights."""
+    row_starts, column_starts = (
         np.unique(np.linspace(0, count, blocks + 1).astype(int)[:-1])
-        for count, blocks in zip(weights.shape, most, strict=True)
+        for count, blocks in zip(weights.shape, max_blocks, strict=True)
     )
 
     def sum_blocks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-        return np.add.reduceat(np.add.reduceat(values.astype(float), at_rows, axis=0), at_columns, axis=1)
+        return np.add.reduceat(np.add.reduceat(values.astype(float), row_starts, axis=0), column_starts, axis=1)
 
     count = sum_blocks(np.ones(weights.shape))
     offsets = np.stack([sum_blocks(aperture.offsets_m[..., i]) / count for i in range(3)], axis=-1)
     return replace(aperture, offsets_m=offsets), sum_blocks(weights)
 
 
-def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
+def compute_limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     """Return the half-power width at `point` [3] along an axis, m, from the spread of wavenumbers in the aperture.
 
-    Of the middle row or column and the first RX; infinite if it has one position along the axis.
+    It is that of the middle row or column and the first RX; infinite if that line has one position.
     """
     middle = tuple(n // 2 for n in aperture.offsets_m.shape[:2])
     if axis == 0:
@@ -130,8 +131,8 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     else:
         line = aperture.offsets_m[:, middle[1]]
     slope = np.zeros(len(line))
-    for place in (aperture.antennas.tx_m, aperture.antennas.rx_m[0]):
-        difference = point - line - place
+    for antenna in (aperture.antennas.tx_m, aperture.antennas.rx_m[0]):
+        difference = point - line - antenna
         slope += difference[:, axis] / np.linalg.norm(difference, axis=1)
     # Cycles per metre.
     wavenumber_range = np.ptp(slope) * aperture.frequencies_hz.mean() / SPEED_OF_LIGHT_M_S
@@ -141,7 +142,7 @@ def limit_m(aperture: Aperture, point: NDArray[np.float64], axis: int) -> float:
     return float("inf")
 
 
-def _cut(
+def _compute_cut(
     aperture: Aperture, weights: NDArray[np.floating], point: NDArray[np.float64], axis: int, cell_m: float
 ) -> tuple[NDArray[np.float64], float]:
     """Return the amplitude of a point's image [n] along an axis through the point [3], and the step in metres.
@@ -149,24 +150,24 @@ def _cut(
     The amplitude is 1 at the point, which is in the middle. `cell_m` is the resolution cell.
     """
     # Largest numbers of blocks (rows, columns).
-    most = (_BLOCKS_ACROSS, _BLOCKS_ALONG) if axis == 0 else (_BLOCKS_ALONG, _BLOCKS_ACROSS)
-    blocks, block_weights = _combine_positions(aperture, weights, most)
+    max_blocks = (_BLOCKS_ACROSS, _BLOCKS_ALONG) if axis == 0 else (_BLOCKS_ALONG, _BLOCKS_ACROSS)
+    blocks, block_weights = _combine_positions(aperture, weights, max_blocks)
     point_grid = ImageGrid(point[:1], point[1:2], float(point[2]), aperture.grid.pixel_m)
     # The echo of the point alone, [rx, frequency, row, column].
-    of_point = DirectImager(replace(blocks, grid=point_grid)).samples(np.ones((1, 1))) * block_weights
-    count = int(_CELLS * _POINTS)
-    step = cell_m / _POINTS
+    point_samples = DirectImager(replace(blocks, grid=point_grid)).samples(np.ones((1, 1))) * block_weights
+    count = int(_CELLS_EACH_SIDE * _POINTS_PER_CELL)
+    step = cell_m / _POINTS_PER_CELL
     voxels = np.tile(point, (2 * count + 1, 1))
     voxels[:, axis] += np.arange(-count, count + 1) * step
     shift = blocks.offsets_m.reshape(-1, 3)
     a = aperture.antennas
     total = np.zeros(len(voxels), complex)
-    for rx, samples in enumerate(of_point):
-        by_position = samples.reshape(len(samples), -1).T
+    for rx, samples in enumerate(point_samples):
+        samples_by_position = samples.reshape(len(samples), -1).T
         tx_m = a.tx_m + shift
         rx_m = a.rx_m[rx] + shift
         direct_m = np.full(len(shift), a.direct_m[rx])
-        total += backproject(by_position, aperture.frequencies_hz, tx_m, rx_m, voxels, direct_m)
+        total += backproject(samples_by_position, aperture.frequencies_hz, tx_m, rx_m, voxels, direct_m)
     cut = np.abs(total)
     return cut / (cut[count] or 1.0), step
 
@@ -176,10 +177,10 @@ def _measure_width(cut: NDArray[np.float64]) -> float:
     middle = cut.size // 2
     sides = []
     for side in (cut[middle:], cut[middle::-1]):
-        below_half_power = np.flatnonzero(side < _HALF_POWER)
-        if not below_half_power.size:
+        indices_below = np.flatnonzero(side < _HALF_POWER)
+        if not indices_below.size:
             return float("inf")
-        i = below_half_power[0]
+        i = indices_below[0]
         sides.append(i - 1 + (side[i - 1] - _HALF_POWER) / (side[i - 1] - side[i]))
     return float(sum(sides))
 
@@ -194,15 +195,15 @@ def _measure_sidelobe_db(cut: NDArray[np.float64]) -> float:
     return float(20 * np.log10(max(max(levels), 1e-9)))
 
 
-def imaging_facts(builder: ImageBuilder, images: Images) -> dict[str, BoardImaging | list[str]]:
+def describe_imaging(builder: ImageBuilder, images: Images) -> dict[str, BoardImaging | list[str]]:
     """Return the entry `imaging` of quality.json: the figures by board, and `notices` if there are any."""
-    facts: dict[str, BoardImaging | list[str]] = {name: board_facts(board) for name, board in builder.boards.items()}
+    facts: dict[str, BoardImaging | list[str]] = {name: describe_board(board) for name, board in builder.boards.items()}
     if images.notices:
         facts["notices"] = list(images.notices)
     return facts
 
 
-def board_facts(board: BoardSamples) -> BoardImaging:
+def describe_board(board: BoardSamples) -> BoardImaging:
     """Return the figures of one board.
 
     `masked` is the share of the tapered aperture without data, `loss_db` the loss that it causes in the sum of a
@@ -220,7 +221,7 @@ def board_facts(board: BoardSamples) -> BoardImaging:
     )
     if masked >= 1:
         return facts
-    response = point_response(board.aperture, weights)
+    response = compute_point_response(board.aperture, weights)
     return msgspec.structs.replace(
         facts,
         # Zero is added because a loss of -0.0 would be written so.
@@ -241,8 +242,8 @@ def _round_pair(pair: tuple[float, float]) -> Pair:
 # Limits of the field of view: the alias-free field for a step size, and the mirror zone around flat plates. TX and RX
 # move together, so an echo's phase slope against stage offset, `k (sin a_tx + sin a_rx)`, depends only on the object's
 # place relative to the stage. Samples `d` apart cannot distinguish slopes that differ by `2 pi / d`: an object has a
-# ghost where its slope differs by that much. The nearest ghost counts, seen from the middle half of the aperture,
-# because the taper suppresses the rest.
+# ghost at each place whose slope differs by a multiple of that. The nearest ghost counts, seen from the middle half of
+# the aperture, because the taper suppresses the rest.
 
 
 @dataclass(frozen=True)
@@ -280,7 +281,7 @@ class PhaseSlope:
         return 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S * total
 
 
-def field_limits(rig: Instrument) -> FieldLimits:
+def compute_field_limits(rig: Instrument) -> FieldLimits:
     """Compute the limits for a rig's grid."""
     chirp = rig.chirp
     grid = rig.grid
@@ -313,13 +314,13 @@ def _find_nearest_ghost_m(
 
     if not reaches_ghost(_MAX_DISTANCE_M):
         return float("inf")
-    near = 0.0
-    far = _MAX_DISTANCE_M
+    free_m = 0.0
+    ghost_m = _MAX_DISTANCE_M
     # Bisection: importing scipy.optimize takes longer than the whole forecast of `polysight plan`.
-    while far - near > _PRECISION_M:
-        middle = (near + far) / 2
+    while ghost_m - free_m > _PRECISION_M:
+        middle = (free_m + ghost_m) / 2
         if reaches_ghost(middle):
-            far = middle
+            ghost_m = middle
         else:
-            near = middle
-    return far
+            free_m = middle
+    return ghost_m

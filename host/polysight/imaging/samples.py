@@ -40,21 +40,21 @@ from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# `Reduction.maps` is fitted to echoes from `_BESIDE_M` before the direct path to `_BESIDE_M` behind the gate, and at
+# `Reduction.maps` is fitted to echoes from `_MARGIN_M` before the direct path to `_MARGIN_M` behind the gate, and at
 # least to `_PASSED_M` behind the band's middle (decimation passes 1 m); `_ECHO` is their amplitude relative to the
 # noise (chosen).
-_BESIDE_M = 0.1
+_MARGIN_M = 0.1
 _PASSED_M = 1.0
 _ECHO = 30.0
 # Noise power of a sample relative to echoes from the gate, for the estimate of the direct path (chosen).
-_NOISE = 1e-3
+_NOISE_POWER = 1e-3
 
 Image = NDArray[np.complex64]
 _log = logging.getLogger(__name__)
 # Largest number of multiplications of a matrix product: for more, OpenBLAS copies both matrices first, a fifth slower.
-_PRODUCT = 1_000_000
+_MAX_PRODUCT = 1_000_000
 # The columns of such a product fill groups of this size: 22 columns take an eighth longer than 24 (OpenBLAS, AVX2).
-_COLUMNS = 8
+_COLUMN_GROUP = 8
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Reduction:
         # Decimation passes paths about `middle_m`, half way between the direct path (0) and the middle of the gate.
         middle_m = sum(self.gate_m) / 4
         decimated = decimation(FOLD * sweep_hz.size, middle_m * step_hz / SPEED_OF_LIGHT_M_S)
-        paths = np.linspace(-_BESIDE_M, max(self.gate_m[1] + _BESIDE_M, middle_m + _PASSED_M), 4 * sweep_hz.size)
+        paths = np.linspace(-_MARGIN_M, max(self.gate_m[1] + _MARGIN_M, middle_m + _PASSED_M), 4 * sweep_hz.size)
         echoes = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(self.sweep_hz[linear], paths))
         signals = np.concatenate([np.eye(len(echoes)), _ECHO / np.sqrt(paths.size) * echoes], axis=1)
         solution = np.linalg.lstsq((decimated @ signals).T, (maps[:, linear] @ signals).T, rcond=None)[0]
@@ -139,7 +139,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     m = np.linalg.lstsq(basis, target, rcond=1e-6)[0]
 
     echoes = np.exp(2j * np.pi * np.outer(sweep, delay_s)) / np.sqrt(delay_s.size)
-    covariance = echoes @ echoes.conj().T + _NOISE * np.eye(b - a)
+    covariance = echoes @ echoes.conj().T + _NOISE_POWER * np.eye(b - a)
     direct = np.linalg.solve(covariance, np.ones(b - a)).conj()
     direct /= direct.sum()
 
@@ -150,8 +150,8 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     direct_of_all[a:b] = direct
     # Echoes at the samples' frequencies are combinations of echoes at the few frequencies.
     wave = np.exp(2j * np.pi * np.outer(delay_s, frequencies))
-    from_few = np.linalg.lstsq(wave, np.exp(2j * np.pi * np.outer(delay_s, sweep)), rcond=1e-9)[0].T
-    model = (matrix[:, a:b] @ from_few).astype(np.complex128)
+    samples_from_few = np.linalg.lstsq(wave, np.exp(2j * np.pi * np.outer(delay_s, sweep)), rcond=1e-9)[0].T
+    model = (matrix[:, a:b] @ samples_from_few).astype(np.complex128)
     return Reduction(frequencies, matrix, direct_of_all, model, gate_m, sample_frequencies_hz(chirp))
 
 
@@ -170,7 +170,7 @@ class Imager(Protocol):
         """Image weighted samples, complex64 [rx, frequency, row, column], 0 where masked: complex [ny, nx]."""
         ...
 
-    def constant(self, echo: Any, weights: Any) -> Any:
+    def image_constant_echo(self, echo: Any, weights: Any) -> Any:
         """Image an echo, complex [rx, frequency], at every position, times weights [row, column]."""
         ...
 
@@ -418,10 +418,10 @@ class BoardSamples:
             return self._apply_gate(samples[:, ::-1], sweep_hz)[..., ::-1]
         if sweep_hz.size not in self._maps:
             self._maps[sweep_hz.size] = _pair_maps(self._reduction.maps(sweep_hz))
-        used, maps = self._maps[sweep_hz.size]
-        pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used]
+        used_samples, maps = self._maps[sweep_hz.size]
+        pairs = np.asarray(samples, np.complex64).view(np.float32)[..., used_samples]
         gated = np.empty((*pairs.shape[:2], maps.shape[1]), np.float32)
-        step = max(1, _PRODUCT // maps.size)
+        step = max(1, _MAX_PRODUCT // maps.size)
         for first in range(0, pairs.shape[1], step):
             np.matmul(pairs[:, first : first + step], maps, out=gated[:, first : first + step])
         count = self._reduction.frequencies_hz.size + 1
@@ -430,7 +430,7 @@ class BoardSamples:
     def _prepare(self) -> None:
         """Create the spectral imager of all rows if the aperture is regular; keep it while positions do not change."""
         if self._final is None and geometry.find_irregularity(self.aperture) is None:
-            # The same slack as the live imager, so that both share their spectra.
+            # The slack equals that of the live imager, so that both share their spectra.
             self._final = SpectralImager(self.aperture, slack_m=SLACK_M)
             if self._live is not None:
                 self._spectra = np.zeros((*self._cube.shape[:3], self._final.lattice.band.size), np.complex64)
@@ -459,11 +459,13 @@ class BoardSamples:
         # Positions between are evenly spaced; a row between two has the shift of the one before.
         count_y = len(self.valid)
         count_x = len(self.valid[0])
-        along = np.arange(count_x) / columns
+        column_index = np.arange(count_x) / columns
         for index in range(count_y):
             coarse_offset = coarse._offsets[index // rows]
             for axis in range(3):
-                self._offsets[index, :, axis] = np.interp(along, np.arange(len(coarse_offset)), coarse_offset[:, axis])
+                self._offsets[index, :, axis] = np.interp(
+                    column_index, np.arange(len(coarse_offset)), coarse_offset[:, axis]
+                )
         y_m = coarse._offsets[:, 0, 1]
         self._offsets[..., 1] = np.interp(np.arange(count_y) / rows, np.arange(len(y_m)), y_m)[:, None]
         self._final = None
@@ -520,12 +522,12 @@ class BoardSamples:
         """Return the samples divided by the gain of each RX, not weighted, [rx, frequency, row, column]."""
         return self._cube * self._rx_factors()[:, None, :, None]
 
-    def current(self) -> tuple[Image, Image, str | None]:
+    def image_current_sums(self) -> tuple[Image, Image, str | None]:
         """Return :meth:`image` from running sums if there are any: fast, and equal within 1e-6 of the peak."""
         if self._live is None:
             return self.image()
         image = self._live.image_of_sum(1 / self.rx_calibration())
-        return image / self.count, self._live.constant_of_sum() / self.count, None
+        return image / self.count, self._live.image_summed_constant_echo() / self.count, None
 
     def image(self, grid: geometry.ImageGrid | None = None) -> tuple[Image, Image, str | None]:
         """Return image and footprint of the rows so far, complex64 [ny, nx], and a notice if imaging is slow.
@@ -616,10 +618,10 @@ class BoardSamples:
         f = self._reduction.frequencies_hz
         sweep_per_m = -2j * np.pi * (f[-1] - f[0]) / SPEED_OF_LIGHT_M_S
         with np.errstate(divide="ignore", invalid="ignore"):
-            of_mirror = mirror_slope / footprint
+            mirror_change = mirror_slope / footprint
             # Times (-j 2 pi / c)^2, as the slopes are times -j 2 pi / c.
-            variance = mirror_bend / footprint - of_mirror**2
-            change = (slope / image - of_mirror) / variance * sweep_per_m
+            variance = mirror_bend / footprint - mirror_change**2
+            change = (slope / image - mirror_change) / variance * sweep_per_m
         return np.where(np.isfinite(change), change, complex(np.nan, np.nan)).astype(np.complex64)
 
     def mirror_image(self, behind_m: float) -> Image:
@@ -637,7 +639,7 @@ class BoardSamples:
 
     def _image_constant(self, imager: Imager, echo: NDArray[np.complexfloating]) -> Image:
         """Return the image of an echo [rx, frequency] at every usable position, as a mean over these and the RX."""
-        image: Any = imager.constant((echo * self.used_rx[:, None]).astype(np.complex64), self.weights)
+        image: Any = imager.image_constant_echo((echo * self.used_rx[:, None]).astype(np.complex64), self.weights)
         return (image / self.count).astype(np.complex64)
 
     def _compute_range_slope_factors(self) -> NDArray[np.complex64]:
@@ -668,20 +670,23 @@ def _pair_maps(maps: NDArray[np.complex128]) -> tuple[slice, NDArray[np.float32]
 
     With x as pairs, `pairs[..., slice] @ real_maps` are the pairs of `maps @ x`: a real product is 1.5 times as fast as
     such a narrow complex one. The slice leaves out samples at the ends with weight 0. Columns of zeros fill the last
-    group of `_COLUMNS`.
+    group of `_COLUMN_GROUP`.
     """
-    used = np.flatnonzero(maps.any(axis=0))[[0, -1]]
-    maps = np.pad(maps[:, used[0] : used[1] + 1], ((0, -len(maps) % (_COLUMNS // 2)), (0, 0)))
+    used_range = np.flatnonzero(maps.any(axis=0))[[0, -1]]
+    maps = np.pad(maps[:, used_range[0] : used_range[1] + 1], ((0, -len(maps) % (_COLUMN_GROUP // 2)), (0, 0)))
     paired = np.empty((maps.shape[1], 2, maps.shape[0], 2), np.float32)
     # Real part of the result, then its imaginary part.
     paired[:, 0, :, 0] = maps.real.T
     paired[:, 1, :, 0] = -maps.imag.T
     paired[:, 0, :, 1] = maps.imag.T
     paired[:, 1, :, 1] = maps.real.T
-    return slice(2 * used[0], 2 * used[1] + 2), paired.reshape(2 * maps.shape[1], -1)
+    return slice(2 * used_range[0], 2 * used_range[1] + 2), paired.reshape(2 * maps.shape[1], -1)
 
 
-def _wrong_row_error(what: str) -> DataError:
+def _wrong_row_error(problem: str) -> DataError:
     return DataError(
-        what, "the data were recorded with another rig file", "use the rig file of this scan", code=ErrorCode.MISMATCH
+        problem,
+        "the data were recorded with another rig file",
+        "use the rig file of this scan",
+        code=ErrorCode.MISMATCH,
     )

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.imaging.images import ImageBuilder, Mask, SubBandImages
-from polysight.imaging.resolution import field_limits
+from polysight.imaging.resolution import compute_field_limits
 from polysight.imaging.samples import BoardSamples, choose_imager
 from polysight.results import ReconstructedPositions
 from polysight_shared.config import Instrument
@@ -34,7 +34,8 @@ ITERATIONS = 40
 MOST_ADDED = 4
 """Largest number of steps into which a step between positions is divided; chosen."""
 TEST_SHARE = 10
-"""One in so many recorded rows, columns or positions is left out of the first fit, to test the prediction; chosen."""
+"""One in this number of recorded rows, columns or positions is left out of the first fit, to test the prediction;
+chosen."""
 # The power iteration comes from below: after 12 rounds 5 % are added (chosen), so that the estimate is not too small.
 _POWER_ROUNDS = 12
 _EIGENVALUE_MARGIN = 1.05
@@ -123,15 +124,15 @@ def reconstruct(
 
     # FISTA (Beck and Teboulle, SIAM J. Imaging Sciences 2, 2009, equations 4.1 to 4.3): each step starts from a point
     # ahead of the last image, in the direction of the last change.
-    ahead = x
+    extrapolated = x
     momentum = 1.0
     residuals = []
     for _ in range(iterations):
-        misfit = forward(ahead) - data
+        misfit = forward(extrapolated) - data
         residuals.append(float(np.linalg.norm(misfit)) / norm)
-        new = _shrink_amplitudes(ahead - adjoint(misfit) / np.float32(lipschitz), threshold)
+        new = _shrink_amplitudes(extrapolated - adjoint(misfit) / np.float32(lipschitz), threshold)
         next_momentum = (1 + np.sqrt(1 + 4 * momentum * momentum)) / 2
-        ahead = (new + (momentum - 1) / next_momentum * (new - x)).astype(np.complex64)
+        extrapolated = (new + (momentum - 1) / next_momentum * (new - x)).astype(np.complex64)
         x = new
         momentum = next_momentum
     return Reconstruction(x, np.array(residuals))
@@ -163,9 +164,9 @@ def find_added_steps(rig: Instrument) -> tuple[int, int]:
 
     The image itself is the scene: ghosts of objects in it must lie outside. At most `MOST_ADDED`.
     """
-    free_mm = field_limits(rig).alias_free_mm
+    free_mm = compute_field_limits(rig).alias_free_mm
     size_mm = (rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm)
-    columns, rows = (int(np.ceil(size / free)) for size, free in zip(size_mm, free_mm, strict=True))
+    columns, rows = (int(np.ceil(size / alias_free_mm)) for size, alias_free_mm in zip(size_mm, free_mm, strict=True))
     return min(MOST_ADDED, max(1, rows)), min(MOST_ADDED, max(1, columns))
 
 

@@ -37,10 +37,10 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Length of the cross-fade relative to the kernel's length in x, and its smallest length in columns. Chosen: a shorter
 # one has a wider spectrum, a longer one a longer period.
-_FADE = 0.08
+_FADE_SHARE = 0.08
 _FADE_COLUMNS = 20
 # Relative to the kernel's strongest spectral bin: weaker ones are left out (chosen: more bins are slower).
-_FILLED = 1e-5
+_LEAST_BIN = 1e-5
 KEEP_BYTES = 1 << 28
 """Size of the cache: two boards of the published grid take 115 MB, 166 MB with the kernels of a live scan."""
 # Lattices and kernels by key, the least recently used first.
@@ -50,11 +50,11 @@ SLACK_M = 2e-3
 """Largest deviation of a row's start along x from the aperture; chosen: one step of the published grid."""
 # Amplitude relative to the strongest principal component: weaker ones are left out (chosen: 17 of the published rig's
 # 40 stay).
-_LEFT_OUT = 6e-6
+_LEAST_COMPONENT = 6e-6
 # Wavenumbers processed in double precision at a time: with 32 a live scan keeps 11 MB more, in no less time.
 _CHUNK = 8
 # Complex numbers in a cache line
-_LINE = 8
+_CACHE_LINE = 8
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
     step = column_step_m(offsets) or grid.pixel_m
     exact_columns = (last - first) / step + 1
     # Number of columns of one period: the exact lags and the cross-fade.
-    columns = _find_fast_length(math.ceil(exact_columns + max(_FADE * exact_columns, _FADE_COLUMNS)))
+    columns = _find_fast_length(math.ceil(exact_columns + max(_FADE_SHARE * exact_columns, _FADE_COLUMNS)))
     band = _find_band(aperture, first, last, step, columns)
     # The period has at least as many points as the band has bins.
     stride_x = -(-band.size // columns)
@@ -190,7 +190,7 @@ def _find_band(aperture: Aperture, first: float, last: float, step: float, colum
             # exp(-j 2 pi f delay)
             kernel = cross_fade(np, turn(np, delay * f, np.float64, np.complex128), size)
             spectrum = np.maximum(spectrum, np.abs(np.fft.fft(kernel, axis=1)).max(axis=0))
-    filled = np.fft.fftfreq(size, 1 / size)[spectrum > _FILLED * spectrum.max()]
+    filled = np.fft.fftfreq(size, 1 / size)[spectrum > _LEAST_BIN * spectrum.max()]
     return np.arange(round(filled.min()), round(filled.max()) + 1)
 
 
@@ -316,7 +316,7 @@ class RowSpectra:
         return self.xp.asarray(array, device=self.device)
 
     def kernels(self, lines: int) -> Any:
-        """Return the kernels with zeros up to so many lines, complex64 [rx * frequency, lag y, k]."""
+        """Return the kernels, padded with zeros to this number of lines, complex64 [rx * frequency, lag y, k]."""
         return spectra_along_x(self.aperture, self.lattice, lines, self.xp, self.device)
 
     def key(self, *more: Any) -> tuple[Any, ...]:
@@ -339,9 +339,9 @@ class RowSpectra:
 
     def transform_padded(self, padded: Any, ramps: Any, spectra: Any) -> None:
         """Write :meth:`transform_rows` of rows padded with zeros to a period to `spectra`; may overwrite the rows."""
-        whole = transform_in_place(self.xp, padded, axis=-1)
+        full_spectrum = transform_in_place(self.xp, padded, axis=-1)
         for in_band, bins in self._runs:
-            spectra[..., in_band] = whole[..., bins] * ramps[..., in_band]
+            spectra[..., in_band] = full_spectrum[..., bins] * ramps[..., in_band]
 
     def transform_rows_adjoint(self, spectra: Any, ramps: Any) -> Any:
         """Apply the adjoint of :meth:`transform_rows`."""
@@ -380,7 +380,7 @@ class SpectralImager(RowSpectra):
         count = sizes.size_y // sizes.row_stride
         # Rows are padded with zeros below. An odd number of cache lines apart, or they would all use the same places of
         # the cache (transforms took 1.6 times as long).
-        pitch = _LINE * (-(-sizes.band.size // _LINE) | 1)
+        pitch = _CACHE_LINE * (-(-sizes.band.size // _CACHE_LINE) | 1)
         padded_lines = self.xp.zeros((count, pitch), dtype=self.xp.complex64, device=device)
         self._padded_lines = padded_lines[:, : sizes.band.size]
         # Spectrum along y: rows are `row_stride` pitches apart, so that theirs repeats as often in that of the lattice.
@@ -427,17 +427,17 @@ class SpectralImager(RowSpectra):
         shape = self._kernels.shape[1:]
         total = self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device)
         for r in range(rx):
-            part = self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device)
+            channel_sum = self.xp.zeros(shape, dtype=self.xp.complex64, device=self.device)
             for c in range(m):
                 put_spectra(r, c)
                 spectrum = self._transform_along_y()
                 spectrum *= self._kernels[r * m + c, :, :]
-                part += spectrum
-            part *= factors[r]
-            total += part
+                channel_sum += spectrum
+            channel_sum *= factors[r]
+            total += channel_sum
         return self._invert_transform(total)
 
-    def constant(self, echo: Any, weights: Any) -> Any:
+    def image_constant_echo(self, echo: Any, weights: Any) -> Any:
         """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
         xp = self.xp
         echo = self.xp.asarray(echo, dtype=self.xp.complex64)
@@ -526,12 +526,12 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         rx, m = self.aperture.shape[:2]
         # Block diagonal [k, channel, rx], so that each RX keeps a column of its own.
-        by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
+        spectra_by_rx = xp.zeros((lines.shape[-1], rx * m, rx), dtype=xp.complex64, device=self.device)
         for r in range(rx):
-            by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
+            spectra_by_rx[:, r * m : (r + 1) * m, r] = lines[r, :, :].mT
         lags = self._find_lags(index)
         # [k, ny, component] @ [k, component, channel] @ [k, channel, rx]
-        self._sum += xp.matmul(self._kernels[:, lags, :], xp.matmul(self._components, by_rx))
+        self._sum += xp.matmul(self._kernels[:, lags, :], xp.matmul(self._components, spectra_by_rx))
         self._constant += self._echo_kernel[:, lags] * weight_spectra[:, None]
 
     def image_of_sum(self, factors: Any) -> Any:
@@ -539,7 +539,7 @@ class IncrementalImager(RowSpectra):
         total = self.xp.matmul(self._sum, self.put(np.asarray(factors, np.complex64))[:, None])[:, :, 0]
         return self.evaluate_pixels(total.mT)
 
-    def constant_of_sum(self) -> Any:
+    def image_summed_constant_echo(self) -> Any:
         """Return the image of the constant echo for the rows so far, complex64 [ny, nx]."""
         return self.evaluate_pixels(self._constant.mT)
 
@@ -550,11 +550,11 @@ class IncrementalImager(RowSpectra):
         self._add_all(samples, self.xp.zeros((rows, columns), dtype=self.xp.float32, device=self.device))
         return self.image_of_sum(np.ones(rx))
 
-    def constant(self, echo: Any, weights: Any) -> Any:
+    def image_constant_echo(self, echo: Any, weights: Any) -> Any:
         """See :class:`polysight.imaging.samples.Imager`; removes all rows first."""
         self._clear(echo)
         self._add_all(self.xp.zeros(self.aperture.shape, dtype=self.xp.complex64, device=self.device), weights)
-        return self.constant_of_sum()
+        return self.image_summed_constant_echo()
 
     def samples(self, image: Any) -> Any:
         """See :class:`polysight.imaging.samples.Imager`."""
@@ -596,21 +596,21 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         lattice = self.lattice
         channels = math.prod(self.aperture.shape[:2])
-        by_k = xp.empty((lattice.band.size, lattice.lags_y, channels), dtype=xp.complex64, device=self.device)
+        kernels_by_k = xp.empty((lattice.band.size, lattice.lags_y, channels), dtype=xp.complex64, device=self.device)
         # The kernels are stored contiguously by k, so that products are fast.
-        by_k[...] = xp.permute_dims(self.kernels(lattice.lags_y), (2, 1, 0))
+        kernels_by_k[...] = xp.permute_dims(self.kernels(lattice.lags_y), (2, 1, 0))
         powers = []
         bases = []
-        for first in range(0, by_k.shape[0], _CHUNK):
-            last = min(first + _CHUNK, by_k.shape[0])
+        for first in range(0, kernels_by_k.shape[0], _CHUNK):
+            last = min(first + _CHUNK, kernels_by_k.shape[0])
             # Weak components need double precision.
-            exact = xp.astype(by_k[first:last, :, :], xp.complex128)
+            exact = xp.astype(kernels_by_k[first:last, :, :], xp.complex128)
             powers_of_chunk, vectors = xp.linalg.eigh(xp.matmul(xp.conj(exact).mT, exact))
             powers.append(powers_of_chunk)
             bases.append(xp.astype(vectors, xp.complex64))
         power = xp.concat(powers)
         # Ascending: the last component is the strongest at every wavenumber
         strongest = xp.max(power, axis=0)
-        count = int(xp.sum(xp.astype(strongest > _LEFT_OUT**2 * strongest[-1], xp.int64)))
+        count = int(xp.sum(xp.astype(strongest > _LEAST_COMPONENT**2 * strongest[-1], xp.int64)))
         vectors_used = xp.concat([vectors[:, :, -count:] for vectors in bases])
-        return xp.matmul(by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)
+        return xp.matmul(kernels_by_k, vectors_used), xp.asarray(xp.conj(vectors_used).mT, copy=True)

@@ -23,10 +23,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from polysight.calibration import calibration_of_scan
+from polysight.calibration import load_scan_calibration
 from polysight.jobs.output import exit_status
 from polysight.jobs.process import process
-from polysight.process import cores, is_given_images
+from polysight.process import count_cores, is_given_images
 from polysight.products import FINISHED, IMAGE, QUALITY, SCAN, ProcessedScan, write_json
 from polysight.results import NoResult
 from polysight.settings import Settings
@@ -44,14 +44,14 @@ from polysight.store import (
 from polysight_shared.errors import ConfigError, ErrorCode, PolysightError
 from polysight_shared.files import read_json
 
-SUMMARY = "processed.json"
+SUMMARY_FILE = "processed.json"
 """File of the outcomes of all scans, in the folder that holds their products."""
 Status = Literal["done", "skipped", "failed", "stopped"]
 # Files without which products do not count as finished, even if they have the mark.
 _PRODUCTS = (IMAGE, QUALITY)
-PROGRAM = (sys.executable, "-m", "polysight.jobs.batch")
+WORKER_COMMAND = (sys.executable, "-m", "polysight.jobs.batch")
 """Module that processes the job on its standard input."""
-ALIVE = "POLYSIGHT_PARENT_ALIVE"
+PARENT_PIPE_VARIABLE = "POLYSIGHT_PARENT_ALIVE"
 """Environment variable of the program: number of a pipe that closes when the program that started it ends."""
 # Leave a fifth of the free memory to the system: `memory_bytes` is an estimate, and other programs grow meanwhile.
 SHARE_OF_FREE_MEMORY = 0.8
@@ -205,7 +205,7 @@ def data_files(folder: Path, config: Path | None = None) -> list[Path]:
         source = open_source(folder, config, dropped=True)
         if isinstance(source, ScanFolder) and dropped_rows(source):
             patterns = (*patterns, f"{SAMPLES}/*")
-        files += (calibration_of_scan(source).paths or {}).values()
+        files += (load_scan_calibration(source).paths or {}).values()
     for pattern in patterns:
         files += folder.glob(pattern)
     return sorted({file for file in files if file.is_file()})
@@ -218,8 +218,8 @@ def is_finished(job: Job) -> bool:
     except (OSError, ValueError, PolysightError):
         return False
     # Compared as JSON, in which tuples are lists.
-    same = isinstance(mark, dict) and mark.get("made_with") == json.loads(json.dumps(job.made_with))
-    return same and all((job.out / name).exists() for name in _PRODUCTS)
+    has_same_settings = isinstance(mark, dict) and mark.get("made_with") == json.loads(json.dumps(job.made_with))
+    return has_same_settings and all((job.out / name).exists() for name in _PRODUCTS)
 
 
 def run_scan(job: Job, stop: Event | None = None) -> Outcome:
@@ -238,10 +238,15 @@ def run_scan(job: Job, stop: Event | None = None) -> Outcome:
     # Nothing is written to the pipe: its end shows the child that this program has ended.
     child_end, parent_end = os.pipe()
     try:
-        environment[ALIVE] = str(child_end)
+        environment[PARENT_PIPE_VARIABLE] = str(child_end)
         with log.open("wb") as output:
             child = subprocess.Popen(
-                PROGRAM, stdin=subprocess.PIPE, stdout=output, stderr=output, env=environment, pass_fds=(child_end,)
+                WORKER_COMMAND,
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=output,
+                env=environment,
+                pass_fds=(child_end,),
             )
             _follow(child, job, stop)
     finally:
@@ -402,7 +407,7 @@ def process_many(
         if outcome.message:
             line += f": {outcome.message}"
         sys.stderr.write(f"{line}\n")
-        write_json(out / SUMMARY, {"scans": [asdict(outcomes[j.name]) for j in jobs if j.name in outcomes]})
+        write_json(out / SUMMARY_FILE, {"scans": [asdict(outcomes[j.name]) for j in jobs if j.name in outcomes]})
     return [outcomes[j.name] for j in jobs]
 
 
@@ -422,10 +427,10 @@ def process_several(
         raise ConfigError(f"{out} is a file", "several scans need a folder", "give another --out")
     jobs = make_jobs(scans, out)
     positions = max((_count_positions(folder) for folder, _ in scans), default=0)
-    jobs_at_once = at_a_time or fit_scans(positions, cores(), free_memory_bytes())
+    jobs_at_once = at_a_time or fit_scans(positions, count_cores(), free_memory_bytes())
     jobs_at_once = min(jobs_at_once, len(jobs))
     if dask is None:
-        threads = max(1, cores() // jobs_at_once)
+        threads = max(1, count_cores() // jobs_at_once)
         jobs = [msgspec.structs.replace(job, threads=threads) for job in jobs]
     outcomes = process_many(jobs, out, jobs_at_once, dask, again)
     sys.stdout.write(format_table(outcomes, out))
@@ -470,7 +475,7 @@ def format_table(outcomes: Sequence[Outcome], out: Path) -> str:
         lines.append("  ".join([*words, *numbers, text]).rstrip())
     statuses = [outcome.status for outcome in outcomes]
     counts = ", ".join(f"{statuses.count(s)} {s}" for s in ("done", "skipped", "failed", "stopped") if s in statuses)
-    end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY}"
+    end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY_FILE}"
     return "\n".join([*lines, end, ""])
 
 
@@ -523,7 +528,7 @@ def exit_with_parent(pipe: str | None) -> None:
 
 def main() -> int:
     """Process one job; returns the exit status. Output goes to stdout and stderr."""
-    exit_with_parent(os.environ.get(ALIVE))
+    exit_with_parent(os.environ.get(PARENT_PIPE_VARIABLE))
     job = msgspec.msgpack.decode(sys.stdin.buffer.read(), type=Job)
     started_s = time.monotonic()
     try:

@@ -20,8 +20,8 @@ from polysight.calibration import (
     FilterFile,
     StartFile,
     make_header,
+    make_source_entry,
     open_raw,
-    source_scan,
     write_calibration,
 )
 from polysight.imaging import Image, Mask
@@ -57,17 +57,17 @@ def print_result(
     return 0
 
 
-def take_antenna_places(scanned: Instrument, other: Instrument) -> Instrument:
+def take_antenna_places(scanned_rig: Instrument, other_rig: Instrument) -> Instrument:
     """Return a scan's rig with antennas, mounts and object plane of another rig file. Raises ConfigError."""
-    mounts = {b.name: b.mount for b in other.boards}
-    if set(mounts) != {b.name for b in scanned.boards}:
+    mounts = {b.name: b.mount for b in other_rig.boards}
+    if set(mounts) != {b.name for b in scanned_rig.boards}:
         raise ConfigError(
             f"the rig file has the boards {sorted(mounts)}",
             "it belongs to another rig",
             "give the rig file of the scan",
         )
-    boards = tuple(msgspec.structs.replace(b, mount=mounts[b.name]) for b in scanned.boards)
-    return msgspec.structs.replace(scanned, boards=boards, antennas=other.antennas, geometry=other.geometry)
+    boards = tuple(msgspec.structs.replace(b, mount=mounts[b.name]) for b in scanned_rig.boards)
+    return msgspec.structs.replace(scanned_rig, boards=boards, antennas=other_rig.antennas, geometry=other_rig.geometry)
 
 
 def rig_file_keys(kind: str, path: Path) -> list[str]:
@@ -80,7 +80,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
 
     `target` is the file of the points, `prior_mm` the standard deviation of the rig file's positions before the scan.
     """
-    from polysight.calibration import Prior, calibration_of_scan, fit_places, load_echoes, places_file, read_target
+    from polysight.calibration import Prior, fit_places, load_echoes, load_scan_calibration, places_file, read_target
 
     require_writable_folder(out.absolute())
     points = read_target(target)
@@ -89,24 +89,24 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
     rig = source.instrument
     if rig_file is not None:
         rig = take_antenna_places(rig, rig_file)
-    calibration = calibration_of_scan(source)
-    filters = {b.name: calibration.high_pass(b.name) for b in rig.receivers}
+    calibration = load_scan_calibration(source)
+    filters = {place.name: calibration.high_pass(place.name) for place in rig.receivers}
     say("places of boards and plane")
     fit = fit_places(load_echoes(source, rig, filters), rig, points, Prior(board_mm=prior_mm, plane_mm=prior_mm))
-    file = places_file(rig, fit, len(points), [source_scan(source, scan)])
+    file = places_file(rig, fit, len(points), [make_source_entry(source, scan)])
     path = write_calibration(file, out)
     lines = []
-    for name, b in file.boards.items():
-        shift = ", ".join(f"{v:+z.2f} +- {e:.2f}" for v, e in zip(b.shift_mm, b.standard_error_mm, strict=True))
+    for name, place in file.boards.items():
+        shift = ", ".join(f"{v:+z.2f} +- {e:.2f}" for v, e in zip(place.shift_mm, place.standard_error_mm, strict=True))
         lines += [
             f"{name}: shifted by ({shift}) mm in x, y, z",
-            f"{name}: direct path to RX1 {b.direct_path_was_mm:.2f} -> {b.direct_path_mm:.2f}"
-            f" +- {b.direct_path_standard_error_mm:.2f} mm",
+            f"{name}: direct path to RX1 {place.direct_path_was_mm:.2f} -> {place.direct_path_mm:.2f}"
+            f" +- {place.direct_path_standard_error_mm:.2f} mm",
         ]
         # An error of more than half the prior (chosen): most of the answer is the prior.
         lines += [
             f"{name}: the scan does not tell its shift along {axis}: a wider aperture does"
-            for axis, e in zip("xyz", b.standard_error_mm, strict=True)
+            for axis, e in zip("xyz", place.standard_error_mm, strict=True)
             if e > prior_mm / 2
         ]
     lines += [
@@ -135,20 +135,22 @@ def hpf(scans: Sequence[Path], config: Path | None, out: Path, as_json: bool) ->
             "they belong to several sweeps",
             "give the scans of one sweep",
         )
-    names = [b.name for b in sources[0].instrument.receivers]
+    names = [board_filter.name for board_filter in sources[0].instrument.receivers]
     boards = {name: fit_filter(sources, name) for name in steps(names, [f"filters of {name}" for name in names])}
-    source_scans = [source_scan(source, folder) for source, folder in zip(sources, scans, strict=True)]
+    source_scans = [make_source_entry(source, folder) for source, folder in zip(sources, scans, strict=True)]
     file = FilterFile(**make_header("hpf", source_scans), boards=boards)
     path = write_calibration(file, out)
     lines = []
-    for name, b in boards.items():
-        corners = zip(b.programmed_khz, b.corners_khz, b.standard_error_khz, strict=True)
+    for name, board_filter in boards.items():
+        corners = zip(
+            board_filter.programmed_khz, board_filter.corners_khz, board_filter.standard_error_khz, strict=True
+        )
         text = ", ".join(
             f"{programmed:.0f} -> {corner:.1f} +- {error:.1f} kHz" for programmed, corner, error in corners
         )
         lines.append(
-            f"{name}: corners {text}; IF {b.if_from_khz:.0f}..{b.if_to_khz:.0f} kHz, {b.chirps} chirps, the fit leaves"
-            f" {b.residual_db:.2f} dB"
+            f"{name}: corners {text}; IF {board_filter.if_from_khz:.0f}..{board_filter.if_to_khz:.0f} kHz,"
+            f" {board_filter.chirps} chirps, the fit leaves {board_filter.residual_db:.2f} dB"
         )
     return print_result(path, file, lines, rig_file_keys("hpf", path), as_json)
 
@@ -163,7 +165,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
     parts = ()
     if bands > 1:
         parts = sub_bands(source.instrument.chirp, bands)
-    path = write_metal(load_reference(scan, config, bands), [source_scan(source, scan)], out, parts)
+    path = write_metal(load_reference(scan, config, bands), [make_source_entry(source, scan)], out, parts)
     file = read_calibration(path, MetalFile, "metal")
     lines = [
         f"metal on {100 * file.share_of_plane:.0f} % of the image; elsewhere pixels are masked",
@@ -186,25 +188,26 @@ def start_frequency(scan: Path, config: Path | None, out: Path, as_json: bool) -
 
     require_writable_folder(out.absolute())
     source = open_raw(scan, load_rig_file(config))
-    names = [b.name for b in source.instrument.receivers]
+    names = [start.name for start in source.instrument.receivers]
     boards = {name: fit_start(source, name) for name in steps(names, [f"direct path of {name}" for name in names])}
-    file = StartFile(**make_header("start_frequency", [source_scan(source, scan)]), boards=boards)
+    file = StartFile(**make_header("start_frequency", [make_source_entry(source, scan)]), boards=boards)
     path = write_calibration(file, out)
     lines = []
     what_to_set = []
     rate_khz = source.instrument.chirp.sample_rate_hz / 1e3
-    for name, b in boards.items():
-        line = f"{name}: direct path at {b.direct_if_hz / 1e3:.1f} +- {b.direct_if_standard_error_hz / 1e3:.1f} kHz"
-        line += f" ({b.expected_if_hz / 1e3:.0f} kHz by the rig file)"
-        if b.alias:
-            line += f", an alias of {b.direct_if_hz / 1e3 + b.alias * rate_khz:.0f} kHz"
+    for name, start in boards.items():
+        line = f"{name}: direct path at {start.direct_if_hz / 1e3:.1f}"
+        line += f" +- {start.direct_if_standard_error_hz / 1e3:.1f} kHz"
+        line += f" ({start.expected_if_hz / 1e3:.0f} kHz by the rig file)"
+        if start.alias:
+            line += f", an alias of {start.direct_if_hz / 1e3 + start.alias * rate_khz:.0f} kHz"
         lines += [
             line,
-            f"{name}: start_offset_hz {b.start_offset_was_hz:.0f} -> {b.start_offset_hz:.0f} puts it at"
-            f" {b.middle_hz / 1e3:.0f} kHz; where mmWave Studio programs the board:"
-            f" {b.start_offset_hz - b.start_offset_was_hz:+z.0f} Hz to its start frequency",
+            f"{name}: start_offset_hz {start.start_offset_was_hz:.0f} -> {start.start_offset_hz:.0f} puts it at"
+            f" {start.middle_hz / 1e3:.0f} kHz; where mmWave Studio programs the board:"
+            f" {start.start_offset_hz - start.start_offset_was_hz:+z.0f} Hz to its start frequency",
         ]
-        what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {b.start_offset_hz:.0f}"]
+        what_to_set += [f'[[boards]]  name = "{name}"', f"start_offset_hz = {start.start_offset_hz:.0f}"]
     return print_result(path, file, lines, what_to_set, as_json)
 
 

@@ -21,7 +21,7 @@ from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError
 
 # An empty file that marks a folder as a demo, which another demo may overwrite.
-_MARK = ".polysight-demo"
+_MARK_FILE = ".polysight-demo"
 # Starting is mostly imports, of some seconds; the limit is far above them, for an overloaded machine.
 _START_LIMIT_S = 60.0
 # A process that does not end within this time after SIGTERM is killed; chosen.
@@ -79,9 +79,9 @@ def check_scenes(scenes: Iterable[Path], config: Path) -> None:
     """
     require_package("polysight_simulators", "simulators")
     command = [sys.executable, "-m", "polysight_simulators", "check", *map(str, scenes), "--config", str(config)]
-    checked = subprocess.run(command, capture_output=True, text=True, check=False)
-    if checked.returncode != 0:
-        raise _simulator_error(checked.returncode, checked.stderr)
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode != 0:
+        raise _simulator_error(process.returncode, process.stderr)
 
 
 def _simulator_error(status: int, output: str) -> PolysightError:
@@ -96,7 +96,7 @@ def _check_folder(out: Path) -> None:
     """Raise ConfigError if `out` is a file, or a folder with anything but an existing demo."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
-    if out.exists() and any(out.iterdir()) and not (out / _MARK).exists():
+    if out.exists() and any(out.iterdir()) and not (out / _MARK_FILE).exists():
         raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
 
 
@@ -105,7 +105,7 @@ def _make_fresh_folder(out: Path) -> None:
     if out.exists() and any(out.iterdir()):
         shutil.rmtree(out)
     out.mkdir(parents=True, exist_ok=True)
-    (out / _MARK).touch()
+    (out / _MARK_FILE).touch()
 
 
 @contextmanager

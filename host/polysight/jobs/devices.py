@@ -27,12 +27,12 @@ from polysight.radar import (
     SystemClock,
     WordLink,
     check_board,
+    check_constraints,
     make_radar_board,
     open_board,
     plan_lines,
     read_firmware,
     read_image,
-    require,
     trace_words,
 )
 from polysight_shared.config import Board, Instrument, load_instrument
@@ -91,13 +91,14 @@ def _describe_hop(finding: Finding) -> dict[str, str]:
 
 def _format_survey(survey: CardSurvey) -> str:
     """Return the check of one card and its hops as text; hops that were not checked share one line."""
-    b = survey.board
-    if b.record:
-        role = b.role
+    board = survey.board
+    if board.record:
+        role = board.role
     else:
-        role = f"{b.role}, not recorded: only asked"
+        role = f"{board.role}, not recorded: only asked"
     unchecked = [hop.where for hop in survey.hops if hop.level == "note" and not hop.what]
-    text = f"{b.name} ({role}): card {b.card_address}:{b.command_port}, data to {b.host_address}:{b.data_port}\n"
+    text = f"{board.name} ({role}): card {board.card_address}:{board.command_port},"
+    text += f" data to {board.host_address}:{board.data_port}\n"
     text += "".join(_format_hop(hop) for hop in survey.hops if hop.where not in unchecked)
     if unchecked:
         text += f"  not checked {', '.join(unchecked)}\n"
@@ -166,7 +167,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
     present = _set_address(board, at)
     with CardClient(present, rig.limits.command_timeout_s) as card:
         message = (
-            f"{name}: a card, FPGA {card.version()}, answers at {present.card_address}:{present.command_port}; its"
+            f"{name}: a card, FPGA {card.read_version()}, answers at {present.card_address}:{present.command_port}; its"
             f" EEPROM is written again, and cannot be read back.\n{name}: {settings.text()}"
         )
         program_eeprom(card, settings, confirm(message, settings.confirmation, yes))
@@ -194,7 +195,7 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
     while time.monotonic() < deadline:
         try:
             with CardClient(board, _ASK_S) as card:
-                version = str(card.version())
+                version = str(card.read_version())
         except DeviceError:
             was_off = True
         else:
@@ -222,12 +223,12 @@ def reset_card(config: Path, name: str, radar: bool) -> int:
         else:
             card.reset_fpga()
             sys.stdout.write(f"{name}: the card is reset; a scan configures it again\n")
-        sys.stdout.write(f"{name}: the card answers, FPGA {card.version()}\n")
+        sys.stdout.write(f"{name}: the card answers, FPGA {card.read_version()}\n")
     return 0
 
 
 # Word for a step of a board's check that holds, or does not.
-_WORDS = {True: "ok", False: "FAILED"}
+_RESULT_WORDS = {True: "ok", False: "FAILED"}
 
 
 def plan_radars(config: Path) -> int:
@@ -326,7 +327,7 @@ def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[]
 
 def _format_step(name: str, row: StepResult) -> str:
     """Return a step of a board's check as a line; a failed one with the expected outcome and the remedy."""
-    lines = [f"{name}  {row.step:12} {_WORDS[row.passed]:6}  {row.outcome}"]
+    lines = [f"{name}  {row.step:12} {_RESULT_WORDS[row.passed]:6}  {row.outcome}"]
     if not row.passed:
         lines += [f"      expected: {row.expected}", f"      do: {row.remedy}"]
     return "\n".join(lines) + "\n"
@@ -392,7 +393,7 @@ def _load_native_rig(config: Path, name: str) -> Instrument:
     if name not in rig.radar.native:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")
     # The frames of one row are the most that a board has to count.
-    require(rig, rig.grid.columns * rig.burst.pulses)
+    check_constraints(rig, rig.grid.columns * rig.burst.pulses)
     return rig
 
 
@@ -412,9 +413,9 @@ def jog_stage(config: Path, axis: Axis, distance_mm: float, speed_mm_s: float | 
     finally:
         context.destroy(linger=0)
     if as_json:
-        place = {"x_mm": status.x_mm, "y_mm": status.y_mm}
+        position = {"x_mm": status.x_mm, "y_mm": status.y_mm}
         limits = {"travel_x_mm": stage.travel_x_mm, "travel_y_mm": stage.travel_y_mm}
-        print_json({"state": status.state, **place, **limits})
+        print_json({"state": status.state, **position, **limits})
     else:
         sys.stdout.write(f"x {status.x_mm:.3f} mm (limits: 0 and {stage.travel_x_mm:g} mm)\n")
         sys.stdout.write(f"y {status.y_mm:.3f} mm (limits: 0 and {stage.travel_y_mm:g} mm)\n")

@@ -17,7 +17,7 @@ from rich.cells import cell_len
 
 from polysight.jobs.output import name_scan, print_lines
 from polysight.materials import (
-    SPECIMEN,
+    SPECIMEN_SEPARATOR,
     Box,
     Labels,
     SegmentSettings,
@@ -27,15 +27,15 @@ from polysight.materials import (
     clean_name,
     format_box,
     image_extent_mm,
+    make_name_taken_error,
+    make_unknown_box_error,
     material_name,
-    name_taken,
-    no_box,
     pack_labels,
 )
 from polysight.products import IMAGE, LABELS, LABELS_PICTURE, ProcessedScan, find_labels, find_products, label_folder
 from polysight.store import MANIFEST
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, quote
-from polysight_shared.files import folder_held, write_together
+from polysight_shared.files import hold_folder, write_together
 
 METAL = "metal"
 MIN_PIXELS = 16
@@ -64,9 +64,9 @@ class Edits:
     """Changes to labels, applied in this order.
 
     `from_patches` replaces the boxes by one inside each patch of the products, named by the patch's number. `removed`
-    are names of boxes, `renames` are `OLD=NEW`, `specimens` `NAME=SPECIMEN`, where a specimen is one physical piece of
-    a material, kept apart from others when a library is judged; corners of `boxes` are millimetres from the image
-    centre. `metal` is the name of the box that becomes the metal reference; None keeps the present one.
+    are names of boxes, `renames` are `OLD=NEW`, `specimens` `NAME=SPECIMEN_SEPARATOR`, where a specimen is one physical
+    piece of a material, kept apart from others when a library is judged; corners of `boxes` are millimetres from the
+    image centre. `metal` is the name of the box that becomes the metal reference; None keeps the present one.
     """
 
     from_patches: bool = False
@@ -116,7 +116,7 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
     labels = Labels({}, "mm")
     if saved_labels:
         _, by_hand = saved_labels
-        labels = by_hand.in_mm(products.x_m, products.y_m)
+        labels = by_hand.convert_to_mm(products.x_m, products.y_m)
     if edits.has_changes:
         labels, left_out = apply_edits(labels, patches, edits)
     elif list_only or ask is None:
@@ -133,8 +133,8 @@ def label(folder: Path, edits: Edits, list_only: bool = False, ask: Ask | None =
         labels = ask_for_names(patches, ask)
         left_out = []
     labels_folder = label_folder(products.folder)
-    checked, notes = save_labels(labels_folder, products, labels, lambda: _check_unchanged(folder, saved_labels))
-    print_lines(_format_table(checked))
+    checked_labels, notes = save_labels(labels_folder, products, labels, lambda: _check_unchanged(folder, saved_labels))
+    print_lines(_format_table(checked_labels))
     if left_out:
         sys.stdout.write(f"left out, without a name: {', '.join(left_out)}\n")
     sys.stdout.write("".join(f"note: {note}\n" for note in notes))
@@ -170,19 +170,19 @@ def save_labels(
             f"to have none, delete {folder / LABELS}",
             code=ErrorCode.NO_DATA,
         )
-    checked = check_labels(labels, products.x_m, products.y_m, products.valid)
-    checked = replace(
-        checked, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
+    checked_labels = check_labels(labels, products.x_m, products.y_m, products.valid)
+    checked_labels = replace(
+        checked_labels, by_hand=True, description=f"boxes of scan {products.scan_id}, in mm from the image centre"
     )
     # Loads matplotlib, which is needed neither to list boxes nor to refuse them.
     from polysight.report import label_figure
 
-    picture = label_figure(products, checked.boxes, checked.metal)
+    picture = label_figure(products, checked_labels.boxes, checked_labels.metal)
     # The boxes are written last, so that saved boxes always have a picture.
-    with folder_held(folder):
+    with hold_folder(folder):
         check_present()
-        write_together({folder / LABELS_PICTURE: picture, folder / LABELS: pack_labels(checked)})
-    masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked.boxes.items()}
+        write_together({folder / LABELS_PICTURE: picture, folder / LABELS: pack_labels(checked_labels)})
+    masks = {name: box_mask(box, products.x_m, products.y_m) for name, box in checked_labels.boxes.items()}
     notes = []
     if small_boxes := [name for name, mask in masks.items() if (mask & products.valid).sum() < MIN_PIXELS]:
         notes.append(
@@ -190,9 +190,9 @@ def save_labels(
         )
     if dark := _find_dark_boxes(products, masks):
         notes.append(f"as dark as empty background: {', '.join(dark)}; look at the picture")
-    if checked.metal is None:
+    if checked_labels.metal is None:
         notes.append("no box is metal; train then needs a rig calibrated with `polysight calibrate metal`")
-    return checked, notes
+    return checked_labels, notes
 
 
 def remove_labels(folder: Path) -> Path:
@@ -234,7 +234,7 @@ def list_patches(products: ProcessedScan) -> list[PatchToName]:
         inner_box = (x0 + margin_x_mm, y0 + margin_y_mm, x1 - margin_x_mm, y1 - margin_y_mm)
         description = "not named"
         is_metal_reference = False
-        # Of a patch `box` is the name of the drawn box, not its corners.
+        # The `box` of a patch is the name of the drawn box, not its corners.
         if patch.box:
             description = patch.box
         elif patch.refused is not None:
@@ -297,11 +297,11 @@ def apply_edits(labels: Labels, patches: Sequence[PatchToName], edits: Edits) ->
     metal = new_names.get(metal or "")
 
     for name, box in edits.boxes:
-        clean = box_name(name)
+        clean_box_name = box_name(name)
         # The same box under the same name is accepted, so that a command that was killed can be repeated.
-        if boxes.get(clean) != box:
-            _refuse_taken_name(clean, boxes)
-            boxes[clean] = box
+        if boxes.get(clean_box_name) != box:
+            _refuse_taken_name(clean_box_name, boxes)
+            boxes[clean_box_name] = box
 
     # A patch that is still called by its number was not named.
     left_out = [name for name in boxes if name.isdecimal()]
@@ -333,7 +333,7 @@ def _refuse_taken_name(name: str, boxes: Mapping[str, Box]) -> None:
     """Raise DataError if a box has this name, in large or small letters."""
     for other in boxes:
         if other.casefold() == name.casefold():
-            raise name_taken(name, other)
+            raise make_name_taken_error(name, other)
 
 
 def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
@@ -341,12 +341,12 @@ def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
     if name in boxes:
         return name
     # A patch that has no name yet is called by its number.
-    clean = name.strip()
-    if not clean.isdecimal():
-        clean = box_name(name)
-    if clean not in boxes:
-        raise no_box(clean, boxes)
-    return clean
+    clean_name = name.strip()
+    if not clean_name.isdecimal():
+        clean_name = box_name(name)
+    if clean_name not in boxes:
+        raise make_unknown_box_error(clean_name, boxes)
+    return clean_name
 
 
 def _split_at_equals(text: str, boxes: Mapping[str, Box]) -> tuple[str, str]:
@@ -403,7 +403,7 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
                 return name, is_metal
             piece = ask(f"  {name} is there already. Another piece of it? Its name, such as 2 (Enter: another name): ")
             if piece.strip():
-                name = box_name(f"{material_name(name)}{SPECIMEN}{piece}")
+                name = box_name(f"{material_name(name)}{SPECIMEN_SEPARATOR}{piece}")
                 _refuse_taken_name(name, boxes)
                 return name, is_metal
         except DataError as e:
@@ -443,7 +443,7 @@ def _describe_boxes(
     lines.append(f"image: {format_box(image_extent_mm(products.x_m, products.y_m))} from its centre")
     if saved_labels:
         path, by_hand = saved_labels
-        boxes = by_hand.in_mm(products.x_m, products.y_m)
+        boxes = by_hand.convert_to_mm(products.x_m, products.y_m)
         lines += [f"drawn by hand: {path}", *(f"  {line}" for line in _format_table(boxes))]
     if patches:
         lines += ["patches that were found, a box inside each:"]

@@ -38,7 +38,7 @@ from polysight.acquisition import (
 from polysight.settings import Settings
 from polysight.store import MANIFEST, TRUTH, ScanFolder, check_same_scan, manifest, require_raw
 from polysight_shared.config import Notify, load_instrument
-from polysight_shared.errors import ConfigError, PolysightError, ScanError, advice, quote
+from polysight_shared.errors import ConfigError, PolysightError, ScanError, join_advice, quote
 
 if TYPE_CHECKING:
     from polysight.jobs.process import LiveProcessing
@@ -66,7 +66,7 @@ class _PlainConsole(Console):
     """Console that raises OSError for a closed pipe; rich's own would exit and silence stdout."""
 
     def on_broken_pipe(self) -> None:
-        raise BrokenPipeError("nobody reads the messages any more")
+        raise BrokenPipeError("no program reads the messages any more")
 
 
 class ScanBar:
@@ -97,25 +97,29 @@ class ScanBar:
         with suppress(OSError):
             self._bars.stop()
 
-    def update(self, p: ScanProgress) -> None:
-        """Show the progress `p` of the scan."""
-        self._bars.update(self._rows, total=p.rows, completed=p.committed, left=_format_clock(p.remaining_s))
-        if p.row_points:
+    def update(self, progress: ScanProgress) -> None:
+        """Show the progress `progress` of the scan."""
+        self._bars.update(
+            self._rows, total=progress.rows, completed=progress.committed, left=_format_clock(progress.remaining_s)
+        )
+        if progress.row_points:
             # A take is one recording of a row; a row that fails is retaken.
-            row_text = f"row {p.row}"
-            if p.take > 1:
-                row_text += f" take {p.take}"
-            self._bars.update(self._points, description=row_text, total=p.row_points, completed=p.points, visible=True)
-        if p.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
-            self._print(f"{p.phase}: {p.message}")
+            row_text = f"row {progress.row}"
+            if progress.take > 1:
+                row_text += f" take {progress.take}"
+            self._bars.update(
+                self._points, description=row_text, total=progress.row_points, completed=progress.points, visible=True
+            )
+        if progress.phase in ("warning", "retake", "home", "check", "connect", "stop", "held", "wait"):
+            self._print(f"{progress.phase}: {progress.message}")
         # Print now why the rows ended early: the error message itself follows only after the processing.
-        if p.phase == "end" and p.committed < p.rows:
-            self._print(f"{p.phase}: {p.message}")
-        if not self._console.is_terminal and p.phase == "committed":
-            tenth = 10 * p.committed // max(1, p.rows)
+        if progress.phase == "end" and progress.committed < progress.rows:
+            self._print(f"{progress.phase}: {progress.message}")
+        if not self._console.is_terminal and progress.phase == "committed":
+            tenth = 10 * progress.committed // max(1, progress.rows)
             if tenth != self._printed_tenth:
                 self._printed_tenth = tenth
-                self._print(f"{p.committed} of {p.rows} rows, {_format_clock(p.remaining_s)}")
+                self._print(f"{progress.committed} of {progress.rows} rows, {_format_clock(progress.remaining_s)}")
 
     def _print(self, text: str) -> None:
         """Print a line as it is: rich would take brackets, as of `[stage]`, for its markup, and colour numbers."""
@@ -187,7 +191,7 @@ def _add_advice(folder: Path, result: ScanResult, e: BaseException) -> Polysight
     if result.exit_status != "success":
         remedy = f"{result.reason}: `polysight resume {quote(folder)}` goes on, and processes all of them again"
     if isinstance(e, PolysightError):
-        e.remedy = advice(e.remedy, remedy)
+        e.remedy = join_advice(e.remedy, remedy)
         return e
     traceback.print_exception(e)
     return ScanError(

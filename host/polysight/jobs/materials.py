@@ -21,7 +21,7 @@ from polysight.imaging import sub_bands
 from polysight.jobs.output import name_scan, print_json, print_lines
 from polysight.materials import (
     AMPLITUDE_ERROR,
-    PATCHES,
+    PATCHES_FILE,
     SIMULATED_LIBRARY,
     UNKNOWN,
     CatalogueMaterial,
@@ -187,13 +187,13 @@ def _format_layer(layer: Mapping[str, Any] | None) -> str:
     return text + "".join(f"\n     note: {w}" for w in layer["warnings"])
 
 
-def _format_estimate(e: PermittivityFigures) -> str:
+def _format_estimate(estimate: PermittivityFigures) -> str:
     """Format a permittivity with the errors of both parts and their main source."""
-    text = f"{format_permittivity(e.value, width=6):15s}"
-    if e.spread is not None:
-        text += f"  +- {e.spread.real_std:.2f}, {e.spread.loss_std:.2f}"
-    if e.dominated_by:
-        text += f"  mostly {e.dominated_by}"
+    text = f"{format_permittivity(estimate.value, width=6):15s}"
+    if estimate.spread is not None:
+        text += f"  +- {estimate.spread.real_std:.2f}, {estimate.spread.loss_std:.2f}"
+    if estimate.dominated_by:
+        text += f"  mostly {estimate.dominated_by}"
     return text
 
 
@@ -205,7 +205,7 @@ def _load_library(data: Path) -> Library:
 
 
 def _describe_origin(is_simulated: bool) -> str:
-    """Return the word for the origin of data."""
+    """Return the label of the data's origin: simulated or measured."""
     return "simulated" if is_simulated else "measured"
 
 
@@ -271,14 +271,14 @@ def materials(data: Sequence[Path], as_json: bool) -> int:
     if as_json:
         print_json([{"products": str(s.folder), **to_plain(s.materials)} for s in scans])
         return max((print_verdict(s, to_terminal=False) for s in scans), default=0)
-    worst = 0
+    worst_status = 0
     for scan in scans:
         sys.stdout.write(f"{scan.folder}: {name_scan(scan.scan_id, bool(scan.simulated))}\n")
         status = print_verdict(scan)
         if status == 0:
             sys.stdout.write("".join(map(_format_patch_line, scan.segments)))
-        worst = max(worst, status)
-    return worst
+        worst_status = max(worst_status, status)
+    return worst_status
 
 
 def catalogue(as_json: bool) -> int:
@@ -378,7 +378,7 @@ def classify(data: Sequence[Path], library: Path | None, model: str | None, as_j
     -----
     Where one of the scans has no result (verdict `none`) nothing is named; the exit status is that of NoResult.
     """
-    scans = [find_products(folder, PATCHES) for folder in data]
+    scans = [find_products(folder, PATCHES_FILE) for folder in data]
     products = [s for s in scans if s is not None]
     if len({s.folder.resolve() for s in products}) < len(products):
         raise ConfigError(
@@ -415,7 +415,7 @@ def _score_models(data: Path, as_json: bool) -> int:
         library = library.at_angle(library.angles_deg[-1])
     samples = Samples.from_library(library)
     # Two for each model: whole scans left out, then single pixels.
-    scores = [score(samples, model, by_pixel=by_pixel) for model in MODELS for by_pixel in (False, True)]
+    scores = [score(samples, model, by_pixel=score_by_pixel) for model in MODELS for score_by_pixel in (False, True)]
     source = _describe_origin(library.simulated)
     if as_json:
         rows = [{k: v for k, v in asdict(s).items() if "confusion" not in k and k != "names"} for s in scores]
@@ -429,10 +429,10 @@ def _score_models(data: Path, as_json: bool) -> int:
         f"{'':44s}{'whole scans left out':>22s}{'by pixel (optimistic)':>24s}\n"
         f"{'model':44s}{'pixels':>11s}{'patches':>11s}{'pixels':>12s}{'patches':>12s}\n"
     )
-    for by_scan, by_pixel in zip(scores[::2], scores[1::2], strict=True):
+    for score_by_scan, score_by_pixel in zip(scores[::2], scores[1::2], strict=True):
         sys.stdout.write(
-            f"{by_scan.model:44s}{by_scan.pixels:11.1%}{by_scan.patches:11.1%}"
-            f"{by_pixel.pixels:12.1%}{by_pixel.patches:12.1%}\n"
+            f"{score_by_scan.model:44s}{score_by_scan.pixels:11.1%}{score_by_scan.patches:11.1%}"
+            f"{score_by_pixel.pixels:12.1%}{score_by_pixel.patches:12.1%}\n"
         )
     if missing := scores[0].not_judged:
         sys.stdout.write(f"not judged with scans left out, because one scan alone holds them: {', '.join(missing)}\n")
@@ -514,11 +514,11 @@ def _print_names(content: dict[str, Any], several: bool) -> None:
         sys.stdout.write(f"{line}\n")
     print_lines(f"note: {line}" for line in content["contradictions"])
     for refused in content["refused"]:
-        place = ""
+        place_text = ""
         if several:
-            place = f" in {refused['products']}"
+            place_text = f" in {refused['products']}"
         text = format_one_line(Finding("error", refused["what"], refused["why"], refused["do"]))
-        sys.stdout.write(f"{refused['label']:>3}  not judged{place}: {text}\n")
+        sys.stdout.write(f"{refused['label']:>3}  not judged{place_text}: {text}\n")
 
 
 def _describe_contradictions(
@@ -537,16 +537,18 @@ def _describe_contradictions(
     names_by_angle = []
     for i, angle_deg in enumerate(angles_deg):
         # Features of the angles are side by side in columns; evidence has one entry for each angle.
-        features = [np.split(m.features, len(angles_deg), 1)[i] for m in matched]
-        evidence = [m.evidence if m.evidence is None else m.evidence[i : i + 1] for m in matched]
+        features = [np.split(match.features, len(angles_deg), 1)[i] for match in matched]
+        evidence = [match.evidence if match.evidence is None else match.evidence[i : i + 1] for match in matched]
         names_by_angle.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
     lines = []
-    for m, together, *single_scans in zip(matched, named, *names_by_angle, strict=True):
+    for match, together, *single_scans in zip(matched, named, *names_by_angle, strict=True):
         names = [n.verdict.name for n in single_scans]
         materials_alone = {n.verdict.name for n in single_scans if n.verdict.source == "library"}
         if together.verdict.source != "library" and len(materials_alone) > 1:
             answers = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
-            lines.append(f"patch {m.label} contradicts itself: {answers}; was it moved or exchanged between the scans?")
+            lines.append(
+                f"patch {match.label} contradicts itself: {answers}; was it moved or exchanged between the scans?"
+            )
     return lines
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from polysight import surfaces
 from polysight.calibration import SphereFile
 from polysight.imaging import BoardSamples
-from polysight.materials import STEEP, Classifier, name_permittivity
+from polysight.materials import STEEP_FINDING, Classifier, name_permittivity
 from polysight.pipeline import Pipeline
 from polysight.process import load_classifier
 from polysight.products import QUALITY, read_products, write_json
@@ -38,14 +38,14 @@ def take_samples(pipeline: Pipeline) -> tuple[surfaces.Samples, surfaces.Samples
 def take_board_samples(board: BoardSamples, is_mirrored: bool) -> surfaces.Samples:
     """Return the samples of one board; a scan recorded by columns is held mirrored in x = y."""
     antennas = board.aperture.antennas
-    used = board.used_rx
+    used_rx = board.used_rx
     samples = surfaces.Samples(
-        cube=board.calibrate_samples()[used],
+        cube=board.calibrate_samples()[used_rx],
         valid=board.usable,
         offsets_m=board.aperture.offsets_m,
         frequencies_hz=board.aperture.frequencies_hz,
         tx_m=antennas.tx_m,
-        rx_m=antennas.rx_m[used],
+        rx_m=antennas.rx_m[used_rx],
         model=board.model,
         board_middle_m=antennas.rx_m.mean(axis=0),
     )
@@ -83,7 +83,7 @@ def make_rig_optics(rig: Instrument) -> surfaces.Optics:
     return surfaces.make_optics(rig, (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v)))
 
 
-def find_points_in_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.Seen:
+def find_points_in_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces.SeenEchoes:
     """Find the specular points in the rows that a pipeline holds."""
     h, v = take_samples(pipeline)
     # The range gate of the images counts from the direct path, that of `see_points` from zero path.
@@ -92,7 +92,7 @@ def find_points_in_rows(pipeline: Pipeline, optics: surfaces.Optics) -> surfaces
     return surfaces.see_points(h, v, optics, (low + direct_m, high + direct_m))
 
 
-def make_reference(metal: surfaces.Seen) -> surfaces.Reference:
+def make_reference(metal: surfaces.SeenEchoes) -> surfaces.Reference:
     """Return a function from a rig's optics to the gains of both receivers that these points of metal give with it."""
 
     def learn(optics: surfaces.Optics) -> surfaces.Gains:
@@ -101,12 +101,12 @@ def make_reference(metal: surfaces.Seen) -> surfaces.Reference:
     return learn
 
 
-def load_sphere_points(file: SphereFile) -> surfaces.Seen:
+def load_sphere_points(file: SphereFile) -> surfaces.SeenEchoes:
     """Return the points of a metal sphere from its calibration file."""
     h = _parse_echoes(np.array(file.points["h"]))
     v = _parse_echoes(np.array(file.points["v"]))
     # All points are of one segment, the sphere.
-    return surfaces.Seen(h, v, segment=np.zeros(len(h), int))
+    return surfaces.SeenEchoes(h, v, segment=np.zeros(len(h), int))
 
 
 def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
@@ -137,14 +137,17 @@ def _parse_echoes(rows: np.ndarray) -> surfaces.Echoes:
     )
 
 
-def thin_out(metal: surfaces.Seen) -> surfaces.Seen:
+def thin_out(metal: surfaces.SeenEchoes) -> surfaces.SeenEchoes:
     """Return at most `KEPT_POINTS` points of metal, evenly taken: neighbours see overlapping parts of the surface."""
     index = np.linspace(0, len(metal) - 1, min(KEPT_POINTS, len(metal))).round().astype(int)
     return metal[index]
 
 
 def analyse_points(
-    pipeline: Pipeline, optics: surfaces.Optics, seen_rows: surfaces.Seen, reference: surfaces.Reference | None = None
+    pipeline: Pipeline,
+    optics: surfaces.Optics,
+    seen_rows: surfaces.SeenEchoes,
+    reference: surfaces.Reference | None = None,
 ) -> surfaces.Surface:
     """Return the surfaces of a scan's points, named; without a metal `reference` the calibration's sphere is it."""
     calibration = pipeline.calibration
@@ -183,7 +186,7 @@ def save_surface(out: Path, surface: surfaces.Surface) -> None:
 def has_steep_patch(products: Path) -> bool:
     """True if a patch of the products got no permittivity because it is neither flat nor level."""
     segments = read_products(products).segments
-    return any(segment.refused is not None and segment.refused.what == STEEP.what for segment in segments)
+    return any(segment.refused is not None and segment.refused.what == STEEP_FINDING.what for segment in segments)
 
 
 def add_surfaces(pipeline: Pipeline, products: Path) -> None:

@@ -1,6 +1,6 @@
-"""What commands print: results and questions on stdout; progress on stderr.
+"""Output of commands: results and questions on stdout; progress on stderr.
 
-Progress is a line for each step, and, if it is counted, a bar on a terminal or a line now and then elsewhere.
+Progress is one line for each step. For a counted step it is also a bar on a terminal, or elsewhere occasional lines.
 """
 
 from __future__ import annotations
@@ -59,19 +59,19 @@ def say(step: str) -> None:
         sys.stderr.flush()
 
 
-def steps(things: Sequence[T], names: Sequence[str]) -> Iterator[T]:
+def steps(items: Sequence[T], names: Sequence[str]) -> Iterator[T]:
     """Yield the things, one a step; print the name of each before it begins, and its wall time when it is done.
 
     Each is a line of its own, because a step may print lines, too.
     """
-    for k, (thing, name) in enumerate(zip(things, names, strict=True), 1):
-        say(f"[{k}/{len(things)}] {name}")
+    for k, (item, name) in enumerate(zip(items, names, strict=True), 1):
+        say(f"[{k}/{len(items)}] {name}")
         started_s = monotonic()
-        yield thing
-        sys.stderr.write(f"[{k}/{len(things)}] {name}: {monotonic() - started_s:.0f} s\n")
+        yield item
+        sys.stderr.write(f"[{k}/{len(items)}] {name}: {monotonic() - started_s:.0f} s\n")
 
 
-def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:
+def count_steps(items: Iterable[T], total: int, name: str) -> Iterator[T]:
     """Yield the things with a bar for the number that is done, of `total`.
 
     Without a terminal it is a line at the start, then one each time another tenth is done, but not until 5 s after the
@@ -82,17 +82,17 @@ def count_steps(things: Iterable[T], total: int, name: str) -> Iterator[T]:
 
     console = Console(stderr=True)
     if console.is_terminal:
-        yield from track(things, name, total=total, console=console)
+        yield from track(items, name, total=total, console=console)
         return
     say(f"{total} {name}")
     printed = monotonic()
     tenth = 0
-    for done, thing in enumerate(things, 1):
-        yield thing
-        if 10 * done // total > tenth and monotonic() - printed > _LINE_S:
+    for steps_done, item in enumerate(items, 1):
+        yield item
+        if 10 * steps_done // total > tenth and monotonic() - printed > _LINE_S:
             printed = monotonic()
-            tenth = 10 * done // total
-            say(f"{done} of {total} {name}")
+            tenth = 10 * steps_done // total
+            say(f"{steps_done} of {total} {name}")
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.calibration import Calibration, calibration_of_rig, calibration_of_scan
+from polysight.calibration import Calibration, load_rig_calibration, load_scan_calibration
 from polysight.data import find_packaged
 from polysight.imaging import PLANE_REACH_M, Focus, Images, PlaneEstimate, Rise, focus_sweep, image_grid
 from polysight.jobs.measure_surfaces import add_surfaces, has_steep_patch
@@ -29,8 +29,9 @@ from polysight.process import (
     Inputs,
     Products,
     analyse_given_images,
-    boxes_as_patches,
     collect_imaged_scan,
+    convert_boxes_to_patches,
+    explain_unnamed,
     is_given_images,
     lacks_positions,
     load_classifier,
@@ -39,14 +40,13 @@ from polysight.process import (
     read_given_images,
     save_images,
     save_materials,
-    why_unnamed,
 )
-from polysight.products import IMAGE, REPORT, check_products_folder, making_products, raw_dropped, write_json
+from polysight.products import IMAGE, REPORT, check_products_folder, raw_dropped, replace_products, write_json
 from polysight.results import format_one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import MANIFEST, ScanFolder, Source, dropped_rows, manifest, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, advice, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, join_advice, quote
 from polysight_shared.files import require_writable_folder
 
 _log = logging.getLogger(__name__)
@@ -107,9 +107,9 @@ def check_inputs(settings: Settings, inputs: Inputs, calibration: Calibration, r
     DataError
         when the library cannot be read or fitted, a box holds no pixel, or the plate was imaged with other settings.
     """
-    boxes = boxes_as_patches(settings, inputs, *axes_m)
+    boxes = convert_boxes_to_patches(settings, inputs, *axes_m)
     if load_classifier(settings, rig) is None and settings.model != "none":
-        sys.stderr.write(f"note: {why_unnamed(settings, rig, will_be=True)}\n")
+        sys.stderr.write(f"note: {explain_unnamed(settings, rig, will_be=True)}\n")
     metal_in_scene = boxes.metal is not None or settings.metal_box_mm is not None
     metal_plate = calibration.metal_plane(rig, inputs.reference, metal_in_scene, settings.bands)
     if metal_plate is not None:
@@ -124,10 +124,11 @@ def publish_images(pipeline: Pipeline, out: Path, check: Callable[[], None] | No
     """
     if (out / REPORT).exists():
         return
-    # Of a scan that is running: the sums over its rows, which are at hand. The images by which `make_products` replaces
-    # these differ by less than 1e-6 of the peak, unless missing positions are filled (`sparse`).
+    # The images of a running scan come from the sums over its rows, which exist already. The images by which
+    # `make_products` replaces them differ by less than 1e-6 of the peak, unless missing positions are filled
+    # (`sparse`).
     images = pipeline.form_images(from_sums=True)
-    with making_products(out, pipeline.source.scan_id) as new:
+    with replace_products(out, pipeline.source.scan_id) as new:
         if check is not None:
             check()
         scan = collect_imaged_scan(out, pipeline.source, pipeline.rig, images, pipeline.quality, backlash=False)
@@ -147,7 +148,7 @@ def make_products(
     If no materials can be found (the given metal is not metal, a board has no signal), the images alone are written,
     unless `out` holds a report; the error says where they are. Raises PolysightError.
     """
-    with making_products(out, pipeline.source.scan_id, wait) as new, current_step("image") as progress:
+    with replace_products(out, pipeline.source.scan_id, wait) as new, current_step("image") as progress:
         if check is not None:
             check()
         # The rows were added before `out` was locked: `drop-raw` may have run in between.
@@ -168,9 +169,11 @@ def make_products(
                 images_note = (
                     f"{out} holds the earlier products; `polysight image` with another --out writes the images"
                 )
-                raise DataError(e.what, e.why, advice(e.remedy, images_note), code=e.code) from None
+                raise DataError(e.what, e.why, join_advice(e.remedy, images_note), code=e.code) from None
             # Raised below, after the `with`: an error inside it would discard the new images.
-            failed = DataError(e.what, e.why, advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code)
+            failed = DataError(
+                e.what, e.why, join_advice(e.remedy, f"the images are written: {out / IMAGE}"), code=e.code
+            )
     raise failed
 
 
@@ -209,7 +212,7 @@ def _measure_rise(images: Images) -> Rise:
     light = images.illumination
     if light is None:
         return 0.0, 0.0
-    rise = light.rise(images.h, images.v, images.valid)
+    rise = light.estimate_rise(images.h, images.v, images.valid)
     return rise[1 - light.across], rise[light.across]
 
 
@@ -229,7 +232,7 @@ def load_reference(folder: Path, config: Path | None = None, bands: int = 1) -> 
     pipeline, images = form_scan_images(folder, Settings(config=path_text(config), bands=bands))
     mirrored = pipeline.source.mirrored
     parts = tuple(make_plane_reference(pipeline, band) for band in pipeline.sub_bands.finish(mirrored))
-    dispersion = pipeline.builder.disperse()
+    dispersion = pipeline.builder.form_dispersion()
     reference = make_plane_reference(pipeline, images).add_dispersion(
         dispersion.transpose() if mirrored else dispersion
     )
@@ -330,7 +333,7 @@ def process_images(data: Path, out: Path, settings: Settings, inputs: Inputs) ->
     if data.is_dir():
         plates = find_plates(data)
     scan, findings, unnamed = analyse_given_images(pair, settings, inputs, rig, plates)
-    with making_products(out, pair.scan_id) as new, current_step("figures and report"):
+    with replace_products(out, pair.scan_id) as new, current_step("figures and report"):
         products = replace(save_materials(new, scan, findings.analysis, unnamed), folder=out)
     sys.stdout.write(products.summary())
     return products.exit_status
@@ -351,13 +354,13 @@ class LiveProcessing:
 
     def check_new(self, rig: Instrument, truth: Path | None) -> None:
         """Check before the rig moves that a new scan can be processed after its end. Raises PolysightError."""
-        self._check(rig, calibration_of_rig(rig))
+        self._check(rig, load_rig_calibration(rig))
         if truth is not None:
             read_truth(truth)
 
     def check_resumed(self, source: ScanFolder) -> None:
         """Check the same for a scan that is resumed. Raises PolysightError."""
-        self._check(source.instrument, calibration_of_scan(source))
+        self._check(source.instrument, load_scan_calibration(source))
         check_products_folder(self._folder / PRODUCTS, source.scan_id)
 
     def _check(self, rig: Instrument, calibration: Calibration) -> None:
@@ -408,7 +411,7 @@ def _check_dropped(pipeline: Pipeline, out: Path) -> None:
     pipeline.source.reload()
     if not dropped_rows(pipeline.source):
         return
-    pipeline.quality.note(raw_dropped=mark)
+    pipeline.quality.add_entries(raw_dropped=mark)
     absent = pipeline.quality.coverage().rows_absent
     if absent:
         raise DataError(
@@ -429,7 +432,7 @@ def image(data: Path, out: Path, settings: Settings = DEFAULT) -> int:
     pipeline = process_rows(source, data, settings)
     images = pipeline.form_images()
     pipeline.quality.note_imaging(pipeline.builder, images)
-    with making_products(out, source.scan_id) as new:
+    with replace_products(out, source.scan_id) as new:
         save_images(new, collect_imaged_scan(out, source, pipeline.rig, images, pipeline.quality))
     print_lines((*pipeline.quality.coverage().lines(), f"image: {out / IMAGE}"))
     if not images.valid.any():
@@ -510,13 +513,13 @@ def _format_focus(head: str, distance_mm: float, sharpest: Focus, plates: PlaneE
 
 def sync_report(data: Path, out: Path, config: Path | None) -> int:
     """Write figures, JSON and text of the residual errors of synchronisation; return 0. Raises PolysightError."""
-    from polysight.calibration import board_rows
+    from polysight.calibration import read_board_rows
     from polysight.report import SyncReport, write_sync_report
     from polysight.sync import BoardSetup, synchronise_row
 
     require_writable_folder(out.absolute())
     source = raw_source(open_source(data, config), data)
-    calibration = calibration_of_scan(source)
+    calibration = load_scan_calibration(source)
     rig = calibration.rig(source.instrument)
     chirp = rig.chirp
     reports = {}
@@ -526,7 +529,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
         rx = len(setup.path.beam)
         report = reports[board.name] = SyncReport(chirp.sample_rate_hz, chirp.linear_samples, rx)
         say(f"rows of {board.name}")
-        for _, words, valid in board_rows(source, board.name):
+        for _, words, valid in read_board_rows(source, board.name):
             report.add(synchronise_row(words, valid, setup))
     sys.stdout.write(write_sync_report(out, reports, source.scan_id, source.simulated))
     return 0

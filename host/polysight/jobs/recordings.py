@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture import PACKETS, CardReport, Code, Layout, Report, inspect_bin, inspect_pcap, is_pcap
+from polysight.capture import PACKETS_SUFFIX, CardReport, Code, Layout, Report, inspect_bin, inspect_pcap, is_pcap
 from polysight.jobs.output import exit_status, print_json, print_lines
 from polysight.store import (
     MANIFEST,
     PlacedAgain,
-    Replaced,
+    ReplacedRow,
     ScanFolder,
     describe_damage,
     place_again,
@@ -234,7 +234,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
                 f"{row}: {damage}", "a damaged file, or one of another row", "`polysight validate SCAN`",
                 code=ErrorCode.FILE_DAMAGED,
             )  # fmt: skip
-        if not row.with_suffix(PACKETS).exists():
+        if not row.with_suffix(PACKETS_SUFFIX).exists():
             raise DataError(
                 f"{row}: its packets were not kept",
                 "the scan was simulated without cards, or recorded by an older release",
@@ -296,13 +296,17 @@ def replace_folder(folder: Path, as_json: bool) -> int:
     return exit_status(not any(r.damaged for r in rows))
 
 
-def _list_replaced_lines(folder: Path, rows: list[Replaced]) -> list[str]:
+def _list_replaced_lines(folder: Path, rows: list[ReplacedRow]) -> list[str]:
     """Return lines about rows that changed, rows that were left, and the number of equal ones."""
-    changed = [
+    changed_rows = [
         f"row {r.row} of {r.board}: {r.missing_before} bytes missing before, {r.missing_after} now"
         for r in rows
         if r.changed
     ]
     unchanged = [f"row {r.row} of {r.board}: left as it is: {r.why_unchanged}" for r in rows if r.why_unchanged]
-    same = sum(not (r.changed or r.why_unchanged) for r in rows)
-    return [*changed, *unchanged, f"{folder}: {same} of {len(rows)} files come out as they were committed"]
+    unchanged_rows = sum(not (r.changed or r.why_unchanged) for r in rows)
+    return [
+        *changed_rows,
+        *unchanged,
+        f"{folder}: {unchanged_rows} of {len(rows)} files come out as they were committed",
+    ]

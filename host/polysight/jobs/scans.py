@@ -22,9 +22,9 @@ from polysight.catalogue import (
     compare,
     folder_bytes,
     is_scan,
-    printable,
     probe,
     read_notes,
+    remove_unprintable,
 )
 from polysight.jobs.output import confirm, print_json, print_lines
 from polysight.materials import UNKNOWN
@@ -33,13 +33,13 @@ from polysight.products import (
     REPORT,
     ProcessedScan,
     find_products,
-    products_locked,
+    lock_products,
     ranges_text,
     read_products,
     write_json,
 )
 from polysight.results import WARNING_SIGMAS, CheckResult, ComplexNumber, RawDropped, check_plate, read_object, to_plain
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, make_missing_path_error, quote
 from polysight_shared.files import require_writable, write_atomically
 
 if TYPE_CHECKING:
@@ -56,58 +56,65 @@ def scans(root: Path, tags: list[str], text: str, as_json: bool) -> int:
     Raises DataError when there is no such folder.
     """
     if not root.is_dir():
-        raise no_such(root)
+        raise make_missing_path_error(root)
     catalogue = Scans(root)
     not_listed = ""
-    if left_out := catalogue.left_out():
+    if left_out := catalogue.list_left_out():
         not_listed = f"; not listed, because they are links or have unprintable names: {', '.join(left_out)}"
-    matching = [s for s in catalogue.list() if set(tags) <= set(s.tags) and text.casefold() in _join_searchable_text(s)]
+    matching = [
+        summary
+        for summary in catalogue.list()
+        if set(tags) <= set(summary.tags) and text.casefold() in _join_searchable_text(summary)
+    ]
     if as_json:
-        rows = [msgspec.to_builtins(s) | {"bytes": _count_bytes(root, s)} for s in matching]
+        rows = [msgspec.to_builtins(summary) | {"bytes": _count_bytes(root, summary)} for summary in matching]
         print_json({"scans": rows})
         return 0
-    width = min(max((len(s.name) for s in matching), default=0), _NAME_WIDTH)
-    for s in matching:
-        sys.stdout.write(f"{s.name:{width}}  {_count_bytes(root, s) / 1e6:8.1f} MB  {printable(_format_summary(s))}\n")
+    width = min(max((len(summary.name) for summary in matching), default=0), _NAME_WIDTH)
+    for summary in matching:
+        line = remove_unprintable(_format_summary(summary))
+        sys.stdout.write(f"{summary.name:{width}}  {_count_bytes(root, summary) / 1e6:8.1f} MB  {line}\n")
     noun = "scan" if len(matching) == 1 else "scans"
     sys.stdout.write(f"{len(matching)} {noun} under {root}{not_listed}\n")
     return 0
 
 
-def _count_bytes(root: Path, s: Summary) -> int:
+def _count_bytes(root: Path, summary: Summary) -> int:
     """Return the size on the disk; 0 for a folder that does not answer."""
-    if s.state == "silent":
+    if summary.state == "silent":
         return 0
-    return folder_bytes(root / s.name)
+    return folder_bytes(root / summary.name)
 
 
-def _format_summary(s: Summary) -> str:
+def _format_summary(summary: Summary) -> str:
     """Format state, rows, verdict, materials and tags of a scan."""
-    words, _ = BADGES[s.state]
+    words, _ = BADGES[summary.state]
     parts = [words]
-    if s.rows:
-        parts.append(f"{s.committed}/{s.rows} rows")
-    parts.append(s.verdict)
-    if s.images_only:
+    if summary.rows:
+        parts.append(f"{summary.committed}/{summary.rows} rows")
+    parts.append(summary.verdict)
+    if summary.images_only:
         parts.append("images only")
-    parts.append(", ".join(map(_format_name, s.materials)))
-    if s.simulated:
+    parts.append(", ".join(map(_format_name, summary.materials)))
+    if summary.simulated:
         parts.append("simulated")
-    parts.append(" ".join(f"#{tag}" for tag in s.tags))
-    if s.state == "failed" and not s.rows:
-        parts.append(s.reason)
+    parts.append(" ".join(f"#{tag}" for tag in summary.tags))
+    if summary.state == "failed" and not summary.rows:
+        parts.append(summary.reason)
     return "  ".join(part for part in parts if part)
 
 
-def _join_searchable_text(s: Summary) -> str:
+def _join_searchable_text(summary: Summary) -> str:
     """Return all text of a scan's summary that a search looks at, in small letters."""
-    return " ".join((s.name, s.scan_id, s.rig, s.state, s.notes, *s.tags, *s.materials)).casefold()
+    return " ".join(
+        (summary.name, summary.scan_id, summary.rig, summary.state, summary.notes, *summary.tags, *summary.materials)
+    ).casefold()
 
 
 def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> int:
     """Change or print the operator's notes and tags of a scan; returns 0. Raises PolysightError."""
     if not folder.is_dir():
-        raise no_such(folder)
+        raise make_missing_path_error(folder)
     if not (is_scan(folder) or store.is_source(folder)):
         raise DataError(
             f"{folder}: no scan is in it", "notes belong to a scan; nothing was recorded or processed in this folder",
@@ -126,14 +133,14 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
     lines = [f"tags: {', '.join(notes.tags) or 'none'}"]
     if notes.notes:
         lines.insert(0, notes.notes)
-    sys.stdout.write(printable("\n".join(lines), keep="\n") + "\n")
+    sys.stdout.write(remove_unprintable("\n".join(lines), keep="\n") + "\n")
     return 0
 
 
 def ask_scan(folder: Path, request: str) -> int:
     """Send pause, continue, stop or abort to a running scan; return 0 when it is received. Raises PolysightError."""
     if not folder.is_dir():
-        raise no_such(folder)
+        raise make_missing_path_error(folder)
     send_command(folder, ScanCommand(request), "polysight ask")
     states = {"pause": "pausing", "continue": "rows", "stop": "stopping", "abort": "aborting"}
     state = STATES[states[request]]
@@ -163,7 +170,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
         lines.append(f"in patch {result.patch.label}: {name}")
     lines += [f"  {n.sigmas:g} standard deviations from {n.name}" for n in result.nearest]
     lines.append(result.profile_why or "range profile: --json")
-    sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
+    sys.stdout.write("".join(f"{remove_unprintable(line)}\n" for line in lines))
     return 0
 
 
@@ -187,15 +194,15 @@ def compare_scans(first: Path, second: Path, picture: Path | None, as_json: bool
         lines.append(f"P differs by more than {values.significant_sigmas:g} standard deviations in {share} of them")
     for pair in values.patches:
         names = " and ".join(map(_format_name, pair.names))
-        place = f"x {pair.place_mm[0]:zg}, y {pair.place_mm[1]:zg} mm ({names})"
+        place_text = f"x {pair.place_mm[0]:zg}, y {pair.place_mm[1]:zg} mm ({names})"
         if pair.difference is None:
-            lines.append(f"{place}: no permittivity in one of them")
+            lines.append(f"{place_text}: no permittivity in one of them")
             continue
-        line = f"{place}: permittivity differs by {_format_complex(pair.difference)}"
+        line = f"{place_text}: permittivity differs by {_format_complex(pair.difference)}"
         if pair.sigmas is not None:
             line += f": {pair.sigmas:g} standard deviations"
         lines.append(line)
-    sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
+    sys.stdout.write("".join(f"{remove_unprintable(line)}\n" for line in lines))
     return 0
 
 
@@ -230,7 +237,7 @@ def _format_complex(number: ComplexNumber | PermittivityDifference) -> str:
 
 
 # Word that a person types to confirm the removal of raw rows.
-WORD = "drop"
+CONFIRMATION_WORD = "drop"
 
 
 def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
@@ -253,7 +260,7 @@ def drop_raw(folder: Path, products: Path | None, yes: bool) -> int:
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
         return 0
     products = read_products(products or folder, REPORT).folder
-    with products_locked(products), store.lock_samples(scan):
+    with lock_products(products), store.lock_samples(scan):
         return _confirm_and_drop(scan, folder, products, yes)
 
 
@@ -285,10 +292,12 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
         indices = sorted(int(path.stem) for path in paths if path.parent == folder_of_board)
         files = f"{ranges_text(indices)} ({len(indices)} files)"
         sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: rows {files}\n")
-    answer = confirm(text, WORD, yes)
-    if answer != WORD:
+    answer = confirm(text, CONFIRMATION_WORD, yes)
+    if answer != CONFIRMATION_WORD:
         raise ConfigError(
-            f"nothing dropped: answered {answer!r}", f"the answer was not {WORD!r}", f"type {WORD}, or --yes"
+            f"nothing dropped: answered {answer!r}",
+            f"the answer was not {CONFIRMATION_WORD!r}",
+            f"type {CONFIRMATION_WORD}, or --yes",
         )
     _mark_as_only_data(products, scan)
     store.drop(scan, processed, products)
@@ -377,22 +386,22 @@ def check_scans(folders: Sequence[Path]) -> list[tuple[ProcessedScan, CheckResul
     DataError
         if there is no processed scan with a check plate.
     """
-    checked = []
+    checked_scans = []
     for folder in folders:
         if find_products(folder) is not None:
             scan = read_products(folder)
-            checked.append((scan, check_scan(scan)))
+            checked_scans.append((scan, check_scan(scan)))
             continue
         for summary in reversed(Scans(folder).list()):
             scan_below = find_products(folder / summary.name)
             if scan_below is not None and scan_below.rig is not None and scan_below.rig.check.name:
-                checked.append((scan_below, check_scan(scan_below)))
-    if not checked:
+                checked_scans.append((scan_below, check_scan(scan_below)))
+    if not checked_scans:
         raise DataError(
             "no processed scan with a check plate", "nothing was processed, or no rig file names a plate",
             "`polysight process SCAN --out DIR`; docs/how-to/check-plate.md", code=ErrorCode.NO_DATA,
         )  # fmt: skip
-    return checked
+    return checked_scans
 
 
 def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
@@ -403,20 +412,20 @@ def check(folders: Sequence[Path], chart: Path | None, as_json: bool) -> int:
     """
     if chart is not None:
         require_writable(chart)
-    checked = check_scans(folders)
+    checked_scans = check_scans(folders)
     if chart is not None:
         from matplotlib.figure import Figure
 
         fig = Figure(figsize=CHART_IN, dpi=DOTS_PER_INCH, layout="constrained")
-        draw_control_chart(fig, checked)
+        draw_control_chart(fig, checked_scans)
         buffer = io.BytesIO()
         fig.savefig(buffer, format="png")
         write_atomically(chart, buffer.getvalue())
     if as_json:
-        print_json([{"scan_id": scan.scan_id, **to_plain(result)} for scan, result in checked])
+        print_json([{"scan_id": scan.scan_id, **to_plain(result)} for scan, result in checked_scans])
     else:
-        print_lines([_describe(scan, result) for scan, result in checked])
-    return int(any(result.level in ("action", "missing") for _, result in checked))
+        print_lines([_describe(scan, result) for scan, result in checked_scans])
+    return int(any(result.level in ("action", "missing") for _, result in checked_scans))
 
 
 def _describe(scan: ProcessedScan, result: CheckResult) -> str:
@@ -433,7 +442,7 @@ def _describe(scan: ProcessedScan, result: CheckResult) -> str:
     )
 
 
-def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, CheckResult]]) -> None:
+def draw_control_chart(fig: Figure, checked_scans: Sequence[tuple[ProcessedScan, CheckResult]]) -> None:
     """Draw real part and loss of the check plate over the scans, and the known value.
 
     Bars of the scans and the band of the known value are `WARNING_SIGMAS` standard deviations to either side. A scan's
@@ -443,13 +452,13 @@ def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, Check
     names = []
     measured = []
     errors = []
-    for scan, result in checked:
+    for scan, result in checked_scans:
         if result.measured and result.measured_std:
             names.append(scan.scan_id)
             measured.append(result.measured)
             errors.append([WARNING_SIGMAS * std for std in result.measured_std])
     # The known value and its band are those of the latest scan.
-    _, latest = checked[-1]
+    _, latest = checked_scans[-1]
     for part, (ax, title) in enumerate(zip(axes, ("real part", "loss"), strict=True)):
         values = [value[part] for value in measured]
         bars = [error[part] for error in errors]
@@ -461,6 +470,6 @@ def draw_control_chart(fig: Figure, checked: Sequence[tuple[ProcessedScan, Check
         ax.set_ylabel(title)
     axes[-1].set_xticks(range(len(names)), names, rotation=30, ha="right", fontsize=8)
     # A scan that does not say whether it was simulated may be: the chart is marked.
-    stamp = " (simulated)" if any(scan.simulated is not False for scan, _ in checked) else ""
+    stamp = " (simulated)" if any(scan.simulated is not False for scan, _ in checked_scans) else ""
     title = f"Check plate {latest.name}{stamp}: bars and band are ± {WARNING_SIGMAS} standard deviations"
     fig.suptitle(title, fontsize=11)

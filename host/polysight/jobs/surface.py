@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from polysight.calibration import SphereFile, make_header, open_raw, source_scan, write_calibration
+from polysight.calibration import SphereFile, make_header, make_source_entry, open_raw, write_calibration
 from polysight.jobs import measure_surfaces
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import process_rows
@@ -20,7 +20,7 @@ from polysight.surfaces import (
     Gains,
     Optics,
     Reference,
-    Seen,
+    SeenEchoes,
     Surface,
     find_shape,
     find_voltages,
@@ -44,12 +44,12 @@ LEAST_METAL_POINTS = 60
 RADIUS_TOLERANCE = 0.15
 
 
-def process_to_points(data: Path, rig: Path | Instrument | None) -> tuple[Pipeline, Optics, Seen]:
+def process_to_points(data: Path, rig: Path | Instrument | None) -> tuple[Pipeline, Optics, SeenEchoes]:
     """Process the rows of a scan, and find the specular points in it. Raises PolysightError.
 
     `rig`: rig, or rig file, of published data; a scan folder has its own.
     """
-    # Where the raw data was deleted, the samples that the scan folder keeps are used.
+    # If the raw data was deleted, the samples that the scan folder keeps are used.
     source = open_source(data, rig, dropped=True)
     pipeline = process_rows(source, data, Settings(depth_range_mm=1e3 * DEPTH_M))
     optics = measure_surfaces.make_rig_optics(pipeline.rig)
@@ -194,7 +194,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     gains = learn_gains(find_voltages(chosen_metal, optics), optics.wave_number)
     check_is_metal(scan, gains)
     file = SphereFile(
-        **make_header("sphere", [source_scan(raw, scan)]),
+        **make_header("sphere", [make_source_entry(raw, scan)]),
         radius_mm=radius_mm,
         radius_found_mm=1e3 * radius_m,
         centre_mm=(1e3 * float(centre[0]), 1e3 * float(centre[1]), 1e3 * float(centre[2])),

@@ -50,7 +50,7 @@ from polysight.products import (
 )
 from polysight.settings import Settings
 from polysight.store import TRUTH, open_source, versions
-from polysight_shared.errors import ConfigError, DataError, ScanError, no_such, quote
+from polysight_shared.errors import ConfigError, DataError, ScanError, make_missing_path_error, quote
 
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -133,29 +133,29 @@ def _process_rows(data: Path, config: Path, labels: Labels) -> TrainingScan:
     source = open_source(data, config)
     pipeline = process_rows(source, data, Settings(model="none"))
     images = pipeline.form_images()
-    checked = check_labels(labels, images.x_m, images.y_m, images.valid)
-    if checked.metal is None and pipeline.calibration.reference() is None:
+    checked_labels = check_labels(labels, images.x_m, images.y_m, images.valid)
+    if checked_labels.metal is None and pipeline.calibration.reference() is None:
         raise _no_metal_error(data)
-    pipeline.inputs = Inputs(labels=checked)
+    pipeline.inputs = Inputs(labels=checked_labels)
     findings = pipeline.examine(images)
     if not findings.verdict.usable:
         raise findings.verdict.error("no library was written")
-    return _add_labels(source.scan_id, findings.analysis, source.simulated, checked)
+    return _add_labels(source.scan_id, findings.analysis, source.simulated, checked_labels)
 
 
 def _load_images(saved: ProcessedScan, labels: Labels) -> TrainingScan:
     """Use the saved images of a labelled scan. Raises as :func:`_process_rows`."""
     if saved.verdict is not None and not saved.verdict.usable:
         raise saved.verdict.error("no library was written")
-    checked = check_labels(labels, saved.x_m, saved.y_m, saved.valid)
-    segmentation, names = checked.patches(saved.x_m, saved.y_m)
-    metal = next((label for label, name in names.items() if name == checked.metal), None)
+    checked_labels = check_labels(labels, saved.x_m, saved.y_m, saved.valid)
+    segmentation, names = checked_labels.patches(saved.x_m, saved.y_m)
+    metal = next((label for label, name in names.items() if name == checked_labels.metal), None)
     if metal is None:
         raise _no_metal_error(saved.folder)
     pair = Images(saved.h, saved.v, saved.x_m, saved.y_m, saved.valid)
     materials = analyse(pair, _read_optics(saved), KnownScene(segmentation, metal))
-    # Where it is not known, the scan counts as simulated.
-    return _add_labels(saved.scan_id, materials, saved.simulated is not False, checked)
+    # If it is not known, the scan counts as simulated.
+    return _add_labels(saved.scan_id, materials, saved.simulated is not False, checked_labels)
 
 
 def _read_optics(saved: ProcessedScan) -> Optics:
@@ -272,7 +272,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         )
     if scenes is not None and not files:
         if not scenes.is_dir():
-            raise no_such(scenes)
+            raise make_missing_path_error(scenes)
         raise DataError(
             f"{scenes}: no scene files", "none of its files ends in .toml", "give a folder of scene files (*.toml)"
         )

@@ -29,19 +29,19 @@ from polysight.materials.catalogue import (
     same_material as same_material,
 )
 from polysight.materials.classify import (
-    DISCRIMINANT as DISCRIMINANT,
+    DISCRIMINANT_MODEL as DISCRIMINANT_MODEL,
+    MODEL_OF_OPTION as MODEL_OF_OPTION,
     MODELS as MODELS,
-    PAPER as PAPER,
-    SHORT as SHORT,
+    PAPER_MODEL as PAPER_MODEL,
     Classifier as Classifier,
     classifier_sentence as classifier_sentence,
 )
 from polysight.materials.copies import find_copies as find_copies
-from polysight.materials.discriminant import REJECTED as REJECTED, ErrorDiscriminant as ErrorDiscriminant
-from polysight.materials.kinds import permittivity_slope as permittivity_slope
+from polysight.materials.discriminant import REJECTED_SHARE as REJECTED_SHARE, ErrorDiscriminant as ErrorDiscriminant
+from polysight.materials.kinds import find_permittivity_slope as find_permittivity_slope
 from polysight.materials.labels import (
-    METALS as METALS,
-    SPECIMEN as SPECIMEN,
+    METAL_WORDS as METAL_WORDS,
+    SPECIMEN_SEPARATOR as SPECIMEN_SEPARATOR,
     Labels as Labels,
     Plates as Plates,
     box_name as box_name,
@@ -52,9 +52,9 @@ from polysight.materials.labels import (
     format_box as format_box,
     image_extent_mm as image_extent_mm,
     is_metal as is_metal,
+    make_name_taken_error as make_name_taken_error,
+    make_unknown_box_error as make_unknown_box_error,
     material_name as material_name,
-    name_taken as name_taken,
-    no_box as no_box,
     pack_labels as pack_labels,
     patches_from_plates as patches_from_plates,
     read_labels as read_labels,
@@ -62,7 +62,7 @@ from polysight.materials.labels import (
     specimen_seed as specimen_seed,
     truth_plates as truth_plates,
 )
-from polysight.materials.layers import METAL as METAL, Layer as Layer, LayerFit as LayerFit
+from polysight.materials.layers import METAL_PERMITTIVITY as METAL_PERMITTIVITY, Layer as Layer, LayerFit as LayerFit
 from polysight.materials.library import (
     CHANNELS as CHANNELS,
     SAME_ANGLE_DEG as SAME_ANGLE_DEG,
@@ -77,7 +77,7 @@ from polysight.materials.library import (
 )
 from polysight.materials.measure import (
     NOT_PASSIVE as NOT_PASSIVE,
-    STRONGER_V as STRONGER_V,
+    STRONGER_V_REASON as STRONGER_V_REASON,
     Permittivity as Permittivity,
     estimate_permittivity as estimate_permittivity,
 )
@@ -90,9 +90,9 @@ from polysight.materials.names import (
     format_permittivity as format_permittivity,
 )
 from polysight.materials.result import (
-    PATCHES as PATCHES,
+    PATCHES_FILE as PATCHES_FILE,
     SMEAR as SMEAR,
-    STEEP as STEEP,
+    STEEP_FINDING as STEEP_FINDING,
     MatchedPatch as MatchedPatch,
     MaterialsResult as MaterialsResult,
     ScanPatches as ScanPatches,

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import Image, Images, Rise, correct_tilt
-from polysight.materials.classify import PAPER, Classifier
+from polysight.materials.classify import PAPER_MODEL, Classifier
 from polysight.materials.common_change import CommonChange, estimate_common_change
-from polysight.materials.inversion import EVEN_LIGHT, MOVED, UNEVEN_LIGHT, Inversion, RigPrior, invert
+from polysight.materials.inversion import EVEN_LIGHT, MOVED_PROBABILITY, UNEVEN_LIGHT, Inversion, RigPrior, invert
 from polysight.materials.kinds import (
     Kinds,
     PatchDispersion,
@@ -47,18 +47,18 @@ from polysight.materials.metal import (
     Halo,
     MetalReference,
     channel_ratio_of,
+    divide_by_reference,
     find_halo,
     find_metals,
+    make_missing_reference,
     metal_by_label,
     metal_evidence,
     metal_in_box,
     metal_unevenness,
-    no_metal,
-    to_metal,
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.phase_sign import join_signs, mirror_phases
-from polysight.materials.result import LEVEL, MaterialsResult, PatchResult, Tilts, pixel_features
+from polysight.materials.result import LEVEL_TILTS, MaterialsResult, PatchResult, Tilts, pixel_features
 from polysight.materials.segment import (
     Box,
     Patch,
@@ -119,24 +119,24 @@ class Optics:
         """Return the optics of a rig under the chosen incidence angles, with this standard deviation of the angle.
 
         Leakage without a `leakage_std` in the rig file was not measured: it is not subtracted, its mean is zero, and
-        `leakage_prior` is the size of both its parts. The mount may have moved since a measurement (`MOVED`).
-        `channels_known`: amplitudes are relative to the direct path.
+        `leakage_prior` is the size of both its parts. The mount may have moved since a measurement
+        (`MOVED_PROBABILITY`). `channels_known`: amplitudes are relative to the direct path.
         """
-        p = rig.polarimetry
+        polarimetry = rig.polarimetry
         leakage = (0j, 0j)
-        leakage_std = float(p.leakage_prior / np.sqrt(2))
-        if p.leakage_std is not None:
-            leakage = (complex(*p.leakage_h), complex(*p.leakage_v))
-            leakage_std = p.leakage_std
+        leakage_std = float(polarimetry.leakage_prior / np.sqrt(2))
+        if polarimetry.leakage_std is not None:
+            leakage = (complex(*polarimetry.leakage_h), complex(*polarimetry.leakage_v))
+            leakage_std = polarimetry.leakage_std
         prior = RigPrior(
             theta_std_rad=theta_std_rad,
             leakage=leakage,
             leakage_std=max(leakage_std, LEAST_LEAKAGE_STD),
-            leakage_measured=p.leakage_std is not None,
+            leakage_measured=polarimetry.leakage_std is not None,
             channels_known=channels_known,
-            moved=0.0 if p.leakage_std is None else MOVED,
+            moved=0.0 if polarimetry.leakage_std is None else MOVED_PROBABILITY,
         )
-        return cls(angles.used_rad, prior, p.smooth_px)
+        return cls(angles.used_rad, prior, polarimetry.smooth_px)
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None
     Without the illumination of the plane the images are returned unchanged, and no tilt is known.
     """
     if images.illumination is None:
-        return images, LEVEL
+        return images, LEVEL_TILTS
     if tilts is None:
         tilts = Tilts.estimate(images, images.illumination, segmentation)
     risen_patches = [p for p in segmentation.patches if p.label in tilts.rises]
@@ -186,7 +186,7 @@ def level(images: Images, segmentation: Segmentation, tilts: Tilts | None = None
 BEHIND_PATCH = 0.6
 """Background in a plate over that beside the plates: of tables in scenes of the independent generator. It is less than
 1: what changes plates and metal alike cancels in their ratio, and a table is brightest at its own edges."""
-UNEVEN_METAL = 0.5
+UNEVEN_METAL_SHARE = 0.5
 """Error of each part of the metal's ln(V / H), as a share of the distance between its value by root mean squares and by
 the median of pixels: where metal lies at the end of the scan neither is right (`benchmarks coverage`)."""
 HALO_OF_METAL = 4.0
@@ -202,7 +202,7 @@ RAISED_RAD_PER_M = 1.1
 """Error of the phase of V / H per metre between the planes of a plate and of the metal: an error d of the difference
 between the angles of both boards changes it by 2 k sin(theta) d; 0.4 mrad: places of boards are wrong by about half a
 millimetre where the images of H and V lie on each other (chosen)."""
-FILLED = 0.1
+FILLED_LEVEL = 0.1
 """Least |H| relative to metal at which an image without edges counts as filled with one material; chosen."""
 POSSIBLE_SIGN = 0.05
 """If the other sign of the phases is likelier than this (chosen), an undeclared metal has to pass with it, too."""
@@ -220,7 +220,7 @@ def analyse(
     plane = known_scene.plane
     if plane is not None:
         plane.check_axes(images.x_m, images.y_m)
-        images = images.within(plane.valid)
+        images = images.limit_to_area(plane.valid)
     images, apart_mm = align(images)
     segmentation = _select_patches(images, known_scene)
     images, tilts = level(images, segmentation)
@@ -230,7 +230,9 @@ def analyse(
         images=images, segmentation=segmentation, tilts=tilts, apart_mm=apart_mm, plane=plane, optics=optics,
         kinds=kinds,
     )  # fmt: skip
-    relative = most_like_metal([scene.relative_to(metal) for metal in _references(images, known_scene, segmentation)])
+    relative = find_most_like_metal(
+        [scene.measure_relative_to(metal) for metal in _list_references(images, known_scene, segmentation)]
+    )
     judged = relative.judged
     labels = [p.label for p in judged]
     inversion = relative.solution.inversion
@@ -379,7 +381,7 @@ class SceneScatter:
         change = None if metal is None else estimate_common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, segmentation.patches, images)
         metal_at_end = np.hypot(*border.get(reference.label or 0, (0.0, 0.0))) / np.sqrt(2)
-        uneven = 0.0 if metal is None else UNEVEN_METAL * metal_unevenness(raw, reference.mask)
+        uneven = 0.0 if metal is None else UNEVEN_METAL_SHARE * metal_unevenness(raw, reference.mask)
         return cls(
             scatter=scatter, usual=usual_scatter(scatters), metal=metal, change=change, metal_spread=spread,
             border=border, tilts=tilts, lit_evenly=evenly, metal_rise=metal_rise, halo=halo,
@@ -415,8 +417,8 @@ class SceneScatter:
             return replace(prior, reference_std=LEAST_STD)
         amplitude, phase = relative_errors(self.metal, self.usual)
         std = float(np.hypot(np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
-        around = HALO_OF_METAL * self.halo.level
-        return replace(prior, reference_std=float(np.sqrt(std**2 + around**2 + self.metal_std**2)))
+        halo_error = HALO_OF_METAL * self.halo.level
+        return replace(prior, reference_std=float(np.sqrt(std**2 + halo_error**2 + self.metal_std**2)))
 
     def measure(
         self, patch: Patch, channels: tuple[Image, Image], theta_rad: float, dispersion: PatchDispersion | None
@@ -425,25 +427,25 @@ class SceneScatter:
 
         `channels` are H and V relative to metal, smoothed inside patches; `theta_rad` is the patch's incidence angle.
         """
-        at_end = self.border.get(patch.label, (0.0, 0.0))
+        border_error = self.border.get(patch.label, (0.0, 0.0))
         local_std = (
-            float(np.hypot(self.metal_spread or 0.0, at_end[0])),
-            float(np.hypot(np.hypot(self.metal_spread or 0.0, at_end[1]), self.raised_std.get(patch.label, 0.0))),
+            float(np.hypot(self.metal_spread or 0.0, border_error[0])),
+            float(np.hypot(np.hypot(self.metal_spread or 0.0, border_error[1]), self.raised_std.get(patch.label, 0.0))),
         )
         scatter = self.scatter.get(patch.label)
         rise = self.tilts.in_plane(patch.label)
         change = None
         if scatter is not None and self.change is not None:
             change = self.change.log_ratio(list(self.scatter).index(patch.label))
-        of_ratio = measure_patch(
+        ratio_measurement = measure_patch(
             patch, *channels, theta_rad, scatter, self.usual, change=change, local_std=local_std, rise=rise
         )
-        patch_measurement = replace(of_ratio, dispersion=dispersion)
+        patch_measurement = replace(ratio_measurement, dispersion=dispersion)
         if not patch_measurement.brightness:
             return patch_measurement
-        around = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
-        behind = abs(patch_measurement.inverse_ratio) * self.background_in(patch_measurement)
-        return replace(patch_measurement, std=float(np.sqrt(patch_measurement.std**2 + around**2 + behind**2)))
+        halo = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
+        background = abs(patch_measurement.inverse_ratio) * self.background_in(patch_measurement)
+        return replace(patch_measurement, std=float(np.sqrt(patch_measurement.std**2 + halo**2 + background**2)))
 
     def background_in(self, measurement: PatchMeasurement) -> float:
         """Return the standard deviation of each part of a patch's ln(V / H) by what lies behind it."""
@@ -500,12 +502,12 @@ class _Scene:
     optics: Optics
     kinds: Kinds
 
-    def relative_to(self, reference: MetalReference) -> RelativeScene:
+    def measure_relative_to(self, reference: MetalReference) -> RelativeScene:
         """Measure and solve the scene relative to this reference, and weigh whether it is metal."""
         images = self.images
         segmentation = self.segmentation
         theta = np.asarray(self.optics.theta_rad, np.float64)
-        raw = to_metal(images, reference, self.plane)
+        raw = divide_by_reference(images, reference, self.plane)
         # H and V relative to metal, smoothed.
         rh = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
         rv = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
@@ -533,7 +535,7 @@ class _Scene:
         )  # fmt: skip
 
 
-def most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
+def find_most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
     """Return the scene relative to the reference that the other patches show best to be bare metal.
 
     A reference that its own V / H contradicts, or that is not a flat plate, is taken only if none is better; of equals
@@ -568,7 +570,7 @@ def _name_patches(
         if estimate.evidence is None:
             continue
         interior = patch.interior
-        if classifier.model == PAPER:
+        if classifier.model == PAPER_MODEL:
             # The paper's classifier compares pixels: their V / H gets the correction of their patch.
             correction = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
             pixels_p = p[interior].astype(np.complex128) / correction
@@ -605,9 +607,9 @@ def _estimate_raised_std(images: Images, patches: Sequence[Patch], metal: npt.ND
     """Return patch number to the error of the phase of V / H, as the patch and the metal lie on different planes."""
     if images.raised_m is None or not metal.any():
         return {}
-    of_metal = float(np.median(images.raised_m[metal]))
-    inside = {p.label: images.raised_m[p.interior] for p in patches if p.interior.any()}
-    return {label: RAISED_RAD_PER_M * abs(float(np.median(of_patch)) - of_metal) for label, of_patch in inside.items()}
+    metal_m = float(np.median(images.raised_m[metal]))
+    inside_m = {p.label: images.raised_m[p.interior] for p in patches if p.interior.any()}
+    return {label: RAISED_RAD_PER_M * abs(float(np.median(patch_m)) - metal_m) for label, patch_m in inside_m.items()}
 
 
 def _mean_angle(theta: npt.NDArray[np.float64], patch: Patch) -> float:
@@ -642,13 +644,13 @@ def _select_patches(images: Images, known_scene: KnownScene) -> Segmentation:
         return Segmentation(np.zeros(images.h.shape, np.int32), ())
     even = images if known_scene.plane is None else known_scene.plane.apply(images)
     segmentation = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
-    filled = known_scene.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED
+    filled = known_scene.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED_LEVEL
     if not segmentation.patches and filled:
         return whole_plane(images.valid, images.x_m, images.y_m, SegmentSettings().margin_mm)
     return segmentation
 
 
-def _references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
+def _list_references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
     """Return the given metal reference, or else the brightest patch and others like it; `no_metal` without patches."""
     if isinstance(known_scene.metal, PlaneReference):
         return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
@@ -656,7 +658,7 @@ def _references(images: Images, known_scene: KnownScene, segmentation: Segmentat
         return (metal_by_label(known_scene.metal, segmentation),)
     if known_scene.metal is not None:
         return (metal_in_box(known_scene.metal, segmentation, images.x_m, images.y_m, images.valid),)
-    return find_metals(images.h, images.v, segmentation) or (no_metal(images.usable),)
+    return find_metals(images.h, images.v, segmentation) or (make_missing_reference(images.usable),)
 
 
 def smooth_inside(image: Image, segmentation: Segmentation, sigma_px: float) -> Image:
@@ -680,12 +682,12 @@ def permittivity_change(result: MaterialsResult, angles: IncidenceChoice) -> dic
     `largest_permittivity_change` is |eps_other / eps - 1|, `of_patch` its number; empty without any permittivity.
     """
     changes = []
-    for r in result.patches:
-        pixels = r.patch.interior
-        if r.permittivity.value is not None and pixels.any():
+    for patch_result in result.patches:
+        pixels = patch_result.patch.interior
+        if patch_result.permittivity.value is not None and pixels.any():
             mean_angles_rad = np.array([np.mean(angles.used_rad[pixels]), np.mean(angles.other_rad[pixels])])
-            eps = permittivity_from_ratio(r.permittivity.ratio, mean_angles_rad)
-            changes.append((float(abs(eps[1] / eps[0] - 1)), r.patch.label))
+            eps = permittivity_from_ratio(patch_result.permittivity.ratio, mean_angles_rad)
+            changes.append((float(abs(eps[1] / eps[0] - 1)), patch_result.patch.label))
     if not changes:
         return {}
     largest, label = max(changes)

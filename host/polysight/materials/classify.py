@@ -50,9 +50,9 @@ from polysight.materials.names import (
 )
 from polysight_shared.errors import DataError, ErrorCode
 
-GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
+WEIGHT_GRID = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Values of lambda_H and lambda_V to try, relative to lambda_P = 1, with each channel scaled by its spread; chosen."""
-MARGIN = 2.0
+UNKNOWN_MARGIN = 2.0
 """Distance beyond which a pixel is unknown, over the 99th percentile of the material's own pixels between scans.
 
 Chosen: a smaller margin calls more pixels of new placements unknown, a larger one accepts more foreign materials."""
@@ -82,23 +82,23 @@ class Weights:
     def from_dict(raw: dict[str, Any]) -> Weights:
         """Rebuild the weights from the result of :meth:`to_dict`. Raises DataError if they are not valid."""
         try:
-            w = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
+            weights = Weights(float(raw["h"]), float(raw["v"]), float(raw["p"]), raw["measure"], int(raw["neighbours"]))
         except (KeyError, TypeError, ValueError) as e:
             raise DataError(
                 f"the library's weights cannot be read: {e}", "another release made it", "train it again",
                 code=ErrorCode.VALUE_INVALID,
             ) from None  # fmt: skip
-        if w.measure not in MEASURES or min(w.h, w.v, w.p) < 0 or w.neighbours < 1:
+        if weights.measure not in MEASURES or min(weights.h, weights.v, weights.p) < 0 or weights.neighbours < 1:
             raise DataError(
                 f"the library's weights are invalid: {raw}", "another release made it", "train it again",
                 code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
-        return w
+        return weights
 
 
-def combine(channels: Distances, w: Weights) -> Real:
+def combine(channels: Distances, weights: Weights) -> Real:
     """Return the weighted sum of the distances in H, V and P, float64 in their shape."""
-    return w.h * channels[0] + w.v * channels[1] + w.p * channels[2]
+    return weights.h * channels[0] + weights.v * channels[1] + weights.p * channels[2]
 
 
 class PaperKnn(Model):
@@ -129,9 +129,11 @@ class PaperKnn(Model):
         # Slow imports, which most commands do not need.
         from polysight.materials.paper_knn import PaperKNeighborsClassifier
 
-        w = self.weights
-        count = min(w.neighbours, samples.names.size)
-        self._knn = PaperKNeighborsClassifier(count, weight_h=w.h, weight_v=w.v, weight_p=w.p, measure=w.measure)
+        weights = self.weights
+        count = min(weights.neighbours, samples.names.size)
+        self._knn = PaperKNeighborsClassifier(
+            count, weight_h=weights.h, weight_v=weights.v, weight_p=weights.p, measure=weights.measure
+        )
         self._materials, self._material_of_pixel = np.unique(samples.names, return_inverse=True)
         # Numbers, which scikit-learn checks faster than names.
         self._knn.fit(ratio_columns(samples.x), self._material_of_pixel)
@@ -157,8 +159,8 @@ class PaperKnn(Model):
         if distances is None:
             return voted
         material = np.searchsorted(self.distributions.names, voted.names)
-        to_material = distances[np.arange(len(voted.patches)), material]
-        return replace(voted, distance=np.maximum(voted.distance, to_material))
+        distance_to_material = distances[np.arange(len(voted.patches)), material]
+        return replace(voted, distance=np.maximum(voted.distance, distance_to_material))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Return each pixel's name [n], and its mean distance to its neighbours over the material's threshold [n]."""
@@ -212,7 +214,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     same_scan = few.groups[:, None] == few.groups[None, :]
     # Every pixel must find as many neighbours in other scans.
     judge = _LeftOut.prepare(few, same_scan, min(neighbours, int((~same_scan).sum(axis=1).min())))
-    grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(GRID, GRID)]
+    grid = [(0.0, 0.0)] if channels == "P" else [(0.0, 0.0), *product(WEIGHT_GRID, WEIGHT_GRID)]
     tried: list[tuple[float, float, Weights]] = []
     p_alone: dict[str, float] = {}
     for measure in MEASURES:
@@ -231,9 +233,11 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     top = max(accuracy for accuracy, _, _ in tried)
     accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
     distances = channel_distances(few.x, few.x, weights.measure)
-    by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
-    by_channel["p"] = p_alone[weights.measure]
-    return Fit(weights, accuracy, by_channel, _compute_thresholds(combine(distances, weights), neighbours, few))
+    accuracy_by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
+    accuracy_by_channel["p"] = p_alone[weights.measure]
+    return Fit(
+        weights, accuracy, accuracy_by_channel, _compute_thresholds(combine(distances, weights), neighbours, few)
+    )
 
 
 def _draw_few_pixels(samples: Samples) -> Samples:
@@ -263,17 +267,17 @@ class _LeftOut:
 
     def accuracy(self, distance: Real) -> float:
         """Return the pixel accuracy for distances [n, n], mean over the materials of two or more scans."""
-        to_other_scans = np.where(self.same_scan, np.inf, distance)
+        distance_to_other_scans = np.where(self.same_scan, np.inf, distance)
         count = np.bincount(self.classes)
         # The nearest in any order: votes need none. Values are partitioned several times faster than their indices.
         last = self.voters - 1
-        is_near = to_other_scans <= np.partition(to_other_scans, last, axis=1)[:, last, None]
+        is_near = distance_to_other_scans <= np.partition(distance_to_other_scans, last, axis=1)[:, last, None]
         members = (self.classes[:, None] == np.arange(count.size)).astype(np.float32)
         votes = is_near.astype(np.float32) @ members
-        # Where several pixels are as far as the last one that votes, the partition of indices decides.
+        # If several pixels are as far as the last one that votes, the partition of indices decides which of them votes.
         tied = is_near.sum(axis=1) > self.voters
         if tied.any():
-            nearest = np.argpartition(to_other_scans[tied], last, axis=1)[:, : self.voters]
+            nearest = np.argpartition(distance_to_other_scans[tied], last, axis=1)[:, : self.voters]
             votes[tied] = count_votes(self.classes[nearest], count.size)
         voted = votes.argmax(axis=1)
         return float(np.mean((np.bincount(self.classes, voted == self.classes) / count)[self.shared]))
@@ -297,17 +301,17 @@ def _compute_thresholds(distance: Real, neighbours: int, few: Samples) -> dict[s
                 k = min(neighbours, d.shape[1])
                 near.append(np.partition(d, k - 1, axis=1)[:, :k].mean(axis=1))
         if near:
-            out[str(name)] = MARGIN * float(np.percentile(np.concatenate(near), 99))
+            out[str(name)] = UNKNOWN_MARGIN * float(np.percentile(np.concatenate(near), 99))
     usual = float(np.median(list(out.values()))) if out else 0.0
     return {name: float(np.clip(value, 0.5 * usual, 3 * usual)) for name, value in out.items()}
 
 
-PAPER = "weighted KNN (paper)"
-DISCRIMINANT = "discriminant of error sources"
+PAPER_MODEL = "weighted KNN (paper)"
+DISCRIMINANT_MODEL = "discriminant of error sources"
 """Names of the models in library files."""
-SHORT = {"knn": PAPER, "discriminant": DISCRIMINANT}
+MODEL_OF_OPTION = {"knn": PAPER_MODEL, "discriminant": DISCRIMINANT_MODEL}
 """Names of models in commands."""
-EARLIER = (
+EARLIER_MODELS = (
     "own-spread",
     "discriminant of error sources, own spread",
     "linear discriminant",
@@ -318,8 +322,8 @@ EARLIER = (
 
 
 MODELS: dict[str, Callable[[str], Model]] = {
-    PAPER: PaperKnn,
-    DISCRIMINANT: ErrorDiscriminant,
+    PAPER_MODEL: PaperKnn,
+    DISCRIMINANT_MODEL: ErrorDiscriminant,
 }
 """Name to the model's class, which is called with the channels to use, one of `CHANNELS`."""
 
@@ -335,7 +339,7 @@ class Classifier:
         Weights of the paper's KNN; they select that model, and replace the library's own weights, but not its
         thresholds: give weights of the same scale.
     model
-        A key of `MODELS` or `SHORT`; default: the library's model.
+        A key of `MODELS` or `MODEL_OF_OPTION`; default: the library's model.
     angles_deg
         Incidence angle of the scan, or of several scans of the same patches in their order; required if the library
         has more than one.
@@ -379,7 +383,7 @@ class Classifier:
                 "give the incidence angle of the scan",
                 code=ErrorCode.KEY_MISSING,
             )
-        # Of the library, what it holds for each angle.
+        # The parts of the library, one for each angle.
         parts = [library.at_angle(a) for a in angles_deg or library.angles_deg]
         if len({p.angles_deg[0] for p in parts}) < len(parts):
             raise DataError(
@@ -392,10 +396,10 @@ class Classifier:
         self.library = library
         self.fit = fit
         self.angles_deg = tuple(p.angles_deg[0] for p in parts)
-        self.model = PAPER
+        self.model = PAPER_MODEL
         if not weights:
-            self.model = _check_model_name(model or fit.get("model", PAPER))
-        if self.model == PAPER:
+            self.model = _check_model_name(model or fit.get("model", PAPER_MODEL))
+        if self.model == PAPER_MODEL:
             if weights is None:
                 weights = Weights.from_dict(fit["weights"]) if "weights" in fit else Weights()
             self._model = PaperKnn(weights=weights, thresholds=fit.get("thresholds"))
@@ -435,48 +439,48 @@ class Classifier:
         finite are unknown. `evidence` is that of each scan on each patch; None where only the pixels are known. The
         paper's KNN uses the pixels alone.
         """
-        if self.model == PAPER:
+        if self.model == PAPER_MODEL:
             return [self._name_by_votes(x) for x in patches]
         named = []
-        for x, of_patch in zip(patches, evidence or [None] * len(patches), strict=True):
+        for x, patch_evidence in zip(patches, evidence or [None] * len(patches), strict=True):
             _, _, ratios = split_by_angle(x)
-            if of_patch is None:
-                of_patch = [
+            if patch_evidence is None:
+                patch_evidence = [
                     derive_evidence_from_pixels(t, kinds) for t, kinds in zip(ratios.T, self.kinds, strict=True)
                 ]
-            named.append(name_patch(self.kinds, of_patch, ratios))
+            named.append(name_patch(self.kinds, patch_evidence, ratios))
         return named
 
     def _name_by_votes(self, x: Real) -> NamedPatch:
         """Name a patch by the votes of its pixels' nearest neighbours."""
-        good = usable(x)
-        if not good.any():
-            return make_patch_without_pixels(good.size)
-        voted = self._model.by_scan(x[good], np.zeros(int(good.sum()), np.intp))
-        pixel_names = np.full(good.size, UNKNOWN, f"<U{max(len(UNKNOWN), *map(len, self.names))}")
-        pixel_names[good] = np.where(voted.pixel_distance <= 1, voted.pixel_names, UNKNOWN)
-        pixel_distance = np.full(good.size, np.inf)
-        pixel_distance[good] = voted.pixel_distance
-        nearest = str(voted.names[0])
+        is_usable = usable(x)
+        if not is_usable.any():
+            return make_patch_without_pixels(is_usable.size)
+        voted = self._model.by_scan(x[is_usable], np.zeros(int(is_usable.sum()), np.intp))
+        pixel_names = np.full(is_usable.size, UNKNOWN, f"<U{max(len(UNKNOWN), *map(len, self.names))}")
+        pixel_names[is_usable] = np.where(voted.pixel_distance <= 1, voted.pixel_names, UNKNOWN)
+        pixel_distance = np.full(is_usable.size, np.inf)
+        pixel_distance[is_usable] = voted.pixel_distance
+        nearest_name = str(voted.names[0])
         distance = float(voted.distance[0])
         verdict = PatchName(
-            name=nearest if distance <= 1 else UNKNOWN,
+            name=nearest_name if distance <= 1 else UNKNOWN,
             confidence=float(voted.confidence[0]),
             votes=compute_name_shares(pixel_names),
             distance=distance,
-            pixels=int(good.sum()),
-            nearest=nearest,
+            pixels=int(is_usable.sum()),
+            nearest=nearest_name,
         )
         return NamedPatch(pixel_names, pixel_distance, verdict)
 
 
-def _check_model_name(given: str) -> str:
+def _check_model_name(given_name: str) -> str:
     """Return the key of `MODELS` for a name, a short or an earlier one. Raises DataError if there is none."""
-    name = DISCRIMINANT if given in EARLIER else SHORT.get(given, given)
+    name = DISCRIMINANT_MODEL if given_name in EARLIER_MODELS else MODEL_OF_OPTION.get(given_name, given_name)
     if name not in MODELS:
         raise DataError(
-            f"no classifier is called {given!r}", "the library was made by another version, or the name is wrong",
-            f"one of {', '.join(SHORT)}", code=ErrorCode.VALUE_INVALID,
+            f"no classifier is called {given_name!r}", "the library was made by another version, or the name is wrong",
+            f"one of {', '.join(MODEL_OF_OPTION)}", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return name
 
@@ -503,8 +507,8 @@ def classifier_sentence(classifier: Classifier) -> str:
             out += f" (split by pixel, which is optimistic: {100 * judged['pixels_split_by_pixel']:.1f} %)"
         channel = fit.get("by_channel", {})
         if {"h", "v", "p"} <= set(channel):
-            alone = ", ".join(f"{k.upper()} {100 * channel[k]:.0f} %" for k in "hvp")
-            out += f"; the KNN by one channel alone: {alone}"
+            single_channels = ", ".join(f"{k.upper()} {100 * channel[k]:.0f} %" for k in "hvp")
+            out += f"; the KNN by one channel alone: {single_channels}"
         out += "."
         if missing := fit.get("not_judged"):
             out += (

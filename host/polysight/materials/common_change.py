@@ -31,32 +31,32 @@ from polysight.materials.measure import Scatter
 Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
-STABLE = 0.6
+STABLE_PROBABILITY = 0.6
 """Prior probability that the rig does not drift, neither in amplitude nor in phase. Chosen: an even drift makes the
 same slope on all plates, as shifted images do. With 0.8 such a drift is missed. With 0.4 the half widths of the error
 intervals of undisturbed scenes are 8 % larger than with 0.6 (scenes of the independent generator)."""
-DRIFTS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.015, 0.06)}
+DRIFT_STDS: dict[bool, tuple[float, ...]] = {True: (0.002,), False: (0.015, 0.06)}
 """Standard deviations of the drift of either part of ln(V / H) over a scan (chosen). Key: True for a stable rig, False
 for one that drifts, as usual (0.015) or by up to 15 % and 9 degrees (0.06: 2.5 of them). Values of one key are equally
 probable."""
 DRIFT_LENGTHS_M = (0.05, 0.07, 0.15)
 """Correlation lengths of the drift along y, the slow axis of the scan: half a wave of it is 0.13 to 0.4 m long. All
 are equally probable."""
-SLOPE_SEEN = 0.88
+SEEN_SLOPE_SHARE = 0.88
 """Slope of ln(V / H) within a plate's image over the slope of the gain. A pixel has the gain averaged over a Fresnel
 zone. Near a plate's edge only the plate's side of that zone echoes, so the average is nearer the gain in the middle of
 the plate. In 100 drifting scenes of the independent generator the gain changed between plates by 1.1 to 1.2 times the
 integral of the slopes."""
-FRINGES = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
+FRINGE_PRIOR = {0.0: 0.95, 0.05: 0.025, 0.15: 0.025}
 """Standard deviation of the fringes in either part of ln(V / H), to its prior probability; 0: no fringes. The published
 rig shows 10 to 20 %."""
 FRINGE_LENGTHS_M = (0.03, 0.05)
 """Correlation lengths of fringes whose period is 0.2 to 0.3 m. Shorter ones average out over a plate."""
-COMMON_SLOPES = {0.15: 0.7, 0.5: 0.2, 2.0: 0.1}
+COMMON_SLOPE_PRIOR = {0.15: 0.7, 0.5: 0.2, 2.0: 0.1}
 """Standard deviation of the slope of ln(V / H) that all plates share, per metre, to its prior probability (chosen). H
 and V in the same place have 0.1 to 0.3 (scenes of the independent generator), images some millimetres apart 0.5, and
 images of a small aperture 1 to 3."""
-OWN_SLOPES = (0.05, 1.0, 3.0)
+OWN_SLOPE_STDS = (0.05, 1.0, 3.0)
 """Standard deviations of a plate's own slope, per metre: flat, uneven, and disturbed plates. All three are equally
 probable: if flat plates are preferred, the ripple of the published picture counts as fringes, and the half widths of
 its plates' intervals are 30 instead of 19 %."""
@@ -98,7 +98,7 @@ class CommonChange:
     ----------
     value, std
         complex [plate]: change by drift and fringes; its errors, that of the real part as the real part of `std`, that
-        of the imaginary part as its imaginary part: 1.96 of them hold 95 % or more (`_Explained.error`).
+        of the imaginary part as its imaginary part: 1.96 of them hold 95 % or more (`_ExpectedFromSlopes.error`).
     drift, drift_std
         complex [plate]: the same by drift alone; `drift_std` are standard deviations.
     ripple
@@ -135,8 +135,8 @@ class CommonChange:
         """
         std = complex(self.std[plate])
         ripple = float(self.ripple[plate])
-        of_phase = PHASE_OF_CHANGE * float(np.hypot(std.imag, ripple))
-        return complex(self.value[plate]), (float(np.hypot(std.real, ripple)), of_phase)
+        phase_std = PHASE_OF_CHANGE * float(np.hypot(std.imag, ripple))
+        return complex(self.value[plate]), (float(np.hypot(std.real, ripple)), phase_std)
 
 
 def estimate_common_change(
@@ -187,12 +187,12 @@ def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], bord
     (noise_real_x, _), (noise_imag_x, noise_imag_y) = noises
     slopes = np.stack([real_x, imag_x, imag_y])
     errors = np.stack([noise_real_x, noise_imag_x, noise_imag_y])
-    usual = float(
+    usual_slope = float(
         np.mean([_estimate_excess_variance(s[~border], e[~border]) for s, e in zip(slopes, errors, strict=True)])
     )
     # Plates at the border, whose slopes say nothing about it, get the usual size.
-    excess = np.where(border, len(slopes) * usual, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
-    return np.sqrt((WEIGHT_OF_USUAL * usual + excess) / (WEIGHT_OF_USUAL + len(slopes)))
+    excess = np.where(border, len(slopes) * usual_slope, np.maximum(np.sum(slopes**2 - errors**2, axis=0), 0.0))
+    return np.sqrt((WEIGHT_OF_USUAL * usual_slope + excess) / (WEIGHT_OF_USUAL + len(slopes)))
 
 
 def _estimate_excess_variance(slopes: Real, errors: Real) -> float:
@@ -212,7 +212,7 @@ class _Field:
     """Covariances of a smooth field of unit variance on the plane, at the plates.
 
     A value is the field at a plate minus the field at the origin. A slope is as the plate's image shows it, smaller
-    than the field's by `SLOPE_SEEN`; slopes along x stand before those along y.
+    than the field's by `SEEN_SLOPE_SHARE`; slopes along x stand before those along y.
 
     Attributes
     ----------
@@ -236,17 +236,19 @@ class _Field:
         """
         count = len(places_m)
         distance = (places_m[:, None] - places_m[None]) * np.array(axes)
-        from_origin = (places_m - origin_m) * np.array(axes)
+        distance_from_origin = (places_m - origin_m) * np.array(axes)
         covariance = np.exp(-0.5 * np.sum(distance**2, axis=-1) / length_m**2)
-        with_origin = np.exp(-0.5 * np.sum(from_origin**2, axis=-1) / length_m**2)
+        covariance_with_origin = np.exp(-0.5 * np.sum(distance_from_origin**2, axis=-1) / length_m**2)
         # Derivatives of the Gaussian covariance with respect to both places, and to one place.
         product = distance[..., :, None] * distance[..., None, :] / length_m**2
-        of_slopes = covariance[..., None, None] * (np.diag(axes) - product) / length_m**2
-        with_slopes = (covariance[..., None] * distance + (with_origin[:, None] * from_origin)[None]) / length_m**2
+        slope_covariance = covariance[..., None, None] * (np.diag(axes) - product) / length_m**2
+        covariance_with_slopes = (
+            covariance[..., None] * distance + (covariance_with_origin[:, None] * distance_from_origin)[None]
+        ) / length_m**2
         return cls(
-            of_slopes=SLOPE_SEEN**2 * of_slopes.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count),
-            with_slopes=SLOPE_SEEN * with_slopes.transpose(0, 2, 1).reshape(count, 2 * count),
-            of_itself=2 - 2 * with_origin,
+            of_slopes=SEEN_SLOPE_SHARE**2 * slope_covariance.transpose(2, 0, 3, 1).reshape(2 * count, 2 * count),
+            with_slopes=SEEN_SLOPE_SHARE * covariance_with_slopes.transpose(0, 2, 1).reshape(count, 2 * count),
+            of_itself=2 - 2 * covariance_with_origin,
         )
 
 
@@ -277,10 +279,10 @@ class _Fields:
         """Return the fields for plates at places [plate, 2], relative to the origin [2]."""
         shared = []
         prior = []
-        cases = itertools.product(FRINGES.items(), FRINGE_LENGTHS_M, COMMON_SLOPES.items(), (True, False))
+        cases = itertools.product(FRINGE_PRIOR.items(), FRINGE_LENGTHS_M, COMMON_SLOPE_PRIOR.items(), (True, False))
         for (fringe, fringe_prior), fringe_m, (common, common_prior), stable in cases:
             shared.append((fringe, fringe_m, common, stable))
-            prior.append(fringe_prior * common_prior * (STABLE if stable else 1 - STABLE))
+            prior.append(fringe_prior * common_prior * (STABLE_PROBABILITY if stable else 1 - STABLE_PROBABILITY))
         return cls(
             drifts=[_Field.with_axes((0, 1), length_m, places_m, origin_m) for length_m in DRIFT_LENGTHS_M],
             fringes={length_m: _Field.with_axes((1, 1), length_m, places_m, origin_m) for length_m in FRINGE_LENGTHS_M},
@@ -288,7 +290,7 @@ class _Fields:
             log_prior=np.log(prior),
         )
 
-    def explain(self, slopes: Real, noise: Real) -> _Explained:
+    def explain(self, slopes: Real, noise: Real) -> _ExpectedFromSlopes:
         """Explain the slopes [2, plate] of one part of ln(V / H), once for each case of `shared`.
 
         `noise` [2, plate] is the standard deviation of the slopes.
@@ -296,16 +298,16 @@ class _Fields:
         explained: dict[tuple[float, float, float, bool], tuple[Real, ...]] = {}
         parts = []
         for fringe, fringe_m, common, stable in self.shared:
-            # Where there are no fringes their length makes no difference.
+            # Without fringes their length makes no difference.
             case = (fringe, fringe_m if fringe > 0 else FRINGE_LENGTHS_M[0], common, stable)
             if case not in explained:
                 explained[case] = _list_arrays(self._explain(slopes, noise, *case))
             parts.append(explained[case])
-        return _Explained(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+        return _ExpectedFromSlopes(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def _explain(
         self, slopes: Real, noise: Real, fringe: float, fringe_m: float, common: float, stable: bool
-    ) -> _Explained:
+    ) -> _ExpectedFromSlopes:
         """Explain the slopes by one case of `shared`, averaged over drifts and the plates' own slopes by their
         evidence.
 
@@ -316,57 +318,57 @@ class _Fields:
         fringes = self.fringes[fringe_m]
         # One slope that all plates share along x, and an independent one along y.
         shared_slope = np.kron(np.eye(2), np.ones((count, count)))
-        of_common_causes = common**2 * shared_slope + fringe**2 * fringes.of_slopes
+        common_covariance = common**2 * shared_slope + fringe**2 * fringes.of_slopes
         own_slopes, own_slopes_prior = _list_own_variances(count)
         own_variances = (noise.ravel() ** 2 + own_slopes)[:, :, None] * np.eye(2 * count)
-        drifts = list(itertools.product(self.drifts, DRIFTS[stable]))
+        drifts = list(itertools.product(self.drifts, DRIFT_STDS[stable]))
         drifts_at_once = max(1, MOST_NUMBERS // max(1, own_variances.size))
         parts = []
         for first in range(0, len(drifts), drifts_at_once):
             fields_of_drift = drifts[first : first + drifts_at_once]
-            explained = of_common_causes + np.stack([drift**2 * field.of_slopes for field, drift in fields_of_drift])
+            explained = common_covariance + np.stack([drift**2 * field.of_slopes for field, drift in fields_of_drift])
             # Gaussian process: the expected value of any quantity is its covariance with the slopes times `answer`,
             # [drift, own, 2 plate].
             inverse = np.asarray(np.linalg.inv(explained[:, None] + own_variances), np.float64)
             answer = inverse @ measured
-            of_drift = np.stack([drift**2 * field.with_slopes for field, drift in fields_of_drift])
-            of_all = of_drift + fringe**2 * fringes.with_slopes
+            drift_covariance = np.stack([drift**2 * field.with_slopes for field, drift in fields_of_drift])
+            total_covariance = drift_covariance + fringe**2 * fringes.with_slopes
             variance_of_drift = np.stack([drift**2 * field.of_itself for field, drift in fields_of_drift])
             variance_of_all = variance_of_drift + fringe**2 * fringes.of_itself
-            square = _compute_mean_square(answer, inverse, of_all, variance_of_all)
+            square = _compute_mean_square(answer, inverse, total_covariance, variance_of_all)
             # Without fringes the drift is all there is.
             drift_square = square
             if fringe > 0:
-                drift_square = _compute_mean_square(answer, inverse, of_drift, variance_of_drift)
+                drift_square = _compute_mean_square(answer, inverse, drift_covariance, variance_of_drift)
             # Prior of the case, and the normal distribution of the slopes with the covariance inverted above.
-            log_prior = np.log(own_slopes_prior / len(DRIFTS[stable]))
+            log_prior = np.log(own_slopes_prior / len(DRIFT_STDS[stable]))
             log_evidence = log_prior - 0.5 * answer @ measured + 0.5 * np.linalg.slogdet(inverse)[1]
             cases_at_once = log_evidence.size
-            cases = _Explained(
+            cases = _ExpectedFromSlopes(
                 log_evidence=log_evidence.ravel(),
-                mean=(answer @ of_all.mT).reshape(cases_at_once, count),
+                mean=(answer @ total_covariance.mT).reshape(cases_at_once, count),
                 square=square.reshape(cases_at_once, count),
-                drift=(answer @ of_drift.mT).reshape(cases_at_once, count),
+                drift=(answer @ drift_covariance.mT).reshape(cases_at_once, count),
                 drift_square=drift_square.reshape(cases_at_once, count),
                 remaining=slopes - (answer @ explained).reshape(cases_at_once, 2, count),
             )
             parts.append(cases)
-        return _Explained.average_over(parts)
+        return _ExpectedFromSlopes.average_over(parts)
 
 
 @functools.cache
 def _list_own_variances(count: int) -> tuple[Real, Real]:
     """Return variances of the plates' own slopes, [case, 2 plate] (x before y), and the prior probability of each case.
 
-    A case is a pair of `OWN_SLOPES`, one along x and one along y.
+    A case is a pair of `OWN_SLOPE_STDS`, one along x and one along y.
     """
     variances = []
     priors = []
-    for along_x, along_y in itertools.product(OWN_SLOPES, OWN_SLOPES):
+    for along_x, along_y in itertools.product(OWN_SLOPE_STDS, OWN_SLOPE_STDS):
         variances.append(np.repeat([along_x**2, along_y**2], count))
-        prior = (1 - ALIKE_BOTH_WAYS) / len(OWN_SLOPES) ** 2
+        prior = (1 - ALIKE_BOTH_WAYS) / len(OWN_SLOPE_STDS) ** 2
         if along_x == along_y:
-            prior += ALIKE_BOTH_WAYS / len(OWN_SLOPES)
+            prior += ALIKE_BOTH_WAYS / len(OWN_SLOPE_STDS)
         priors.append(prior)
     return np.array(variances), np.array(priors)
 
@@ -384,7 +386,7 @@ def _compute_mean_square(answer: Real, inverse: Real, with_slopes: Real, of_itse
 
 
 @dataclass(frozen=True)
-class _Explained:
+class _ExpectedFromSlopes:
     """Drift and fringes expected from the slopes of one part of ln(V / H) (real or imaginary), for some cases.
 
     Attributes
@@ -407,7 +409,7 @@ class _Explained:
     remaining: Real
 
     @classmethod
-    def average_over(cls, parts: Sequence[_Explained]) -> _Explained:
+    def average_over(cls, parts: Sequence[_ExpectedFromSlopes]) -> _ExpectedFromSlopes:
         """Return one case: the average over all cases of `parts`, weighted by their evidence."""
         together = cls(*(np.concatenate(arrays) for arrays in zip(*map(_list_arrays, parts), strict=True)))
         largest = float(together.log_evidence.max())
@@ -415,9 +417,9 @@ class _Explained:
         average = together.average(weight / weight.sum())
         return replace(average, log_evidence=np.array([largest + np.log(weight.sum())]))
 
-    def average(self, weight: Real) -> _Explained:
+    def average(self, weight: Real) -> _ExpectedFromSlopes:
         """Return one case: the average over the cases with weights [case] that sum to 1."""
-        return _Explained(*(np.tensordot(weight, array, 1)[None] for array in _list_arrays(self)))
+        return _ExpectedFromSlopes(*(np.tensordot(weight, array, 1)[None] for array in _list_arrays(self)))
 
     @property
     def std(self) -> Real:
@@ -451,6 +453,6 @@ class _Explained:
         return np.sqrt(np.maximum(self.drift_square - self.drift**2, 0.0))
 
 
-def _list_arrays(explained: _Explained) -> tuple[Real, ...]:
+def _list_arrays(explained: _ExpectedFromSlopes) -> tuple[Real, ...]:
     """Return the values of the fields, in the order in which the class declares them."""
     return tuple(getattr(explained, field.name) for field in fields(explained))

@@ -22,7 +22,7 @@ LEAST_OVERLAP = 0.6
 """Least share of a copy that a shifted plate covers, and of the shifted plates that copies cover; chosen."""
 SAME_DB = 3.0
 """Largest deviation of a copy's level from the others', relative to its plate; chosen."""
-VISIBLE = 0.06
+VISIBLE_AMPLITUDE = 0.06
 """Amplitude relative to the brightest plate at which the other channel shows a patch: -24 dB; chosen."""
 SKIRT_PX = 4
 """Pixels around the plates in which a copy cannot be distinguished from the plate's own edge; chosen."""
@@ -64,7 +64,9 @@ def _are_plates(copies: Copies, patches: Sequence[Patch], other: np.ndarray, pix
     """
     brightest = max(float(np.median(other[p.mask])) for p in patches)
     visible_patches = [
-        p for p in patches if p.label in copies.labels and float(np.median(other[p.mask])) > VISIBLE * brightest
+        p
+        for p in patches
+        if p.label in copies.labels and float(np.median(other[p.mask])) > VISIBLE_AMPLITUDE * brightest
     ]
     if len(visible_patches) < len(copies.labels):
         return False

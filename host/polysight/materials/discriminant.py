@@ -39,14 +39,14 @@ from polysight.materials.specimens import (
     relative,
 )
 
-REJECTED = 0.02
+REJECTED_SHARE = 0.02
 """Share of the known materials' pixels, and of their patches, that are called unknown. Chosen: a smaller share accepts
 more foreign materials."""
 # Largest numbers of iterations of the common error and of the two-way fit; chosen.
 COMMON_ERROR_ROUNDS = 30
 TWO_WAY_ROUNDS = 30
 # Least distance of unknown patches: just above 1, the threshold.
-BEYOND = 1.001
+UNKNOWN_DISTANCE = 1.001
 LN_2PI = float(np.log(2 * np.pi))
 
 
@@ -156,9 +156,9 @@ class ErrorDiscriminant(Model):
         dof = max(int(informative.sum()) - np.unique(material[informative]).size - scans + 1, 1)
         # Covariances: within patches, between patches, and of the scans' offsets.
         pixel = d - mean[patch]
-        used = informative[patch]
+        is_used = informative[patch]
         self.within = self._decorrelate_angles(
-            _compute_covariance(pixel[used], max(int(used.sum() - informative.sum()), 1))
+            _compute_covariance(pixel[is_used], max(int(is_used.sum() - informative.sum()), 1))
         )
         self._effects = self._compute_specimen_effects()
         # The only patch of a material is its mean: its residual of zero says nothing about errors.
@@ -203,15 +203,15 @@ class ErrorDiscriminant(Model):
         """
         log_h = self._anchor_h[:, None] - self._anchor_h
         differences = self._select_channels(relative(log_h, self._anchor_t[:, None] - self._anchor_t, self._anchor_t))
-        of_patch = self._patch_covariances(self.pixels) + self.scan
-        inverse = np.linalg.inv((of_patch[:, None] + of_patch) / 2)
+        patch_covariance = self._patch_covariances(self.pixels) + self.scan
+        inverse = np.linalg.inv((patch_covariance[:, None] + patch_covariance) / 2)
         return np.sqrt(np.einsum("abd,abde,abe->ab", differences, inverse, differences))
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Classify each pixel independently: return name, str [n], and distance over the threshold, float64 [n]."""
-        q, cost = costs(self._compute_deviations(x) - self.level, self._compute_pixel_covariances())
+        distance2, cost = costs(self._compute_deviations(x) - self.level, self._compute_pixel_covariances())
         best = cost.argmin(axis=1)
-        return self.names[best], np.sqrt(q[np.arange(len(x)), best] / self.pixel_level)
+        return self.names[best], np.sqrt(distance2[np.arange(len(x)), best] / self.pixel_level)
 
     def pixel_probabilities(self, x: Real) -> Real:
         """Return the probability of each material for pixels classified independently, [n, materials]."""
@@ -238,13 +238,13 @@ class ErrorDiscriminant(Model):
         best = cost.argmin(axis=1)
         distances = np.sqrt(distance2 / self.patch_level)
         is_none = probability[:, -1] > probability[row, best]
-        distance = np.where(is_none, np.maximum(distances[row, best], BEYOND), distances[row, best])
+        distance = np.where(is_none, np.maximum(distances[row, best], UNKNOWN_DISTANCE), distances[row, best])
 
         pixel_distance2, pixel_cost = costs(deviations - shift, self._patch_covariances(1.0) + spread)
-        of_pixel = pixel_cost.argmin(axis=1)
-        pixel_distance = np.sqrt(pixel_distance2[np.arange(len(x)), of_pixel] / self.pixel_level)
+        material_of_pixel = pixel_cost.argmin(axis=1)
+        pixel_distance = np.sqrt(pixel_distance2[np.arange(len(x)), material_of_pixel] / self.pixel_level)
         return NamedScan(
-            pixel_names=self.names[of_pixel],
+            pixel_names=self.names[material_of_pixel],
             pixel_distance=pixel_distance,
             patches=ids,
             names=self.names[best],
@@ -288,9 +288,9 @@ class ErrorDiscriminant(Model):
         # |H|, |V| and t = V / H relative to metal, complex; [n, angles] each.
         h, v, t = split_by_angle(x)
         logs = np.log(np.maximum(h, 1e-6)), np.log(np.maximum(v, 1e-6))
-        of_material = [material == k for k in range(self.names.size)]
+        is_of_material = [material == k for k in range(self.names.size)]
         self._anchor_h, self._anchor_v, self._anchor_t = (
-            np.stack([c[members].mean(axis=0) for members in of_material]) for c in (*logs, t)
+            np.stack([c[members].mean(axis=0) for members in is_of_material]) for c in (*logs, t)
         )
         features_per_angle = self._select_channels(np.zeros((1, 3))).size
         angle = np.arange(features_per_angle * h.shape[1]) // features_per_angle
@@ -308,19 +308,21 @@ class ErrorDiscriminant(Model):
         # `relative` converts deviations of ln|H| and of t to those of ln|H|, ln|V| and arg P.
         return self._select_channels(relative(log_h, t[:, None] - self._anchor_t, self._anchor_t))
 
-    def _select_channels(self, every: Real) -> Real:
+    def _select_channels(self, features: Real) -> Real:
         """Select the model's channels of ln|H|, ln|V|, arg P [..., angles, 3]; return [..., features]."""
-        h = every[..., 0]
-        v = every[..., 1]
-        angle = every[..., 2]
+        h = features[..., 0]
+        v = features[..., 1]
+        angle = features[..., 2]
         columns = {"H": (h,), "V": (v,), "P": (v - h, angle), "H+V+P": (h, v, angle)}[self.channels]
-        return np.stack(columns, axis=-1).reshape(*every.shape[:-2], -1)
+        return np.stack(columns, axis=-1).reshape(*features.shape[:-2], -1)
 
     @staticmethod
     def _find_metal_like(x: Real, patch: npt.NDArray[np.intp]) -> npt.NDArray[np.bool_]:
         """Return true for patches 0, 1, ... whose median V / H is nearly 1 under all angles, bool [patch]."""
-        q = split_by_angle(x)[2]
-        middle = np.stack([median_by_patch(t.real, patch) + 1j * median_by_patch(t.imag, patch) for t in q.T], axis=1)
+        inverse_ratio = split_by_angle(x)[2]
+        middle = np.stack(
+            [median_by_patch(t.real, patch) + 1j * median_by_patch(t.imag, patch) for t in inverse_ratio.T], axis=1
+        )
         return np.asarray((np.abs(middle - 1) < METAL_WITHOUT_ERROR).all(axis=1), np.bool_)
 
     def _decorrelate_angles(self, covariance: Real) -> Real:
@@ -352,9 +354,9 @@ class ErrorDiscriminant(Model):
         own patches (each left out of its material's mean). Without enough patches there is no threshold.
         """
         width = patches.shape[1]
-        free = max(dof - width + 1, 1)
+        freedom = max(dof - width + 1, 1)
         if dof > width:
-            law = float(width * dof / free * scipy.special.fdtri(width, free, 1 - REJECTED))
+            law = float(width * dof / freedom * scipy.special.fdtri(width, freedom, 1 - REJECTED_SHARE))
         else:
             law = np.inf
         left_out = (self.placements / np.maximum(self.placements - 1, 1))[:, None]
@@ -363,7 +365,7 @@ class ErrorDiscriminant(Model):
             """Return the squared distance that a share REJECTED of the library's own deviations exceeds."""
             d = deviations * left_out[index]
             distance2 = np.einsum("nd,nde,ne->n", d, np.linalg.inv(covariances)[index], d)
-            return float(np.quantile(distance2, 1 - REJECTED))
+            return float(np.quantile(distance2, 1 - REJECTED_SHARE))
 
         self.patch_level = max(
             law, find_left_out_quantile(patches, material, self._patch_covariances(self.pixels) + self.scan)
@@ -379,11 +381,11 @@ def _fit_two_way(mean: Real, material: npt.NDArray, scan: npt.NDArray, informati
     """
     offset = np.zeros((scan.max() + 1, mean.shape[1]))
     level = np.zeros((material.max() + 1, mean.shape[1]))
-    of_material = np.arange(len(level))[:, None] == material
-    of_scan = (np.arange(len(offset))[:, None] == scan) & informative
-    material_mean = of_material / np.maximum(of_material.sum(axis=1, keepdims=True), 1)
-    scan_mean = of_scan / np.maximum(of_scan.sum(axis=1, keepdims=True), 1)
-    informed = of_scan.any(axis=1)
+    is_of_material = np.arange(len(level))[:, None] == material
+    is_of_scan = (np.arange(len(offset))[:, None] == scan) & informative
+    material_mean = is_of_material / np.maximum(is_of_material.sum(axis=1, keepdims=True), 1)
+    scan_mean = is_of_scan / np.maximum(is_of_scan.sum(axis=1, keepdims=True), 1)
+    informed = is_of_scan.any(axis=1)
     for _ in range(TWO_WAY_ROUNDS):
         level = material_mean @ (mean - offset[scan] * informative[:, None])
         offset = scan_mean @ (mean - level[material])
@@ -402,12 +404,12 @@ def _clip_eigenvalues(a: Real) -> Real:
     return (vectors * np.maximum(values, 0)) @ vectors.T
 
 
-def _append_none(probability: Real, beyond: Real) -> Real:
+def _append_none(probability: Real, unknown_probability: Real) -> Real:
     """Return the probabilities [n, materials + 1] with, last, that of none of the materials.
 
-    `beyond` [n, materials] is the chi-square of a patch minus the threshold that 2 % of a material's patches exceed.
-    At the threshold half of the probability goes to none of the materials, far beyond it all, so that a patch called
-    unknown for its distance has no likelier name.
+    `unknown_probability` [n, materials] is the chi-square of a patch minus the threshold that 2 % of a material's
+    patches exceed. At the threshold half of the probability goes to none of the materials, far beyond it all, so that a
+    patch called unknown for its distance has no likelier name.
     """
-    member_probability = probability * scipy.special.expit(-beyond)
+    member_probability = probability * scipy.special.expit(-unknown_probability)
     return np.concatenate([member_probability, 1 - member_probability.sum(axis=1, keepdims=True)], axis=1)

@@ -41,10 +41,10 @@ from polysight.materials.kinds import (
     PatchEstimate,
     PatchMeasurement,
     RatioEvidence,
-    brightness_density,
+    compute_brightness_density,
+    compute_log_layer_odds,
     compute_probability_of_same_material,
-    log_layer_odds,
-    permittivity_slope,
+    find_permittivity_slope,
     split_complex,
     turn_covariance,
 )
@@ -65,11 +65,11 @@ LIBRARY_SHARE = (0.05, 0.85)
 WEIGHT_OF_KINDS = 0.8
 """Weight of the patches' materials as evidence if the leakage was never measured (coarsened posterior; Miller and
 Dunson, 2019). Plates are alike, and taken as independent. With 1, eps'' of 33 scenes were 0.9 standard errors low."""
-MOVED = 0.5
+MOVED_PROBABILITY = 0.5
 MOVED_STD = 0.025
 """Probability that the mount has moved since its leakage was measured, and the standard deviation of the leakage then
 (1 to 3 degrees, chosen). With a probability of 0.1 only 85 % of the 95 % regions held where V's board had turned."""
-TURN = -0.82
+TURN_PER_RISE = -0.82
 TURN_STD = 0.1
 """Change of a per radian of rise across the plane of incidence, and its standard deviation: -sin(theta) of the
 published rig; 0.1 for antennas whose polarisation turns off axis. A TX turned to the other side has the other sign."""
@@ -77,7 +77,7 @@ UNEVEN_LIGHT = (1.0, 1.0)
 EVEN_LIGHT = (0.3, 0.5)
 """Standard deviations of G, per radian, along the plane of incidence and across it, as H's board and V's see a plate
 from different points; without and with the correction of illumination. The independent generator has 0.6 along."""
-PAINTED = 0.02
+PAINTED_PROBABILITY = 0.02
 POSSIBLY_PAINTED = 0.2
 """Prior probability that the metal is painted or coated; and posterior probability above which paint is an error of
 pixels and sub-bands, too. Both chosen: a lower second one would widen the errors of what is rather bare metal."""
@@ -113,7 +113,7 @@ TURN_BY_RISE = 11
 LIGHT_ACROSS = (12, 13)
 LIGHT_ALONG = 14
 PAINT = 15
-WIDTH = 16
+PARTICLE_WIDTH = 16
 COLUMNS_OF_SOURCE = {
     "metal reference": (*REFERENCE, PAINT),
     "leakage": (*LEAKAGE_H, *LEAKAGE_V, HAS_MOVED),
@@ -165,7 +165,7 @@ class RigPrior:
     moved: float = 0.0
     metal_rise: tuple[float, float] = (0.0, 0.0)
     lighting_std: tuple[float, float] = UNEVEN_LIGHT
-    painted: float = PAINTED
+    painted: float = PAINTED_PROBABILITY
 
 
 @dataclass(frozen=True)
@@ -240,8 +240,8 @@ def true_ratio(inverse: npt.ArrayLike, a: npt.ArrayLike, b: npt.ArrayLike, rho: 
     """Return t of a measured V / H: the first formula of the module's docstring, solved for t, with c = 0 and w = 0."""
     a = np.asarray(a, np.complex128)
     b = np.asarray(b, np.complex128)
-    without_reference = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
-    return np.asarray((without_reference - b) / (1 - a * without_reference), np.complex128)
+    ratio_without_reference = np.asarray(inverse, np.complex128) * (1 + b) / ((1 + a) * (1 + np.asarray(rho)))
+    return np.asarray((ratio_without_reference - b) / (1 - a * ratio_without_reference), np.complex128)
 
 
 def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None = None) -> Inversion:
@@ -260,11 +260,11 @@ def invert(measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kin
     parts = model.log_likelihoods(z)
     for i in range(model.patch_count):
         # A patch is measured without the evidence that it, or another of its material, must be some material.
-        without_patch = weights.copy()
-        without_patch[1:] *= 1 - model.same[i]
-        particles = _anneal_without_patch(model, z, weights, without_patch, rng, parts)
+        weights_without_patch = weights.copy()
+        weights_without_patch[1:] *= 1 - model.same[i]
+        particles = _anneal_without_patch(model, z, weights, weights_without_patch, rng, parts)
         patches.append(_estimate(model, particles, i, rng))
-    return _solution(model, (z, log_evidence, log_bare), tuple(patches))
+    return _collect_solution(model, (z, log_evidence, log_bare), tuple(patches))
 
 
 def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[Real, float, float]:
@@ -280,7 +280,7 @@ def sample_posterior(model: SceneLikelihood, rng: np.random.Generator) -> tuple[
     for hypothesis, probability in model.hypotheses():
         prior_particles = rng.standard_normal((PARTICLES, model.width))
         z, log_evidence = _anneal(hypothesis, prior_particles, no_evidence, model.weights, rng)
-        samples.append(hypothesis.within(model.prior, z))
+        samples.append(hypothesis.move_into(model.prior, z))
         log_weights.append(float(np.log(probability) + log_evidence))
         if hypothesis.prior.painted == 0:
             log_bare = np.logaddexp(log_bare, log_weights[-1])
@@ -302,7 +302,7 @@ class SceneLikelihood:
     `weights` [1 + patch]: of the log likelihoods; `same` [patch, patch]: probability of the same material.
     """
 
-    width = WIDTH
+    width = PARTICLE_WIDTH
 
     def __init__(self, measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds | None) -> None:
         self.prior = prior
@@ -316,26 +316,26 @@ class SceneLikelihood:
         unlike_metal = np.abs(self.measured - 1) > METAL_WITHOUT_BRIGHTNESS
         self.bright = np.isfinite(level) & (level > 0) & unlike_metal
         self.log_level = np.log(np.where(self.bright, level, 1.0))
-        self.own = self._own_covariances(measurements)
+        self.own = self._compute_own_covariances(measurements)
         self.own_variance = np.array([np.trace(s.covariance) / 2 for s in measurements], np.float64)
-        self.densities = None if kinds is None or not measurements else self._densities(kinds)
+        self.densities = None if kinds is None or not measurements else self._map_densities(kinds)
         self.same = compute_probability_of_same_material(measurements)
         # Plates of one material count as one: else six of a material that no library has would shift the leakage.
         self.weights = np.append(1.0, 1 / self.same.sum(axis=1))
         self.dispersions = tuple(s.dispersion for s in measurements)
-        self.log_layer_odds = np.array([log_layer_odds(d, kinds) for d in self.dispersions])
+        self.log_layer_odds = np.array([compute_log_layer_odds(d, kinds) for d in self.dispersions])
 
-    def _own_covariances(self, measurements: Sequence[PatchMeasurement]) -> Real:
+    def _compute_own_covariances(self, measurements: Sequence[PatchMeasurement]) -> Real:
         """Return the covariance of each patch's t by its own errors, [patch, 2, 2]: V / H's, turned to first order."""
         if not measurements:
             return np.zeros((0, 2, 2))
         nominal = np.zeros((1, self.width))
         step = 1e-4 * np.maximum(np.abs(self.measured), 1e-3)
-        at_measured = self.ratios(nominal)[0]
-        at_next = self.ratios(nominal, step)[0]
-        return turn_covariance((at_next - at_measured) / step, np.stack([s.covariance for s in measurements]))
+        ratios = self.ratios(nominal)[0]
+        stepped = self.ratios(nominal, step)[0]
+        return turn_covariance((stepped - ratios) / step, np.stack([s.covariance for s in measurements]))
 
-    def _densities(self, kinds: Kinds) -> DensityMaps:
+    def _map_densities(self, kinds: Kinds) -> DensityMaps:
         """Return maps of the density of t by kinds of materials, one for each patch around its possible values of t."""
         drawn_ratios = self.ratios(np.random.default_rng(1).standard_normal((PARTICLES, self.width)))
         maps = []
@@ -354,14 +354,14 @@ class SceneLikelihood:
     def hypotheses(self) -> list[tuple[SceneLikelihood, float]]:
         """Return the scene with the mount moved or not, and the metal painted or not; and the probability of each."""
         out: list[tuple[SceneLikelihood, float]] = []
-        paint_cases = _certainties(self._estimate_paint_probability())
-        for (moved, share), (painted, paint_share) in itertools.product(_certainties(self.prior.moved), paint_cases):
+        paint_cases = _list_cases(self._estimate_paint_probability())
+        for (moved, share), (painted, paint_share) in itertools.product(_list_cases(self.prior.moved), paint_cases):
             hypothesis = copy.copy(self)
             hypothesis.prior = replace(self.prior, moved=moved, painted=painted)
             out.append((hypothesis, share * paint_share))
         return out
 
-    def within(self, prior: RigPrior, z: Real) -> Real:
+    def move_into(self, prior: RigPrior, z: Real) -> Real:
         """Convert particles of this hypothesis to particles of `prior`, in which it is one of several cases."""
         out = z.copy()
         out[:, HAS_MOVED] = _place(z[:, HAS_MOVED], self.prior.moved, prior.moved)
@@ -376,8 +376,8 @@ class SceneLikelihood:
         """Return a and b at the metal's place, [..., 1] each."""
         p = self.prior
         scale = np.where(self.has_moved(z), max(MOVED_STD, p.leakage_std), p.leakage_std)
-        a = p.leakage[0] + scale * _complex(z, LEAKAGE_H)
-        b = p.leakage[1] + scale * _complex(z, LEAKAGE_V)
+        a = p.leakage[0] + scale * _join_complex(z, LEAKAGE_H)
+        b = p.leakage[1] + scale * _join_complex(z, LEAKAGE_V)
         return a, b
 
     def has_moved(self, z: Real) -> npt.NDArray[np.bool_]:
@@ -392,17 +392,18 @@ class SceneLikelihood:
 
     def turn(self, z: Real) -> Real:
         """Return the change of a, and minus that of b, per radian of rise across the plane of incidence, [..., 1]."""
-        return TURN + TURN_STD * z[..., TURN_BY_RISE, None]
+        return TURN_PER_RISE + TURN_STD * z[..., TURN_BY_RISE, None]
 
     def lighting(self, z: Real) -> Complex:
         """Return G.w, the change of ln(V / H) of each patch by its rise relative to the metal's, [..., patch]."""
         std_along, std_across = self.prior.lighting_std
         rise = self.rise - np.array(self.prior.metal_rise)
         # The phase of V / H is taken to change by a tenth of what the amplitude does (chosen).
-        by_patterns = z[..., LIGHT_ACROSS[0], None] + 0.1j * z[..., LIGHT_ACROSS[1], None]
-        across = std_across * by_patterns - 4 * self.turn(z)  # turn(z) is -sin(theta), see the module's docstring
-        along = std_along * z[..., LIGHT_ALONG, None]
-        return along * rise[:, 0] + across * rise[:, 1]
+        pattern_slope = z[..., LIGHT_ACROSS[0], None] + 0.1j * z[..., LIGHT_ACROSS[1], None]
+        # turn(z) is -sin(theta), see the module's docstring.
+        change_across = std_across * pattern_slope - 4 * self.turn(z)
+        change_along = std_along * z[..., LIGHT_ALONG, None]
+        return change_along * rise[:, 0] + change_across * rise[:, 1]
 
     def angle(self, z: Real) -> Real:
         """Return the true angles, [..., patch]."""
@@ -428,7 +429,7 @@ class SceneLikelihood:
         """Return t of every patch, [..., patch], from the measured V / H plus a `change` [patch] of it."""
         measured = self.measured + change
         a, b = self.leakage_of_patches(z)
-        rho = self.prior.reference_std * _complex(z, REFERENCE)
+        rho = self.prior.reference_std * _join_complex(z, REFERENCE)
         return true_ratio(measured * np.exp(-self.lighting(z)) * self.reference_ratio(z), a, b, rho)
 
     def permittivities(self, z: Real) -> Complex:
@@ -466,7 +467,7 @@ class SceneLikelihood:
 
     def _log_likelihoods(self, z: Real, half_spaces: HalfSpaces) -> Real:
         """Return the `log_likelihoods` of z, given the half spaces of the patches at z."""
-        density = brightness_density(self.brightness_off(z, half_spaces), self.brightness_std(z)[..., None])
+        density = compute_brightness_density(self.brightness_off(z, half_spaces), self.brightness_std(z)[..., None])
         brightness_log = np.where(self.bright, np.log(density + 1e-300), 0.0).sum(axis=-1, keepdims=True)
         if self.kinds is None:
             no_evidence = np.zeros((*brightness_log.shape[:-1], self.patch_count))
@@ -474,14 +475,14 @@ class SceneLikelihood:
         if self.densities is None:
             return brightness_log
         ratios_of_kinds = half_spaces.move_to_angle(self.kinds.theta_rad)
-        of_library, of_half_spaces, of_layers = np.exp(self.densities.log_densities(ratios_of_kinds))
-        of_others = of_half_spaces + of_layers * np.exp(self.log_layer_odds)
+        library_density, half_space_density, layer_density = np.exp(self.densities.log_densities(ratios_of_kinds))
+        other_density = half_space_density + layer_density * np.exp(self.log_layer_odds)
         library_share = self.library_share(z)[..., None]
-        of_some_kind = np.log(library_share * of_library + (1 - library_share) * of_others)
-        return np.concatenate([brightness_log, of_some_kind], axis=-1)
+        log_kind_density = np.log(library_share * library_density + (1 - library_share) * other_density)
+        return np.concatenate([brightness_log, log_kind_density], axis=-1)
 
 
-def _certainties(probability: float) -> list[tuple[float, float]]:
+def _list_cases(probability: float) -> list[tuple[float, float]]:
     """Return pairs (0: it is not so, or 1: it is so; probability of that), without pairs of probability 0."""
     return [(value, share) for value, share in ((0.0, 1 - probability), (1.0, probability)) if share > 0]
 
@@ -498,7 +499,7 @@ def _place(z: Real, certainty: float, probability: float) -> Real:
     return scipy.special.ndtri(low + (high - low) * scipy.special.ndtr(z))
 
 
-def _complex(z: Real, columns: tuple[int, int]) -> Complex:
+def _join_complex(z: Real, columns: tuple[int, int]) -> Complex:
     """Return the complex number whose real and imaginary part are two columns of particles, [..., 1]."""
     return z[..., columns[0], None] + 1j * z[..., columns[1], None]
 
@@ -577,7 +578,7 @@ def _resample(weight: Real, rng: np.random.Generator) -> npt.NDArray[np.intp]:
     return np.minimum(np.searchsorted(np.cumsum(weight) / weight.sum(), places), weight.size - 1)
 
 
-def _solution(
+def _collect_solution(
     model: SceneLikelihood, posterior: tuple[Real, float, float], patches: tuple[PatchEstimate, ...]
 ) -> Inversion:
     """Collect the solution from the `posterior` that `sample_posterior` returns and the estimates of the patches."""
@@ -588,7 +589,7 @@ def _solution(
     a, b = (leakage[:, 0] for leakage in model.leakage(z))
     unit = max(prior.leakage_std, 1e-12)
     leakage_in_units = np.stack([a.real, a.imag, b.real, b.imag], axis=1) / unit
-    reference = prior.reference_std * _complex(z, REFERENCE)
+    reference = prior.reference_std * _join_complex(z, REFERENCE)
     if painted.mean() > POSSIBLY_PAINTED:
         reference = reference + 1j * paint
     reference_in_units = split_complex(reference[:, 0]) / max(prior.reference_std, 1e-12)
@@ -618,10 +619,10 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     t = model.ratios(z)[:, i]
     middle = complex(t.mean())
     ratio_covariance = np.cov(split_complex(t).T) + model.own[i]
-    evidence = None if model.kinds is None else _evidence(model, model.kinds, z, i)
-    from_metal = min(abs(middle - 1), abs(1 / middle - 1)) if middle else 1.0
+    evidence = None if model.kinds is None else _collect_evidence(model, model.kinds, z, i)
+    metal_gap = min(abs(middle - 1), abs(1 / middle - 1)) if middle else 1.0
     # Written with `not`, so that a ratio that is not a number gets no permittivity either.
-    if not from_metal >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(ratio_covariance) / 2)):
+    if not metal_gap >= max(METAL_WITHOUT_PERMITTIVITY, LEAST_DISTANCE * np.sqrt(np.trace(ratio_covariance) / 2)):
         return PatchEstimate(middle, ratio_covariance, None, None, {}, evidence)
 
     angles = model.angle(z)[:, i]
@@ -631,8 +632,10 @@ def _estimate(model: SceneLikelihood, z: Real, i: int, rng: np.random.Generator)
     drawn_values = np.asarray(permittivity_from_ratio(drawn_t, angles), np.complex128)
     # Near metal the moments of the far tail do not exist: three standard deviations of the ratio are kept.
     difference = split_complex(drawn_t - middle)
-    inside = np.einsum("...i,ij,...j->...", difference, np.linalg.inv(ratio_covariance), difference) < CHI2_997
-    parts = split_complex(drawn_values[inside] - value)
+    distance2_of_region = (
+        np.einsum("...i,ij,...j->...", difference, np.linalg.inv(ratio_covariance), difference) < CHI2_997
+    )
+    parts = split_complex(drawn_values[distance2_of_region] - value)
     covariance = np.asarray(parts.T @ parts / len(parts), np.float64)
     # A tail (the mount may have moved) widens a covariance more than the region that holds 95 %.
     distance2 = np.einsum("...i,ij,...j->...", parts, np.linalg.inv(covariance), parts)
@@ -654,21 +657,21 @@ def _shares_of_sources(model: SceneLikelihood, z: Real, i: int, value: complex) 
     # Effect of one source: its columns vary as in the particles, all others stay at their mean. Its part of the
     # variance is its covariance with the whole error, so that correlated sources add up to the whole.
     mean = np.tile(z.mean(axis=0), (len(z), 1))
-    of_all = model.permittivities(z)[:, i] - value
-    slope_at_mean = permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])
+    total_deviation = model.permittivities(z)[:, i] - value
+    slope_at_mean = find_permittivity_slope(model.ratios(mean[:1])[0, i], model.theta[i])
     variance = {"scatter": float(abs(slope_at_mean) ** 2 * np.trace(model.own[i]))}
-    at_mean = model.permittivities(mean[:1])[0, i]
+    permittivity_at_mean = model.permittivities(mean[:1])[0, i]
     for source, columns in COLUMNS_OF_SOURCE.items():
-        alone = mean.copy()
-        alone[:, columns] = z[:, columns]
-        effect = model.permittivities(alone)[:, i] - at_mean
-        variance[source] = max(0.0, float(np.mean((np.conj(effect) * of_all).real)))
+        single_source = mean.copy()
+        single_source[:, columns] = z[:, columns]
+        effect = model.permittivities(single_source)[:, i] - permittivity_at_mean
+        variance[source] = max(0.0, float(np.mean((np.conj(effect) * total_deviation).real)))
     total = sum(variance.values())
     usable = np.isfinite(total) and total > 0
     return {source: part / total for source, part in variance.items()} if usable else {}
 
 
-def _evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
+def _collect_evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> RatioEvidence:
     """Return the evidence for the name of patch `i`: its t at the incidence angle of `kinds`, with covariance."""
     half_spaces = model.half_spaces(z)
     t = half_spaces.move_to_angle(kinds.theta_rad)[:, i]

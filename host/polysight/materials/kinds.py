@@ -1,9 +1,10 @@
 """Kinds of materials that a plate may be of, as densities over t = 1 / P: a library's, the literature's, and others.
 
-P = H / V is relative to metal; eps = eps' - j eps''. A kind is metal, or a half space whose ln eps' and eps'' are
-normal, as specimens differ; to first order its t is normal, too. A patch is of a kind of the library or of the
-literature, or any other half space, thin plate or stack. The density of t under all of them is the prior of the joint
-inversion; its parts give the probabilities of names. Eq. 2 and 3 of the POLySIGHT paper convert eps to P and back.
+P = H / V is relative to metal; eps = eps' - j eps''. `of no kind` means: of no listed material. A kind is metal, or a
+half space whose ln eps' and eps'' are normal, as specimens differ; to first order its t is normal, too. A patch is of a
+kind of the library or of the literature, or any other half space, thin plate or stack. The density of t under all of
+them is the prior of the joint inversion; its parts give the probabilities of names. Eq. 2 and 3 of the POLySIGHT paper
+convert eps to P and back.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ USUAL_LIBRARY_SHARE = 0.5
 """Expected share of a library's materials in a scan that was processed without it; chosen."""
 LITERATURE_SHARE = 0.4
 """Share of the literature's kinds in thick plates that are of no kind of the library. The others are metal or any half
-space. Chosen, as are the shares of metal and of thin plates: a larger share draws uncertain names to it."""
+space. The shares of this, of metal and of thin plates are chosen: with a larger one, uncertain patches get such
+names."""
 METAL_SHARE = 0.1
 """Share of metal in these thick plates; chosen."""
 SHEET_SHARE = 0.27
@@ -256,9 +258,9 @@ def compute_probability_of_same_material(measurements: Sequence[PatchMeasurement
     reference, which hardly change the difference.
     """
     inverse_ratios = np.array([m.inverse_ratio for m in measurements], np.complex128)
-    of_errors = np.array([m.covariance for m in measurements], np.float64).reshape(-1, 2, 2)
-    of_specimens = np.square(SPECIMEN_STD * np.abs(inverse_ratios))[:, None, None] * np.eye(2)
-    covariance = of_errors + of_specimens
+    error_covariance = np.array([m.covariance for m in measurements], np.float64).reshape(-1, 2, 2)
+    specimen_covariance = np.square(SPECIMEN_STD * np.abs(inverse_ratios))[:, None, None] * np.eye(2)
+    covariance = error_covariance + specimen_covariance
     inverse = np.linalg.inv(covariance[:, None] + covariance)
     difference = split_complex(inverse_ratios[:, None] - inverse_ratios)
     distance2 = np.einsum("...i,...ij,...j->...", difference, inverse, difference)
@@ -296,18 +298,18 @@ class HalfSpaces:
             root = np.sqrt(np.square(self._q) + (self._sine2 - other2))
             along_q = root.real * self._q.real + root.imag * self._q.imag
             root = root * np.copysign(np.cos(other_rad) / other2, along_q)
-            moved = (root - 1) / (root + 1)
-        return np.where(np.isfinite(moved), moved, self.t)
+            moved_t = (root - 1) / (root + 1)
+        return np.where(np.isfinite(moved_t), moved_t, self.t)
 
 
-def brightness_density(difference: Real | float, std: Real | float) -> Real:
-    """Return the density, but for a factor, of ln |H| minus the expected: usual (`std`) or odd (`ODD_BRIGHTNESS`)."""
-    usual = (1 - ODD_BRIGHTNESS) / std * np.exp(-0.5 * (difference / std) ** 2)
-    odd = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
-    return np.asarray(usual + odd, np.float64)
+def compute_brightness_density(difference: Real | float, std: Real | float) -> Real:
+    """Return a multiple of the density of ln |H| minus the expected value: usual (`std`) or odd (`ODD_BRIGHTNESS`)."""
+    usual_density = (1 - ODD_BRIGHTNESS) / std * np.exp(-0.5 * (difference / std) ** 2)
+    odd_density = ODD_BRIGHTNESS / ODD_BRIGHTNESS_STD * np.exp(-0.5 * (difference / ODD_BRIGHTNESS_STD) ** 2)
+    return np.asarray(usual_density + odd_density, np.float64)
 
 
-def permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
+def find_permittivity_slope(t: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Complex:
     """Return d eps / d t of Eq. 3, broadcast, with t = 1 / P: eps = sin^2 (1 + tan^2 u^2), u = (1 + t) / (1 - t)."""
     t = np.asarray(t, np.complex128)
     return 4 * np.sin(theta_rad) ** 2 * np.tan(theta_rad) ** 2 * (1 + t) / (1 - t) ** 3
@@ -399,12 +401,12 @@ class Kinds:
         along_y = -0.5 * inverse[:, 1, 1:] * y**2
         x *= -inverse[:, 0, 1:]
         for k in np.flatnonzero((columns[1] > columns[0]) & (rows[1] > rows[0])):
-            of_rows = slice(rows[0, k], rows[1, k])
-            of_columns = slice(columns[0, k], columns[1, k])
-            exponent = y[k, of_rows, None] * x[k, of_columns]
-            exponent += along_x[k, of_columns]
-            exponent += along_y[k, of_rows, None]
-            density[0 if self.in_library[k] else 1, of_rows, of_columns] += np.exp(exponent, out=exponent)
+            row_slice = slice(rows[0, k], rows[1, k])
+            column_slice = slice(columns[0, k], columns[1, k])
+            exponent = y[k, row_slice, None] * x[k, column_slice]
+            exponent += along_x[k, column_slice]
+            exponent += along_y[k, row_slice, None]
+            density[0 if self.in_library[k] else 1, row_slice, column_slice] += np.exp(exponent, out=exponent)
         density[1:] *= 1 - STACK_SHARE
         density[2] += STACK_SHARE / np.pi
         # A density of zero counts as 1e-12: its logarithm stays finite.
@@ -424,17 +426,17 @@ class Kinds:
         eps_loss = np.where(np.isfinite(parts[..., 1]), -parts[..., 1], 0.0)
         real = np.clip(eps_real, *REAL_RANGE)
         loss = np.clip(eps_loss, *LOSS_RANGE)
-        at_border = t.copy()
+        border_t = t.copy()
         is_outside = (real != parts[..., 0]) | (loss != -parts[..., 1])
-        at_border[is_outside] = inverse_ratio(real[is_outside] - 1j * loss[is_outside], self.theta_rad)
-        # At the border and not at t: near t = 1, which is metal, the slope has no bound.
-        slope = np.abs(permittivity_slope(at_border, self.theta_rad))
+        border_t[is_outside] = inverse_ratio(real[is_outside] - 1j * loss[is_outside], self.theta_rad)
+        # The slope is taken at the border instead of t: near t = 1, which is metal, it has no bound.
+        slope = np.abs(find_permittivity_slope(border_t, self.theta_rad))
         # The density over both coordinates, times their derivatives by eps' and eps'', times that of eps by t, squared
         # for an area. An error of eps'' widens the linear part of its coordinate.
         floor = np.hypot(SOFT_LOSS, slope * std)
         density = slope**2 * _interpolate_coordinate_density(real, loss) / (real * np.hypot(loss, floor))
-        beyond = np.abs(t - at_border) / max(std, LEAST_STD_OF_T)
-        return np.asarray(density * np.exp(-0.5 * np.minimum(beyond, MOST_STD_BEYOND) ** 2), np.float64)
+        distance_beyond = np.abs(t - border_t) / max(std, LEAST_STD_OF_T)
+        return np.asarray(density * np.exp(-0.5 * np.minimum(distance_beyond, MOST_STD_BEYOND) ** 2), np.float64)
 
 
 @dataclass(frozen=True)
@@ -527,19 +529,19 @@ def _compute_shares(kinds: Sequence[Kind], sheets: float) -> tuple[Real, float]:
 
     The rest are patches of no kind of the library. `sheets` is the share of thin plates in it.
     """
-    in_library = np.array([kind.source == "library" for kind in kinds])
-    is_metal = np.array([kind.permittivity is None for kind in kinds]) & ~in_library
-    in_literature = ~in_library & ~is_metal
-    share_literature = LITERATURE_SHARE if in_literature.any() else 0.0
+    is_in_library = np.array([kind.source == "library" for kind in kinds])
+    is_metal = np.array([kind.permittivity is None for kind in kinds]) & ~is_in_library
+    is_in_literature = ~is_in_library & ~is_metal
+    share_literature = LITERATURE_SHARE if is_in_literature.any() else 0.0
     shares = np.zeros(len(kinds))
-    for mask, share in ((in_library, 1.0), (is_metal, METAL_SHARE), (in_literature, share_literature)):
+    for mask, share in ((is_in_library, 1.0), (is_metal, METAL_SHARE), (is_in_literature, share_literature)):
         if mask.any():
             shares[mask] = share / mask.sum()
-    shares[~in_library] *= 1 - sheets
+    shares[~is_in_library] *= 1 - sheets
     return shares, (1 - METAL_SHARE - share_literature) * (1 - sheets)
 
 
-def _half_space_coordinates(real: npt.ArrayLike, loss: npt.ArrayLike) -> Real:
+def _compute_coordinates(real: npt.ArrayLike, loss: npt.ArrayLike) -> Real:
     """Return the coordinates of half spaces eps' - j eps'', ln eps' and asinh(eps'' / SOFT_LOSS), float64 [2, ...]."""
     return np.stack([np.log(real), np.arcsinh(np.asarray(loss, np.float64) / SOFT_LOSS)])
 
@@ -551,25 +553,27 @@ def _tabulate_coordinate_density() -> tuple[Real, Real, Real]:
     All families of the catalogue have the same weight: those with many entries (laminates, tissues) are not more common
     on a table than others. Density that would lie beyond the ranges is reflected at their ends.
     """
-    ends = _half_space_coordinates(REAL_RANGE, LOSS_RANGE)
+    ends = _compute_coordinates(REAL_RANGE, LOSS_RANGE)
     axes = [np.linspace(low, high, _COORDINATE_CELLS) for low, high in ends]
     step = np.array([axis[1] - axis[0] for axis in axes])
     materials = load_catalogue()
     _, family_index, family_size = np.unique([m.kind for m in materials], return_inverse=True, return_counts=True)
     eps = np.array([material.permittivity for material in materials], np.complex128)
-    places = _half_space_coordinates(np.clip(eps.real, *REAL_RANGE), np.clip(-eps.imag, *LOSS_RANGE))
+    places = _compute_coordinates(np.clip(eps.real, *REAL_RANGE), np.clip(-eps.imag, *LOSS_RANGE))
     edges = [np.append(axis - d / 2, axis[-1] + d / 2) for axis, d in zip(axes, step, strict=True)]
     weights = 1 / (family_size.size * family_size[family_index])
     count = np.histogram2d(places[0], places[1], edges, weights=weights)[0]
-    near = scipy.ndimage.gaussian_filter(count, np.array(NEAR_LITERATURE_STD) / step, mode="reflect") / step.prod()
-    even = 1 / np.prod(ends[:, 1] - ends[:, 0])
-    return NEAR_LITERATURE * near + (1 - NEAR_LITERATURE) * even, axes[0], axes[1]
+    density_near_literature = (
+        scipy.ndimage.gaussian_filter(count, np.array(NEAR_LITERATURE_STD) / step, mode="reflect") / step.prod()
+    )
+    even_density = 1 / np.prod(ends[:, 1] - ends[:, 0])
+    return NEAR_LITERATURE * density_near_literature + (1 - NEAR_LITERATURE) * even_density, axes[0], axes[1]
 
 
 def _interpolate_coordinate_density(real: Real, loss: Real) -> Real:
     """Interpolate the table of `_tabulate_coordinate_density` at eps' and eps'' linearly; shape of `real`."""
     table, real_axis, loss_axis = _tabulate_coordinate_density()
-    x, y = _half_space_coordinates(real, loss)
+    x, y = _compute_coordinates(real, loss)
     cells = np.stack([np.interp(x, real_axis, _CELL_NUMBERS), np.interp(y, loss_axis, _CELL_NUMBERS)])
     # map_coordinates takes no scalars.
     density = scipy.ndimage.map_coordinates(table, cells.reshape(2, -1), order=1, mode="nearest")
@@ -613,33 +617,33 @@ def draw_sheet_dispersions(theta_rad: float, band_hz: tuple[float, float]) -> Re
         slope += share * offset * coefficients
     variance = float(np.sum(weight * position**2) / weight.sum())
     with np.errstate(divide="ignore", invalid="ignore"):
-        of_s, of_p = slope / mean / variance
-    change = np.stack([of_s.real, (of_p - of_s).real, (of_p - of_s).imag], axis=-1)
+        slope_s, slope_p = slope / mean / variance
+    change = np.stack([slope_s.real, (slope_p - slope_s).real, (slope_p - slope_s).imag], axis=-1)
     return np.where(np.isfinite(change), change, 0.0)
 
 
-def layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
+def compute_layer_odds(dispersion: PatchDispersion, theta_rad: float) -> Real:
     """Return the likelihood of a change over the sweep for each drawn thin plate over that for a half space, [draw]."""
-    of_sheets = draw_sheet_dispersions(theta_rad, dispersion.band_hz)
-    width = np.sqrt(dispersion.std**2 + DISPERSION_KERNEL**2 + (DISPERSION_MODEL * of_sheets) ** 2)
-    layers = _sum_log_normal_densities(dispersion.change - of_sheets, width)
-    usual = np.log(1 - ODD_DISPERSION) + _sum_log_normal_densities(dispersion.change, dispersion.std)
-    odd = np.log(ODD_DISPERSION) + _sum_log_normal_densities(
+    sheet_dispersions = draw_sheet_dispersions(theta_rad, dispersion.band_hz)
+    width = np.sqrt(dispersion.std**2 + DISPERSION_KERNEL**2 + (DISPERSION_MODEL * sheet_dispersions) ** 2)
+    layers = _sum_log_normal_densities(dispersion.change - sheet_dispersions, width)
+    log_usual_density = np.log(1 - ODD_DISPERSION) + _sum_log_normal_densities(dispersion.change, dispersion.std)
+    log_odd_density = np.log(ODD_DISPERSION) + _sum_log_normal_densities(
         dispersion.change, np.hypot(dispersion.std, ODD_DISPERSION_STD)
     )
-    log_odds = layers - np.logaddexp(usual, odd)
+    log_odds = layers - np.logaddexp(log_usual_density, log_odd_density)
     return np.asarray(np.exp(np.clip(log_odds, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)), np.float64)
 
 
-def log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> float:
-    """Return ln of the mean of `layer_odds` over the thin plates; 0 without dispersion or without kinds."""
+def compute_log_layer_odds(dispersion: PatchDispersion | None, kinds: Kinds | None) -> float:
+    """Return ln of the mean of `compute_layer_odds` over the thin plates; 0 without dispersion or without kinds."""
     if dispersion is None or kinds is None:
         return 0.0
-    return float(np.log(np.mean(layer_odds(dispersion, kinds.theta_rad))))
+    return float(np.log(np.mean(compute_layer_odds(dispersion, kinds.theta_rad))))
 
 
 def _sum_log_normal_densities(difference: Real, std: Real) -> Real:
-    """Return the sum over the last axis of the logarithms of normal densities, but for a constant."""
+    """Return the sum over the last axis of the logarithms of normal densities, up to a constant."""
     return np.sum(-0.5 * (difference / std) ** 2 - np.log(std), axis=-1)
 
 

@@ -32,8 +32,9 @@ _DRAWN_HERE = "labels.json"
 
 
 def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
-    """Return the plates in the content of truth.json: name, centre_mm, size_mm, and what it is of: permittivity,
-    metal, layers or strips.
+    """Return the plates in the content of truth.json.
+
+    A plate has a name, `centre_mm`, `size_mm`, and its material: permittivity, metal, layers or strips.
 
     Plates that are marked as background, such as a table, are left out: they need no name. Raises DataError if the
     content is invalid.
@@ -72,7 +73,7 @@ def specimen_seed(path: Path) -> int | None:
 
     Raises DataError.
     """
-    # Only to check the file: what it holds is read again below.
+    # This only checks the file, which is read again below.
     read_truth(path)
     # [real, loss]: relative standard deviations of the plates' permittivities; zeros: no deviation.
     scene = read_json(path).get("scene")
@@ -103,36 +104,36 @@ def _read_plate(raw: Mapping[str, Any]) -> TruthPlate:
     TypeError, ValueError or OverflowError for a malformed one.
     """
     cx, cy = (float(c) for c in raw["centre_mm"])
-    w, h = (float(s) for s in raw["size_mm"])
+    width, height = (float(s) for s in raw["size_mm"])
     eps = None
     metal = bool(raw.get("metal", False))
     if not metal and not raw.get("layers") and raw.get("strips_deg") is None:
         real, loss = raw["permittivity"]
         eps = complex(float(real), -float(loss))
     thickness = raw.get("thickness_mm")
-    numbers = [cx, cy, w, h]
+    numbers = [cx, cy, width, height]
     if eps is not None:
         numbers += [eps.real, eps.imag]
     if not np.isfinite(numbers).all():
         raise ValueError(f"a number of plate {raw['name']} is not finite")
-    box = (cx - w / 2, cy - h / 2, cx + w / 2, cy + h / 2)
+    box = (cx - width / 2, cy - height / 2, cx + width / 2, cy + height / 2)
     return TruthPlate(str(raw["name"]), box, eps, None if thickness is None else float(thickness), metal)
 
 
-METALS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
-"""Words that make the name of a material that of a metal."""
-SPECIMEN = "#"
+METAL_WORDS = ("metal", "copper", "aluminium", "aluminum", "steel", "brass", "iron")
+"""A material with one of these words in its name is a metal."""
+SPECIMEN_SEPARATOR = "#"
 """Separates a box's material from its specimen: `oak#2` is a second piece of oak."""
 
 
 def is_metal(name: str) -> bool:
     """Return true if a material's name is that of a metal."""
-    return any(word in METALS for word in re.findall(r"[a-z]+", name.lower()))
+    return any(word in METAL_WORDS for word in re.findall(r"[a-z]+", name.lower()))
 
 
 def material_name(name: str) -> str:
     """Return the material of a box named material or material#specimen."""
-    return name.partition(SPECIMEN)[0]
+    return name.partition(SPECIMEN_SEPARATOR)[0]
 
 
 def format_box(box: Box) -> str:
@@ -178,9 +179,9 @@ class Labels:
 
     def specimen(self, name: str) -> str | None:
         """Return the physical piece in a box: as given, or the part of its name after `#`; None if not known."""
-        return self.specimens.get(name) or name.partition(SPECIMEN)[2] or None
+        return self.specimens.get(name) or name.partition(SPECIMEN_SEPARATOR)[2] or None
 
-    def in_mm(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Labels:
+    def convert_to_mm(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Labels:
         """Return the labels with boxes in millimetres from the centre of an image with these axes."""
         if self.unit == "mm":
             return self
@@ -242,29 +243,29 @@ def read_labels(path: Path) -> Labels:
             code=ErrorCode.FILE_UNREADABLE,
         ) from None  # fmt: skip
 
-    def invalid(what: str, expected: str) -> DataError:
+    def make_error(what: str, expected: str) -> DataError:
         return DataError(f"{path}: {what}", f"expected {expected}", remedy, code=ErrorCode.VALUE_INVALID)
 
     boxes = raw.get("labels") if isinstance(raw, dict) else None
     if not isinstance(boxes, dict):
-        raise invalid("no `labels`", "{name: [x0, y0, x1, y1]} under that key")
+        raise make_error("no `labels`", "{name: [x0, y0, x1, y1]} under that key")
     out: dict[str, Box] = {}
     for name, box in boxes.items():
         if not (isinstance(box, list) and len(box) == 4 and all(_is_number(b) for b in box)):
-            raise invalid(f"labels.{name} = {box!r}", "four finite numbers [x0, y0, x1, y1]")
+            raise make_error(f"labels.{name} = {box!r}", "four finite numbers [x0, y0, x1, y1]")
         out[str(name)] = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
     unit = raw.get("unit", "pixel")
     metal = raw.get("metal")
     specimens = raw.get("specimens") or {}
     if unit not in ("mm", "pixel"):
-        raise invalid(f"unit = {unit!r}", '"mm" or "pixel"')
+        raise make_error(f"unit = {unit!r}", '"mm" or "pixel"')
     if not (metal is None or (isinstance(metal, str) and metal in out)):
-        raise invalid(f"metal = {metal!r}", f"the name of a box: {', '.join(out)}")
+        raise make_error(f"metal = {metal!r}", f"the name of a box: {', '.join(out)}")
     if not (isinstance(specimens, dict) and all(n in out and isinstance(s, str) for n, s in specimens.items())):
-        raise invalid(f"specimens = {specimens!r}", "{name of a box: name of the piece}")
-    by_hand = raw.get("by_hand") is True
+        raise make_error(f"specimens = {specimens!r}", "{name of a box: name of the piece}")
+    is_by_hand = raw.get("by_hand") is True
     text = raw.get("description")
-    return Labels(out, unit, metal, specimens, by_hand, text if isinstance(text, str) else "")
+    return Labels(out, unit, metal, specimens, is_by_hand, text if isinstance(text, str) else "")
 
 
 def _is_number(value: Any) -> bool:
@@ -340,8 +341,8 @@ def patches_from_labels(
 LONGEST_NAME = 80
 RESERVED = ("unknown", "none of these", "possible layer")
 """Words that the classifier uses."""
-# Boxes may overlap, or leave the image, by so much. Label files hold three decimals, so that edges that touch may be
-# off by 0.001 mm; chosen ten times as large, far below a pixel.
+# Overlap of boxes, and part outside the image, that is accepted. Label files have three decimals, so that edges that
+# touch may differ by 0.001 mm. Chosen ten times as large, which is far below a pixel.
 _TOLERANCE_MM = 0.01
 # Invisible characters: two names that differ by one of them look the same.
 _HIDDEN = re.compile("[\u00ad\u200b\u200e\u200f\u202a-\u202e\u2060-\u2069\ufeff]")
@@ -355,23 +356,23 @@ def clean_name(text: str, kind: str = "name") -> str:
     """
     name = re.sub(" +", " ", unicodedata.normalize("NFC", text).strip())
     shortened = name if len(name) <= 40 else f"{name[:40]}..."
-    wrong = ""
+    reason = ""
     # Categories: control, surrogate and private characters, line and paragraph separators.
     if not name:
-        wrong = "it is empty"
+        reason = "it is empty"
     elif len(name) > LONGEST_NAME:
-        wrong = f"it has {len(name)} characters, the limit is {LONGEST_NAME}"
+        reason = f"it has {len(name)} characters, the limit is {LONGEST_NAME}"
     elif _HIDDEN.search(name) or any(unicodedata.category(c) in ("Cc", "Cs", "Co", "Zl", "Zp") for c in name):
-        wrong = "it has control characters, which figures and tables cannot show"
+        reason = "it has control characters, which figures and tables cannot show"
     elif kind == "name" and name.casefold() in RESERVED:
-        wrong = "the classifier uses this word for unknown materials"
+        reason = "the classifier uses this word for unknown materials"
     elif kind == "name" and name.casefold().endswith("(literature)"):
-        wrong = "names of the literature end like this, which the library has not measured"
+        reason = "names of the literature end like this, which the library has not measured"
     elif kind == "name" and name.isdecimal():
-        wrong = "a plain number is the number of a patch"
-    if wrong:
+        reason = "a plain number is the number of a patch"
+    if reason:
         raise DataError(
-            f"{kind} {shortened!a} cannot be used", wrong, "give another one, such as oak or PMMA 3 mm",
+            f"{kind} {shortened!a} cannot be used", reason, "give another one, such as oak or PMMA 3 mm",
             code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     return name
@@ -379,10 +380,10 @@ def clean_name(text: str, kind: str = "name") -> str:
 
 def box_name(text: str) -> str:
     """Clean the name of a box: material or material#specimen. Raises DataError as :func:`clean_name`."""
-    material, mark, specimen = text.partition(SPECIMEN)
+    material, mark, specimen = text.partition(SPECIMEN_SEPARATOR)
     if not mark:
         return clean_name(material)
-    return f"{clean_name(material)}{SPECIMEN}{clean_name(specimen, 'specimen')}"
+    return f"{clean_name(material)}{SPECIMEN_SEPARATOR}{clean_name(specimen, 'specimen')}"
 
 
 def image_extent_mm(x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Box:
@@ -403,20 +404,22 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
     a name is invalid or used twice; if a metal reference or a specimen has no box; if there are several boxes and the
     metal reference is not known.
     """
-    labels_mm = labels.in_mm(x_m, y_m)
+    labels_mm = labels.convert_to_mm(x_m, y_m)
     boxes = {}
     extent = image_extent_mm(x_m, y_m)
     for name, box in labels_mm.boxes.items():
-        clean = box_name(name)
-        if twin := next((other_name for other_name in boxes if other_name.casefold() == clean.casefold()), None):
-            raise name_taken(clean, twin)
-        boxes[clean] = _check_box(clean, box, extent)
+        clean_box = box_name(name)
+        if existing_name := next(
+            (other_name for other_name in boxes if other_name.casefold() == clean_box.casefold()), None
+        ):
+            raise make_name_taken_error(clean_box, existing_name)
+        boxes[clean_box] = _check_box(clean_box, box, extent)
         mask = box_mask(box, x_m, y_m)
         if valid is not None:
             mask &= valid
         if not mask.any():
             raise DataError(
-                f"box of {clean}, {format_box(box)}: no scanned pixel",
+                f"box of {clean_box}, {format_box(box)}: no scanned pixel",
                 "it is smaller than a pixel, or outside the scanned area",
                 "draw it where labels.png shows the material",
                 code=ErrorCode.NO_DATA,
@@ -430,23 +433,23 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
         named_boxes.append(metal)
     missing = [n for n in named_boxes if n not in boxes]
     if missing:
-        raise no_box(missing[0], boxes)
+        raise make_unknown_box_error(missing[0], boxes)
     return replace(labels_mm, boxes=boxes, specimens=specimens, metal=metal or _find_metal_by_name(boxes))
 
 
-def name_taken(name: str, twin: str) -> DataError:
-    """Return the error for a box name that exists already; `twin` is its spelling there."""
-    as_said = "" if name == twin else f" (as {twin})"
+def make_name_taken_error(name: str, existing_name: str) -> DataError:
+    """Return the error for a box name that exists already; `existing_name` is its spelling there."""
+    spelling_text = "" if name == existing_name else f" (as {existing_name})"
     return DataError(
-        f"the name {name} exists already{as_said}",
+        f"the name {name} exists already{spelling_text}",
         "each box needs its own name",
-        f"name a second piece of the same material {material_name(name)}{SPECIMEN}2;"
-        f" to move a box: --remove {twin} --box {twin}=x0,y0,x1,y1",
+        f"name a second piece of the same material {material_name(name)}{SPECIMEN_SEPARATOR}2;"
+        f" to move a box: --remove {existing_name} --box {existing_name}=x0,y0,x1,y1",
         code=ErrorCode.NAME_TAKEN,
     )
 
 
-def no_box(name: str, boxes: Mapping[str, Any]) -> DataError:
+def make_unknown_box_error(name: str, boxes: Mapping[str, Any]) -> DataError:
     """Return the error for an unknown name of a box; the keys of `boxes` are the known ones."""
     listed = ", ".join(boxes) if boxes else "there are none"
     return DataError(
@@ -477,11 +480,11 @@ def _check_box(name: str, box: Box, extent: Box) -> Box:
 
 def _check_apart(name: str, a: Box, other_name: str, b: Box) -> None:
     """Raise DataError if two boxes overlap, beyond rounding."""
-    across = min(a[2], b[2]) - max(a[0], b[0])
-    up = min(a[3], b[3]) - max(a[1], b[1])
-    if across > _TOLERANCE_MM and up > _TOLERANCE_MM:
+    overlap_x = min(a[2], b[2]) - max(a[0], b[0])
+    overlap_y = min(a[3], b[3]) - max(a[1], b[1])
+    if overlap_x > _TOLERANCE_MM and overlap_y > _TOLERANCE_MM:
         raise DataError(
-            f"the boxes of {name} and {other_name} overlap by {across:.1f} x {up:.1f} mm",
+            f"the boxes of {name} and {other_name} overlap by {overlap_x:.1f} x {overlap_y:.1f} mm",
             f"pixels of one material would count as another; {name}: {format_box(a)}; {other_name}: {format_box(b)}",
             "make one of them smaller: a box lies inside its material, 5 mm or more from the edge",
             code=ErrorCode.VALUES_CONFLICT,

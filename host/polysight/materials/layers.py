@@ -36,7 +36,7 @@ Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 # Frequencies of a sub-band at which a layer is modelled; chosen.
 _FREQUENCIES = 24
-METAL = complex(np.inf, 0.0)
+METAL_PERMITTIVITY = complex(np.inf, 0.0)
 """Permittivity that means a layer of metal: a perfect conductor."""
 
 
@@ -64,10 +64,10 @@ class Spectrum:
         length = 2 * (last - first) / (bands + 1)
         starts = np.linspace(first, last - length, bands)
         # A few frequencies suffice for a smooth window: the phase of inner echoes changes slowly with frequency.
-        inside = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
-        # Every second point of the longer window lies where `inside` does: in the middle of one of equal parts.
+        share_of_band = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
+        # Every second point of the longer window lies where `share_of_band` does: in the middle of one of equal parts.
         weight = window_weights(window, 2 * _FREQUENCIES - 1)[::2]
-        frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * inside)
+        frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * share_of_band)
         return cls(frequency, np.tile(weight / weight.sum(), (bands, 1)))
 
     def thin(self, step: int) -> Spectrum:
@@ -164,7 +164,7 @@ class Layer:
     Attributes
     ----------
     name
-        For messages.
+        Text for messages.
     permittivity
         eps' - j eps''; None: unknown. Infinite: metal.
     thickness_m
@@ -206,7 +206,8 @@ def average(
 
     `eps` and `thickness` (metres) of each layer, and `theta_rad`, are numbers or arrays [..., 1, 1].
     """
-    # Metal has -1 in both polarisations: reflections are relative to it but for a sign that ratio and magnitude drop.
+    # Metal has -1 in both polarisations: reflections are relative to it except for a sign that ratio and magnitude
+    # drop.
     reflections = multilayer(eps, thickness, spectrum.frequency_hz, theta_rad)
     r_s, r_p = (np.asarray((r * spectrum.weight).sum(axis=-1), np.complex128) for r in reflections)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -250,27 +251,27 @@ START_PHASE_RAD = 0.25
 # "Index" here and below is sqrt(eps' - sin^2), the wave vector along the normal over that in vacuum.
 LOSS_TANGENTS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 2.0)
 INDEX_STEPS = 60
-STARTS = 24
-RIVAL = 9.0
+STARTS_SOLVED = 24
+RIVAL_CHI2 = 9.0
 """A second solution is a rival if its chi-square is within this of the best: three standard deviations, enlarged as the
 error bars if the model misses the data."""
 MAX_THICKNESS_M = 30e-3
 """Largest thickness to fit; chosen."""
-UNLIKELY = 1e-3
+UNLIKELY_PROBABILITY = 1e-3
 """Probability of a larger chi-square below which the stack does not explain the data; chosen."""
-DETERMINED = 0.05
+DETERMINED_HALF_WIDTH = 0.05
 """Largest relative half width of 95 % regions of a fit that is not ambiguous; chosen."""
 # Draws of the posterior for its second moments; chosen.
 _DRAWS = 1500
 # Draws farther away than this, in standard deviations, are left out; chosen.
-_REACH = 4.0
+_MAX_DEVIATION = 4.0
 # Width of the distribution that samples are drawn from, relative to the linear standard deviations; chosen: a wider one
 # covers a bent valley, but leaves fewer draws in a straight one.
 _DRAW_WIDTH = 1.15
 # Range of the incidence angle's error, in standard deviations; chosen, wide enough never to bind.
 _ANGLE_RANGE = (-8.0, 8.0)
 # Ratio of sampled to linear standard deviations above which the sampled ones are used; chosen.
-_BENT = 1.15
+_NONLINEAR_RATIO = 1.15
 
 
 @dataclass(frozen=True)
@@ -315,31 +316,31 @@ class LayerFit:
     @property
     def relative_std(self) -> float:
         """The larger of the standard deviations (one sigma) of permittivity and of thickness, relative."""
-        of_permittivity = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
+        permittivity_std = float(np.hypot(self.std_real, self.std_loss)) / abs(self.permittivity)
         if not self.thickness_m:
-            return of_permittivity
-        return max(of_permittivity, self.std_thickness_m / self.thickness_m)
+            return permittivity_std
+        return max(permittivity_std, self.std_thickness_m / self.thickness_m)
 
     @property
     def ambiguous(self) -> bool:
         """True if there are rivals, or two sigma of a fitted thickness or permittivity exceed 5 %.
 
-        The limit is `DETERMINED`.
+        The limit is `DETERMINED_HALF_WIDTH`.
         """
-        return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED)
+        return bool(self.rivals) or (self.std_thickness_m > 0 and 2 * self.relative_std > DETERMINED_HALF_WIDTH)
 
     def warnings(self) -> list[str]:
         """Return the warnings about this fit, one sentence each."""
         out = []
-        for r in self.rivals:
-            if r.thickness_m is None or not self.std_thickness_m:
+        for rival in self.rivals:
+            if rival.thickness_m is None or not self.std_thickness_m:
                 size = ""
             else:
-                size = f" at {1e3 * r.thickness_m:.3g} mm"
+                size = f" at {1e3 * rival.thickness_m:.3g} mm"
             freedom = f" for {self.freedom} degrees of freedom" if self.freedom > 0 else ""
             out.append(
-                f"{format_permittivity(r.permittivity)}{size} is not excluded: chi-square {r.chi2:.1f}, the best has"
-                f" {self.chi2:.1f}{freedom}"
+                f"{format_permittivity(rival.permittivity)}{size} is not excluded: chi-square {rival.chi2:.1f},"
+                f" the best has {self.chi2:.1f}{freedom}"
             )
         if self.rivals and self.freedom <= 0:
             out.append(
@@ -351,7 +352,7 @@ class LayerFit:
                 f"ambiguous: permittivity and thickness are determined to {100 * self.relative_std:.0f} % only;"
                 " measure the thickness"
             )
-        if self.freedom > 0 and scipy.special.chdtrc(self.freedom, self.chi2) < UNLIKELY:
+        if self.freedom > 0 and scipy.special.chdtrc(self.freedom, self.chi2) < UNLIKELY_PROBABILITY:
             out.append(
                 f"the stack does not explain the data: chi-square {self.chi2:.0f} for {self.freedom} degrees of freedom"
             )
@@ -408,16 +409,16 @@ def fit_layer(
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
     # Solve roughly from every start, and exactly where the result may be the best or a rival.
-    by_fit = operator.attrgetter("chi2")
-    rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=by_fit)
+    read_chi2 = operator.attrgetter("chi2")
+    rough = sorted((model.solve(start, precision=1e-3) for start in model.starts()), key=read_chi2)
     # Chi-square is not exact yet: three times the margin is kept.
-    level = rough[0].chi2 + 3 * RIVAL * model.fit(rough[0], by_sampling=False).stretch
-    solutions = sorted((model.solve(solution.x) for solution in _drop_repetitions(rough, level, 0.01)), key=by_fit)
-    level = solutions[0].chi2 + RIVAL * model.fit(solutions[0], by_sampling=False).stretch
-    near = [model.fit(solution, by_sampling=True) for solution in _drop_repetitions(solutions, level, 1e-3)]
-    best = near[0]
+    level = rough[0].chi2 + 3 * RIVAL_CHI2 * model.fit(rough[0], by_sampling=False).stretch
+    solutions = sorted((model.solve(solution.x) for solution in _drop_repetitions(rough, level, 0.01)), key=read_chi2)
+    level = solutions[0].chi2 + RIVAL_CHI2 * model.fit(solutions[0], by_sampling=False).stretch
+    sampled_fits = [model.fit(solution, by_sampling=True) for solution in _drop_repetitions(solutions, level, 1e-3)]
+    best = sampled_fits[0]
     rivals = list[LayerFit]()
-    for rival in near[1:]:
+    for rival in sampled_fits[1:]:
         if all(_differ(rival, accepted) for accepted in (best, *rivals)):
             rivals.append(rival)
     return replace(best, rivals=tuple(rivals))
@@ -453,7 +454,7 @@ class _Solution:
     # Unknowns [n], as of :class:`_Model`.
     x: Real
     chi2: float
-    # Of the residuals, [residual, n].
+    # Derivatives of the residuals by the unknowns, [residual, n].
     jacobian: Real
     active: npt.NDArray[np.intp]
 
@@ -566,20 +567,20 @@ class _Model:
         mesh = np.meshgrid(*axes, indexing="ij")
         real = mesh[0] ** 2 + sine2
         x = [real, mesh[1]]
-        outside = np.zeros(real.shape, bool)
+        is_outside = np.zeros(real.shape, bool)
         if self.fits_thickness:
             x[1] = np.minimum(mesh[1] * real, LOSS_RANGE[1])
             x.append(mesh[2] / (2 * self.wavenumber * mesh[0]))
-            outside = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
+            is_outside = (x[2] < self.range_mm[0]) | (x[2] > self.range_mm[1])
         if self.fits_angle:
             x.append(np.zeros(real.shape))
         grid = np.stack(x, axis=-1)
         chi2 = np.full(real.shape, np.inf)
         # A few frequencies of a sub-band are enough for start values.
-        chi2[~outside] = np.sum(self.residuals(grid[~outside], thin=6) ** 2, axis=-1)
-        valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~outside
+        chi2[~is_outside] = np.sum(self.residuals(grid[~is_outside], thin=6) ** 2, axis=-1)
+        valleys = (chi2 == scipy.ndimage.minimum_filter(chi2, size=3, mode="nearest")) & ~is_outside
         cells = np.argwhere(valleys)
-        order = np.argsort(chi2[tuple(cells.T)])[:STARTS]
+        order = np.argsort(chi2[tuple(cells.T)])[:STARTS_SOLVED]
         return [grid[tuple(cell)] for cell in cells[order]]
 
     def _differentiate(self, x: Real) -> Real:
@@ -611,9 +612,9 @@ class _Model:
         n = self.unknowns
         covariance = np.asarray(np.linalg.pinv(solution.jacobian.T @ solution.jacobian), np.float64)
         own_covariance = self._draw_second_moments(solution, covariance) if by_sampling else covariance[:n, :n]
-        # As `LayerFit.stretch`.
+        # The factor is that of `LayerFit.stretch`.
         stretch = max(1.0, solution.chi2 / self.freedom) if self.freedom > 0 else 1.0
-        # Metres instead of millimetres.
+        # The thickness is stored in metres instead of millimetres.
         units = np.array([1.0, 1.0, 1e-3])[:n]
         own_covariance = np.asarray(stretch * own_covariance * np.outer(units, units), np.float64)
         std = np.sqrt(np.maximum(np.diag(own_covariance), 0.0))
@@ -644,23 +645,24 @@ class _Model:
         """
         n = self.unknowns
         x = solution.x
-        to_straight = self._differentiate_straight(x)
-        spread = to_straight @ covariance @ to_straight.T
+        derivatives = self._differentiate_straight(x)
+        spread = derivatives @ covariance @ derivatives.T
         # A little is added, so that rounding leaves no negative eigenvalue.
         spread = spread + np.diag(1e-12 * np.maximum(np.diag(spread), 1e-18))
-        # A wide proposal (Student's t, five degrees of freedom); beyond _REACH there is another valley: a rival.
+        # A wide proposal (Student's t, five degrees of freedom); beyond _MAX_DEVIATION there is another valley: a
+        # rival.
         rng = np.random.default_rng(0)
         freedom = 5.0
         unit = rng.standard_normal((_DRAWS, x.size)) / np.sqrt(rng.chisquare(freedom, (_DRAWS, 1)) / freedom)
-        unit = _DRAW_WIDTH * unit[np.sum(unit**2, axis=1) < (_REACH / _DRAW_WIDTH) ** 2]
+        unit = _DRAW_WIDTH * unit[np.sum(unit**2, axis=1) < (_MAX_DEVIATION / _DRAW_WIDTH) ** 2]
         draws = self._convert_from_straight(x, unit @ np.linalg.cholesky(spread).T)
-        inside = np.all((draws >= self.lower) & (draws <= self.upper), axis=-1)
+        is_inside = np.all((draws >= self.lower) & (draws <= self.upper), axis=-1)
         linear = covariance[:n, :n]
-        if not np.any(inside):
+        if not np.any(is_inside):
             return linear
-        draws = draws[inside]
-        unit = unit[inside]
-        # Logarithm of the posterior over the proposal's density, but for a constant.
+        draws = draws[is_inside]
+        unit = unit[is_inside]
+        # Logarithm of the posterior over the proposal's density, up to a constant.
         log = -0.5 * np.sum(self.residuals(draws) ** 2, axis=-1)
         log += (freedom + x.size) / 2 * np.log1p(np.sum((unit / _DRAW_WIDTH) ** 2, axis=1) / freedom)
         weight = np.exp(log - log.max())
@@ -668,7 +670,7 @@ class _Model:
         differences = (draws - x)[:, :n]
         second = (differences * weight[:, None]).T @ differences
         ratio = np.sqrt(np.diag(second) / np.maximum(np.diag(linear), 1e-30))
-        return second if np.any(ratio > _BENT) else linear
+        return second if np.any(ratio > _NONLINEAR_RATIO) else linear
 
     def _differentiate_straight(self, x: Real) -> Real:
         """Return derivatives of (eps', eps'', thickness times index, angle) by the unknowns, [n, n]."""

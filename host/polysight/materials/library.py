@@ -125,15 +125,15 @@ class Library:
 
         Raises DataError if there are none: |P| changes by 10 % in a degree, so other angles cannot be used.
         """
-        near = [a for a in self.angles_deg if abs(a - angle_deg) <= SAME_ANGLE_DEG]
-        if not near:
+        near_angles_deg = [a for a in self.angles_deg if abs(a - angle_deg) <= SAME_ANGLE_DEG]
+        if not near_angles_deg:
             raise DataError(
                 f"the library has no patch at {angle_deg:.1f} degrees of incidence",
                 f"its incidence angles are {', '.join(f'{a:g}' for a in self.angles_deg)} degrees",
                 "train a library at this angle, or process without naming: --model none",
                 code=ErrorCode.MISMATCH,
             )
-        angle = min(near, key=lambda a: abs(a - angle_deg))
+        angle = min(near_angles_deg, key=lambda a: abs(a - angle_deg))
         entries_of_angle = tuple(e for e in self.entries if abs(e.incidence_deg - angle) <= SAME_ANGLE_DEG)
         return Library(entries_of_angle, self.fit_for([angle]), self.note)
 
@@ -251,7 +251,7 @@ def _read_entries(rows: list[dict[str, Any]], h: npt.NDArray, v: npt.NDArray, p:
 
 
 Real = npt.NDArray[np.float64]
-WIDTH = 4
+COLUMNS_PER_ANGLE = 4
 """Columns of one angle: |H|, |V|, real and imaginary part of 1/P = V/H."""
 CHANNELS = ("H", "V", "P", "H+V+P")
 """Channels that a classifier may use (Fig. 20 of the paper)."""
@@ -273,7 +273,7 @@ def usable(x: Real) -> npt.NDArray[np.bool_]:
 
 def split_by_angle(x: Real) -> tuple[Real, Real, npt.NDArray[np.complex128]]:
     """Return |H|, |V| and V / H of features [n, 4 * angles], each [n, angles]."""
-    h, v, real, imag = np.moveaxis(x.reshape(len(x), x.shape[1] // WIDTH, WIDTH), -1, 0)
+    h, v, real, imag = np.moveaxis(x.reshape(len(x), x.shape[1] // COLUMNS_PER_ANGLE, COLUMNS_PER_ANGLE), -1, 0)
     return h, v, real + 1j * imag
 
 
@@ -294,7 +294,7 @@ def ratio_columns(features: Real) -> Real:
 
     Several angles follow each other, four columns each.
     """
-    table = features.reshape(len(features), -1, WIDTH).copy()
+    table = features.reshape(len(features), -1, COLUMNS_PER_ANGLE).copy()
     inverse = table[..., 2] + 1j * table[..., 3]
     inverse = np.where(np.abs(inverse) < 1 / _LARGEST_RATIO, 1 / _LARGEST_RATIO, inverse)
     table[..., 2] = (1 / inverse).real
@@ -319,22 +319,22 @@ def channel_distances(a: Real, b: Real, measure: Measure | None) -> Distances:
     """
     a_h, a_v, a_inverse = split_by_angle(a)
     b_h, b_v, b_inverse = split_by_angle(b)
-    in_h = np.zeros((len(a), len(b)))
-    in_v = np.zeros_like(in_h)
-    in_p = np.zeros_like(in_h)
+    h_distance = np.zeros((len(a), len(b)))
+    v_distance = np.zeros_like(h_distance)
+    p_distance = np.zeros_like(h_distance)
     for angle in range(a_h.shape[1]):
-        in_h += np.abs(a_h[:, None, angle] - b_h[None, :, angle])
-        in_v += np.abs(a_v[:, None, angle] - b_v[None, :, angle])
+        h_distance += np.abs(a_h[:, None, angle] - b_h[None, :, angle])
+        v_distance += np.abs(a_v[:, None, angle] - b_v[None, :, angle])
         if measure is not None:
-            in_p += ratio_distance(1 / a_inverse[:, None, angle], 1 / b_inverse[None, :, angle], measure)
-    return in_h, in_v, in_p
+            p_distance += ratio_distance(1 / a_inverse[:, None, angle], 1 / b_inverse[None, :, angle], measure)
+    return h_distance, v_distance, p_distance
 
 
 def find_neighbours(distance: Real, count: int) -> npt.NDArray[np.intp]:
     """Return the columns of the `count` smallest values of each row, nearest first, [rows, count]."""
-    nearest = np.argpartition(distance, count - 1, axis=1)[:, :count]
-    order = np.argsort(np.take_along_axis(distance, nearest, axis=1), axis=1, kind="stable")
-    return np.take_along_axis(nearest, order, axis=1)
+    nearest_indices = np.argpartition(distance, count - 1, axis=1)[:, :count]
+    order = np.argsort(np.take_along_axis(distance, nearest_indices, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(nearest_indices, order, axis=1)
 
 
 def count_votes(neighbour_classes: npt.NDArray[np.intp], classes: int) -> npt.NDArray[np.intp]:
@@ -389,9 +389,9 @@ class Samples:
             return self.groups
         # Each group has the name of the first group that it is joined to; a plate joins all groups that show it.
         joined = {g: g for g in np.unique(self.groups).tolist()}
-        with_specimen = self.specimens != ""
-        plates = self.plates[with_specimen]
-        groups = self.groups[with_specimen]
+        has_specimen = self.specimens != ""
+        plates = self.plates[has_specimen]
+        groups = self.groups[has_specimen]
         for plate in np.unique(plates):
             joined_groups = {joined[g] for g in np.unique(groups[plates == plate]).tolist()}
             for group, first_group in joined.items():
@@ -424,16 +424,16 @@ class Samples:
         groups = []
         patches = []
         specimens = []
-        for i, e in enumerate(library.entries):
+        for i, entry in enumerate(library.entries):
             with np.errstate(divide="ignore", invalid="ignore"):
-                features = feature_matrix(e.h, e.v, e.p)
-            good = np.flatnonzero(usable(features))
-            pixels = rng.permutation(good)[:pixels_per_patch]
+                features = feature_matrix(entry.h, entry.v, entry.p)
+            usable_pixels = np.flatnonzero(usable(features))
+            pixels = rng.permutation(usable_pixels)[:pixels_per_patch]
             x.append(features[pixels])
-            names += [e.name] * pixels.size
-            groups += [e.scan] * pixels.size
+            names += [entry.name] * pixels.size
+            groups += [entry.scan] * pixels.size
             patches += [i] * pixels.size
-            specimens += [e.specimen or ""] * pixels.size
+            specimens += [entry.specimen or ""] * pixels.size
         if not names:
             raise DataError(
                 "the library has no usable pixel",
@@ -485,14 +485,14 @@ class Samples:
             for name in np.unique(self.names):
                 our_patches = np.unique(self.patches[(self.groups == a) & (self.names == name)])
                 their_patches = np.unique(other.patches[(other.groups == b) & (other.names == name)])
-                for p, q in zip(our_patches, their_patches, strict=False):
-                    i = np.flatnonzero(self.patches == p)
-                    j = np.flatnonzero(other.patches == q)
+                for our_patch, their_patch in zip(our_patches, their_patches, strict=False):
+                    i = np.flatnonzero(self.patches == our_patch)
+                    j = np.flatnonzero(other.patches == their_patch)
                     n = min(i.size, j.size)
                     our_rows.append(rng.permutation(i)[:n])
                     their_rows.append(rng.permutation(j)[:n])
                     groups += [a if a == b else f"{a} + {b}"] * n
-                    patches += [p] * n
+                    patches += [our_patch] * n
         if not groups:
             raise DataError(
                 "no material was seen under both angles", "the materials' names differ", "train both angles",
@@ -577,11 +577,11 @@ def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> 
 def median_by_patch(values: Real, patch: npt.NDArray[np.intp]) -> Real:
     """Return the median of the values [n] of each patch, [patches]; `patch` [n] are numbers from 0, all of them in use.
 
-    All patches at once: `numpy.median` takes 30 us a call, and scores need it for thousands of patches.
+    All patches are computed together: `numpy.median` takes 30 us a call, and scores need it for thousands of patches.
     """
     count = np.bincount(patch)
-    in_order = values[np.lexsort((values, patch))]
+    sorted_values = values[np.lexsort((values, patch))]
     first = np.cumsum(count) - count
-    middle = (in_order[first + (count - 1) // 2] + in_order[first + count // 2]) / 2
+    middle = (sorted_values[first + (count - 1) // 2] + sorted_values[first + count // 2]) / 2
     # Values that are not numbers are sorted to the end.
-    return np.where(np.isnan(in_order[first + count - 1]), np.nan, middle)
+    return np.where(np.isnan(sorted_values[first + count - 1]), np.nan, middle)

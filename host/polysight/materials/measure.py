@@ -17,7 +17,7 @@ import numpy.typing as npt
 import scipy
 
 from polysight.imaging import Dispersion, Image, Images, Mask
-from polysight.materials.kinds import Kinds, PatchDispersion, PatchEstimate, PatchMeasurement, permittivity_slope
+from polysight.materials.kinds import Kinds, PatchDispersion, PatchEstimate, PatchMeasurement, find_permittivity_slope
 from polysight.materials.names import may_be_thin
 from polysight.materials.segment import Patch, Segmentation, touches_border
 from polysight.materials.specimens import METAL_WITHOUT_PERMITTIVITY
@@ -68,7 +68,7 @@ LEAST_LEVEL = 2.0
 ODD_SHARE = 0.15
 ODD_RATIO = 0.15
 """Share of pixels that are this far from the median V / H above which a patch holds several materials; both chosen."""
-RIPPLE = 0.5
+RIPPLE_SHARE = 0.5
 """Distance from the median V / H, relative to it, up to which no pixel is odd, either: real metal ripples by 25 % and
 13 degrees, so that a tenth of its pixels lie two standard deviations of 0.24 away."""
 HALVES_APART = 0.07
@@ -79,11 +79,11 @@ ODD_NOISE = 2.0
 NOISE_OF_HALVES = 22.0
 """Difference of the halves' medians by noise in V / H, times the root of the pixels, over the noise's root mean square:
 three standard deviations, with one independent value in nine pixels and medians that scatter by 1.25 of means."""
-DIM_V = 0.12
+DIM_V_RATIO = 0.12
 """|V| over |H| below which the phase between both is not judged; chosen."""
 LEAST_COHERENCE = 0.7
 """Least coherence of H and V over the pixels of a plate; chosen."""
-IN_NOISE = 2.0
+LEAST_V_OVER_NOISE = 2.0
 """|V| over its background below which V is mostly noise and its phase is not used. Chosen."""
 # Margin around patches that does not count as background; chosen.
 _AROUND_PX = 6
@@ -91,20 +91,20 @@ _AROUND_PX = 6
 # 29 times as large; dim plates of drawn scenes are 0.1 to 1.3 times, or two that touch. Between them it is chosen.
 LARGEST_DIM_PLATE = 6.0
 
-AMPLIFIES = "it would amplify beyond its error bar"
-BELOW_AIR = "its permittivity would be below that of air"
-STRONGER_V = "V is stronger than H, relative to the metal"
+AMPLIFIES_REASON = "it would amplify beyond its error bar"
+BELOW_AIR_REASON = "its permittivity would be below that of air"
+STRONGER_V_REASON = "V is stronger than H, relative to the metal"
 POSSIBLE_LAYER = "possible layer"
-NOT_PASSIVE = (AMPLIFIES, BELOW_AIR, STRONGER_V, POSSIBLE_LAYER)
+NOT_PASSIVE = (AMPLIFIES_REASON, BELOW_AIR_REASON, STRONGER_V_REASON, POSSIBLE_LAYER)
 """Reasons for refusing plates that are not half spaces; they may be fitted as layers."""
-THIN = Finding(
+LAYER_FINDING = Finding(
     "error",
     POSSIBLE_LAYER,
     "its V / H, or what it changes over the sweep, is that of a thin plate or a stack with a probability above 0.2",
     "fit it as a layer: `polysight process --bands 5`, then `polysight permittivity --layer NAME,?,?`",
 )
 """Why a possible layer gets no permittivity."""
-ACTIVE = 2.0
+GAIN_STDS = 2.0
 """Chosen: standard deviations of gain, a real part below 1, or |V / H| above 1, beyond which no half space is so."""
 ALLOWED_EXCESS = 0.02
 """Gain, real part below 1, or |V / H| above 1 that is allowed in addition, however small the error is. Chosen."""
@@ -133,9 +133,9 @@ def background_mean(h: Image, v: Image, segmentation: Segmentation, usable: Mask
     window_is_whole = _average_window(background_mask.astype(np.complex128), width_px).real > 1 - 1e-6
     if not window_is_whole.any():
         return 0.0, 0.0
-    behind_h = _average_window(np.where(background_mask, h, 0), width_px)[window_is_whole]
-    behind_v = _average_window(np.where(background_mask, v, 0), width_px)[window_is_whole]
-    return _compute_rms(behind_h), _compute_rms(behind_v)
+    mean_h = _average_window(np.where(background_mask, h, 0), width_px)[window_is_whole]
+    mean_v = _average_window(np.where(background_mask, v, 0), width_px)[window_is_whole]
+    return _compute_rms(mean_h), _compute_rms(mean_v)
 
 
 def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> Mask:
@@ -144,12 +144,12 @@ def _select_background(h: Image, v: Image, segmentation: Segmentation, usable: M
     A region that was left out is taken for a dim plate if it is as small as one, else for the table behind, which is
     background.
     """
-    in_plate = segmentation.labels > 0
+    is_in_plate = segmentation.labels > 0
     largest_px = max((int(patch.mask.sum()) for patch in segmentation.patches), default=0)
     for region in segmentation.left_out:
         if region.sum() <= LARGEST_DIM_PLATE * largest_px:
-            in_plate |= region
-    return usable & np.isfinite(h) & np.isfinite(v) & ~_is_near(in_plate)
+            is_in_plate |= region
+    return usable & np.isfinite(h) & np.isfinite(v) & ~_is_near(is_in_plate)
 
 
 def _is_near(mask: Mask) -> Mask:
@@ -205,7 +205,7 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     power_h = float(np.sum(np.abs(h[pixels].astype(np.complex128)) ** 2))
     power_v = float(np.sum(np.abs(v[pixels].astype(np.complex128)) ** 2))
     level_v = float(np.median(np.abs(v[pixels])))
-    is_dim = level_v < DIM_V * float(np.median(level)) or level_v < IN_NOISE * dark[1]
+    is_dim = level_v < DIM_V_RATIO * float(np.median(level)) or level_v < LEAST_V_OVER_NOISE * dark[1]
     if not is_dim and cross < LEAST_COHERENCE * np.sqrt(power_h * power_v):
         return Finding(
             "error", "H and V do not agree", "their phase difference varies from pixel to pixel, like noise", remedy
@@ -218,7 +218,9 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     if halves_apart(h, v, pixels) > np.hypot(allowed, NOISE_OF_HALVES * noise / np.sqrt(pixels.sum())):
         return Finding("error", several, "its halves have different ratios", separate_plates)
     middle = 1 / median_ratio(h[pixels], v[pixels])
-    odd = np.abs(v[pixels] / h[pixels] - middle) > np.hypot(max(ODD_RATIO, RIPPLE * abs(middle)), ODD_NOISE * noise)
+    odd = np.abs(v[pixels] / h[pixels] - middle) > np.hypot(
+        max(ODD_RATIO, RIPPLE_SHARE * abs(middle)), ODD_NOISE * noise
+    )
     if float(odd.mean()) > ODD_SHARE:
         return Finding("error", several, f"{100 * odd.mean():.0f} % of its pixels have another ratio", separate_plates)
     return None
@@ -229,11 +231,11 @@ def halves_apart(h: Image, v: Image, mask: Mask) -> float:
     rows, columns = np.nonzero(mask & np.isfinite(h) & np.isfinite(v) & (h != 0))
     values = v[rows, columns] / h[rows, columns]
     largest = 0.0
-    for place in (rows, columns):
-        if place.size == 0:
+    for coordinate in (rows, columns):
+        if coordinate.size == 0:
             break
-        low = values[place < np.median(place)]
-        high = values[place > np.median(place)]
+        low = values[coordinate < np.median(coordinate)]
+        high = values[coordinate > np.median(coordinate)]
         if min(low.size, high.size) >= LEAST_PIXELS // 2:
             real = float(np.median(low.real) - np.median(high.real))
             imag = float(np.median(low.imag) - np.median(high.imag))
@@ -401,9 +403,9 @@ def border_errors(patch: Patch, lit: Mask, x_m: Real) -> tuple[float, float]:
     is_lit = np.pad(lit, 1, constant_values=not touches_border(patch.mask))
     if is_lit.all():
         return 0.0, 0.0
-    to_end_px = np.asarray(scipy.ndimage.distance_transform_edt(is_lit))[1:-1, 1:-1]
+    distance_to_end_px = np.asarray(scipy.ndimage.distance_transform_edt(is_lit))[1:-1, 1:-1]
     # Half a pixel: a box drawn by hand may lie over dark pixels, 0 from them.
-    middle_m = max(float(np.median(to_end_px[patch.interior])), 0.5) * abs(float(x_m[1] - x_m[0]))
+    middle_m = max(float(np.median(distance_to_end_px[patch.interior])), 0.5) * abs(float(x_m[1] - x_m[0]))
     amplitude, phase = (
         min(std * (BORDER_M / middle_m) ** power, MOST_BORDER_STD)
         for std, power in zip(BORDER_STD, BORDER_POWERS, strict=True)
@@ -426,30 +428,30 @@ def measure_dispersions(
     plate's level: 0.8 for a table 100 mm behind, 20 dB below a plate.
     """
     dispersion = images.dispersion
-    of_metal = None
+    metal_measurement = None
     if dispersion is not None and plane is None:
-        of_metal = _measure_median_change(dispersion, metal)
+        metal_measurement = _measure_median_change(dispersion, metal)
     elif plane is not None and plane.dispersion is not None:
         h, v = plane.dispersion
-        of_metal = np.array([h.real, (v - h).real, (v - h).imag]), np.zeros(3)
-    if dispersion is None or of_metal is None:
+        metal_measurement = np.array([h.real, (v - h).real, (v - h).imag]), np.zeros(3)
+    if dispersion is None or metal_measurement is None:
         return [None] * len(judged)
-    metal_change, metal_spread = of_metal
-    behind = background_mean(images.h * dispersion.h, images.v * dispersion.v, segmentation, images.usable)
+    metal_change, metal_spread = metal_measurement
+    background = background_mean(images.h * dispersion.h, images.v * dispersion.v, segmentation, images.usable)
     floor = np.array([DISPERSION_STD[0], DISPERSION_STD[1], DISPERSION_STD[1]])
     out: list[PatchDispersion | None] = []
     for patch in judged:
-        of_patch = _measure_median_change(dispersion, patch.interior)
+        patch_change = _measure_median_change(dispersion, patch.interior)
         level_h = np.median(np.abs(images.h[patch.interior]))
         level_v = np.median(np.abs(images.v[patch.interior]))
-        if of_patch is None or not min(level_h, level_v) > 0:
+        if patch_change is None or not min(level_h, level_v) > 0:
             out.append(None)
             continue
-        change, spread = of_patch
-        behind_h = DISPERSION_BEHIND * behind[0] / level_h
-        behind_v = DISPERSION_BEHIND * behind[1] / level_v
-        of_behind = np.array([behind_h, np.hypot(behind_h, behind_v), np.hypot(behind_h, behind_v)])
-        variance = floor**2 + DISPERSION_SHARE**2 * (spread**2 + metal_spread**2) + of_behind**2
+        change, spread = patch_change
+        std_h = DISPERSION_BEHIND * background[0] / level_h
+        std_v = DISPERSION_BEHIND * background[1] / level_v
+        background_std = np.array([std_h, np.hypot(std_h, std_v), np.hypot(std_h, std_v)])
+        variance = floor**2 + DISPERSION_SHARE**2 * (spread**2 + metal_spread**2) + background_std**2
         out.append(PatchDispersion(change - metal_change, np.sqrt(variance), dispersion.band_hz))
     return out
 
@@ -615,7 +617,7 @@ def estimate_permittivity(
     pixel_values = pixel_values[np.isfinite(pixel_values)]
     re = np.percentile(pixel_values.real, [30, 70])
     im = np.percentile(pixel_values.imag, [30, 70])
-    std = float(abs(permittivity_slope(inverse, float(theta.mean()))) * inverse_std)
+    std = float(abs(find_permittivity_slope(inverse, float(theta.mean()))) * inverse_std)
     return Permittivity(
         value=value,
         real_range=(float(re[0]), float(re[1])),
@@ -641,17 +643,17 @@ def permittivity_of_patch(
     inversion; None for a patch that it did not include, which gets no permittivity.
     """
     # Pixels get the corrections of their patch, so that their median ratio is the inversion's.
-    alone = estimate_permittivity(h, v, theta_rad)
-    if estimate is not None and alone.ratio and np.isfinite(alone.ratio):
-        alone = estimate_permittivity(h, v * complex(estimate.inverse_ratio * alone.ratio), theta_rad)
+    single = estimate_permittivity(h, v, theta_rad)
+    if estimate is not None and single.ratio and np.isfinite(single.ratio):
+        single = estimate_permittivity(h, v * complex(estimate.inverse_ratio * single.ratio), theta_rad)
     if estimate is None or estimate.permittivity is None or estimate.covariance is None:
-        return Permittivity.not_estimated(alone.ratio, alone.inverse_std, alone.metal_distance, alone.pixels)
+        return Permittivity.not_estimated(single.ratio, single.inverse_std, single.metal_distance, single.pixels)
     ratio = 1 / estimate.inverse_ratio if estimate.inverse_ratio else complex(np.inf, 0.0)
     real_std, loss_std = (float(s) for s in np.sqrt(np.diag(estimate.covariance)))
     covariance = estimate.inverse_ratio_covariance
-    ranges = alone.real_range or (np.nan, np.nan), alone.imag_range or (np.nan, np.nan)
+    ranges = single.real_range or (np.nan, np.nan), single.imag_range or (np.nan, np.nan)
     return replace(
-        alone,
+        single,
         value=estimate.permittivity,
         real_range=ranges[0],
         imag_range=ranges[1],
@@ -665,19 +667,20 @@ def permittivity_of_patch(
     )
 
 
-def _find_impossibility(e: Permittivity) -> Finding | None:
+def _find_impossibility(estimate: Permittivity) -> Finding | None:
     """Return why a permittivity is impossible for a passive material, beyond its error; None if it is possible."""
     remedy = "measure leakage (`polysight leakage`); fit a thin plate as a layer (`polysight permittivity --layer`)"
     causes = "likely causes: leakage, a layered plate, a wrong metal reference, or H and V of different places"
     # Eq. 3 does not distinguish P from 1 / P, but no half space reflects more of p than of s.
-    if e.ratio and not e.metal_like and abs(1 / e.ratio) > 1 + ACTIVE * e.inverse_std + ALLOWED_EXCESS:
-        return Finding("error", STRONGER_V, causes, remedy)
-    if e.value is None or e.real_std is None or e.loss_std is None:
+    largest_inverse = 1 + GAIN_STDS * estimate.inverse_std + ALLOWED_EXCESS
+    if estimate.ratio and not estimate.metal_like and abs(1 / estimate.ratio) > largest_inverse:
+        return Finding("error", STRONGER_V_REASON, causes, remedy)
+    if estimate.value is None or estimate.real_std is None or estimate.loss_std is None:
         return None
-    if e.value.imag > ACTIVE * e.loss_std + ALLOWED_EXCESS:
-        return Finding("error", AMPLIFIES, causes, remedy)
-    if e.value.real < 1 - ACTIVE * e.real_std - ALLOWED_EXCESS:
-        return Finding("error", BELOW_AIR, causes, remedy)
+    if estimate.value.imag > GAIN_STDS * estimate.loss_std + ALLOWED_EXCESS:
+        return Finding("error", AMPLIFIES_REASON, causes, remedy)
+    if estimate.value.real < 1 - GAIN_STDS * estimate.real_std - ALLOWED_EXCESS:
+        return Finding("error", BELOW_AIR_REASON, causes, remedy)
     return None
 
 
@@ -685,5 +688,9 @@ def refuse_impossible(
     patches: Mapping[int, Permittivity], estimates: Mapping[int, PatchEstimate], kinds: Kinds
 ) -> dict[int, Finding]:
     """Return patch number to why it is not a half space: an impossible permittivity, or possibly a thin plate."""
-    thin = {label: THIN for label, e in estimates.items() if e.evidence is not None and may_be_thin(e.evidence, kinds)}
+    thin = {
+        label: LAYER_FINDING
+        for label, e in estimates.items()
+        if e.evidence is not None and may_be_thin(e.evidence, kinds)
+    }
     return thin | {label: reason for label, e in patches.items() if (reason := _find_impossibility(e)) is not None}

@@ -29,7 +29,7 @@ import numpy.typing as npt
 import scipy
 
 from polysight.imaging import Image, Images, Mask
-from polysight.materials.inversion import WIDTH, Inversion, RigPrior, SceneLikelihood, invert, sample_posterior
+from polysight.materials.inversion import PARTICLE_WIDTH, Inversion, RigPrior, SceneLikelihood, invert, sample_posterior
 from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, HalfSpaces, Kinds, PatchMeasurement, inverse_ratio
 from polysight.materials.measure import median_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
@@ -83,10 +83,10 @@ HALO_EXCESS = 1.26
 """Smallest median of |V| / |H| beside a plate that is a halo, both relative to metal: 2 dB. Beside the metal
 undisturbed scenes of an independent generator have -4 to 1.1 dB, clipped ones -0.3 to 8.7 dB (seven of eight above 2.4
 dB)."""
-OVERDRIVING = 2.0
+OVERDRIVING_RATIO = 2.0
 """Smallest |V| of the metal over that of any other plate for a halo: only such an echo overdrives the receiver of V.
 Without this limit, sidelobes of the neighbours of a dielectric that is declared as metal would count as its halo."""
-USUAL_POWER = 0.56
+USUAL_POWER_RATIO = 0.56
 """Usual power of V over that of H beside plates without a halo: -2.5 dB, the median of these undisturbed scenes. The
 power there is sidelobes of dielectrics, which reflect s (H) better than p (V)."""
 
@@ -170,7 +170,7 @@ class _DielectricReference(SceneLikelihood):
     than in the base class, for eps' and for the loss tangent of the reference.
     """
 
-    width = WIDTH + 2
+    width = PARTICLE_WIDTH + 2
 
     def __init__(
         self, measurements: Sequence[PatchMeasurement], prior: RigPrior, kinds: Kinds, channel_ratio_db: float | None
@@ -185,7 +185,7 @@ class _DielectricReference(SceneLikelihood):
     def reference_permittivity(self, z: Real) -> Complex:
         """Return the permittivity of the reference, eps' - j eps'', [..., 1], within the ranges of `REFERENCE_REAL`."""
         real, tangent = (
-            low * (high / low) ** scipy.special.ndtr(z[..., WIDTH + i, None])
+            low * (high / low) ** scipy.special.ndtr(z[..., PARTICLE_WIDTH + i, None])
             for i, (low, high) in enumerate((REFERENCE_REAL, REFERENCE_LOSS_TANGENT))
         )
         return real * (1 - 1j * tangent)
@@ -214,9 +214,9 @@ class _DielectricReference(SceneLikelihood):
         # reference, with the same prior probability as a second metal patch: its ratio is then 1, with this variance
         # of real and imaginary part each.
         variance = METAL_SPREAD**2 + self.own_variance
-        of_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
-        of_some_kind = parts[..., 1:] + 2 * np.log(size)
-        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + of_some_kind, np.log(METAL_SHARE) + of_same_material)
+        log_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
+        log_some_kind = parts[..., 1:] + 2 * np.log(size)
+        patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + log_some_kind, np.log(METAL_SHARE) + log_same_material)
         brightness_log = parts[..., :1]
         if self.channel_ratio_db is not None:
             too_dark_db = 20 * np.log10(size) - self.channel_ratio_db
@@ -252,15 +252,15 @@ def metal_evidence(
         inversion = invert(measurements, prior, kinds)
     score = inversion.log_evidence - log_evidence_of_dielectric(measurements, prior, kinds, level_db)
     if level_db is not None:
-        # Of metal it is 0 dB; the evidence for a dielectric has a term for it, too.
+        # The level of metal is 0 dB; the evidence for a dielectric has a term for the level, too.
         score -= 0.5 * (level_db / CHANNEL_RATIO_STD_DB) ** 2
     # The evidence for bare metal is that for metal, times the probability of bare after over that before.
-    bare = score + inversion.log_bare - float(np.log1p(-prior.painted))
+    bare_score = score + inversion.log_bare - float(np.log1p(-prior.painted))
     culprit = None
     if score < CONFLICT_SCORE:
         fit = dict(zip(patches, inversion.fit.tolist(), strict=True))
         culprit = min(unlike, key=lambda label: fit[label])
-    return MetalEvidence(score, bare, len(unlike), level_db, culprit)
+    return MetalEvidence(score, bare_score, len(unlike), level_db, culprit)
 
 
 @dataclass(frozen=True)
@@ -292,8 +292,8 @@ class MetalReference:
         """True if the evidence is sure, or if the metal was declared and no evidence speaks against it."""
         if self.evidence is None:
             return self.given
-        declared = self.given and not self.evidence.against and self.evidence.culprit is None
-        return declared or self.evidence.sure
+        is_declared = self.given and not self.evidence.against and self.evidence.culprit is None
+        return is_declared or self.evidence.sure
 
 
 def metal_in_box(
@@ -322,17 +322,17 @@ def metal_in_box(
             "give --metal-box x0,y0,x1,y1 inside the image",
             code=ErrorCode.NO_DATA,
         )
-    place = "" if label is None else f", inside patch {label}"
+    place_text = "" if label is None else f", inside patch {label}"
     return MetalReference(
-        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{place}", given=True
+        mask, label, f"given as a box around ({', '.join(f'{b:.0f}' for b in box_mm)}) mm{place_text}", given=True
     )
 
 
 def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
     """Take the patch `label` as the metal reference. Raises DataError if there is no such patch."""
-    for p in segmentation.patches:
-        if p.label == label:
-            return MetalReference(p.interior, label, f"given as patch {label}", given=True)
+    for patch in segmentation.patches:
+        if patch.label == label:
+            return MetalReference(patch.interior, label, f"given as patch {label}", given=True)
     raise DataError(
         f"there is no patch {label} to take as metal",
         f"{len(segmentation.patches)} patches were found",
@@ -341,7 +341,7 @@ def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
     )
 
 
-def no_metal(usable: Mask) -> MetalReference:
+def make_missing_reference(usable: Mask) -> MetalReference:
     """Return the reference of a scene without patches: all `usable` pixels, as if all were metal."""
     return MetalReference(usable, None, "none: no patch was found")
 
@@ -360,7 +360,7 @@ def gains_as_plates(images: Images, metal_mask: Mask) -> tuple[complex, complex]
     return gain_h * metal_p, gain_v
 
 
-def to_metal(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
+def divide_by_reference(images: Images, metal: MetalReference, reference: PlaneReference | None) -> Images:
     """Divide both channels by metal; leakage is not removed.
 
     The metal is `reference`, which was scanned separately, or without that the region `metal` of these images. If the
@@ -460,33 +460,33 @@ def find_halo(metal: Mask, patches: Sequence[Patch], images: Images) -> Halo:
     plates = np.logical_or.reduce([metal_mask, *(p.mask for p in patches)])
     other_plates = [patch for patch in patches if patch.interior.any() and not (patch.mask & metal).any()]
     strongest_v = max((float(np.median(relative[1][patch.interior])) for patch in other_plates), default=0.0)
-    if OVERDRIVING * strongest_v > 1:
+    if OVERDRIVING_RATIO * strongest_v > 1:
         return Halo()
-    free = images.usable & (_measure_distance_mm(plates, pixel_mm) > AROUND_MM[0])
-    level = _measure_excess(relative, free, metal_mask, HALO_MM, pixel_mm)
+    is_free = images.usable & (_measure_distance_mm(plates, pixel_mm) > AROUND_MM[0])
+    level = _measure_excess(relative, is_free, metal_mask, HALO_MM, pixel_mm)
     if level == 0:
         return Halo()
-    from_metal_mm = _measure_distance_mm(metal_mask, pixel_mm)
-    around = {}
+    distance_from_metal_mm = _measure_distance_mm(metal_mask, pixel_mm)
+    halo_of_patch = {}
     for patch in patches:
-        around[patch.label] = _measure_excess(relative, free, patch.mask, AROUND_MM, pixel_mm)
+        halo_of_patch[patch.label] = _measure_excess(relative, is_free, patch.mask, AROUND_MM, pixel_mm)
         # A plate near the metal lies in the halo, even if no pixel beside it is free to measure that.
-        if patch.mask.any() and float(from_metal_mm[patch.mask].min()) <= HALO_MM[1]:
-            around[patch.label] = max(around[patch.label], level)
-    return Halo(level, around)
+        if patch.mask.any() and float(distance_from_metal_mm[patch.mask].min()) <= HALO_MM[1]:
+            halo_of_patch[patch.label] = max(halo_of_patch[patch.label], level)
+    return Halo(level, halo_of_patch)
 
 
 def _measure_excess(
-    relative: Sequence[np.ndarray], free: Mask, plate: Mask, reach_mm: tuple[float, float], pixel_mm: float
+    relative: Sequence[np.ndarray], is_free: Mask, plate: Mask, reach_mm: tuple[float, float], pixel_mm: float
 ) -> float:
     """Return the amplitude of the halo in V beside a plate; 0 if there is none, or no pixel beside the plate is free.
 
-    Its power is the median power of V minus `USUAL_POWER` times that of H. `relative` are |H| and |V| over those of
-    metal, float [ny, nx]; `free` [ny, nx] are the pixels away from all plates; `reach_mm` is the smallest and the
+    Its power is the median power of V minus `USUAL_POWER_RATIO` times that of H. `relative` are |H| and |V| over those
+    of metal, float [ny, nx]; `is_free` [ny, nx] are the pixels away from all plates; `reach_mm` is the smallest and the
     largest distance from the plate.
     """
     distance = _measure_distance_mm(plate, pixel_mm)
-    ring = free & (distance > reach_mm[0]) & (distance <= reach_mm[1])
+    ring = is_free & (distance > reach_mm[0]) & (distance <= reach_mm[1])
     if not ring.any():
         return 0.0
     h, v = (channel[ring] for channel in relative)
@@ -494,7 +494,7 @@ def _measure_excess(
         return 0.0
     power_h = float(np.median(h)) ** 2
     power_v = float(np.median(v)) ** 2
-    return float(np.sqrt(max(0.0, power_v - USUAL_POWER * power_h)))
+    return float(np.sqrt(max(0.0, power_v - USUAL_POWER_RATIO * power_h)))
 
 
 def _measure_distance_mm(mask: Mask, pixel_mm: float) -> np.ndarray:

@@ -24,9 +24,9 @@ from polysight.materials.kinds import (
     USUAL_LIBRARY_SHARE,
     Kinds,
     RatioEvidence,
-    brightness_density,
+    compute_brightness_density,
+    compute_layer_odds,
     inverse_ratio,
-    layer_odds,
     move_to_angle_of_kinds,
     split_complex,
 )
@@ -36,20 +36,20 @@ Real = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 
 UNKNOWN = "unknown"
-LOOK_ALIKES = 1.8
+LOOK_ALIKE_ODDS = 1.8
 """Odds that a patch is of no kind of the library over those by the share and the densities of kinds (`Kinds`):
 materials are more alike than a smooth density says. Chosen: in 616 scenes of an independent generator, half of whose
 plates no library has, 82 % of the names said at 0.8 to 0.95 were right without it, and 87 % with it."""
-INCLUSIONS = 0.05
+INCLUSION_SHARE = 0.05
 """Share of a patch's pixels that may be of any material of the library (chosen); the prior of the others is the patch's
 probabilities."""
 UNKNOWN_BUDGET = 0.03
 """Relative error of V / H, in addition to its pixels' spread, if the scan's error budget is not known; chosen."""
-LIKELY = 0.005
+LEAST_PROBABILITY = 0.005
 """Materials of less probability are not listed; chosen."""
 LIKELY_UNKNOWN = 0.05
-"""A material that the library lacks is not told as a rival with less probability: a few percent are always left for it;
-chosen."""
+"""A material that the library lacks is not reported as a rival with less probability: a few percent are always left for
+it; chosen."""
 LAYER = "possible layer"
 """Name of a patch that is rather a thin plate or a stack of layers than a half space."""
 POSSIBLY_THIN = 0.2
@@ -157,16 +157,16 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
     weight = first.share * np.sqrt(np.linalg.det(inverse / (2 * np.pi))) * np.exp(-0.5 * distance2)
     library_shares = [evidence.library_share for evidence in scan_evidence]
     library_share = float(np.mean(library_shares)) if first.in_library.any() else 0.0
-    library_share = library_share / (library_share + LOOK_ALIKES * (1 - library_share))
+    library_share = library_share / (library_share + LOOK_ALIKE_ODDS * (1 - library_share))
     weight = weight * np.where(first.in_library, library_share, 1 - library_share)
     drawn_sheets = np.stack([kind.sheets for kind in kinds], axis=1)
-    by_dispersion = _weigh_dispersion(kinds, scan_evidence)
+    dispersion_weight = _weigh_dispersion(kinds, scan_evidence)
     density = _evaluate_normal(drawn_sheets, t, errors + SHEET_KERNEL**2 * np.eye(size))
-    density = density * _weigh_brightness(kinds, scan_evidence) * by_dispersion
+    density = density * _weigh_brightness(kinds, scan_evidence) * dispersion_weight
     sheet = (1 - library_share) * first.sheet_share * float(np.mean(density))
     # Stacks of layers count only where the change over the sweep can distinguish them from half spaces.
     if any(evidence.dispersion is not None for evidence in scan_evidence):
-        sheet += (1 - library_share) * STACK_SHARE / np.pi ** len(scan_evidence) * float(np.mean(by_dispersion))
+        sheet += (1 - library_share) * STACK_SHARE / np.pi ** len(scan_evidence) * float(np.mean(dispersion_weight))
     other_weight = (1 - library_share) * first.other * _evaluate_other_density(kinds, scan_evidence)
     distance = np.sqrt(distance2 / scipy.special.chdtri(size, 0.01))
     total = float(weight.sum()) + sheet + other_weight
@@ -183,11 +183,11 @@ def may_be_thin(evidence: RatioEvidence, kinds: Kinds) -> bool:
 
 
 def _weigh_dispersion(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Real:
-    """Return the product of `layer_odds` over the scans in which the change over the sweep was measured, [draw]."""
+    """Return the product of `compute_layer_odds` over the scans that measured the change over the sweep, [draw]."""
     odds = np.ones(kinds[0].sheets.size)
     for kind, evidence in zip(kinds, scan_evidence, strict=True):
         if evidence.dispersion is not None:
-            odds = odds * layer_odds(evidence.dispersion, kind.theta_rad)
+            odds = odds * compute_layer_odds(evidence.dispersion, kind.theta_rad)
     return odds
 
 
@@ -196,9 +196,9 @@ def _weigh_brightness(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvide
     odds = np.ones(kinds[0].sheets.size)
     for kind, evidence in zip(kinds, scan_evidence, strict=True):
         if np.isfinite(evidence.brightness_off):
-            of_sheets = evidence.brightness_off - kind.sheet_brightness_off
-            density = brightness_density(of_sheets, evidence.brightness_std)
-            odds = odds * density / brightness_density(evidence.brightness_off, evidence.brightness_std)
+            sheet_brightness = evidence.brightness_off - kind.sheet_brightness_off
+            density = compute_brightness_density(sheet_brightness, evidence.brightness_std)
+            odds = odds * density / compute_brightness_density(evidence.brightness_off, evidence.brightness_std)
     return odds
 
 
@@ -211,7 +211,7 @@ def _evaluate_normal(draws: Complex, mean: Complex, covariance: Real) -> Real:
 
 
 def _evaluate_other_density(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> float:
-    """Return the density of the measured t, one per scan, as a half space of no kind.
+    """Return the density of the measured t, one per scan, of half spaces that are no listed material.
 
     With several scans it is averaged over half spaces drawn from the most exact measurement.
     """
@@ -267,9 +267,9 @@ def summarise_literature(kinds: Kinds, odds: Odds) -> tuple[str, npt.NDArray[np.
         named_groups = likeliest_groups[:group_count]
         listed_names = []
         for group in named_groups:
-            in_group = np.where(group_index == group, probability, 0.0)
-            likeliest = int(in_group.argmax())
-            if in_group[likeliest] >= MOST_OF_IT * group_probability[group]:
+            member_probability = np.where(group_index == group, probability, 0.0)
+            likeliest = int(member_probability.argmax())
+            if member_probability[likeliest] >= MOST_OF_IT * group_probability[group]:
                 listed_names.append(str(names[likeliest]))
             else:
                 listed_names.append(str(group_names[group]))
@@ -291,7 +291,7 @@ def name_patch(
 
     The name is the likeliest of: each material of the library, those of the literature together, a layer, and none of
     these. A material whose value lies outside of the patch's own 99 % region (errors and specimens together) is
-    never the name. Pixels are assumed to be of their patch's material, except for the share `INCLUSIONS`.
+    never the name. Pixels are assumed to be of their patch's material, except for the share `INCLUSION_SHARE`.
 
     Parameters
     ----------
@@ -306,7 +306,8 @@ def name_patch(
     if not usable.any():
         return make_patch_without_pixels(usable.size)
     kind_evidence = [
-        move_to_angle_of_kinds(evidence, of_scan) for evidence, of_scan in zip(kind_evidence, kinds, strict=True)
+        move_to_angle_of_kinds(evidence, kinds_of_scan)
+        for evidence, kinds_of_scan in zip(kind_evidence, kinds, strict=True)
     ]
     odds = weigh_kinds(kinds, kind_evidence)
     # The kinds are the same at every angle; only their ratios differ.
@@ -344,46 +345,48 @@ def _find_verdict(
             probability[name] = float(odds.kinds[k])
         else:
             literature[name] = float(odds.kinds[k])
-    nearest = min(probability, key=lambda name: distances[name], default=None)
+    nearest_name = min(probability, key=lambda name: distances[name], default=None)
     if literature_name:
         probability[literature_name] = float(odds.kinds[in_literature_name].sum())
         distances[literature_name] = float(odds.distance[in_literature_name].min())
     # Sheets are thin plates; stacks of layers count with them.
     if kinds.sheet_share:
         probability[LAYER] = odds.sheet
-    likely = _sort_likeliest_first(probability)
+    likely_names = _sort_likeliest_first(probability)
     # Names of little probability count as unknown, so that the sum stays one.
-    likely[UNKNOWN] = round(1.0 - sum(likely.values()), 4)
-    likely = _sort_likeliest_first(likely, least=0.0)
+    likely_names[UNKNOWN] = round(1.0 - sum(likely_names.values()), 4)
+    likely_names = _sort_likeliest_first(likely_names, least_probability=0.0)
 
-    name = next(iter(likely))
+    name = next(iter(likely_names))
     distance = distances.get(name, np.inf)
-    if name in (UNKNOWN, LAYER) and nearest is not None:
-        distance = distances[nearest]
+    if name in (UNKNOWN, LAYER) and nearest_name is not None:
+        distance = distances[nearest_name]
     return PatchName(
         name=name,
-        confidence=likely[name],
+        confidence=likely_names[name],
         votes={},
         distance=distance,
         pixels=0,
-        probabilities=likely,
-        nearest=nearest,
+        probabilities=likely_names,
+        nearest=nearest_name,
         literature=_sort_likeliest_first(literature),
         from_literature=name == literature_name,
     )
 
 
-def _sort_likeliest_first(probability: Mapping[str, float], least: float = LIKELY) -> dict[str, float]:
-    """Return the probabilities of at least `least`, rounded to four digits, largest first."""
+def _sort_likeliest_first(
+    probability: Mapping[str, float], least_probability: float = LEAST_PROBABILITY
+) -> dict[str, float]:
+    """Return the probabilities of at least `least_probability`, rounded to four digits, largest first."""
     ordered = sorted(probability.items(), key=lambda item: -item[1])
-    return {name: round(p, 4) for name, p in ordered if p >= least}
+    return {name: round(p, 4) for name, p in ordered if p >= least_probability}
 
 
 def compute_name_shares(pixel_names: npt.NDArray[np.str_]) -> dict[str, float]:
     """Return the share of the pixels, str [n], with each name, largest first."""
     names, count = np.unique(pixel_names, return_counts=True)
-    by_share = sorted(zip(names.tolist(), count.tolist(), strict=True), key=lambda row: (-row[1], row[0]))
-    return {name: number / pixel_names.size for name, number in by_share}
+    sorted_by_share = sorted(zip(names.tolist(), count.tolist(), strict=True), key=lambda row: (-row[1], row[0]))
+    return {name: number / pixel_names.size for name, number in sorted_by_share}
 
 
 def derive_evidence_from_pixels(inverse_ratios: npt.NDArray[np.complex128], kinds: Kinds) -> RatioEvidence:
@@ -402,7 +405,7 @@ def derive_evidence_from_pixels(inverse_ratios: npt.NDArray[np.complex128], kind
 
 
 def make_patch_without_pixels(pixels: int) -> NamedPatch:
-    """Return the unknown patch of so many `pixels`, none of which is usable."""
+    """Return the name of an unknown patch with this number of `pixels`, none of which is usable."""
     verdict = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
     return NamedPatch(np.full(pixels, UNKNOWN), np.full(pixels, np.inf), verdict)
 
@@ -434,19 +437,19 @@ def _name_pixels(
     scan_covariance = scipy.linalg.block_diag(*(evidence.covariance for evidence in kind_evidence))
     errors = scan_covariance + pixel_covariance + 1e-10 * np.eye(parts)
     # [kind, parts, ways in which specimens differ].
-    effects = np.concatenate([of_scan.effects[has_name] for of_scan in kinds], axis=1)
+    effects = np.concatenate([kinds_of_scan.effects[has_name] for kinds_of_scan in kinds], axis=1)
     inverse = np.linalg.inv(effects @ effects.mT + errors)
 
     # Squared Mahalanobis distance of each pixel to each kind, [n, kind].
-    means = np.stack([of_scan.t[has_name] for of_scan in kinds], axis=1)
+    means = np.stack([kinds_of_scan.t[has_name] for kinds_of_scan in kinds], axis=1)
     ratios: npt.NDArray[np.complex128] = np.where(usable.reshape(-1, 1), inverse_ratios, 0)
     difference = split_complex(ratios[:, None, :] - means).reshape(pixel_count, -1, parts)
     distance2 = np.einsum("nki,kij,nkj->nk", difference, inverse, difference)
 
     # Bayes: the prior is the patch's result, and for inclusions any material of the library. The
     # exponent is limited to -700, so that a likelihood is never zero: of zeros alone the first name would be largest.
-    in_library = np.take(kinds[0].in_library, np.flatnonzero(has_name))
-    prior = (1 - INCLUSIONS) * patch_odds[has_name] + INCLUSIONS * in_library / max(in_library.sum(), 1)
+    is_in_library = np.take(kinds[0].in_library, np.flatnonzero(has_name))
+    prior = (1 - INCLUSION_SHARE) * patch_odds[has_name] + INCLUSION_SHARE * is_in_library / max(is_in_library.sum(), 1)
     likelihood = prior * np.sqrt(np.linalg.det(inverse)) * np.exp(-0.5 * np.minimum(distance2, 1400))
 
     # Kinds of the same name are added up; the name of the largest sum is the pixel's.
@@ -456,7 +459,7 @@ def _name_pixels(
     best_likelihood = name_likelihood[np.arange(pixel_count), best_name]
     share = best_likelihood / np.maximum(name_likelihood.sum(axis=1), 1e-300)
     # Kinds without a name take their part from the patch's probability; inclusions give some back.
-    probability_of_named = min(1.0, float(patch_odds[has_name].sum()) + INCLUSIONS)
+    probability_of_named = min(1.0, float(patch_odds[has_name].sum()) + INCLUSION_SHARE)
     confidence = np.where(usable, share * probability_of_named, 0.0)
 
     # A pixel outside of the 99 % region of every kind of that name is unknown.
@@ -478,13 +481,13 @@ def add_explanation(
     """
     verdict = named.verdict
     estimate = _format_estimate(permittivity, covariance)
-    nearest = verdict.nearest
+    nearest_name = verdict.nearest
     if verdict.name in library:
-        nearest = verdict.name
+        nearest_name = verdict.name
     nearest_material = ""
     nearest_clause = ""
-    if nearest is not None:
-        nearest_material = _add_permittivity(nearest, library.get(nearest))
+    if nearest_name is not None:
+        nearest_material = _add_permittivity(nearest_name, library.get(nearest_name))
         nearest_clause = f"; nearest: {nearest_material}"
 
     if verdict.name == UNKNOWN and estimate:
@@ -511,8 +514,8 @@ def _list_rivals(verdict: PatchName) -> str:
     """Return a clause on the other likely names; empty for the KNN, which has no probabilities."""
     rivals = []
     for name, probability in verdict.probabilities.items():
-        least = LIKELY_UNKNOWN if name == UNKNOWN else LIKELY
-        if name == verdict.name or probability < least:
+        least_probability = LIKELY_UNKNOWN if name == UNKNOWN else LEAST_PROBABILITY
+        if name == verdict.name or probability < least_probability:
             continue
         rival = "a material that the library lacks" if name == UNKNOWN else name
         rivals.append(f"{rival} {100 * probability:.0f} %")

@@ -15,7 +15,14 @@ from sklearn.neighbors import KNeighborsClassifier
 from sklearn.utils import check_array, gen_batches
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from polysight.materials.library import WIDTH, Measure, Real, channel_distances, find_neighbours, ratio_columns
+from polysight.materials.library import (
+    COLUMNS_PER_ANGLE,
+    Measure,
+    Real,
+    channel_distances,
+    find_neighbours,
+    ratio_columns,
+)
 
 # Pixels whose distances are computed together: 512 x 20,000 numbers are 80 MB.
 _CHUNK = 512
@@ -32,7 +39,7 @@ def paper_distance(
     """
     first = np.atleast_2d(np.asarray(a, np.float64))
     second = np.atleast_2d(np.asarray(b, np.float64))
-    if first.shape[1] % WIDTH:
+    if first.shape[1] % COLUMNS_PER_ANGLE:
         distance = np.abs(first[:, None, :] - second[None, :, :]).sum(axis=2)
     else:
         # `channel_distances` takes 1/P in place of P. Without a weight of P it is spared the work: its distance is 0.
@@ -104,7 +111,7 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
         available = self.n_samples_fit_ - (X is None)
         neighbours: Any = n_neighbors or self.n_neighbors
         count = min(int(neighbours), available)
-        nearest = np.empty((len(pixels), count), np.intp)
+        nearest_indices = np.empty((len(pixels), count), np.intp)
         distances = np.empty((len(pixels), count))
         for rows in gen_batches(len(pixels), _CHUNK):
             distance = self.metric(pixels[rows], self._fit_X)
@@ -112,6 +119,6 @@ class PaperKNeighborsClassifier(KNeighborsClassifier):
                 # A pixel is not a neighbour of itself.
                 row_indices = np.arange(rows.start, rows.stop)
                 distance[row_indices - rows.start, row_indices] = np.inf
-            nearest[rows] = find_neighbours(distance, count)
-            distances[rows] = np.take_along_axis(distance, nearest[rows], axis=1)
-        return (distances, nearest) if return_distance else nearest
+            nearest_indices[rows] = find_neighbours(distance, count)
+            distances[rows] = np.take_along_axis(distance, nearest_indices[rows], axis=1)
+        return (distances, nearest_indices) if return_distance else nearest_indices

@@ -23,7 +23,7 @@ from msgspec import UNSET, structs
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise
 from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior
-from polysight.materials.kinds import PatchDispersion, RatioEvidence, permittivity_slope
+from polysight.materials.kinds import PatchDispersion, RatioEvidence, find_permittivity_slope
 from polysight.materials.labels import Labels
 from polysight.materials.library import Real, feature_matrix
 from polysight.materials.measure import Permittivity, background, ratio_sigma
@@ -39,7 +39,7 @@ MAX_BEND = 3.5
 """Curvature above which a patch is not a flat plate, 1 / m. Flat plates that are uneven by 0.25 mm have up to 1.4 in
 drawn scenes and ripple of the published picture up to 3; sheets bent to a radius of 150 mm have 5.6, spheres of 100 mm
 6 to 10."""
-STEEP = Finding(
+STEEP_FINDING = Finding(
     "error",
     "tilted or curved beyond what is modelled",
     f"its phase rises by more than {np.degrees(MAX_RISE):.1f} degrees, or bends as that of a radius below "
@@ -77,8 +77,10 @@ class Tilts:
     @classmethod
     def estimate(cls, images: Images, illumination: Illumination, segmentation: Segmentation) -> Tilts:
         """Estimate the rise of each patch from its phase; patches that are steeper than the model allows are marked."""
-        rises = {p.label: illumination.rise(images.h, images.v, p.interior, p.mask) for p in segmentation.patches}
-        bends = {p.label: illumination.bend(images.h, images.v, p.interior) for p in segmentation.patches}
+        rises = {
+            p.label: illumination.estimate_rise(images.h, images.v, p.interior, p.mask) for p in segmentation.patches
+        }
+        bends = {p.label: illumination.estimate_bend(images.h, images.v, p.interior) for p in segmentation.patches}
         steep = frozenset(
             label
             for label, rise in rises.items()
@@ -92,7 +94,7 @@ class Tilts:
 
     def refusals(self) -> dict[int, Finding]:
         """Return patch number to why it has no permittivity, of the steep patches."""
-        return {label: SMEAR if label in self.smears else STEEP for label in self.steep}
+        return {label: SMEAR if label in self.smears else STEEP_FINDING for label in self.steep}
 
     def in_plane(self, label: int) -> Rise:
         """Return the rise of a patch along the plane of incidence and across it, radians; 0 if it is not known."""
@@ -118,9 +120,9 @@ def find_smears(images: Images, segmentation: Segmentation) -> frozenset[int]:
     )
 
 
-LEVEL = Tilts({}, 1)
+LEVEL_TILTS = Tilts({}, 1)
 """No tilt is known."""
-SHRINKS = {
+MEASURE_AGAINST = {
     "scatter": "even plates with nothing behind them; a larger plate, a finer grid, or more pulses a position",
     "metal reference": "a larger metal plate, or `polysight calibrate metal`",
     "leakage": "measure leakage with metal strips: `polysight leakage`",
@@ -237,7 +239,7 @@ class MaterialsResult:
     boxes: dict[int, str] = field(default_factory=dict)
     library: tuple[str, ...] = ()
     withheld: bool = False
-    tilts: Tilts = LEVEL
+    tilts: Tilts = LEVEL_TILTS
     brightness_off: Mapping[int, float] = field(default_factory=dict)
     evidence: Mapping[int, RatioEvidence] = field(default_factory=dict)
     apart_mm: tuple[float, float] = (0.0, 0.0)
@@ -261,7 +263,7 @@ class MaterialsResult:
         return figures
 
     def without_result(self) -> MaterialsResult:
-        """Return the same patches without names, ratios, permittivities and metal reference."""
+        """Return the patches without names, ratios, permittivities and metal reference."""
         patches = tuple(replace(r, permittivity=Permittivity.not_estimated(), named=None) for r in self.patches)
         metal = replace(self.metal, label=None, given=False, how=f"none ({self.metal.how})")
         return replace(self, patches=patches, metal=metal, bands={}, withheld=True)
@@ -284,15 +286,15 @@ class MaterialsResult:
         vanishes, and even a large relative error of V / H changes the permittivity little.
         """
         out = {}
-        for r in self.patches:
-            if r.refused is not None:
+        for patch_result in self.patches:
+            if patch_result.refused is not None:
                 continue
-            error = self.disturbed.get(r.patch.label, 0.0)
-            e = r.permittivity
-            if e.value and e.ratio:
-                slope = permittivity_slope(1 / e.ratio, np.radians(self.incidence_deg(r.patch)))
-                error *= min(1.0, float(abs(slope / e.ratio / e.value)))
-            out[r.patch.label] = error
+            error = self.disturbed.get(patch_result.patch.label, 0.0)
+            estimate = patch_result.permittivity
+            if estimate.value and estimate.ratio:
+                slope = find_permittivity_slope(1 / estimate.ratio, np.radians(self.incidence_deg(patch_result.patch)))
+                error *= min(1.0, float(abs(slope / estimate.ratio / estimate.value)))
+            out[patch_result.patch.label] = error
         return out
 
     def incidence_deg(self, patch: Patch) -> float:
@@ -303,35 +305,35 @@ class MaterialsResult:
             angles = self.theta_rad
         return float(np.degrees(np.mean(angles)))
 
-    def _describe_patch(self, r: PatchResult) -> PatchFigures:
+    def _describe_patch(self, patch_result: PatchResult) -> PatchFigures:
         """Return the figures of one patch for materials.json; lengths, the tilt and |H| are rounded."""
-        label = r.patch.label
-        e = r.permittivity
-        x0, y0, x1, y1 = r.patch.box_mm
-        level = np.abs(self.h[r.patch.interior])
+        label = patch_result.patch.label
+        estimate = patch_result.permittivity
+        x0, y0, x1, y1 = patch_result.patch.box_mm
+        level = np.abs(self.h[patch_result.patch.interior])
         level = level[np.isfinite(level)]
         figures = PatchFigures(
             label=label,
             metal_reference=label == self.metal.label,
-            metal_like=e.metal_like and r.refused is None,
+            metal_like=estimate.metal_like and patch_result.refused is None,
             box_mm=(round(x0, 3), round(y0, 3), round(x1, 3), round(y1, 3)),
-            outline_mm=[(round(float(x), 2), round(float(y), 2)) for x, y in r.patch.outline_mm],
-            pixels=r.patch.pixels,
-            interior_pixels=e.pixels,
-            incidence_deg=self.incidence_deg(r.patch),
-            ratio=ComplexNumber.from_complex(e.ratio),
-            inverse_ratio_std=_replace_infinite(e.inverse_std),
+            outline_mm=[(round(float(x), 2), round(float(y), 2)) for x, y in patch_result.patch.outline_mm],
+            pixels=patch_result.patch.pixels,
+            interior_pixels=estimate.pixels,
+            incidence_deg=self.incidence_deg(patch_result.patch),
+            ratio=ComplexNumber.from_complex(estimate.ratio),
+            inverse_ratio_std=_replace_infinite(estimate.inverse_std),
             amplitude_h=round(float(np.median(level)), 6) if level.size else None,
-            refused=r.refused,
+            refused=patch_result.refused,
             bands=self.bands.get(label, UNSET),
             box=self.boxes.get(label, UNSET),
         )
-        if r.truth is not None:
-            figures = structs.replace(figures, truth=_describe_truth(r.truth, self.library))
-        if r.verdict is not None:
-            figures = _add_name(figures, r.verdict)
-        if r.refused is None:
-            figures = structs.replace(figures, permittivity=_describe_permittivity(e))
+        if patch_result.truth is not None:
+            figures = structs.replace(figures, truth=_describe_truth(patch_result.truth, self.library))
+        if patch_result.verdict is not None:
+            figures = _add_name(figures, patch_result.verdict)
+        if patch_result.refused is None:
+            figures = structs.replace(figures, permittivity=_describe_permittivity(estimate))
             if label in self.tilts.rises:
                 across_deg = round(float(np.degrees(self.tilts.across_rad(label))), 3)
                 figures = structs.replace(figures, tilt_across_deg=across_deg)
@@ -349,11 +351,11 @@ def ratio_slopes(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real
     scale = np.array([prior.leakage_std, prior.leakage_std, prior.reference_std])
     # Pixels without a ratio have no error either.
     with np.errstate(invalid="ignore"):
-        by_real_part = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
-    by_error = np.stack([by_real_part, 1j * by_real_part], axis=-1).reshape(*t.shape, 6)
+        slope_of_real_part = np.stack([-(1 - t) * t, -(1 - t), -t], axis=-1) * scale
+    slope_of_error = np.stack([slope_of_real_part, 1j * slope_of_real_part], axis=-1).reshape(*t.shape, 6)
     # The square root of the covariance, of which rounding can make an eigenvalue negative.
     values, vectors = np.linalg.eigh(estimate.nuisance_covariance)
-    return np.stack([by_error.real, by_error.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.stack([slope_of_error.real, slope_of_error.imag], axis=-2) @ (vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def ratio_error(estimate: Inversion, prior: RigPrior, t: npt.ArrayLike) -> Real:
@@ -381,22 +383,22 @@ def _replace_infinite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _describe_permittivity(e: Permittivity) -> PermittivityFigures | None:
+def _describe_permittivity(estimate: Permittivity) -> PermittivityFigures | None:
     """Return value and errors for materials.json; None if it is not known."""
-    if e.value is None or e.real_range is None or e.imag_range is None:
+    if estimate.value is None or estimate.real_range is None or estimate.imag_range is None:
         return None
     return PermittivityFigures(
-        real=e.value.real,
-        imag=e.value.imag,
-        real_p30_p70=e.real_range,
-        imag_p30_p70=e.imag_range,
-        real_std=e.real_std,
-        imag_std=e.loss_std,
-        covariance=None if e.covariance is None else e.covariance.tolist(),
-        half_widths_68=e.half_widths_68,
-        shares=dict(e.shares),
-        dominated_by=e.dominated_by,
-        do=SHRINKS.get(e.dominated_by or "", ""),
+        real=estimate.value.real,
+        imag=estimate.value.imag,
+        real_p30_p70=estimate.real_range,
+        imag_p30_p70=estimate.imag_range,
+        real_std=estimate.real_std,
+        imag_std=estimate.loss_std,
+        covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
+        half_widths_68=estimate.half_widths_68,
+        shares=dict(estimate.shares),
+        dominated_by=estimate.dominated_by,
+        do=MEASURE_AGAINST.get(estimate.dominated_by or "", ""),
     )
 
 
@@ -411,10 +413,10 @@ def _describe_truth(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures
     )
 
 
-PATCHES = "patches.npz"
+PATCHES_FILE = "patches.npz"
 PATCHES_FORMAT = "polysight-patches-1"
 """Name of the file in a scan's products, and of its format: a file of another one is refused."""
-APART_MM = 20.0
+SAME_PATCH_MM = 20.0
 """Largest distance between the centres of one patch in two scans. Chosen: less than half of a plate and its gap."""
 NEAR_MM = 4.0
 """Largest distance between pixels of two scans that show the same spot: about the resolution."""
@@ -480,18 +482,18 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
     Patches without a name of the library are called "patch", a metal reference that is one of them "metal".
     """
     boxes: dict[str, Box] = {}
-    for r in result.patches:
+    for patch_result in result.patches:
         name = "patch"
-        if result.boxes.get(r.patch.label):
-            name = result.boxes[r.patch.label]
-        elif r.patch.label == result.metal.label:
+        if result.boxes.get(patch_result.patch.label):
+            name = result.boxes[patch_result.patch.label]
+        elif patch_result.patch.label == result.metal.label:
             name = "metal"
-        elif r.verdict is not None and r.verdict.source == "library":
-            name = r.verdict.name
-        inside = r.patch.interior if r.patch.interior.any() else r.patch.mask
-        rows = np.flatnonzero(inside.any(axis=1))
-        columns = np.flatnonzero(inside.any(axis=0))
-        key = name if name not in boxes else f"{name} ({r.patch.label})"
+        elif patch_result.verdict is not None and patch_result.verdict.source == "library":
+            name = patch_result.verdict.name
+        interior = patch_result.patch.interior if patch_result.patch.interior.any() else patch_result.patch.mask
+        rows = np.flatnonzero(interior.any(axis=1))
+        columns = np.flatnonzero(interior.any(axis=0))
+        key = name if name not in boxes else f"{name} ({patch_result.patch.label})"
         boxes[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
     return Labels(boxes, description=description)
 
@@ -503,13 +505,20 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
     rows = []
     places = [np.zeros((0, 2))]
     features = [np.zeros((0, 4))]
-    for r in result.patches:
-        pixels = r.patch.interior
+    for patch_result in result.patches:
+        pixels = patch_result.patch.interior
         iy, ix = np.nonzero(pixels)
         places.append(np.stack([x[ix], y[iy]], axis=1))
         features.append(pixel_features(result.h[pixels], result.v[pixels], result.p[pixels]))
-        truth = r.truth.name if r.truth else None
-        rows.append({"label": r.patch.label, "centre_mm": r.patch.centre_mm, "truth": truth, "pixels": int(ix.size)})
+        truth = patch_result.truth.name if patch_result.truth else None
+        rows.append(
+            {
+                "label": patch_result.patch.label,
+                "centre_mm": patch_result.patch.centre_mm,
+                "truth": truth,
+                "pixels": int(ix.size),
+            }
+        )
     angle = float(np.degrees(np.mean(result.theta_rad)))
     judged = list(result.evidence)
     meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows, "judged": judged}
@@ -608,7 +617,7 @@ def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPat
 def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
     """Return the patches that all scans show at the same place, pixel by pixel.
 
-    Two patches match if their centres are each other's nearest and at most `APART_MM` apart. Pixels match by their
+    Two patches match if their centres are each other's nearest and at most `SAME_PATCH_MM` apart. Pixels match by their
     position in the patch, so that the scans' image centres may differ by up to half a patch.
     """
     matched = []
@@ -639,11 +648,13 @@ def _find_partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatch
     """Return the other scan's patch nearest to this one, if this one is also the nearest to it."""
 
     def nearest(patch: ScanPatch, among: ScanPatches) -> ScanPatch | None:
-        def distance_mm(p: ScanPatch) -> float:
-            return float(np.hypot(p.centre_mm[0] - patch.centre_mm[0], p.centre_mm[1] - patch.centre_mm[1]))
+        def distance_mm(candidate: ScanPatch) -> float:
+            return float(
+                np.hypot(candidate.centre_mm[0] - patch.centre_mm[0], candidate.centre_mm[1] - patch.centre_mm[1])
+            )
 
         best = min(among.patches, key=distance_mm, default=None)
-        return best if best is not None and distance_mm(best) <= APART_MM else None
+        return best if best is not None and distance_mm(best) <= SAME_PATCH_MM else None
 
     partner = nearest(patch, other_scan)
     if partner is not None and nearest(partner, own_scan) is patch:

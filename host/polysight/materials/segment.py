@@ -32,7 +32,7 @@ Box = tuple[float, float, float, float]
 _LEAST_WEIGHT = 0.1
 EDGE_DB = 6.0
 """A plate's edge is at half of its amplitude, the edge of a band-limited step."""
-OVERFLOW = 1.5
+OVERFLOW_GROWTH = 1.5
 """Growth within one step of the threshold by which a region runs into its background; chosen."""
 MOST_SCATTER_DB = 4.0
 """Largest scatter of a background's level: that of a real picture is 3.8 dB; with more, plates are among the pixels."""
@@ -41,13 +41,13 @@ PLAIN_DB = 14.0
 alone 24 have a patch, 10 without this rule; all that it adds have speckle wider than 5.9 mm (standard deviation)."""
 SMALLEST_SHARE = 0.75
 """Least area of a patch, relative to a square of the least width: a corner of a skirt has 0.6."""
-BODY = 0.65
+BODY_SHARE = 0.65
 """Parts of a region narrower than this share of its width do not belong to it. Chosen: more rounds corners."""
 STEP_DB = 1.0
 """Step of the falling threshold; chosen."""
 BACKGROUND_PERCENT = 20.0
 """Percentile of a channel's power that is its background: plates rarely fill more of an image."""
-NOISY = 0.005
+NOISY_BACKGROUND = 0.005
 """Background relative to the brightest part above which a channel hardly shows plates: that of a real picture is 4.6 dB
 lower in H, 12 dB in V."""
 LEAST_POWER = 1e-12
@@ -58,7 +58,7 @@ MOST_APART_MM = 10.0
 ones have no such cause."""
 EDGE_FLOOR = 0.05
 """Level relative to the brightest below which edges do not count; chosen."""
-ALIKE = 0.5
+LEAST_CORRELATION = 0.5
 """Least correlation of the edges in H and V once they lie on each other: images of noise have less than 0.1."""
 
 
@@ -217,7 +217,7 @@ def level_db(h: Image, v: Image, usable: Mask, smooth_px: float, plate_px: float
             backgrounds.append(max(float(np.percentile(p[usable], BACKGROUND_PERCENT)) / top, LEAST_POWER))
     power = np.zeros(h.shape)
     for scaled, background in zip(channels, backgrounds, strict=True):
-        is_noisy = background > NOISY
+        is_noisy = background > NOISY_BACKGROUND
         weight = min(backgrounds) / background if is_noisy else 1.0
         power = np.maximum(power, weight * scaled)
     return 10 * np.log10(np.maximum(power, LEAST_POWER))
@@ -261,11 +261,11 @@ def segment(
     smooth_level = _remove_speckle(np.maximum(level, cfg.floor_db), usable, cfg, pixel_mm)
     # Smoothing the outline may have left too little of a region.
     least_pixels = SMALLEST_SHARE * cfg.smallest_mm**2 / pixel_mm**2
-    found = _find_regions(smooth_level, usable, cfg, pixel_mm)
-    regions = [(mask, parts) for mask, parts in found if mask.sum() >= least_pixels]
+    found_regions = _find_regions(smooth_level, usable, cfg, pixel_mm)
+    regions = [(mask, parts) for mask, parts in found_regions if mask.sum() >= least_pixels]
     least_db = _find_least_level_db(smooth_level, usable, cfg, pixel_mm)
     if np.isfinite(least_db):
-        # Where plates fill a small image, dim ones are among the dark pixels beside metal: the gaps are the background.
+        # If plates fill a small image, dim ones are among the dark pixels beside metal: the gaps are the background.
         gaps = level[_select_gaps(usable, [mask for mask, _ in regions], cfg.margin_mm / pixel_mm)]
         if gaps.size >= least_pixels:
             least_db = min(least_db, max(float(np.median(gaps)) + PLAIN_DB, cfg.dimmest_db))
@@ -275,7 +275,7 @@ def segment(
         region_db = float(np.median(smooth_level[mask]))
         if region_db >= least_db:
             masks.append(mask)
-            left_out += [part for part in cut_off if float(np.median(smooth_level[part])) >= cfg.dimmest_db]
+            left_out += [cut_part for cut_part in cut_off if float(np.median(smooth_level[cut_part])) >= cfg.dimmest_db]
         elif region_db >= cfg.dimmest_db:
             left_out.append(mask)
     labels = np.zeros(h.shape, np.int32)
@@ -298,9 +298,9 @@ def _is_cut(mask: Mask, smallest_px: float) -> bool:
 
     An end of the scan within the image cuts none: there the footprint falls slowly, and interiors end before it.
     """
-    at_border = mask.copy()
-    at_border[1:-1, 1:-1] = False
-    return float(at_border.sum()) > smallest_px
+    border_mask = mask.copy()
+    border_mask[1:-1, 1:-1] = False
+    return float(border_mask.sum()) > smallest_px
 
 
 def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: float) -> float:
@@ -324,10 +324,10 @@ def _find_least_level_db(image: Real, usable: Mask, cfg: SegmentSettings, pixel_
 
 def _select_gaps(usable: Mask, regions: Sequence[Mask], margin_px: float) -> Mask:
     """Return the usable pixels that are farther than the margin from every region."""
-    in_no_region = np.ones(usable.shape, bool)
+    is_in_no_region = np.ones(usable.shape, bool)
     for mask in regions:
-        in_no_region &= ~mask
-    return usable & (np.asarray(scipy.ndimage.distance_transform_edt(in_no_region)) > margin_px)
+        is_in_no_region &= ~mask
+    return usable & (np.asarray(scipy.ndimage.distance_transform_edt(is_in_no_region)) > margin_px)
 
 
 def _find_reading_place(mask: Mask, y_mm: Real, row_pitch_mm: float) -> tuple[float, float]:
@@ -371,14 +371,16 @@ def _are_separate(level: Real, bright: Mask, least_contrast_db: float) -> bool:
     required. One small patch has little of the variance, but lies far above the spread of the dark class: by four of
     its standard deviations (chosen).
     """
-    w = float(bright.mean())
+    bright_share = float(bright.mean())
     gap = float(level[bright].mean() - level[~bright].mean())
-    is_bimodal = w * (1 - w) * gap**2 >= 0.70 * float(level.var()) or gap >= 4 * float(level[~bright].std())
+    is_bimodal = bright_share * (1 - bright_share) * gap**2 >= 0.70 * float(level.var()) or gap >= 4 * float(
+        level[~bright].std()
+    )
     return gap >= least_contrast_db and is_bimodal
 
 
 @dataclass(frozen=True, eq=False)
-class _Growing:
+class _GrowingRegion:
     """A region that grows while the threshold falls: its mask at each threshold, and its median level, dB."""
 
     masks: tuple[tuple[float, Mask], ...]
@@ -408,7 +410,7 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
     skirt_px = max(1.0, cfg.margin_mm / pixel_mm)
     remaining = usable.copy()
     regions: list[tuple[Mask, list[Mask]]] = []
-    growing: list[_Growing] = []
+    growing: list[_GrowingRegion] = []
 
     def take_region(mask: Mask) -> None:
         """Add a region, and remove its pixels and its skirt from the remaining ones."""
@@ -418,13 +420,13 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
         remaining[window][np.asarray(scipy.ndimage.distance_transform_edt(~mask[window])) <= skirt_px] = False
 
     for threshold in np.arange(float(level[usable].max()), cfg.floor_db, -STEP_DB) - STEP_DB:
-        grown: list[_Growing] = []
+        grown: list[_GrowingRegion] = []
         for region in _find_components(_open_mask((level > threshold) & remaining, opening_px)):
             # Regions at the threshold before that have grown into this one, and those of them that stand out enough to
             # be patches: two that meet, or one that runs over, are cut where they were.
             parts = [node for node in growing if (node.mask & region).any()]
             standing_out = [node for node in parts if node.level_db - threshold >= cfg.least_contrast_db]
-            overflows = any(region.sum() > OVERFLOW * node.mask.sum() for node in standing_out)
+            overflows = any(region.sum() > OVERFLOW_GROWTH * node.mask.sum() for node in standing_out)
             region_db = float(np.median(level[region]))
             if len(standing_out) > 1 or overflows:
                 for node in standing_out:
@@ -434,13 +436,13 @@ def _find_regions(level: Real, usable: Mask, cfg: SegmentSettings, pixel_mm: flo
                 take_region(region)
             else:
                 earlier_masks = max(parts, key=lambda node: int(node.mask.sum())).masks if parts else ()
-                grown.append(_Growing((*earlier_masks, (float(threshold), region)), region_db))
+                grown.append(_GrowingRegion((*earlier_masks, (float(threshold), region)), region_db))
         growing = grown
     return regions
 
 
 def _smooth_outline(mask: Mask) -> Mask:
-    """Fill the holes of a region, cut off parts narrower than `BODY` of its width (speckle, bridges to a neighbour).
+    """Fill the holes of a region, cut off parts narrower than `BODY_SHARE` of its width (speckle, bridges).
 
     Of the rest the largest part stays, with a smooth outline.
     """
@@ -449,7 +451,7 @@ def _smooth_outline(mask: Mask) -> Mask:
     filled = np.asarray(scipy.ndimage.binary_fill_holes(mask[window]), bool)
     half_width = float(np.asarray(scipy.ndimage.distance_transform_edt(np.pad(filled, 1))).max())
     body = max(
-        _find_components(_open_mask(filled, BODY * half_width)), key=lambda part: int(part.sum()), default=filled
+        _find_components(_open_mask(filled, BODY_SHARE * half_width)), key=lambda part: int(part.sum()), default=filled
     )
     smooth = np.zeros_like(mask)
     smooth[window] = np.asarray(scipy.ndimage.gaussian_filter(body.astype(float), 1.0)) > 0.5
@@ -459,12 +461,12 @@ def _smooth_outline(mask: Mask) -> Mask:
 def _open_mask(mask: Mask, radius_px: float) -> Mask:
     """Remove parts that are narrower than a disk of this radius (morphological opening, by distances)."""
     window = _find_window(mask)
-    inside = mask[window]
+    window_mask = mask[window]
     opened = np.zeros_like(mask)
-    depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(inside, 1)))[1:-1, 1:-1]
+    depth = np.asarray(scipy.ndimage.distance_transform_edt(np.pad(window_mask, 1)))[1:-1, 1:-1]
     core = depth > radius_px
     if core.any():
-        opened[window] = inside & (np.asarray(scipy.ndimage.distance_transform_edt(~core)) <= radius_px)
+        opened[window] = window_mask & (np.asarray(scipy.ndimage.distance_transform_edt(~core)) <= radius_px)
     return opened
 
 
@@ -490,7 +492,7 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     """Move V onto H; return the images, and where V lay relative to H, millimetres (x, y).
 
     The images are returned unchanged if they lie on each other, or if their edges cannot be compared: there are none,
-    they are farther apart than `MOST_APART_MM`, or not alike (`ALIKE`).
+    they are farther apart than `MOST_APART_MM`, or not alike (`LEAST_CORRELATION`).
     """
     edges_h = _measure_edges(images.h, images.usable)
     edges_v = _measure_edges(images.v, images.usable)
@@ -505,7 +507,7 @@ def align(images: Images) -> tuple[Images, tuple[float, float]]:
     apart_mm = -back_px[::-1] * pixel_mm
     moved_edges = np.asarray(scipy.ndimage.shift(edges_v, back_px, order=1))
     correlation = float(np.corrcoef(edges_h.ravel(), moved_edges.ravel())[0, 1])
-    if not LEAST_APART_MM <= float(np.hypot(*apart_mm)) <= MOST_APART_MM or correlation < ALIKE:
+    if not LEAST_APART_MM <= float(np.hypot(*apart_mm)) <= MOST_APART_MM or correlation < LEAST_CORRELATION:
         return images, (0.0, 0.0)
     usable_v = np.where(images.usable, images.v, 0).astype(np.complex128)
     v = np.asarray(scipy.ndimage.shift(usable_v, back_px, order=3, mode="nearest"))
@@ -573,10 +575,10 @@ def drop_corners(outline: Real, tolerance: float) -> Real:
         between = outline[start + 1 : end] - outline[start]
         side = outline[end] - outline[start]
         length = float(side @ side)
-        along = np.zeros(len(between))
+        position_along = np.zeros(len(between))
         if length > 0:
-            along = np.clip(between @ side / length, 0.0, 1.0)
-        distances = np.hypot(*(between - along[:, None] * side).T)
+            position_along = np.clip(between @ side / length, 0.0, 1.0)
+        distances = np.hypot(*(between - position_along[:, None] * side).T)
         if distances.size and distances.max() > tolerance:
             corner = start + 1 + int(distances.argmax())
             kept_indices.add(corner)

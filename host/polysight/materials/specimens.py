@@ -5,7 +5,7 @@ the loss (Fig. 17 of the POLySIGHT paper). `(ln eps', ln eps'')` is assumed to b
 coefficients, converts its spread to correlated errors of ln|H|, ln|V| and arg P (P = H / V), relative to metal, for all
 angles together because they show the same specimen.
 
-Thresholds near metal and the scale `SOFT` are chosen.
+Thresholds near metal and the scale `SOFT_RATIO` are chosen.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ METAL_UNLIKE = 0.2
 """|V/H - 1| above which a patch is evidence for the metal beside it; metal looks like water beside water."""
 METAL_SPECIMENS = 0.1
 """|V/H - 1| below which a material is metal, whose specimens do not differ."""
-SOFT = 0.05
+SOFT_RATIO = 0.05
 """|V / H| below which its errors are additive (leakage, noise) instead of relative (gain, phase)."""
 # Difference quotient of the features by ln eps' and ln eps''; chosen.
 _STEP = 1e-4
 # Expectation maximisation ends after these rounds, or when one changes the pooled variances by less than this share.
 _ROUNDS = 300
-_SETTLED = 1e-3
+_SETTLED_CHANGE = 1e-3
 # Without any loss ln eps'' would not exist.
 _LEAST_LOSS = 1e-3
 
 
 def soft_modulus(t: npt.ArrayLike) -> Real:
-    """Return the scale of errors of t = V / H [any]: `sqrt(|t|^2 + SOFT^2)`, as V may vanish (Brewster's angle)."""
-    return np.asarray(np.hypot(np.abs(t), SOFT), np.float64)
+    """Return the scale of errors of t = V / H [any]: `sqrt(|t|^2 + SOFT_RATIO^2)`, as V may be zero."""
+    return np.asarray(np.hypot(np.abs(t), SOFT_RATIO), np.float64)
 
 
 def features(permittivity: npt.ArrayLike, angles_rad: Sequence[float]) -> tuple[Real, Complex]:
@@ -88,8 +88,8 @@ def relative(log_h: Real, dt: Complex, t: Complex) -> Real:
     To first order; with :func:`soft_modulus` instead of |t|, so that they stay finite if V vanishes.
     """
     # dt / t: its real part is the change of ln|V / H|, its imaginary part that of arg(V / H) = -arg P.
-    along = dt * np.exp(-1j * np.angle(t)) / soft_modulus(t)
-    return np.stack([log_h, log_h + along.real, -along.imag], axis=-1)
+    change_along_t = dt * np.exp(-1j * np.angle(t)) / soft_modulus(t)
+    return np.stack([log_h, log_h + change_along_t.real, -change_along_t.imag], axis=-1)
 
 
 def apparent_permittivity(t: Complex, angles_rad: Sequence[float]) -> complex:
@@ -152,7 +152,7 @@ def fit_spread(
         )
         placement = (residuals_left.T @ residuals_left + uncertainty) / len(residuals)
         placement = average_channels(placement) if gains_alike else placement
-        if np.abs(pooled / pooled_before - 1).max() < _SETTLED:
+        if np.abs(pooled / pooled_before - 1).max() < _SETTLED_CHANGE:
             break
     return _spread_each_material(pooled, second_moments, material_of_specimen, has_spread), placement
 

@@ -28,10 +28,18 @@ from msgspec import structs
 
 from polysight.imaging import Image, Images, Mask, SubBand
 from polysight.materials.analyse import Optics, level, smooth_inside
-from polysight.materials.layers import METAL, THICKNESS_RANGE_M, Bands, Layer, LayerFit, Spectrum, fit_layer
+from polysight.materials.layers import (
+    METAL_PERMITTIVITY,
+    THICKNESS_RANGE_M,
+    Bands,
+    Layer,
+    LayerFit,
+    Spectrum,
+    fit_layer,
+)
 from polysight.materials.library import Library
 from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, measure_scatter, median_ratio, relative_errors
-from polysight.materials.metal import MetalReference, to_metal
+from polysight.materials.metal import MetalReference, divide_by_reference
 from polysight.materials.result import MaterialsResult, ratio_slopes
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, ScanMaterials
@@ -119,15 +127,18 @@ def band_rows(
             f"give a reference with --bands {len(bands)}",
             code=ErrorCode.MISMATCH,
         )
-    parts: dict[int, list[BandFigures]] = {r.patch.label: [] for r in result.patches}
+    parts: dict[int, list[BandFigures]] = {patch_result.patch.label: [] for patch_result in result.patches}
     for k, (band, band_images) in enumerate(zip(bands, images, strict=True)):
         reference = references[k] if references is not None else None
         h, v, error = _divide_by_metal(result, band_images, leakage, smooth_px, reference)
-        for r in result.patches:
-            pixels = r.patch.interior & band_images.valid
+        for patch_result in result.patches:
+            pixels = patch_result.patch.interior & band_images.valid
             full_band = (result.h[pixels], result.v[pixels])
-            parts[r.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
-    std_by_label = {r.patch.label: _estimate_common_std(result, r.patch.interior) for r in result.patches}
+            parts[patch_result.patch.label].append(_measure_band(band, h[pixels], v[pixels], full_band, error))
+    std_by_label = {
+        patch_result.patch.label: _estimate_common_std(result, patch_result.patch.interior)
+        for patch_result in result.patches
+    }
     return {label: _add_covariance(rows, result, std_by_label[label]) for label, rows in parts.items()}
 
 
@@ -153,9 +164,9 @@ def _add_covariance(rows: list[BandFigures], result: MaterialsResult, common: fl
     # Effects on real and imaginary part of each band's V / H: of six independent errors of leakage and metal reference,
     # and of the plate's common error.
     slopes = ratio_slopes(result.inversion, result.prior, 1 / np.array(ratios, np.complex128)).reshape(2 * len(rows), 6)
-    of_plate = common * np.tile(np.eye(2), (len(rows), 1))
+    plate_covariance = common * np.tile(np.eye(2), (len(rows), 1))
     variances = np.repeat([(row.own_std or 0.0) ** 2 for row in rows], 2)
-    covariance = slopes @ slopes.T + of_plate @ of_plate.T + np.diag(variances)
+    covariance = slopes @ slopes.T + plate_covariance @ plate_covariance.T + np.diag(variances)
     std = np.sqrt(np.diag(covariance).reshape(-1, 2).mean(axis=1))
     return [
         structs.replace(row, inverse_ratio_std=float(std[k]), covariance=covariance[2 * k : 2 * k + 2].tolist())
@@ -182,7 +193,7 @@ def _divide_by_metal(
     pair, _ = level(images, result.segmentation, result.tilts)
     h = np.where(images.valid, pair.h, complex(np.nan, np.nan)).astype(pair.h.dtype)
     v = np.where(images.valid, pair.v, complex(np.nan, np.nan)).astype(pair.v.dtype)
-    relative = remove_leakage(to_metal(replace(pair, h=h, v=v), metal, reference), leakage)
+    relative = remove_leakage(divide_by_reference(replace(pair, h=h, v=v), metal, reference), leakage)
     h = smooth_inside(relative.h, result.segmentation, smooth_px)
     v = smooth_inside(relative.v, result.segmentation, smooth_px)
     return h, v, _measure_reference_spread(h, v, metal, reference)
@@ -199,7 +210,7 @@ def _measure_band(band: SubBand, h: Image, v: Image, sweep_channels: tuple[Image
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
         return BandFigures(first_hz=band.first_hz, last_hz=band.last_hz)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Of the differences to the whole sweep.
+        # Spreads of the differences to the whole sweep.
         spread = inverse_spread(np.ones_like(h), v / h - sweep_channels[1] / sweep_channels[0])
         spread_h = _relative_spread(np.abs(h / sweep_channels[0]))
     own_amplitude_std = None
@@ -308,14 +319,14 @@ _RANGE = re.compile(r"([0-9.eE+]+)\s*-\s*([0-9.eE+]+)")
 
 def parse_layer(text: str) -> Layer:
     """Parse a layer in one of `LAYER_FORMS`. Raises ValueError for another form."""
-    name, *rest = (part.strip() for part in text.split(","))
-    if rest == ["metal"]:
-        return Layer(name, METAL)
-    if rest and rest[0] == "?" and len(rest) <= 2:
-        return _parse_unknown_layer(name, *rest[1:])
-    if len(rest) not in (2, 3):
+    name, *numbers = (part.strip() for part in text.split(","))
+    if numbers == ["metal"]:
+        return Layer(name, METAL_PERMITTIVITY)
+    if numbers and numbers[0] == "?" and len(numbers) <= 2:
+        return _parse_unknown_layer(name, *numbers[1:])
+    if len(numbers) not in (2, 3):
         raise ValueError(text)
-    real, loss, *thickness = (float(part) for part in rest)
+    real, loss, *thickness = (float(part) for part in numbers)
     if not (np.isfinite(real) and np.isfinite(loss)):
         raise ValueError(text)
     return Layer(name, complex(real, -loss), _convert_to_metres(thickness[0]) if thickness else None)
@@ -402,7 +413,7 @@ def incidence_std_rad(materials: ScanMaterials | None) -> float:
 def layer_content(fit: LayerFit) -> dict[str, Any]:
     """Return a fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
     has_thickness = fit.std_thickness_m > 0
-    # Of eps', eps'' and the thickness.
+    # Units of eps', eps'' and the thickness (millimetres a metre).
     units = np.array([1.0, 1.0, 1e3])[: 3 if has_thickness else 2]
     if fit.covariance is None:
         covariance = None
@@ -495,7 +506,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeftOutPatch:
     """Estimate of one patch by a line fitted without its concentration."""
 
     name: str
@@ -511,7 +522,7 @@ class ConcentrationResult:
     """The line through all patches, and the estimates with each concentration left out."""
 
     line: Line
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[LeftOutPatch, ...]
 
     @property
     def median_error(self) -> float:
@@ -569,14 +580,14 @@ def fit_concentration(
         )
     x = np.array([float(np.median(polarisation_angle_rad(e.p))) for e in entries])
     y = np.array([percent_by_name[e.name] for e in entries])
-    rows: list[LeftOut] = []
+    rows: list[LeftOutPatch] = []
     for value in sorted(values):
         test = y == value
         line = Line.through(x[~test], y[~test])
         low, high = line.interval(x[test], confidence)
         names = [entries[i].name for i in np.flatnonzero(test)]
         estimates = zip(names, line.percent(x[test]), low, high, strict=True)
-        rows += [LeftOut(name, value, float(percent), float(lo), float(hi)) for name, percent, lo, hi in estimates]
+        rows += [LeftOutPatch(name, value, float(percent), float(lo), float(hi)) for name, percent, lo, hi in estimates]
     return ConcentrationResult(Line.through(x, y), tuple(rows))
 
 

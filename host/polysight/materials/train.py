@@ -35,8 +35,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from polysight.materials.classify import DISCRIMINANT, MODELS, PAPER, fit_weights
-from polysight.materials.labels import METALS, find_label_file, is_metal, read_labels
+from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, fit_weights
+from polysight.materials.labels import METAL_WORDS, find_label_file, is_metal, read_labels
 from polysight.materials.library import Entry, Library, Real, Samples, majority
 from polysight.materials.result import MaterialsResult
 from polysight.materials.segment import Box
@@ -55,8 +55,8 @@ ORIENTATIONS = {
     "x and y swapped, y from the last row": lambda a: a.T[::-1],
 }
 """Name to a function that turns an image so that rows are y and columns x."""
-# How much more of the variance another orientation must explain: chosen, so that chance does not turn images.
-_CLEARLY = 0.05
+# Share of the variance that another orientation must explain in addition; chosen: chance must not turn images.
+_CLEAR_DIFFERENCE = 0.05
 # Module and name of what the published pickles may call: arrays and plain numbers, of old and new releases of numpy.
 _ALLOWED = {
     ("numpy", "ndarray"),
@@ -73,8 +73,8 @@ _ALLOWED = {
 # Usual number of parts of the cross-validation; one part is left out at a time; chosen.
 FOLDS = 8
 # The split of a score whose training and test pixels are of the same patches.
-OPTIMISTIC = "by pixel (optimistic)"
-PIXELS = 16
+OPTIMISTIC_SPLIT = "by pixel (optimistic)"
+PATCH_PIXELS = 16
 """Pixels of each patch, in a library and to judge models; chosen."""
 
 
@@ -173,8 +173,8 @@ def compute_explained_variance(scan: LabelledScan) -> float:
     label = np.zeros(level.shape, int)
     for i, name in enumerate(scan.boxes, 1):
         label[scan.mask(name)] = i
-    within = sum(float(((level[label == k] - level[label == k].mean()) ** 2).sum()) for k in np.unique(label))
-    return 1 - within / max(float(((level - level.mean()) ** 2).sum()), 1e-30)
+    variance_within = sum(float(((level[label == k] - level[label == k].mean()) ** 2).sum()) for k in np.unique(label))
+    return 1 - variance_within / max(float(((level - level.mean()) ** 2).sum()), 1e-30)
 
 
 def image_orientation(scans: Sequence[LabelledScan]) -> str:
@@ -188,7 +188,7 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
             shares[orientation] = -1.0
     first = next(iter(ORIENTATIONS))
     best = max(shares, key=lambda h: shares[h])
-    return best if shares[best] > shares[first] + _CLEARLY else first
+    return best if shares[best] > shares[first] + _CLEAR_DIFFERENCE else first
 
 
 def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
@@ -202,7 +202,7 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
         raise DataError(
             f"{scan.scan}: none of its boxes is of metal: {', '.join(scan.boxes)}",
             "everything is measured relative to metal",
-            f"a metal box has one of these words in its name: {', '.join(METALS)}", code=ErrorCode.NO_DATA,
+            f"a metal box has one of these words in its name: {', '.join(METAL_WORDS)}", code=ErrorCode.NO_DATA,
         )  # fmt: skip
     metal_h, metal_v = metal_gains(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
     h = scan.h / np.asarray(metal_h, scan.h.dtype)
@@ -251,7 +251,7 @@ def angle_in_text(texts: Iterable[str]) -> float | None:
 _MAX_BYTES = 1 << 30
 
 
-class _Restricted(pickle.Unpickler):
+class _RestrictedUnpickler(pickle.Unpickler):
     """An unpickler for arrays and plain types."""
 
     def find_class(self, module: str, name: str) -> Any:
@@ -267,7 +267,7 @@ def read_pickle(path: Path) -> Any:
     Raises DataError if the file is missing, damaged, or would call anything but numpy's array constructors.
     """
     try:
-        return _Restricted(io.BytesIO(read_bounded(path, _MAX_BYTES))).load()
+        return _RestrictedUnpickler(io.BytesIO(read_bounded(path, _MAX_BYTES))).load()
     except DataError:
         raise
     except OSError as e:
@@ -494,16 +494,16 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     group: optimistic, see the module's docstring. `folds` is the largest number of folds. Raises DataError with fewer
     than two groups, or without a material in two groups.
     """
-    of_pixel = np.empty_like(samples.names)
-    in_scan = np.empty_like(samples.names)
-    of_patch = np.empty_like(samples.names)
+    pixel_name = np.empty_like(samples.names)
+    name_in_scan = np.empty_like(samples.names)
+    patch_name = np.empty_like(samples.names)
     unknown, learnt = np.zeros((2, samples.names.size), bool)
-    sure = np.zeros(samples.names.size)
+    confidence = np.zeros(samples.names.size)
     for train, test in splits(samples, by_pixel, folds):
         learnt[test] = np.isin(samples.names[test], samples.names[train])
         model_of_fold = MODELS[model](channels)
         model_of_fold.fit(samples.take(train))
-        of_pixel[test], distance = model_of_fold.by_pixel(samples.x[test])
+        pixel_name[test], distance = model_of_fold.by_pixel(samples.x[test])
         test_sets = [test]
         if model_of_fold.knows_scans:
             test_sets = [test[samples.groups[test] == group] for group in np.unique(samples.groups[test])]
@@ -511,32 +511,32 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             if model_of_fold.knows_scans:
                 predicted = model_of_fold.by_scan(samples.x[test_set], samples.patches[test_set])
             else:
-                predicted = majority(of_pixel[test_set], distance, samples.patches[test_set])
+                predicted = majority(pixel_name[test_set], distance, samples.patches[test_set])
             row = np.searchsorted(predicted.patches, samples.patches[test_set])
-            in_scan[test_set] = predicted.pixel_names
-            of_patch[test_set] = predicted.names[row]
+            name_in_scan[test_set] = predicted.pixel_names
+            patch_name[test_set] = predicted.names[row]
             # Distances are in units of the limit up to which a patch gets a name.
             unknown[test_set] = (predicted.distance > 1)[row]
-            sure[test_set] = predicted.confidence[row]
+            confidence[test_set] = predicted.confidence[row]
     names = np.unique(samples.names)
-    tables = [_confusions(samples.names[learnt], p[learnt], names) for p in (of_pixel, in_scan, of_patch)]
+    tables = [_confusions(samples.names[learnt], p[learnt], names) for p in (pixel_name, name_in_scan, patch_name)]
     judged = np.isin(names, samples.names[learnt])
     # Each patch is represented by one pixel: patches of learnt materials, and those of them that were named.
     first = np.unique(samples.patches, return_index=True)[1]
     first = first[learnt[first]]
     named = first[~unknown[first]]
-    right = (of_patch == samples.names)[named]
+    right = (patch_name == samples.names)[named]
     pixels_right, in_scan_right, by_patch_right = (float(np.mean(np.diag(t)[judged])) for t in tables)
     scans = np.unique(samples.independent).size
-    split = OPTIMISTIC if by_pixel else f"whole scans left out, {scans} scans"
+    split = OPTIMISTIC_SPLIT if by_pixel else f"whole scans left out, {scans} scans"
     return Score(
         model=model, channels=channels, split=split,
         pixels=pixels_right, in_scan=in_scan_right, by_patch=by_patch_right,
-        patches=float(np.mean((of_patch == samples.names)[first])), unknown=float(np.mean(unknown[first])),
+        patches=float(np.mean((patch_name == samples.names)[first])), unknown=float(np.mean(unknown[first])),
         confusion=tables[0], patch_confusion=tables[2],
         names=tuple(str(n) for n in names), not_judged=tuple(str(n) for n in names[~judged]),
-        calibration=calibration_error(sure[named], right), named=int(named.size),
-        said=float(sure[named].mean()) if named.size else float("nan"),
+        calibration=calibration_error(confidence[named], right), named=int(named.size),
+        said=float(confidence[named].mean()) if named.size else float("nan"),
         right=float(right.mean()) if named.size else float("nan"),
     )  # fmt: skip
 
@@ -575,7 +575,8 @@ def fit_library(library: Library) -> Library:
     Raises DataError with fewer than two scans of an angle, or without a material in two of them: a split by pixel would
     be too optimistic.
     """
-    samples = {f"{angle:g}": Samples.from_library(library.at_angle(angle), PIXELS) for angle in library.angles_deg}
+    entries = {f"{angle:g}": library.at_angle(angle) for angle in library.angles_deg}
+    samples = {angle: Samples.from_library(part, PATCH_PIXELS) for angle, part in entries.items()}
     fits = {angle: fit_samples(angle_samples) for angle, angle_samples in samples.items()}
     if len(samples) > 1:
         fits["+".join(samples)] = fit_samples(reduce(Samples.join, samples.values()))
@@ -591,15 +592,15 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
     """
     scores = {model: score(samples, model) for model in MODELS}
     weighted = fit_weights(samples)
-    own_score = scores[DISCRIMINANT]
+    own_score = scores[DISCRIMINANT_MODEL]
     judged = {s.model: {"pixels": s.pixels, "patches": s.patches} for s in scores.values()}
-    for name in (DISCRIMINANT, PAPER):
+    for name in (DISCRIMINANT_MODEL, PAPER_MODEL):
         judged[name]["pixels_split_by_pixel"] = score(samples, name, by_pixel=True).pixels
     if all(is_metal(name) for name in set(own_score.names) - set(own_score.not_judged)):
         # All is relative to metal: that it is named right says nothing about names.
         judged = {}
     return {
-        "model": DISCRIMINANT,
+        "model": DISCRIMINANT_MODEL,
         "weights": weighted.weights.to_dict(),
         "thresholds": weighted.thresholds,
         "by_channel": weighted.by_channel,
@@ -650,28 +651,28 @@ class TrainingScan:
 
 
 def make_entries(scan: TrainingScan) -> list[Entry]:
-    """Return the library entries of one scan: each patch of known material, with up to `PIXELS` interior pixels.
+    """Return the library entries of one scan: each patch of known material, with up to `PATCH_PIXELS` pixels.
 
     Pixels are taken at even intervals, so that the same scan always gives the same entries.
     """
     entries = []
-    r = scan.result
-    for patch in r.patches:
+    result = scan.result
+    for patch in result.patches:
         name = (scan.names or {}).get(patch.patch.label) or (patch.truth.name if patch.truth else None)
-        rows, cols = np.nonzero(r.usable_pixels(patch.patch))
+        rows, cols = np.nonzero(result.usable_pixels(patch.patch))
         if name is None or rows.size == 0:
             continue
-        pick = np.unique(np.linspace(0, rows.size - 1, min(PIXELS, rows.size)).round().astype(int))
+        pick = np.unique(np.linspace(0, rows.size - 1, min(PATCH_PIXELS, rows.size)).round().astype(int))
         picked = (rows[pick], cols[pick])
         eps = patch.truth.permittivity if patch.truth else None
-        theta = r.theta_rad[picked] if r.theta_rad.ndim else r.theta_rad
+        theta = result.theta_rad[picked] if result.theta_rad.ndim else result.theta_rad
         entries.append(
             Entry(
                 name=name,
                 scan=scan.scan,
-                h=np.abs(r.h[picked]).astype(np.float32),
-                v=np.abs(r.v[picked]).astype(np.float32),
-                p=r.p[picked].astype(np.complex64),
+                h=np.abs(result.h[picked]).astype(np.float32),
+                v=np.abs(result.v[picked]).astype(np.float32),
+                p=result.p[picked].astype(np.complex64),
                 incidence_deg=float(np.degrees(np.mean(theta))),
                 simulated=scan.simulated,
                 thickness_mm=patch.truth.thickness_mm if patch.truth else None,

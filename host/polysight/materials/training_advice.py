@@ -19,7 +19,7 @@ def accuracy_lines(library: Library) -> list[str]:
     """Return for each angle how often names are correct on scans left out of training, or why this is not known."""
     lines: list[str] = []
     for angle, fit in library.fit["angles"].items():
-        in_one_scan_only = ", ".join(fit["not_judged"])
+        materials_in_one_scan = ", ".join(fit["not_judged"])
         if not fit["judged"]:
             lines.append(
                 f"{angle} degrees: accuracy not known: it is measured on a second scan of a material, and there is none"
@@ -31,7 +31,7 @@ def accuracy_lines(library: Library) -> list[str]:
             f"{angle} degrees: on scans left out {100 * fit['pixel_accuracy']:.1f} % of the pixels and"
             f" {100 * fit['patch_accuracy']:.1f} % of the patches are named right ({fit['model']},"
             f" {fit['materials'] - len(fit['not_judged'])} materials)"
-            + (f"; not known for materials of one scan: {in_one_scan_only}" if in_one_scan_only else "")
+            + (f"; not known for materials of one scan: {materials_in_one_scan}" if materials_in_one_scan else "")
         )
     return lines
 
@@ -60,15 +60,16 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
         # Libraries of earlier releases have no confidence.
         return []
     missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
-    # Scans of one and the same piece cannot show how often names are right on another piece.
+    # Scans of a single piece cannot show how often names are right on another piece.
     freedom = fit["specimen_freedom"]
     if freedom == 0:
-        known = "how far specimens of a material differ is not known: no second one of any is named"
+        spread_text = "how far specimens of a material differ is not known: no second one of any is named"
     elif freedom == 1:
-        known = "how far specimens of a material differ is known from one beyond the first"
+        spread_text = "how far specimens of a material differ is known from one beyond the first"
     else:
-        known = f"how far specimens of a material differ is known from {freedom} beyond the first ones"
-    need = f"{known}; to know it to 25 %, scan {missing} more (polysight label SCAN --specimen NAME=WHICH names them)"
+        spread_text = f"how far specimens of a material differ is known from {freedom} beyond the first ones"
+    need = f"{spread_text}; to know it to 25 %, scan {missing} more"
+    need += " (polysight label SCAN --specimen NAME=WHICH names them)"
     lines = []
     # Standard deviation of a share of so many names by chance, at least that of a share of about 95 %.
     chance = np.sqrt(max(fit["right"] * (1 - fit["right"]), 0.05) / max(fit["named"], 1))

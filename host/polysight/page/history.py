@@ -24,44 +24,46 @@ from polysight_shared.messages import AnyEvent, Capture, Fault, State
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode as decode_config
 
-K = FaultKind
 CAUSES: dict[FaultKind, tuple[str, str]] = {
-    K.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` takes the row again"),
-    K.RADAR_STOPPED: (
+    FaultKind.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` takes the row again"),
+    FaultKind.RADAR_STOPPED: (
         "The radar hit a fault of its own",
         "It is armed again; if that fails, power-cycle the board",
     ),
-    K.RADAR_WAITS: ("SYNC_IN pulses did not reach the board", "Check its SYNC_IN wire and the fan-out buffer"),
-    K.NO_END: ("The Pi or the network was busy", "Nothing, while it is rare; else the Pi's load and network"),
-    K.COUNTS_DIFFER: ("The stage and the Pi counted different numbers of points", "Check the stage's trigger wire"),
-    K.NO_DATA: (
+    FaultKind.RADAR_WAITS: ("SYNC_IN pulses did not reach the board", "Check its SYNC_IN wire and the fan-out buffer"),
+    FaultKind.NO_END: ("The Pi or the network was busy", "Nothing, while it is rare; else the Pi's load and network"),
+    FaultKind.COUNTS_DIFFER: (
+        "The stage and the Pi counted different numbers of points",
+        "Check the stage's trigger wire",
+    ),
+    FaultKind.NO_DATA: (
         "The radar is not armed, or its card has lost network or power",
         "`polysight card` names the silent hop",
     ),
-    K.HELD: ("Somebody held the stage for more than 2 s", "Nothing"),
-    K.PULSES_MISSED: (
+    FaultKind.HELD: ("Somebody held the stage for more than 2 s", "Nothing"),
+    FaultKind.PULSES_MISSED: (
         "The board missed SYNC_IN pulses",
         "Check its SYNC_IN wire; after the scan run `polysight doctor`",
     ),
-    K.SLIPPED: (
+    FaultKind.SLIPPED: (
         "The board saw edges on SYNC_IN that the Pi did not send",
         "Check its SYNC_IN wire and ground, and cables beside it",
     ),
-    K.FRAMES_MISSING: (
+    FaultKind.FRAMES_MISSING: (
         "The board missed SYNC_IN pulses, or the end of its data was lost",
         "Check its SYNC_IN wire; after the scan run `polysight doctor`",
     ),
-    K.CARD_DROPPED: ("The card could not send as fast as the radar measured", "Check its cable and the switch"),
-    K.LOST_BY_HOST: ("This machine was too busy to receive the packets", "Close other programs on the host"),
-    K.LOST_ON_THE_WAY: (
+    FaultKind.CARD_DROPPED: ("The card could not send as fast as the radar measured", "Check its cable and the switch"),
+    FaultKind.LOST_BY_HOST: ("This machine was too busy to receive the packets", "Close other programs on the host"),
+    FaultKind.LOST_ON_THE_WAY: (
         "Packets were lost between card and host",
         "Nothing, while it is rare; else check cable and switch",
     ),
-    K.CONFLICTING: (
+    FaultKind.CONFLICTING: (
         "Packets with the same counters brought different bytes",
         "Nothing: the row is retaken. If it comes back, reset the card: `polysight card reset BOARD`",
     ),
-    K.UNLOCATED: (
+    FaultKind.UNLOCATED: (
         "Packets were lost at the row's beginning, or the radar saw triggers that were not sent",
         "Nothing, while it is rare; else check cable, switch and SYNC_IN wire",
     ),
@@ -73,21 +75,21 @@ RowMark = Literal["committed", "kept", "rejected"]
 RECEPTION = ("packets", "duplicates", "late", "kernel_drops", "malformed", "pulses_missed")
 
 
-def sentence(text: str) -> str:
+def capitalise(text: str) -> str:
     """Return the text with a capital letter first; a command is not changed."""
     if text.startswith("polysight"):
         return text
     return text[:1].upper() + text[1:]
 
 
-def notice_of_error(error: PolysightError, level: Level = "warning") -> Finding:
+def make_error_notice(error: PolysightError, level: Level = "warning") -> Finding:
     """Return the notice of an error that was raised."""
-    return Finding(level, sentence(error.what), sentence(error.why), sentence(error.remedy), code=error.code)
+    return Finding(level, capitalise(error.what), capitalise(error.why), capitalise(error.remedy), code=error.code)
 
 
-def notice_of_fault(event: Fault) -> Finding:
+def make_fault_notice(event: Fault) -> Finding:
     """Return the notice of a fault of the Pi: a note if a person requested it, a warning if the rig can continue."""
-    table = explain(event.number)
+    explanation = explain(event.number)
     passing_faults = (PiFault.HOST_LOST, PiFault.POINTS_MISMATCH)
     level: Level = "error"
     if event.number == PiFault.ABORTED:
@@ -95,28 +97,32 @@ def notice_of_fault(event: Fault) -> Finding:
     elif PiFault.EDGE_LOST <= event.number <= PiFault.PERIOD_TOO_SHORT or event.number in passing_faults:
         # A fault of a burst ends its row, which is taken again.
         level = "warning"
-    details = {} if event.problem == table.problem else {"detail": event.problem}
-    problem = f"Fault {event.number} at the Pi: {table.problem}"
+    details = {} if event.problem == explanation.problem else {"detail": event.problem}
+    problem = f"Fault {event.number} at the Pi: {explanation.problem}"
     return Finding(
-        level, problem, sentence(event.cause or table.cause), sentence(event.remedy or table.remedy), facts=details
+        level,
+        problem,
+        capitalise(event.cause or explanation.cause),
+        capitalise(event.remedy or explanation.remedy),
+        facts=details,
     )
 
 
 def _find_cause(faults: Sequence[store.RowFault]) -> tuple[str, str]:
     """Return the likely cause and remedy of a row's faults: those of the first known kind; both "" for none."""
     for fault in faults:
-        if fault.kind == K.PI_FAULT and fault.number:
-            table = explain(fault.number)
-            return sentence(table.cause), sentence(table.remedy)
+        if fault.kind == FaultKind.PI_FAULT and fault.number:
+            explanation = explain(fault.number)
+            return capitalise(explanation.cause), capitalise(explanation.remedy)
         if fault.kind in CAUSES:
             return CAUSES[FaultKind(fault.kind)]
     return "", ""
 
 
-def notice_of_rejection(
+def make_rejection_notice(
     row: int, take: int, reasons: Sequence[str], faults: Sequence[store.RowFault], utc: str
 ) -> Finding:
-    """Return the notice of a rejected take; one that somebody asked for is not a fault."""
+    """Return the notice of a rejected take; one that a person requested is not a fault."""
     cause, remedy = _find_cause(faults)
     remedy = remedy or "Nothing: the row is retaken automatically"
     if is_on_request(faults):
@@ -126,8 +132,8 @@ def notice_of_rejection(
 
 
 def is_on_request(faults: Sequence[store.RowFault]) -> bool:
-    """True if a take was rejected only because somebody aborted the scan."""
-    return bool(faults) and all(fault.kind == K.ON_REQUEST for fault in faults)
+    """True if a take was rejected only because a person aborted the scan."""
+    return bool(faults) and all(fault.kind == FaultKind.ON_REQUEST for fault in faults)
 
 
 def _make_row_notice(row: int, problem: str, why_do: tuple[str, str], reasons: Sequence[str], utc: str) -> Finding:
@@ -173,8 +179,8 @@ class PiState:
         The running row, its take and the last point that was passed; row -1 between rows.
     faults
         Faults since the last row that was done.
-    deaf
-        Reason why no events can be received; None if they can.
+    receive_error
+        Error that prevents the reception of events; None if they are received.
     """
 
     heard_s: float = 0.0
@@ -186,10 +192,10 @@ class PiState:
     take: int = 0
     point: int = 0
     faults: tuple[Finding, ...] = ()
-    deaf: Finding | None = None
+    receive_error: Finding | None = None
 
 
-def seconds(utc: str) -> float:
+def parse_seconds(utc: str) -> float:
     """Return an ISO time in seconds since 1970."""
     return datetime.fromisoformat(utc).timestamp()
 
@@ -206,7 +212,8 @@ class ScanHistory:
     notices
         Faults in the order of the facts and events.
     run_started_s, last_commit_s
-        Times of the last run and the last row, seconds since 1970; a pause moves the latter on by its length.
+        Start of the last run, and time of the last row, seconds since 1970; the latter is later by the length of
+        pauses.
     last_row_utc
         Time of the last row as the manifest has it; "" before.
     rows_since_trouble
@@ -222,7 +229,7 @@ class ScanHistory:
         self.scan_id = started.scan_id
         self.simulated = started.simulated
         self.notices: list[Finding] = []
-        self.run_started_s = seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
+        self.run_started_s = parse_seconds(started.started_utc or "1970-01-01T00:00:00+00:00")
         self.last_commit_s = 0.0
         self.last_row_utc = ""
         self.rows_since_trouble = 0
@@ -295,21 +302,23 @@ class ScanHistory:
         elif isinstance(fact, store.RowRejected):
             if not is_on_request(fact.faults):
                 self.rows_since_trouble = 0
-            self.notices.append(notice_of_rejection(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc))
+            self.notices.append(
+                make_rejection_notice(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc)
+            )
         elif isinstance(fact, store.RowWithdrawn):
             problem = f"Row {fact.row} on the disk differs from what was committed"
             why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
             self.notices.append(_make_row_notice(fact.row, problem, why_do, fact.reasons, fact.withdrawn_utc))
         elif isinstance(fact, store.ScanResumed):
-            self.run_started_s = seconds(fact.resumed_utc)
+            self.run_started_s = parse_seconds(fact.resumed_utc)
             if fact.rig:
                 # The Pi has another address from now on.
                 self.instrument = store.with_connection(self.instrument, fact.rig)
         elif isinstance(fact, store.ScanPaused):
-            self._paused_at = seconds(fact.paused_utc)
+            self._paused_at = parse_seconds(fact.paused_utc)
         elif isinstance(fact, store.ScanContinued) and self.last_commit_s:
             # The time of a pause does not count as time of the row.
-            self.last_commit_s += seconds(fact.continued_utc) - self._paused_at
+            self.last_commit_s += parse_seconds(fact.continued_utc) - self._paused_at
 
     def _add_committed_row(self, fact: store.RowCommitted) -> None:
         """Add the time of a committed row, and a notice if it was kept with gaps."""
@@ -324,7 +333,7 @@ class ScanHistory:
         if not fact.committed_utc:
             # `polysight simulate` writes all rows together, without times.
             return
-        committed_s = seconds(fact.committed_utc)
+        committed_s = parse_seconds(fact.committed_utc)
         self.last_row_utc = fact.committed_utc
         if self.last_commit_s > self.run_started_s:
             self._row_seconds.append(committed_s - self.last_commit_s)
@@ -336,12 +345,12 @@ class ScanHistory:
         """Add events of the event log; repeated ones change nothing."""
         for event in events:
             if isinstance(event, Capture):
-                worst = self.trigger or TriggerHealth(0, 0)
-                width_ns = max(worst.width_max_ns, event.width_max_ns)
-                self.trigger = TriggerHealth(width_ns, max(worst.jitter_max_ns, event.jitter_ns))
+                health = self.trigger or TriggerHealth(0, 0)
+                width_ns = max(health.width_max_ns, event.width_max_ns)
+                self.trigger = TriggerHealth(width_ns, max(health.jitter_max_ns, event.jitter_ns))
             elif isinstance(event, Fault) and event.seq not in self._fault_seqs:
                 self._fault_seqs.add(event.seq)
-                self.notices.append(notice_of_fault(event))
+                self.notices.append(make_fault_notice(event))
 
     @property
     def row_seconds(self) -> tuple[float, str] | None:

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import msgspec
 
-from polysight.acquisition import STATES, Button, Life, StateLevel, time_left
+from polysight.acquisition import STATES, Button, SignOfLife, StateLevel, time_left
 from polysight.catalogue import Picture, Program
-from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, seconds, sentence
+from polysight.page.history import BoardCounts, PiState, ScanHistory, TriggerHealth, capitalise, parse_seconds
 from polysight.results import Verdict, rules
 from polysight.store import ScanEnded
 from polysight.sync import PUBLISHED_STD
@@ -23,11 +23,11 @@ from polysight_shared.errors import quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import WIDTH_US
 
-SINCE = "{since}"
+ELAPSED_PLACEHOLDER = "{since}"
 """The page puts the elapsed time here."""
-# A fault stays in the headline until so many rows came without one; chosen.
+# Number of rows without a fault after which the last fault leaves the headline; chosen.
 RECENT_ROWS = 3
-# A row is late after so many usual durations, and after at least so many seconds; chosen.
+# A row is late if it takes longer than `LATE_ROWS` usual durations and longer than `LATE_S` seconds; chosen.
 LATE_ROWS = 3.0
 LATE_S = 60.0
 # Residual of the direct path above which a row gives a warning; chosen, 0.004 is usual.
@@ -112,7 +112,7 @@ class LifeSigns:
         Now. Times are seconds since 1970.
     """
 
-    life: Life | None
+    life: SignOfLife | None
     alive: bool
     killed: bool
     alive_s: float
@@ -161,7 +161,7 @@ class Inputs:
 class Status(msgspec.Struct, frozen=True):
     """The headline: one of `STATES` with its words filled in, and the buttons that may be pressed.
 
-    `SINCE` in `detail` stands for the time elapsed since `since_s` (seconds since 1970).
+    `ELAPSED_PLACEHOLDER` in `detail` stands for the time elapsed since `since_s` (seconds since 1970).
     """
 
     key: str
@@ -315,10 +315,10 @@ def estimate_time_left(history: ScanHistory, now_s: float) -> tuple[int | None, 
         return None, ""
     row_s, basis = history.row_seconds
     row_began_s = max(history.last_commit_s, history.run_started_s)
-    in_row_s = 0.0
+    elapsed_in_row_s = 0.0
     if not history.paused:
-        in_row_s = now_s - row_began_s
-    return round(time_left(rows_left, row_s, in_row_s)), basis
+        elapsed_in_row_s = now_s - row_began_s
+    return round(time_left(rows_left, row_s, elapsed_in_row_s)), basis
 
 
 def _describe_pictures(history: ScanHistory, shown: ShownResults) -> PicturesState:
@@ -343,8 +343,8 @@ def _collect_notices(inputs: Inputs) -> list[Finding]:
         notices.append(inputs.failure)
     if history is not None:
         # Why the Pi's events cannot be received.
-        if inputs.pi.deaf is not None and history.ended is None:
-            notices.append(inputs.pi.deaf)
+        if inputs.pi.receive_error is not None and history.ended is None:
+            notices.append(inputs.pi.receive_error)
         if inputs.shown.problem is not None:
             notices.append(inputs.shown.problem)
         notices += sync_notices(inputs.shown, history.plan.columns)
@@ -362,9 +362,9 @@ def sync_notices(shown: ShownResults, columns: int) -> list[Finding]:
         row = max(rows)
         sync = rows[row]
         for dead in rules.judge_dead_rx(board, {rx: [row] for rx in sync.dead_rx}, rows=1):
-            what = sentence(dead.what)
-            why = sentence(dead.why)
-            do = sentence(dead.do)
+            what = capitalise(dead.what)
+            why = capitalise(dead.why)
+            do = capitalise(dead.do)
             notices.append(Finding("warning", what, why, do, where=f"row {row}"))
         if sync.masked > MASKED_SHARE * columns:
             problem = f"{board}: {sync.masked} of {columns} positions of row {row} have no usable direct path"
@@ -386,7 +386,7 @@ def sync_notices(shown: ShownResults, columns: int) -> list[Finding]:
 def make_status(key: str, **words: str | int) -> Status:
     """Return the status of a state of the table, with its texts filled in."""
     state = STATES[key]
-    filled = {"since": SINCE, **words}
+    filled = {"since": ELAPSED_PLACEHOLDER, **words}
     # A line that can be pasted into a shell.
     pasted = {**filled, "folder": quote(str(words.get("folder", "")))}
     return Status(
@@ -479,9 +479,9 @@ def _judge_end(inputs: Inputs, history: ScanHistory, ended: ScanEnded) -> Status
     if ended.exit_status == "abort":
         key = "aborted" if ended.asked == "abort" else "stopped"
         return make_status(key, asker=ended.asker or "somebody", safe=safe, folder=folder)
-    problem = f"{sentence(ended.reason)}."
-    do = sentence(ended.remedy) or f"`polysight resume {quote(folder)}`"
-    return make_status("failed", what=problem, safe=safe, why=sentence(ended.why) or "See its terminal", do=do)
+    problem = f"{capitalise(ended.reason)}."
+    do = capitalise(ended.remedy) or f"`polysight resume {quote(folder)}`"
+    return make_status("failed", what=problem, safe=safe, why=capitalise(ended.why) or "See its terminal", do=do)
 
 
 def cut_fraction(iso_time: str) -> str:
@@ -514,7 +514,7 @@ def _judge_trouble(inputs: Inputs, history: ScanHistory) -> Status | None:
         return make_status_since("frozen", signs.alive_s, safe=safe, folder=folder)
     if signs.pi_silent_s is not None and signs.pi_silent_s > signs.pi_limit_s:
         return make_status_since("pi_silent", inputs.pi.heard_utc_s)
-    return _judge_request(signs.life or Life(), history, folder)
+    return _judge_request(signs.life or SignOfLife(), history, folder)
 
 
 def _is_connecting(inputs: Inputs, history: ScanHistory) -> bool:
@@ -527,10 +527,10 @@ def _is_connecting(inputs: Inputs, history: ScanHistory) -> bool:
         has_begun_a_row = inputs.pi.row >= 0 or history.last_commit_s > history.run_started_s
         return signs.life is None and not has_begun_a_row
     # The signs of life are those of an earlier run until the manifest says that this one has begun.
-    return seconds(program.started_utc) > history.run_started_s
+    return parse_seconds(program.started_utc) > history.run_started_s
 
 
-def _judge_request(life: Life, history: ScanHistory, folder: str) -> Status | None:
+def _judge_request(life: SignOfLife, history: ScanHistory, folder: str) -> Status | None:
     """Return the status of a scan with a request to pause, stop or abort, from any sender; None without a request."""
     asker = life.asker or "somebody"
     if life.asked == "abort":

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from polysight.acquisition import LAPSE_S, read_life
 from polysight.catalogue import Picture, Program, draw, explain_failure, find_program, read_generation
 from polysight.imaging import Antennas, image_grid, scene_gate_m
-from polysight.page.history import PiState, ScanHistory, notice_of_error, notice_of_fault
+from polysight.page.history import PiState, ScanHistory, make_error_notice, make_fault_notice
 from polysight.page.status import (
     Inputs,
     LifeSigns,
@@ -48,7 +48,7 @@ from polysight_shared.config import Chirp, Instrument
 from polysight_shared.errors import PolysightError, ProtocolError
 from polysight_shared.findings import Finding
 from polysight_shared.raster import plan_raster
-from polysight_shared.sockets import observer
+from polysight_shared.sockets import create_observer
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Range profiles: points of the Fourier transform, points that are shown, and the lowest level; chosen.
@@ -158,7 +158,7 @@ class RowViewer:
                 pipeline = pipeline or Pipeline(self._source, live=True, samples="read")
                 self._add(pipeline, row, take, draws=len(waiting) == 1)
             except PolysightError as e:
-                self._fail(row, take, notice_of_error(e))
+                self._fail(row, take, make_error_notice(e))
             except Exception as e:  # noqa: BLE001  the page shows it; the scan is not concerned
                 row_problem = f"Row {row} cannot be shown: {type(e).__name__}: {e}"
                 self._fail(row, take, Finding("warning", row_problem, "A defect of the live view", "Report it"))
@@ -169,7 +169,7 @@ class RowViewer:
         self._done[row] = take
         for name, board in pipeline.quality.boards.items():
             figures = board.rows[row].figures
-            # Of each stage of synchronisation: standard deviations of frequency (Hz), phase (rad), relative amplitude.
+            # `residuals` has for each stage the standard deviations of frequency (Hz), phase (rad), relative amplitude.
             phases = {stage: phase_rad for stage, (_, phase_rad, _) in figures.residuals.items()}
             object_rad = phases.get("referenced", math.nan)
             direct_rad = phases.get("averaged", math.nan)
@@ -248,7 +248,7 @@ class GrowingFile:
             return b""
 
     def take(self, count: int) -> None:
-        """Mark so many bytes as read: those of whole records."""
+        """Mark the next `count` bytes, those of whole records, as read."""
         self._position += count
 
 
@@ -342,16 +342,16 @@ class PiListener:
         self._thread.start()
 
     def _run(self) -> None:
-        """Receive events until closed; `state.deaf` says why if that is not possible."""
+        """Receive events until closed; `state.receive_error` says why if that is not possible."""
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
             pi = self._instrument.pi
-            socket = observer(context, pi.event_address, Path(pi.key_dir))
+            socket = create_observer(context, pi.event_address, Path(pi.key_dir))
             while not self._ended.is_set():
                 if socket.poll(LISTEN_MS):
                     self._receive(socket.recv_multipart()[-1])
         except PolysightError as e:
-            self.state = replace(self.state, deaf=notice_of_error(e, "note"))
+            self.state = replace(self.state, receive_error=make_error_notice(e, "note"))
         finally:
             context.destroy(linger=0)
 
@@ -360,9 +360,9 @@ class PiListener:
         try:
             event = m.unpack_event(raw)
         except ProtocolError as e:
-            self.state = replace(self.state, deaf=notice_of_error(e, "note"))
+            self.state = replace(self.state, receive_error=make_error_notice(e, "note"))
             return
-        state = replace(self.state, heard_s=time.monotonic(), heard_utc_s=int(time.time()), deaf=None)
+        state = replace(self.state, heard_s=time.monotonic(), heard_utc_s=int(time.time()), receive_error=None)
         if isinstance(event, m.Heartbeat):
             state = replace(state, state=event.state)
         elif isinstance(event, m.StageStatus):
@@ -390,7 +390,7 @@ def _follow_row(state: PiState, event: m.AnyEvent) -> PiState:
             faults = ()
         return replace(state, row=-1, point=0, faults=faults)
     if isinstance(event, m.Fault):
-        return replace(state, faults=(*state.faults, notice_of_fault(event))[-MAX_FAULTS:])
+        return replace(state, faults=(*state.faults, make_fault_notice(event))[-MAX_FAULTS:])
     return state
 
 

@@ -1,7 +1,7 @@
 """`polysight plan`: predict a scan before it is made: time, data, resolution, noise, aliases, warnings.
 
-`forecast` predicts the scan of a rig file to which `Changes` were applied; `propose` searches for the plans with the
-least noise within a time. `scan_time` estimates the duration. `run_plan` is the command; it can take noise and
+`forecast` predicts the scan of a rig file to which `PlanChanges` were applied; `propose` searches for the plans with
+the least noise within a time. `scan_time` estimates the duration. `run_plan` is the command; it can take noise and
 standstill from an earlier scan. `warn_of_scene` checks the plates of a scene, `find_scene_warnings` those of a scene
 file.
 """
@@ -15,7 +15,7 @@ from polysight.planning.forecast import (
     straight_move_s as straight_move_s,
 )
 from polysight.planning.plan_command import (
-    Changes as Changes,
+    PlanChanges as PlanChanges,
     PlanOptions as PlanOptions,
     describe as describe,
     forecast_scene as forecast_scene,

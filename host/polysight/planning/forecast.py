@@ -1,10 +1,10 @@
 """Forecast of a scan from its rig file: time, data, point response, alias-free field, noise, and warnings.
 
 `scan_time` estimates the duration: rows with their ramps, turns, and the standstill between rows
-(docs/spec/stage-line.md, "A row"); motion has trapezoidal speed with constant acceleration. `imaging.field_limits`
-gives the distance from an object to its nearest ghost for a step size, and the mirror zone around flat plates.
-`forecast` returns all of it; `find_warnings` only the warnings, which include settings that stage, Pi or radars would
-refuse.
+(docs/spec/stage-line.md, "A row"); motion has trapezoidal speed with constant acceleration.
+`imaging.compute_field_limits` gives the distance from an object to its nearest ghost for a step size, and the mirror
+zone around flat plates. `forecast` returns all of it; `find_warnings` only the warnings, which include settings that
+stage, Pi or radars would refuse.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from polysight import imaging
 from polysight.capture import PACKET_TIME_US
-from polysight.process import why_unnamed
-from polysight.radar import constraints
+from polysight.process import explain_unnamed
+from polysight.radar import list_constraints
 from polysight.settings import DEFAULT
 from polysight.sync import PUBLISHED_STD
 from polysight_shared.config import CARD_TAIL_S, Instrument
@@ -59,7 +59,7 @@ class ScanTime:
     approach_s
         From the home corner to the start of the first row.
     measuring_s
-        At constant speed from each row's first point to its last.
+        Time at constant speed, from the first point of each row to its last.
     ramps_s
         Acceleration, deceleration, and the run-up of one step (or the backlash) on either side.
     turns_s
@@ -249,14 +249,14 @@ def forecast(
     """
     noise = noise or Noise()
     aperture, taper = describe_aperture(rig)
-    response = imaging.point_response(aperture, taper)
+    response = imaging.compute_point_response(aperture, taper)
     return Forecast(
         rig=rig,
         time=scan_time(rig, row_overhead_s),
         raw_bytes=rig.scan_bytes,
         burst=predict_burst(rig),
         response=response,
-        field=imaging.field_limits(rig),
+        field=imaging.compute_field_limits(rig),
         noise=predict_noise(rig, noise),
         noise_source=noise.source,
         warnings=(*find_warnings(rig, noise, scene_mm), *_check_resolution(rig, response)),
@@ -342,7 +342,7 @@ def find_warnings(rig: Instrument, noise: Noise, scene_mm: tuple[float, float] |
     if phase > published_rad:
         text = f"standard deviation of the direct path's phase {phase:.3f} rad (published rig after all stages:"
         warnings.append(_note("noise", f"{text} {published_rad}): use more pulses a position"))
-    if text := why_unnamed(DEFAULT, rig, will_be=True):
+    if text := explain_unnamed(DEFAULT, rig, will_be=True):
         warnings.append(_note("library", text))
     return tuple(sorted(warnings, key=lambda w: w.level != "error"))
 
@@ -422,9 +422,9 @@ def _check_card(rig: Instrument) -> Iterator[Finding]:
     """Yield findings about packets and data rate of the cards."""
     if fills_whole_packets(rig):
         neighbours = (rig.burst.pulses - 1, rig.burst.pulses + 1)
-        with_end_mark = [pulses for pulses in neighbours if pulses and not fills_whole_packets(rig, pulses)]
-        if with_end_mark:
-            remedy = f"{with_end_mark[0]} pulses a position have an end mark"
+        pulses_with_end_mark = [pulses for pulses in neighbours if pulses and not fills_whole_packets(rig, pulses)]
+        if pulses_with_end_mark:
+            remedy = f"{pulses_with_end_mark[0]} pulses a position have an end mark"
         else:
             remedy = f"no number of pulses has an end mark with {rig.grid.columns} points in a row"
         yield _note(
@@ -456,11 +456,11 @@ def _check_radar(rig: Instrument) -> Iterator[Finding]:
     offsets_known = native or any(board.start_offset_hz for board in rig.boards)
     # Another program that configures the radars may accept settings that this release would refuse.
     level = "error" if native else "note"
-    for constraint in constraints(rig, rig.grid.columns * rig.burst.pulses):
-        about_if = constraint.name.startswith("IF")
-        if constraint.holds or (about_if and not offsets_known):
+    for constraint in list_constraints(rig, rig.grid.columns * rig.burst.pulses):
+        is_about_if = constraint.name.startswith("IF")
+        if constraint.holds or (is_about_if and not offsets_known):
             continue
-        topic = "IF" if about_if else "radar"
+        topic = "IF" if is_about_if else "radar"
         yield Finding(level, f"{constraint}: {constraint.remedy}", where=topic)
     if not offsets_known:
         # Slope times 5 ns, a jitter chosen to show the order of magnitude.
@@ -475,21 +475,21 @@ def _check_radar(rig: Instrument) -> Iterator[Finding]:
 def _check_field(rig: Instrument, scene_mm: tuple[float, float], image_mm: tuple[float, float]) -> Iterator[Finding]:
     """Yield findings about ghosts by the step, and about the aperture that flat plates need; sizes are (x, y)."""
     grid = rig.grid
-    field = imaging.field_limits(rig)
+    field = imaging.compute_field_limits(rig)
     axes = (("x", grid.step_x_mm, grid.columns), ("y", grid.step_y_mm, grid.rows))
     for i, (axis, step, count) in enumerate(axes):
         scene = scene_mm[i]
-        free = field.alias_free_mm[i]
+        alias_free_mm = field.alias_free_mm[i]
         zone = field.mirror_zone_mm[i]
         size = (count - 1) * step
         # From an object at one edge of the scene to a pixel at the other edge of the image.
         need = (scene + image_mm[i]) / 2
-        if free < need:
+        if alias_free_mm < need:
             yield _note(
                 "aliasing",
-                f"in {axis}, steps of {step:g} mm make ghosts {free:.0f} mm from each object; a scene of {scene:.0f} mm"
-                f" in an image of {image_mm[i]:.0f} mm needs {need:.0f} mm: use steps of at most"
-                f" {step * free / need:.2g} mm, a smaller image, or `polysight process --sparse`",
+                f"in {axis}, steps of {step:g} mm make ghosts {alias_free_mm:.0f} mm from each object; a scene of"
+                f" {scene:.0f} mm in an image of {image_mm[i]:.0f} mm needs {need:.0f} mm: use steps of at most"
+                f" {step * alias_free_mm / need:.2g} mm, a smaller image, or `polysight process --sparse`",
             )
         if (good_mm := max(0.0, size - 2 * zone)) < scene:
             yield _note(

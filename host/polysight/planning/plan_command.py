@@ -1,8 +1,8 @@
 """`polysight plan`: print a forecast, or the best plans within a time, as text or JSON.
 
-`measure_noise` and `measure_row_overhead` take noise and standstill from a recorded scan (`--like`). `Changes` holds
-the values of a plan that differ from the rig file; `rig_lines` writes them as lines for a rig file. `propose` varies
-speed, steps and burst, and keeps the aperture.
+`measure_noise` and `measure_row_overhead` take noise and standstill from a recorded scan (`--like`). `PlanChanges`
+holds the values of a plan that differ from the rig file; `rig_lines` writes them as lines for a rig file. `propose`
+varies speed, steps and burst, and keeps the aperture.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.calibration import board_rows
+from polysight.calibration import read_board_rows
 from polysight.planning.forecast import (
     MAX_STEPS_PER_S,
     ROW_OVERHEAD_S,
@@ -71,7 +71,7 @@ _SIMULATED = "the simulated rig's (not measured on hardware; set it with --like 
 
 
 @dataclass(frozen=True)
-class Changes:
+class PlanChanges:
     """Values of a plan that replace those of the rig file; None keeps the rig file's value.
 
     A new step keeps the size of the aperture, rounded to whole steps, if neither a number of positions nor a size is
@@ -189,7 +189,7 @@ def _vary_steps(rig: Instrument) -> Iterator[Instrument]:
     """Yield the rig file with other steps."""
     for nx in _STEP_MULTIPLES:
         for ny in _STEP_MULTIPLES:
-            steps = Changes(step_x_mm=nx * rig.grid.step_x_mm, step_y_mm=ny * rig.grid.step_y_mm)
+            steps = PlanChanges(step_x_mm=nx * rig.grid.step_x_mm, step_y_mm=ny * rig.grid.step_y_mm)
             try:
                 yield steps.apply(rig)
             except ConfigError:
@@ -215,8 +215,8 @@ def _vary_bursts(rig: Instrument, minutes: float, row_overhead_s: float) -> Iter
             # The plan has two pulses for now: the largest number that fits does not depend on it.
             plan = _set_burst(rig, speed, 2, period)
             max_pulses = _find_max_pulses(plan)
-            with_short_last_packet = (n for n in range(max_pulses, 1, -1) if not fills_whole_packets(plan, n))
-            pulses = next(with_short_last_packet, max_pulses)
+            pulses_with_short_packet = (n for n in range(max_pulses, 1, -1) if not fills_whole_packets(plan, n))
+            pulses = next(pulses_with_short_packet, max_pulses)
             # A faster stage leaves time for still fewer pulses.
             if pulses < 2:
                 break
@@ -235,12 +235,12 @@ def _set_burst(rig: Instrument, speed_mm_s: float, pulses: int, period_us: float
 
 def _find_max_pulses(rig: Instrument) -> int:
     """Return the most pulses that a burst may have by time, by its travel, and by the radar's frames in a row."""
-    by_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
+    pulses_in_time = _MAX_DUTY * 1e6 * rig.grid.step_x_mm / rig.stage.speed_mm_s / rig.burst.period_us
     wavelengths_per_us = predict_burst(rig).travel_wavelengths / (1e6 * burst_duration_s(rig.burst))
     # The burst ends with the last chirp of its last frame.
     frame_us = (rig.burst.chirps - 1) * rig.burst.chirp_us
-    by_travel = 1 + (_MAX_TRAVEL_WAVELENGTHS / wavelengths_per_us - frame_us) / rig.burst.period_us
-    return min(int(by_time), int(by_travel), _MAX_FRAMES // rig.grid.columns)
+    pulses_in_travel = 1 + (_MAX_TRAVEL_WAVELENGTHS / wavelengths_per_us - frame_us) / rig.burst.period_us
+    return min(int(pulses_in_time), int(pulses_in_travel), _MAX_FRAMES // rig.grid.columns)
 
 
 def _list_speeds(rig: Instrument, minutes: float) -> Iterator[float]:
@@ -436,7 +436,7 @@ def measure_noise(source: RawSource) -> Noise:
     for board in rig.receivers:
         setup = BoardSetup.from_rig(rig, board)
         report = SyncReport(rig.chirp.sample_rate_hz, rig.chirp.linear_samples, rx)
-        for _, words, valid in board_rows(source, board.name, _NOISE_ROWS):
+        for _, words, valid in read_board_rows(source, board.name, _NOISE_ROWS):
             report.add(synchronise_row(words, valid, setup))
         ratios.append(report.snr)
     if not np.isfinite(ratios).all():
@@ -483,7 +483,7 @@ def measure_row_overhead(folder: Path) -> float | None:
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """Options of the command besides `Changes`.
+    """Options of the command besides `PlanChanges`.
 
     Attributes
     ----------
@@ -507,7 +507,7 @@ class PlanOptions:
 
 def forecast_scene(
     rig: Instrument,
-    changes: Changes,
+    changes: PlanChanges,
     scene: Path | None,
     noise: Noise | None = None,
     row_overhead_s: float = ROW_OVERHEAD_S,
@@ -535,7 +535,7 @@ def _check_plates(prediction: Forecast, plates: list[Plate]) -> Forecast:
     return replace(prediction, warnings=prediction.warnings + notes)
 
 
-def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
+def run_plan(config: Path, changes: PlanChanges, options: PlanOptions) -> int:
     """Print the forecast, or proposals if `minutes` is given; return 1 if the plan would be refused or none fits.
 
     Raises PolysightError if the rig file, a value or the scan of --like is invalid.
@@ -543,12 +543,12 @@ def run_plan(config: Path, changes: Changes, options: PlanOptions) -> int:
     original = load_instrument(config)
     noise, overhead = _choose_assumptions(options)
     if options.minutes is None:
-        f = forecast_scene(original, changes, options.scene, noise, overhead, options.scene_mm)
+        predicted = forecast_scene(original, changes, options.scene, noise, overhead, options.scene_mm)
         if options.as_json:
-            sys.stdout.write(json.dumps(forecast_values(f), indent=1) + "\n")
+            sys.stdout.write(json.dumps(forecast_values(predicted), indent=1) + "\n")
         else:
-            sys.stdout.write(describe(f))
-        return int(not f.possible)
+            sys.stdout.write(describe(predicted))
+        return int(not predicted.possible)
     rig, plates = _apply_scene(original, options.scene)
     proposals = propose(changes.apply(rig), options.minutes, options.count, noise, overhead, options.scene_mm)
     plans = [_check_plates(proposal, plates) for proposal in proposals]

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from polysight.imaging import field_limits, point_response
+from polysight.imaging import compute_field_limits, compute_point_response
 from polysight.materials import SegmentSettings
 from polysight.planning.forecast import Noise, describe_aperture, find_warnings
 from polysight.polarimetry import multilayer, specular_incidence_rad
@@ -105,7 +105,7 @@ def _decode_plate(raw: Mapping[str, Any], path: Path) -> Plate:
 def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]:
     """Yield a note for each gap, size, place or thickness that spoils the result of a plate."""
     aperture, taper = describe_aperture(rig)
-    cell_mm = point_response(aperture, taper).width_mm
+    cell_mm = compute_point_response(aperture, taper).width_mm
     for plate in plates:
         yield from _warn_of_size(plate, cell_mm)
         yield from _warn_of_aperture(plate, rig)
@@ -151,7 +151,7 @@ def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
 
 def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     """Warn of a plate that reaches beyond the area where this aperture images mirrors well."""
-    zone_mm = field_limits(rig).mirror_zone_mm
+    zone_mm = compute_field_limits(rig).mirror_zone_mm
     aperture_mm = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
     for axis in (0, 1):
         # A mirror needs this margin of aperture on every side: the first Fresnel zone around its specular point.

@@ -178,8 +178,8 @@ def smooth(image: npt.NDArray[Any], sigma_px: float) -> npt.NDArray[Any]:
     return smoothed.astype(image.dtype)
 
 
-# Of `plane_reference`: default width of the Gaussian window, and lowest level relative to the plate's 90th percentile
-# in each channel; chosen.
+# Parameters of `plane_reference`: default width of the Gaussian window, and lowest level relative to the plate's 90th
+# percentile in each channel; chosen.
 SMOOTH_MM = 8.0
 FLOOR_DB = -10.0
 # A smaller area of metal is not a plate that covers the plane; chosen.
@@ -244,11 +244,11 @@ class PlaneReference:
 
     def check_axes(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> None:
         """Raise DataError if a scan has other pixels."""
-        same = all(
+        is_same = all(
             np.shape(own_axis) == np.shape(other_axis) and np.allclose(own_axis, other_axis, rtol=0, atol=1e-5)
             for own_axis, other_axis in ((self.x_m, x_m), (self.y_m, y_m))
         )
-        if not same:
+        if not is_same:
             raise DataError(
                 "the images of the metal reference and of this scan have different pixels",
                 "the reference was scanned with another [image], another geometry or another chirp",
@@ -340,9 +340,9 @@ def plane_reference(images: Images, smooth_mm: float = SMOOTH_MM, name: str = ""
     level_db = []
     for power in (power_h, power_v):
         top = float(np.percentile(power[usable], 90)) if usable.any() else 0.0
-        least = float(np.finfo(np.float32).tiny)
-        level_db.append(10 * np.log10(np.maximum(power, least) / max(top, least)))
-        strong &= power >= max(top * 10 ** (FLOOR_DB / 10), least)
+        least_amplitude = float(np.finfo(np.float32).tiny)
+        level_db.append(10 * np.log10(np.maximum(power, least_amplitude) / max(top, least_amplitude)))
+        strong &= power >= max(top * 10 ** (FLOOR_DB / 10), least_amplitude)
     _check_is_alone(level_db[0][usable], level_db[1][usable])
     # The border of the image does not count as an edge of the plate.
     is_plate = np.asarray(scipy.ndimage.binary_erosion(strong, _make_disk(round(2 * smooth_px)), border_value=1), bool)
@@ -398,7 +398,7 @@ Wave = tuple[complex, complex]
 
 
 @dataclass(frozen=True)
-class Standard:
+class MetalStandard:
     """Measurement of a metal standard.
 
     Attributes
@@ -483,7 +483,7 @@ def common_direction(h: Image, v: Image, mask: Mask | None = None) -> Wave:
     return complex(pair[0]), complex(pair[1])
 
 
-def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
+def estimate_leakage(standards: Sequence[MetalStandard]) -> Leakage:
     """Estimate leakage of both boards and gain imbalance from three or more metal standards.
 
     Raises DataError if there are fewer than three, or their waves are too similar.
@@ -497,14 +497,22 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
         )
     # Both channels are scaled to the same size, so that the equations are well conditioned; the solution is scaled
     # back.
-    m = np.array([s.measured for s in standards], np.complex128)
-    scale = np.sqrt(np.mean(np.abs(m / np.linalg.norm(m, axis=1, keepdims=True)) ** 2, axis=0))
-    m = m / scale
-    m /= np.linalg.norm(m, axis=1, keepdims=True)
-    e = np.array([s.wave for s in standards], np.complex128)
-    e /= np.linalg.norm(e, axis=1, keepdims=True)
+    measured = np.array([s.measured for s in standards], np.complex128)
+    scale = np.sqrt(np.mean(np.abs(measured / np.linalg.norm(measured, axis=1, keepdims=True)) ** 2, axis=0))
+    measured = measured / scale
+    measured /= np.linalg.norm(measured, axis=1, keepdims=True)
+    waves = np.array([s.wave for s in standards], np.complex128)
+    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
     # m x (M e) = 0: one equation per standard for the entries g_h, g_h a, g_v b, g_v of M.
-    rows = np.stack([m[:, 1] * e[:, 0], m[:, 1] * e[:, 1], -m[:, 0] * e[:, 0], -m[:, 0] * e[:, 1]], axis=1)
+    rows = np.stack(
+        [
+            measured[:, 1] * waves[:, 0],
+            measured[:, 1] * waves[:, 1],
+            -measured[:, 0] * waves[:, 0],
+            -measured[:, 0] * waves[:, 1],
+        ],
+        axis=1,
+    )
     # The entries are determined up to one factor: the singular vector of the smallest, fourth singular value.
     _, sizes, vh = np.linalg.svd(rows)
     if sizes[2] < MIN_CONDITION * sizes[0]:
@@ -515,10 +523,12 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
             code=ErrorCode.VALUES_CONFLICT,
         )
     g_h, g_ha, g_vb, g_v = vh[3].conj() * np.array([scale[0], scale[0], scale[1], scale[1]])
-    # (H, V) by the estimate, [standard, 2], scaled as `m`.
-    predicted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ e.T).T
+    # (H, V) by the estimate, [standard, 2], scaled as `measured`.
+    predicted = (np.array([[g_h, g_ha], [g_vb, g_v]]) / scale[:, None] @ waves.T).T
     # Sine of the angle between the measured pair and that of the estimate, for each standard.
-    sine = np.abs(m[:, 1] * predicted[:, 0] - m[:, 0] * predicted[:, 1]) / np.linalg.norm(predicted, axis=1)
+    sine = np.abs(measured[:, 1] * predicted[:, 0] - measured[:, 0] * predicted[:, 1]) / np.linalg.norm(
+        predicted, axis=1
+    )
     if len(standards) > 3:
         residual = float(np.sqrt(np.mean(np.minimum(sine, 1.0) ** 2)))
     else:
@@ -526,7 +536,7 @@ def estimate_leakage(standards: Sequence[Standard]) -> Leakage:
     return Leakage(complex(g_ha / g_h), complex(g_vb / g_v), complex(g_h / g_v), residual)
 
 
-def estimate_axial_ratio(plate: Standard, strips: Standard) -> Leakage:
+def estimate_axial_ratio(plate: MetalStandard, strips: MetalStandard) -> Leakage:
     """Estimate equal leakage of both boards (the authors' axial ratio) from the plate and strips in one orientation.
 
     Raises DataError if the strips reflect s and p alike.
@@ -575,10 +585,10 @@ def leakage_from_images(
     """
     gain_h, gain_v = plate
     relative = [
-        Standard(common_direction(ratio(h, gain_h), ratio(v, gain_v), mask), strips_wave(psi, theta_rad))
+        MetalStandard(common_direction(ratio(h, gain_h), ratio(v, gain_v), mask), strips_wave(psi, theta_rad))
         for psi, h, v in strips
     ]
-    full_standard = Standard(PLATE, PLATE)
+    full_standard = MetalStandard(PLATE, PLATE)
     if len(relative) == 1:
         estimate = estimate_axial_ratio(full_standard, relative[0])
     else:

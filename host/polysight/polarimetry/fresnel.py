@@ -120,9 +120,9 @@ def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Compl
     """
     p, theta = np.broadcast_arrays(np.asarray(p, np.complex128), np.asarray(theta_rad, np.float64))
     # Use P or 1/P, whichever has modulus <= 1: no overflow near the Brewster angle.
-    big = np.abs(p) > 1
+    is_large = np.abs(p) > 1
     with np.errstate(invalid="ignore"):
-        small = np.where(np.isinf(p), 0.0, np.where(big, 1.0 / np.where(big, p, 1.0), p))
+        small = np.where(np.isinf(p), 0.0, np.where(is_large, 1.0 / np.where(is_large, p, 1.0), p))
         pole = small == 1
         u = (1 + small) / np.where(pole, 1.0, 1 - small)
         eps = np.sin(theta) ** 2 * (1 + np.tan(theta) ** 2 * u**2)
@@ -358,8 +358,8 @@ def incidence_choice(
     """
     pixel_rad = effective_incidence_map(rig, x_m, y_m)
     one_rad = np.full(pixel_rad.shape, specular_incidence_rad(rig))
-    of_planes = (incidence_on_planes(angle_rad, raised_m, rig) for angle_rad in (one_rad, pixel_rad))
-    return IncidenceChoice(choice, *of_planes)
+    angles_on_planes = (incidence_on_planes(angle_rad, raised_m, rig) for angle_rad in (one_rad, pixel_rad))
+    return IncidenceChoice(choice, *angles_on_planes)
 
 
 def incidence_on_planes(angle_rad: Real, raised_m: Real | None, rig: Instrument) -> Real:

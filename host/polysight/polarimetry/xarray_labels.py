@@ -108,7 +108,7 @@ def keep_labels(*results: str) -> Callable[[Function], Function]:
             if not any(isinstance(entry, xarray.DataArray) for entry in entries):
                 return function(*arguments, **named)
 
-            # xarray hands over all arrays in one row; they are put back where they were.
+            # xarray passes all arrays as one flat list; this puts them back into the arguments.
             def compute(*arrays: Any) -> Any:
                 remaining = iter(arrays)
                 filled = [_fill(value, remaining) for value in values]

@@ -29,7 +29,7 @@ from polysight.polarimetry import (
     plane_reference,
     specular_incidence_rad,
 )
-from polysight.process.inputs import Inputs, boxes_as_patches, load_classifier, why_unnamed
+from polysight.process.inputs import Inputs, convert_boxes_to_patches, explain_unnamed, load_classifier
 from polysight.process.judge import scene_reasons
 from polysight.process.save import Findings, assemble_result
 from polysight.products import IMAGE, SCAN, ProcessedScan
@@ -37,21 +37,21 @@ from polysight.results import GivenImages, IncidenceAngles, ScanFacts, ScanQuali
 from polysight.settings import Settings
 from polysight.store import open_npz, versions
 from polysight_shared.config import Instrument
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, make_missing_path_error
 from polysight_shared.files import read_json
 from polysight_shared.findings import Finding
 
 NPZ = ".npz"
 # Arrays of an .npz file: required, optional, and the error of P = H / V, which only image.npz of this program has.
-CHANNELS = ("h", "v")
+CHANNEL_ARRAYS = ("h", "v")
 AXES = ("x_m", "y_m")
-OPTIONAL = ("valid", "incidence_deg", "simulated", "conjugate", "raised_m")
-OWN_ERROR = "p_sigma"
+OPTIONAL_ARRAYS = ("valid", "incidence_deg", "simulated", "conjugate", "raised_m")
+ERROR_ARRAY = "p_sigma"
 # Images in a folder of the published data.
 SAR_FILES = ("sar_h.npy", "sar_v.npy")
 MIN_PIXELS = 8
 """Least rows and columns of an image: one more than the smallest patch has, 14 mm in seven pixels of 2 mm."""
-EVEN = 0.01
+MAX_UNEVENNESS = 0.01
 """Largest relative deviation of the distance of two pixels from the mean one, and of the pitch in y from that in x;
 chosen."""
 OTHER_SIGN = 0.3
@@ -66,7 +66,7 @@ LEAST_PHASE_RAD = 1e-4
 LEAST_PEAK = 1e-9
 MOST_PEAK = 1e9
 """Range of a channel's largest amplitude: squares, and their squares, stay within single precision."""
-_EXPECTED = (
+_EXPECTED_CONTENT = (
     "expected h, v complex [ny, nx]; optional x_m [nx], y_m [ny], valid and raised_m [ny, nx], incidence_deg,"
     " simulated, conjugate"
 )
@@ -123,7 +123,7 @@ class GivenPair:
             labels = hand_labels
         if labels is None:
             return None
-        return labels.in_mm(self.x_m, self.y_m)
+        return labels.convert_to_mm(self.x_m, self.y_m)
 
 
 def is_given_images(path: Path) -> bool:
@@ -141,7 +141,7 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     if path.is_dir():
         return _read_folder(path, rig)
     if not path.exists():
-        raise no_such(path)
+        raise make_missing_path_error(path)
     arrays = _read_arrays(path)
     _check_channels(path, arrays)
     assumed: list[str] = []
@@ -150,7 +150,7 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     x_m = _make_axis(path, arrays, "x_m", h.shape[1], rig, assumed)
     y_m = _make_axis(path, arrays, "y_m", h.shape[0], rig, assumed)
     _check_square(path, x_m, y_m)
-    unused = sorted(set(arrays) - {*CHANNELS, *AXES, *OPTIONAL, "p", OWN_ERROR})
+    unused = sorted(set(arrays) - {*CHANNEL_ARRAYS, *AXES, *OPTIONAL_ARRAYS, "p", ERROR_ARRAY})
     if unused:
         assumed.append(f"not used: {', '.join(unused)}")
     valid = _find_valid(path, arrays)
@@ -161,7 +161,7 @@ def read_given_images(path: Path, rig: Instrument) -> GivenPair:
     simulated = bool(_number(path, arrays, "simulated") or False) or _is_simulated_product(path)
     conjugate_flag = _number(path, arrays, "conjugate")
     # Only our own images hold the error of P.
-    is_sign_known = conjugate_flag is not None or OWN_ERROR in arrays
+    is_sign_known = conjugate_flag is not None or ERROR_ARRAY in arrays
     if conjugate_flag:
         images = conjugate(images)
     return GivenPair(
@@ -200,21 +200,21 @@ def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
             return {name: archive[name] for name in archive}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as e:
         raise DataError(
-            f"{path}: cannot be read as images: {e}", _EXPECTED, "write it with numpy.savez(path, h=h, v=v)",
+            f"{path}: cannot be read as images: {e}", _EXPECTED_CONTENT, "write it with numpy.savez(path, h=h, v=v)",
             code=ErrorCode.FILE_UNREADABLE,
         ) from None  # fmt: skip
 
 
 def _check_channels(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Raise DataError unless h and v are complex images of one shape."""
-    missing = [name for name in CHANNELS if name not in arrays]
+    missing = [name for name in CHANNEL_ARRAYS if name not in arrays]
     if missing:
         names = ", ".join(arrays) or "nothing"
         raise DataError(
-            f"{path}: no {' and no '.join(missing)}; it holds {names}", _EXPECTED,
+            f"{path}: no {' and no '.join(missing)}; it holds {names}", _EXPECTED_CONTENT,
             "save the s-polarised channel as h and the p-polarised one as v", code=ErrorCode.KEY_MISSING,
         )  # fmt: skip
-    for name in CHANNELS:
+    for name in CHANNEL_ARRAYS:
         array = arrays[name]
         if array.dtype.kind != "c":
             raise DataError(
@@ -265,7 +265,7 @@ def _make_axis(
     values = axis.astype(np.float64)
     steps = np.diff(values)
     pitch = float(steps.mean())
-    if not np.isfinite(values).all() or pitch == 0 or float(np.abs(steps - pitch).max()) > EVEN * abs(pitch):
+    if not np.isfinite(values).all() or pitch == 0 or float(np.abs(steps - pitch).max()) > MAX_UNEVENNESS * abs(pitch):
         raise DataError(
             f"{path}: {name} is not evenly spaced, or not finite", "pixels of one size are needed",
             "form the images on an even grid", code=ErrorCode.VALUE_INVALID,
@@ -277,7 +277,7 @@ def _check_square(path: Path, x_m: npt.NDArray[np.float64], y_m: npt.NDArray[np.
     """Raise DataError unless pixels are square and of 0.1 to 20 mm: other numbers are a mistaken unit."""
     dx = abs(x_m[1] - x_m[0]) * 1e3
     dy = abs(y_m[1] - y_m[0]) * 1e3
-    if not 0.1 <= dx <= 20 or abs(dx - dy) > EVEN * dx:
+    if not 0.1 <= dx <= 20 or abs(dx - dy) > MAX_UNEVENNESS * dx:
         raise DataError(
             f"{path}: pixels of {dx:.4g} x {dy:.4g} mm", "pixels must be square, of 0.1 to 20 mm; axes are in metres",
             "give x_m and y_m in metres, with one pitch", code=ErrorCode.VALUE_INVALID,
@@ -522,8 +522,8 @@ def turn_reasons(result: materials.MaterialsResult) -> list[Finding]:
     )]  # fmt: skip
 
 
-TOLD_PAINT = 0.2
-TOLD_SIGN = 0.02
+REPORTED_PAINT = 0.2
+REPORTED_SIGN = 0.02
 """Probability of paint and of the other sign from which on the verdict reports them; chosen."""
 
 
@@ -534,13 +534,13 @@ def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> l
     taken; `painted` is the probability that the metal reference is painted if the phases are as given: paint and the
     other sign both change the phase of all ratios.
     """
-    if other_sign < TOLD_SIGN and not conjugated:
+    if other_sign < REPORTED_SIGN and not conjugated:
         return []
     treatment = "as they are"
     if conjugated:
         treatment = "the other way round"
     cause = "with the wrong sign losses are wrong; the error bars hold both signs"
-    if conjugated and painted > TOLD_PAINT:
+    if conjugated and painted > REPORTED_PAINT:
         cause += "; or the sign is as given, and the metal reference is painted"
     return [reason(
         "care",
@@ -589,10 +589,10 @@ def analyse_given_images(
     classifier = load_classifier(settings, rig)
     images = replace(pair.images, illumination=describe_illumination(pair.images, rig))
     boxed = replace(inputs, labels=pair.boxes(inputs.labels))
-    scene = boxes_as_patches(settings, boxed, images.x_m, images.y_m)
+    scene = convert_boxes_to_patches(settings, boxed, images.x_m, images.y_m)
     plane = inputs.reference
     if plane is not None and scene.metal is None:
-        images = images.within(plane.valid_on(images.x_m, images.y_m))
+        images = images.limit_to_area(plane.valid_on(images.x_m, images.y_m))
         scene = replace(scene, metal=plane)
     # The specular angle, and the pixels' own: without a raster these are the same.
     everywhere = incidence_on_planes(np.full(images.h.shape, np.radians(angle.deg)), images.raised_m, rig)
@@ -635,5 +635,5 @@ def analyse_given_images(
         processed_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         versions=versions(),
     )
-    unnamed = why_unnamed(settings, rig)
+    unnamed = explain_unnamed(settings, rig)
     return assemble_result(pair.path.parent, facts, quality, findings, unnamed), findings, unnamed

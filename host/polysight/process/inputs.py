@@ -30,7 +30,7 @@ class Inputs:
 NO_INPUTS = Inputs()
 
 
-def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> KnownScene:
+def convert_boxes_to_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> KnownScene:
     """Return the boxes of the label file as patches of an image with axes `x_m`, `y_m`, and the metal in the scene.
 
     The metal is the given metal box; with a scan of a plate no metal in the scene is used; otherwise it is a box
@@ -50,7 +50,7 @@ def boxes_as_patches(settings: Settings, inputs: Inputs, x_m: npt.ArrayLike, y_m
     return KnownScene(patches, metal, names)
 
 
-def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> str:
+def explain_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> str:
     """Return the reason why nothing was named in scans of a rig, as sentences; "" if names are given.
 
     With `will_be` the sentences are about a scan that is processed later.
@@ -61,7 +61,7 @@ def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> s
     if settings.model == "none":
         return f"Nothing {verb} named: naming was left out (--model none)."
     path = library_path(settings)
-    # That of H; V's is nearly the same.
+    # The angle is that of H; the angle of V is nearly the same.
     angle = incidence_deg(rig, rig.receivers[0])
     known_angles = _load_library(path, _find_stamp(path)).angles_deg
     # Classifier refuses an empty library.
@@ -75,8 +75,8 @@ def why_unnamed(settings: Settings, rig: Instrument, will_be: bool = False) -> s
 
 
 def load_classifier(settings: Settings, rig: Instrument) -> Classifier | None:
-    """Return the classifier for scans of a rig; None without naming, see :func:`why_unnamed`. Raises DataError."""
-    if why_unnamed(settings, rig):
+    """Return the classifier for scans of a rig; None without naming, see :func:`explain_unnamed`. Raises DataError."""
+    if explain_unnamed(settings, rig):
         return None
     path = library_path(settings)
     return _fit_classifier(path, _find_stamp(path), settings.model, incidence_deg(rig, rig.receivers[0]))

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.imaging import PlaneEstimate
-from polysight.materials import NOT_PASSIVE, SMEAR, STRONGER_V, Classifier, MaterialsResult, find_copies
+from polysight.materials import NOT_PASSIVE, SMEAR, STRONGER_V_REASON, Classifier, MaterialsResult, find_copies
 from polysight.process.quality import Quality, RowFigures
 from polysight.results import (
     ErrorBudget,
@@ -31,9 +31,9 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     """Return reasons from recording and synchronisation: rows, frames, manifest, and the direct path of each board."""
     coverage = quality.coverage()
     # With RX in another order a direct path is lost, and positions are masked: that is no finding of its own.
-    in_order = [board for board in quality.boards.values() if not board.rx_order]
-    positions = sum(b.positions for b in in_order)
-    masked = sum(b.positions_masked for b in in_order)
+    boards_in_order = [board for board in quality.boards.values() if not board.rx_order]
+    positions = sum(b.positions for b in boards_in_order)
+    masked = sum(b.positions_masked for b in boards_in_order)
     missing: list[Finding] = []
     for name, board in quality.boards.items():
         if board.rx_order:
@@ -47,7 +47,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         missing += _report_disturbances(name, list(board.figures.values()))
         missing += rules.judge_dead_rx(name, board.dead_rx, len(board.rows))
         missing += rules.judge_phase_jumps(name, [(jump.row, jump.angle_rad) for jump in board.find_phase_jumps()])
-    share_masked = _divide(masked, positions, default=0.0 if len(in_order) < len(quality.boards) else 1.0)
+    share_masked = _divide(masked, positions, default=0.0 if len(boards_in_order) < len(quality.boards) else 1.0)
     recorded = rules.judge_recording(coverage, share_masked, is_filled=bool(quality.filled))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + rules.judge_reconstruction(filled)
@@ -159,7 +159,7 @@ def scene_reasons(
     reasons += rules.judge_passivity(no_half_spaces)
     # Many plates with more V than H: the channels may be exchanged.
     plates = len(result.patches) - len(no_plates) - (result.metal.label is not None)
-    reasons += rules.judge_exchange([k for k, v in no_half_spaces.items() if v.what == STRONGER_V], plates)
+    reasons += rules.judge_exchange([k for k, v in no_half_spaces.items() if v.what == STRONGER_V_REASON], plates)
     reasons += _judge_metal(result, refused)
     # Levels of metal relative to the direct path, boards, leakage, and the plane.
     light = result.calibrated.illumination
@@ -194,11 +194,11 @@ def _judge_metal(result: MaterialsResult, refused: Mapping[int, str]) -> list[Fi
     if result.patches and metal.evidence is not None:
         evidence = metal.evidence
         patch = "the given box" if metal.label is None else f"patch {metal.label}"
-        enough = evidence.enough and (metal.given or metal.label not in refused)
+        has_enough_evidence = evidence.enough and (metal.given or metal.label not in refused)
         reasons += rules.judge_metal(
             patch,
-            likely=enough,
-            certain=enough and evidence.sure,
+            is_likely=has_enough_evidence,
+            is_certain=has_enough_evidence and evidence.sure,
             is_given=metal.given,
             contradicted=evidence.against,
             only_patch=evidence.others == 0,
@@ -217,18 +217,20 @@ def _find_no_half_spaces(result: MaterialsResult) -> dict[int, Finding]:
         r.patch.label: r.refused
         for r in result.patches
         if r.refused is not None
-        and (r.refused.what == STRONGER_V or (r.refused.what in NOT_PASSIVE and r.permittivity.value is not None))
+        and (
+            r.refused.what == STRONGER_V_REASON or (r.refused.what in NOT_PASSIVE and r.permittivity.value is not None)
+        )
     }
 
 
 def _find_brightest(result: MaterialsResult) -> tuple[int, float]:
     """Return the number of the brightest patch but the metal, and its median |H| relative to metal, dB; 0, 0: none."""
     levels_db = {}
-    for r in result.patches:
-        h = np.abs(result.h[r.patch.interior])
+    for patch_result in result.patches:
+        h = np.abs(result.h[patch_result.patch.interior])
         levels = h[np.isfinite(h) & (h > 0)]
-        if levels.size and r.patch.label != result.metal.label:
-            levels_db[r.patch.label] = 20 * float(np.log10(np.median(levels)))
+        if levels.size and patch_result.patch.label != result.metal.label:
+            levels_db[patch_result.patch.label] = 20 * float(np.log10(np.median(levels)))
     brightest = max(levels_db, key=lambda label: levels_db[label], default=0)
     return brightest, levels_db.get(brightest, 0.0)
 
@@ -250,11 +252,11 @@ def _measure_median_level(gain: npt.NDArray[np.complexfloating] | complex | None
 def _estimate_leakage_error(result: MaterialsResult) -> float:
     """Return the median relative error of the permittivities due to leakage; 0 without permittivities."""
     parts = []
-    for r in result.patches:
-        e = r.permittivity
-        if e.value is not None and e.covariance is not None and e.shares:
-            share = e.shares.get("leakage", 0.0)
-            parts.append(float(np.sqrt(share * np.trace(e.covariance) / 2)) / abs(e.value))
+    for patch_result in result.patches:
+        estimate = patch_result.permittivity
+        if estimate.value is not None and estimate.covariance is not None and estimate.shares:
+            share = estimate.shares.get("leakage", 0.0)
+            parts.append(float(np.sqrt(share * np.trace(estimate.covariance) / 2)) / abs(estimate.value))
     if parts:
         return float(np.median(parts))
     return 0.0

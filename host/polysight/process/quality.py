@@ -28,7 +28,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from polysight.imaging import ImageBuilder, Images, imaging_facts
+from polysight.imaging import ImageBuilder, Images, describe_imaging
 from polysight.materials import MaterialsResult, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
 from polysight.results import (
@@ -58,33 +58,33 @@ from polysight_shared.raster import plan_raster
 # Nothing is calibrated.
 NO_FILES: Mapping[str, CalibrationSource] = {}
 # Least share of a board's rows that tell another order of the RX; chosen.
-OTHER_ORDER = 0.1
+OTHER_ORDER_SHARE = 0.1
 Count = Annotated[int, msgspec.Meta(ge=0)]
 
 # Rows on either side that an echo is predicted from, and positions on either side in each of them; chosen.
-_ROWS = (-2, -1, 1, 2)
-_POSITIONS = 1
+_PREDICTOR_ROWS = (-2, -1, 1, 2)
+_PREDICTOR_POSITIONS = 1
 # Rows on either side of a jump that the predictor is fitted to, and regularisation relative to its mean power; chosen.
 _FIT_ROWS = 6
 _RIDGE = 1e-3
 # Least jump that is told; chosen.
 _LEAST_RAD = np.radians(9)
-# How clear a jump has to be: its ratio to the error of the prediction, times how far that ratio stands out from the
+# Least clearness of a jump: its ratio to the error of the prediction, times how far that ratio stands out from the
 # third largest one (a jump's neighbours have a share of it). Of 136 boards in drawn scenes without a jump, two thirds
 # of them with rows 6 mm apart, which are predicted badly from their neighbours, the clearest reached 1.5. Of jumps of
 # 60 degrees 82 % reach 2, of 30 degrees 65 % (all simulated); with rows 2 mm apart those of 15 degrees reach 11.
 _LEAST_CLEAR = 2.0
 # The error of the prediction relative to the part that turns, above which a row tells nothing; chosen.
-_MOST_ERROR = 1.0
+_MAX_ERROR = 1.0
 # Least number of rows that tell something: the clearest is compared with the third. Scenes with rows 12 mm apart, where
 # a row is not predicted from its neighbours, have 3 to 5, and jumps of their own; others 8 and more.
-_LEAST_SOUND = 10
+_LEAST_ROWS = 10
 # Times that a jump is measured again with what was found turned back: until then the predictor was fitted across it.
-_AGAIN = 2
+_REPEATS = 2
 # Most jumps of a board that are looked for, one after another (a loose cable makes several); chosen.
 _MOST_JUMPS = 4
 # Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
-_AT_END = 3
+_END_ROWS = 3
 
 
 class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
@@ -236,7 +236,7 @@ class BoardRows:
     def rx_order(self) -> list[int]:
         """Place in the rig file of each recorded RX, counted from 1: the order that most rows with another order show.
 
-        Empty if fewer than `OTHER_ORDER` of all rows show it; rows without an echo cannot.
+        Empty if fewer than `OTHER_ORDER_SHARE` of all rows show it; rows without an echo cannot.
         """
         for row, quality in list(self.rows.items()):
             if row not in self._orders:
@@ -247,7 +247,7 @@ class BoardRows:
         if not orders:
             return []
         order, rows = orders.most_common(1)[0]
-        if rows < OTHER_ORDER * len(self.rows):
+        if rows < OTHER_ORDER_SHARE * len(self.rows):
             return []
         return list(order)
 
@@ -268,7 +268,7 @@ class BoardRows:
     def direct_snr_db(self) -> float | None:
         """Median SNR of the direct path in one sample of one chirp and channel, dB.
 
-        None if unknown (cubes that another program synchronised).
+        The value is None if it is unknown (cubes that another program synchronised).
         """
         values = _collect_finite_values([r.direct_snr for r in self.rows.values()])
         if values.size:
@@ -336,9 +336,9 @@ def _collect_residuals(rows: list[RowFigures]) -> dict[str, Residual]:
     """Return the RMS over rows of the residuals after each stage, weighted by valid positions."""
     residuals = {}
     for stage in dict.fromkeys(name for row in rows for name in row.residuals):
-        with_stage = [row for row in rows if stage in row.residuals]
-        weights = np.array([row.positions - row.positions_masked for row in with_stage], np.float64)
-        squares = np.array([row.residuals[stage] for row in with_stage], np.float64) ** 2
+        rows_with_stage = [row for row in rows if stage in row.residuals]
+        weights = np.array([row.positions - row.positions_masked for row in rows_with_stage], np.float64)
+        squares = np.array([row.residuals[stage] for row in rows_with_stage], np.float64) ** 2
         frequency, phase, amplitude = np.sqrt(weights @ squares / weights.sum()).tolist()
         residuals[stage] = Residual(frequency_std_hz=frequency, phase_std_rad=phase, amplitude_std=amplitude)
     return residuals
@@ -383,7 +383,7 @@ def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[P
     `rows`: number to echoes, complex [rx, position], positions from the smallest x. Numbers that are missing count as
     rows without echo. What was found is turned back before the next jump is looked for.
     """
-    if len(rows) < 2 * _AT_END:
+    if len(rows) < 2 * _END_ROWS:
         return ()
     first = min(rows)
     shape = next(iter(rows.values())).shape
@@ -404,10 +404,10 @@ def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[P
 def _find_clearest_jump(echoes: NDArray[np.complex128]) -> PhaseJump | None:
     """Find the clearest jump of echoes [row, rx, position]; None if no jump is clear."""
     angles, errors = _measure_jumps(echoes)
-    is_sound = errors < _MOST_ERROR
+    is_sound = errors < _MAX_ERROR
     ratio = np.zeros(len(angles))
     ratio[is_sound] = np.abs(angles[is_sound]) / errors[is_sound]
-    if np.count_nonzero(is_sound) < _LEAST_SOUND:
+    if np.count_nonzero(is_sound) < _LEAST_ROWS:
         return None
     row = int(np.argmax(ratio))
     third = float(np.sort(ratio[is_sound])[-3])
@@ -415,7 +415,7 @@ def _find_clearest_jump(echoes: NDArray[np.complex128]) -> PhaseJump | None:
     angle = float(angles[row])
     if not is_clear or abs(angle) < _LEAST_RAD:
         return None
-    for _ in range(_AGAIN):
+    for _ in range(_REPEATS):
         turned = echoes.copy()
         turned[row:] *= np.exp(-1j * angle)
         angle += float(_measure_jumps(turned)[0][row])
@@ -425,46 +425,48 @@ def _find_clearest_jump(echoes: NDArray[np.complex128]) -> PhaseJump | None:
 def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the jump before each row, radians, and the error of its prediction, [row]; the error is inf if unknown."""
     count, rx, positions = echoes.shape
-    padded = np.pad(echoes, ((0, 0), (0, 0), (_POSITIONS, _POSITIONS)))
-    taps = 2 * _POSITIONS + 1
+    padded = np.pad(echoes, ((0, 0), (0, 0), (_PREDICTOR_POSITIONS, _PREDICTOR_POSITIONS)))
+    taps = 2 * _PREDICTOR_POSITIONS + 1
     # [row, rx, position, tap]
     shifted = np.stack([padded[:, :, k : k + positions] for k in range(taps)], axis=-1)
     angles = np.zeros(count)
     errors = np.full(count, np.inf)
-    targets = range(-_ROWS[0], count - _ROWS[-1])
+    targets = range(-_PREDICTOR_ROWS[0], count - _PREDICTOR_ROWS[-1])
     # Neighbours [rx * position, tap] of each target by row, and the sums of least squares over each target's row.
-    neighbours = {k: [shifted[k + d].reshape(rx * positions, taps) for d in _ROWS] for k in targets}
+    neighbours = {k: [shifted[k + d].reshape(rx * positions, taps) for d in _PREDICTOR_ROWS] for k in targets}
     products = {}
     for k in targets:
         together = np.concatenate(neighbours[k], axis=1)
         products[k] = together.conj().T @ together, together.conj().T @ echoes[k].ravel()
-    for jump in range(_AT_END, count - _ROWS[-1]):
+    for jump in range(_END_ROWS, count - _PREDICTOR_ROWS[-1]):
         fitted = [k for k in range(jump - _FIT_ROWS, jump + _FIT_ROWS) if k in products]
         normal = np.sum([products[k][0] for k in fitted], axis=0)
         power = float(np.trace(normal).real) / len(normal)
         if power == 0:
             continue
         right = np.sum([products[k][1] for k in fitted], axis=0)
-        predictor = np.linalg.solve(normal + _RIDGE * power * np.eye(len(normal)), right).reshape(len(_ROWS), taps)
+        predictor = np.linalg.solve(normal + _RIDGE * power * np.eye(len(normal)), right).reshape(
+            len(_PREDICTOR_ROWS), taps
+        )
         turn = 0j
         turned_power = 0.0
         residual = 0.0
-        for k in range(jump + _ROWS[0], jump + _ROWS[-1]):
+        for k in range(jump + _PREDICTOR_ROWS[0], jump + _PREDICTOR_ROWS[-1]):
             if k not in products:
                 continue
             beyond = np.zeros(rx * positions, complex)
-            rest = echoes[k].ravel().copy()
-            for d, values, weights in zip(_ROWS, neighbours[k], predictor, strict=True):
+            unpredicted = echoes[k].ravel().copy()
+            for d, values, weights in zip(_PREDICTOR_ROWS, neighbours[k], predictor, strict=True):
                 is_beyond = (k + d >= jump) != (k >= jump)
                 if is_beyond:
                     beyond += values @ weights
                 else:
-                    rest -= values @ weights
+                    unpredicted -= values @ weights
             # Rows before the jump see it turned one way, rows behind it the other way.
-            product = np.vdot(beyond, rest)
+            product = np.vdot(beyond, unpredicted)
             turn += product.conjugate() if k < jump else product
             turned_power += float(np.vdot(beyond, beyond).real)
-            residual += float(np.vdot(rest - beyond, rest - beyond).real)
+            residual += float(np.vdot(unpredicted - beyond, unpredicted - beyond).real)
         if turned_power > 0:
             angles[jump] = float(np.angle(turn))
             left = max(residual - 2 * (abs(turn) - turn.real), 0.0)
@@ -551,30 +553,30 @@ class Quality:
             positions_absent=len(absent) * plan.columns,
         )
 
-    def note(self, **entries: Any) -> None:
+    def add_entries(self, **entries: Any) -> None:
         """Add entries to quality.json, as `ScanQuality` declares them."""
         self.notes |= entries
 
     def note_imaging(self, builder: ImageBuilder, images: Images) -> None:
         """Add the point response of the aperture to quality.json."""
         with self.measure_time("point response"):
-            self.note(imaging=imaging_facts(builder, images))
+            self.add_entries(imaging=describe_imaging(builder, images))
 
     def note_filled(self, filled: Mapping[str, ReconstructedPositions]) -> None:
         """Add the errors of reconstructed positions, by board, to quality.json and the verdict."""
         self.filled = filled
-        self.note(sparse=dict(filled))
+        self.add_entries(sparse=dict(filled))
 
-    def note_materials(
+    def add_materials(
         self, result: MaterialsResult, angles: IncidenceChoice, valid: NDArray[np.bool_], plane: PlaneReference | None
     ) -> None:
         """Add the effect of the incidence angle and the use of the metal plate to quality.json.
 
         `valid` as of :meth:`IncidenceChoice.facts`.
         """
-        self.note(incidence=msgspec.structs.replace(angles.facts(valid), **permittivity_change(result, angles)))
+        self.add_entries(incidence=msgspec.structs.replace(angles.facts(valid), **permittivity_change(result, angles)))
         if plane is not None:
-            self.note(metal_reference=plane.facts())
+            self.add_entries(metal_reference=plane.facts())
 
     @contextmanager
     def measure_time(self, stage: str) -> Iterator[None]:

@@ -61,13 +61,13 @@ from polysight_shared.config import Instrument
 from polysight_shared.errors import DataError, ErrorCode, quote
 from polysight_shared.files import read_json
 
-HEAD = "samples.json"
+HEAD_FILE = "samples.json"
 """File that describes the kept samples; `rows.jsonl` lists the rows, and each board has a file of records."""
 FORMAT = 1
 """Format of these files."""
-MAKING = 1
+METHOD_VERSION = 1
 """Version of the method that makes samples from raw data."""
-Use = Literal["none", "read", "keep"]
+SampleUse = Literal["none", "read", "keep"]
 """Use of kept samples, see `KeptSamples`."""
 Filters = Mapping[str, HighPass | None]
 """The receivers' high-pass filters by board name; None: as the chirp profile programs them."""
@@ -89,10 +89,10 @@ def list_settings_of_samples(rig: Instrument, filters: Filters) -> dict[str, Any
     # The window over the aperture acts on images, not on samples.
     imaged.pop("apodisation")
     parts = {name: msgspec.to_builtins(getattr(rig, name)) for name in ("chirp", "burst", "grid")}
-    return json.loads(json.dumps({"making": MAKING, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
+    return json.loads(json.dumps({"making": METHOD_VERSION, **imaged, **parts, "speed_mm_s": rig.stage.speed_mm_s}))
 
 
-def cores() -> int:
+def count_cores() -> int:
     """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
@@ -104,7 +104,7 @@ def map_rows(add: Callable[[int], object], rows: Sequence[int], threads: int | N
 
     There are at most `MAX_ROWS` threads. The first error is raised, and rows that were not started are cancelled.
     """
-    count = min(threads or cores(), MAX_ROWS, len(rows))
+    count = min(threads or count_cores(), MAX_ROWS, len(rows))
     if count <= 1:
         for row in rows:
             add(row)
@@ -125,7 +125,7 @@ def map_boards(names: Iterable[str], function: Callable[[str], Result], parallel
     names = list(names)
     count = 1
     if parallel:
-        count = min(cores(), len(names))
+        count = min(count_cores(), len(names))
     if count <= 1:
         return {name: function(name) for name in names}
     with ThreadPoolExecutor(count) as pool:
@@ -176,10 +176,11 @@ class KeptSamples:
         settings: Settings = DEFAULT,
         *,
         live: bool = False,
-        samples: Use = "none",
+        samples: SampleUse = "none",
     ) -> None:
         view = View(settings.depth_mm, settings.columns, settings.rows, settings.pixel_mm)
-        # Echoes of planes so much nearer and farther are kept: images of the rig's view move to the plates' plane.
+        # Echoes of planes that are nearer or farther by this distance are kept: images of the rig's view move to the
+        # plates' plane.
         depth_m = 0.0
         if view == AS_IN_RIG_FILE:
             depth_m = PLANE_REACH_M
@@ -213,21 +214,21 @@ class KeptSamples:
         # Rows without the sub-bands of those on disk are not added to them.
         self._keep &= not self._head or set(self._builders) == set(self._head["frequencies_hz"])
 
-    def _gate_m(self, rig: Instrument, needed: Gate, usual: Gate) -> Gate:
+    def _gate_m(self, rig: Instrument, needed_gate_m: Gate, usual_gate_m: Gate) -> Gate:
         """Return the gate of the samples on disk if it covers the needed one, else the needed one.
 
         Without samples on disk, or if they are damaged, the usual gate is taken instead of theirs. If the needed gate
         is returned, samples on disk are not used, and no rows are kept.
         """
-        gate_on_disk = tuple(self._head.get("gate_m", usual))
-        if self._head and not _has_frequencies(self._head, rig, gate_on_disk, usual):
+        gate_on_disk = tuple(self._head.get("gate_m", usual_gate_m))
+        if self._head and not _has_frequencies(self._head, rig, gate_on_disk, usual_gate_m):
             self._head = {}
-            gate_on_disk = usual
-        if gate_on_disk[0] <= needed[0] and needed[1] <= gate_on_disk[1]:
+            gate_on_disk = usual_gate_m
+        if gate_on_disk[0] <= needed_gate_m[0] and needed_gate_m[1] <= gate_on_disk[1]:
             return gate_on_disk
         self._head = {}
         self._keep = False
-        return needed
+        return needed_gate_m
 
     def processable(self, source: Source, folder: Path) -> list[int]:
         """Return the rows of a source that can be processed: those with raw data or whole samples; log the others.
@@ -237,8 +238,8 @@ class KeptSamples:
         rows = list(source.rows())
         unreadable: list[int] = []
         if isinstance(source, ScanFolder):
-            without_raw = dropped_rows(source)
-            unreadable = [row for row in rows if row in without_raw and not self.is_kept(row)]
+            rows_without_raw = dropped_rows(source)
+            unreadable = [row for row in rows if row in rows_without_raw and not self.is_kept(row)]
             if unreadable and len(unreadable) == len(rows):
                 require_raw(source)
         if unreadable:
@@ -280,7 +281,7 @@ class KeptSamples:
 
     def _read_records(self, row: int) -> dict[str, tuple[Any, RowFigures]] | None:
         """Return a row's record and figures by board; None if one of them is missing, damaged or outdated."""
-        line = self._line(row)
+        line = self._read_row_line(row)
         if line is None:
             return None
         records = {}
@@ -330,7 +331,7 @@ class KeptSamples:
             return None
         return {name: raw_digest(committed.boards[name]) for name in self._quality.boards}
 
-    def _line(self, row: int) -> dict[str, Any] | None:
+    def _read_row_line(self, row: int) -> dict[str, Any] | None:
         """Return the line of rows.jsonl for a row, if it was made from the committed raw data; else None."""
         digests = self._read_digests(row)
         if digests is None or not self._head:
@@ -354,7 +355,7 @@ class KeptSamples:
         if self._scan is None:
             return {}
         try:
-            head = read_json(self._folder / HEAD)
+            head = read_json(self._folder / HEAD_FILE)
         except (OSError, ValueError, DataError):
             return {}
         required = {"format": FORMAT, "scan_id": self._scan.scan_id, "made_with": self._made}
@@ -374,12 +375,12 @@ class KeptSamples:
         """Return a board's records, memory-mapped; None if the file does not fit samples.json."""
         if board not in self._arrays:
             records = open_records(self._folder / f"{board}.npy")
-            if records is None or records.dtype != self._type(board) or records.shape != (self._plan.rows,):
+            if records is None or records.dtype != self._make_record_type(board) or records.shape != (self._plan.rows,):
                 return None
             self._arrays[board] = records
         return self._arrays[board]
 
-    def _type(self, board: str) -> np.dtype[Any]:
+    def _make_record_type(self, board: str) -> np.dtype[Any]:
         """Return the structured type of one board's record of a row: reduced samples, echo, direct path, mask."""
         columns = self._plan.columns
         rx = len(self._builders["samples"].boards[board].aperture.antennas.rx_m)
@@ -391,7 +392,7 @@ class KeptSamples:
 
     def _record(self, board: str, row: int) -> tuple[NDArray[Any], RowFigures]:
         """Return the record of a row, and its quality figures for rows.jsonl."""
-        record = np.zeros((), self._type(board))
+        record = np.zeros((), self._make_record_type(board))
         # Quality is in order of recording, records in order of x.
         forward = slice(None, None, self._plan.row(row).direction)
         for name, builder in self._builders.items():
@@ -419,7 +420,7 @@ class KeptSamples:
         if scan is None:
             return None
         self._folder.mkdir(exist_ok=True)
-        for name in (HEAD, SAMPLE_ROWS, f"{HEAD}.part", *(f"{board}.npy" for board in self._quality.boards)):
+        for name in (HEAD_FILE, SAMPLE_ROWS, f"{HEAD_FILE}.part", *(f"{board}.npy" for board in self._quality.boards)):
             # A link could overwrite another file.
             check_inside(scan.path, f"{SAMPLES}/{name}", SAMPLES)
         rows = os.open(self._folder / SAMPLE_ROWS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
@@ -438,7 +439,7 @@ class KeptSamples:
 
     def _create(self, scan: ScanFolder, rows: int) -> None:
         """Create samples.json and empty records for all rows."""
-        (self._folder / HEAD).unlink(missing_ok=True)
+        (self._folder / HEAD_FILE).unlink(missing_ok=True)
         os.truncate(rows, 0)
         self._lines = {}
         self._read_bytes = 0
@@ -460,10 +461,12 @@ class KeptSamples:
         for board in self._quality.boards:
             # Programs that have the old file mapped keep it: it is not overwritten in place.
             (self._folder / f"{board}.npy").unlink(missing_ok=True)
-            np.lib.format.open_memmap(self._folder / f"{board}.npy", "w+", self._type(board), (self._plan.rows,))
-        part = self._folder / f"{HEAD}.part"
+            np.lib.format.open_memmap(
+                self._folder / f"{board}.npy", "w+", self._make_record_type(board), (self._plan.rows,)
+            )
+        part = self._folder / f"{HEAD_FILE}.part"
         part.write_text(json.dumps(self._head, indent=1) + "\n", encoding="utf-8")
-        part.replace(self._folder / HEAD)
+        part.replace(self._folder / HEAD_FILE)
 
 
 def _is_valid_head(head: Mapping[str, Any]) -> bool:

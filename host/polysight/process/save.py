@@ -13,7 +13,7 @@ from pathlib import Path
 from polysight import products
 from polysight.imaging import Images, PlaneEstimate
 from polysight.materials import (
-    PATCHES,
+    PATCHES_FILE,
     Classifier,
     MaterialsResult,
     TruthPlate,
@@ -201,7 +201,7 @@ def save_materials(out: Path, scan: products.ProcessedScan, result: MaterialsRes
     boxes = make_labels(result, f"patches of scan {scan.scan_id}, in pixels of image.npz")
     write_atomically(out / products.LABELS, pack_labels(boxes))
     # `stamped`: the scan is simulated, or it is not known.
-    write_atomically(out / PATCHES, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
+    write_atomically(out / PATCHES_FILE, pack_patches(result, scan.images.x_m, scan.images.y_m, scan.stamped))
     products.write_json(out / products.MATERIALS, scan.materials)
     write_report(out, scan)
     verdict = scan.verdict or Verdict("good")

@@ -1,13 +1,13 @@
 """Products of processed scans: write a folder of products, read it back, and export it.
 
 `ProcessedScan` is the result of one scan: images, patches, quality, verdict and provenance, read from a folder of
-products (`read_products`) or just computed. Reports, pages, exports and notebooks render it. `making_products` is a
+products (`read_products`) or just computed. Reports, pages, exports and notebooks render it. `replace_products` is a
 context manager: products are written to a temporary folder, which replaces the old one when all are complete.
 `image_dataset`, `patch_dataset` and `full_dataset` are xarray datasets; `export` writes NetCDF, MATLAB and CSV files.
 """
 
 from polysight.products.exports import (
-    PLANE as PLANE,
+    PLANE_DIMENSIONS as PLANE_DIMENSIONS,
     export as export,
     full_dataset as full_dataset,
     image_dataset as image_dataset,
@@ -25,8 +25,8 @@ from polysight.products.folder import (
     find_labels as find_labels,
     find_scan_folder as find_scan_folder,
     label_folder as label_folder,
-    making_products as making_products,
-    products_locked as products_locked,
+    lock_products as lock_products,
+    replace_products as replace_products,
 )
 from polysight.products.maps import (
     CHANNELS as CHANNELS,

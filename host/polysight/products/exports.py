@@ -43,7 +43,7 @@ CONVENTION = (
     " column 0 the smallest x; x_mm and y_mm from the image's centre, x_m and y_m in the rig frame; permittivity is"
     " real - j loss"
 )
-PLANE = ("y_mm", "x_mm")
+PLANE_DIMENSIONS = ("y_mm", "x_mm")
 """Dimensions of images in datasets."""
 # Attribute of a real variable that is one part of a complex one.
 _PART = "complex_part"
@@ -149,19 +149,19 @@ def image_dataset(scan: ProcessedScan) -> xarray.Dataset:
     images = scan.images
     unit = "reflection relative to metal" if scan.metal_referenced else "arbitrary units"
     data = {
-        "h": _describe(PLANE, images.h, "1", f"s-polarised channel, {unit}"),
-        "v": _describe(PLANE, images.v, "1", f"p-polarised channel, {unit}"),
-        "p": _describe(PLANE, images.p, "1", f"polarisation ratio H / V, {unit}"),
-        "valid": _describe(PLANE, images.valid, "1", "True where the scan illuminates the pixel"),
+        "h": _describe(PLANE_DIMENSIONS, images.h, "1", f"s-polarised channel, {unit}"),
+        "v": _describe(PLANE_DIMENSIONS, images.v, "1", f"p-polarised channel, {unit}"),
+        "p": _describe(PLANE_DIMENSIONS, images.p, "1", f"polarisation ratio H / V, {unit}"),
+        "valid": _describe(PLANE_DIMENSIONS, images.valid, "1", "True where the scan illuminates the pixel"),
     }
     if images.p_sigma is not None:
-        about = "standard deviation of p: root of the mean variance of its real and imaginary part"
-        data["p_sigma"] = _describe(PLANE, images.p_sigma, "1", about)
+        long_name = "standard deviation of p: root of the mean variance of its real and imaginary part"
+        data["p_sigma"] = _describe(PLANE_DIMENSIONS, images.p_sigma, "1", long_name)
     angle_rad = nominal_incidence_rad(scan)
     if np.isfinite(angle_rad).all():
         dims = ()
         if np.ndim(angle_rad):
-            dims = PLANE
+            dims = PLANE_DIMENSIONS
         data["incidence_deg"] = _describe(dims, np.degrees(angle_rad), "degree", "incidence angle")
         data["incidence_rad"] = _describe(dims, angle_rad, "rad", "incidence angle")
     return xarray.Dataset(data, _make_axes(scan), provenance(scan))
@@ -201,9 +201,13 @@ def patch_dataset(scan: ProcessedScan) -> xarray.Dataset:
 
     if scan.materials is None:
         raise _no_materials_error(scan)
-    data = {"label": _describe(PLANE, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")}
+    data = {
+        "label": _describe(PLANE_DIMENSIONS, scan.labels, "1", "number of the patch that holds the pixel, 0 for none")
+    }
     if scan.interior is not None:
-        data["interior"] = _describe(PLANE, scan.interior, "1", "True where the pixel is used for the patch's numbers")
+        data["interior"] = _describe(
+            PLANE_DIMENSIONS, scan.interior, "1", "True where the pixel is used for the patch's numbers"
+        )
     data |= _make_figure_variables(scan.segments) | _make_band_variables(scan.segments)
     naming = {"library": scan.materials.library, "model": scan.materials.model}
     attributes = provenance(scan) | {key: text for key, text in naming.items() if text}
@@ -237,10 +241,14 @@ def permittivity_dataset(scan: ProcessedScan) -> xarray.Dataset:
     pixels = map_permittivity(scan)
     mask = "True where the permittivity is possible and known to half of its size"
     data = {
-        "permittivity": _describe(PLANE, pixels.value, "1", "relative permittivity eps' - j eps'' as a half space"),
-        "permittivity_real_standard_error": _describe(PLANE, pixels.real_std, "1", "standard error of eps'"),
-        "permittivity_loss_standard_error": _describe(PLANE, pixels.loss_std, "1", "standard error of eps''"),
-        "mask": _describe(PLANE, pixels.mask, "1", mask),
+        "permittivity": _describe(
+            PLANE_DIMENSIONS, pixels.value, "1", "relative permittivity eps' - j eps'' as a half space"
+        ),
+        "permittivity_real_standard_error": _describe(PLANE_DIMENSIONS, pixels.real_std, "1", "standard error of eps'"),
+        "permittivity_loss_standard_error": _describe(
+            PLANE_DIMENSIONS, pixels.loss_std, "1", "standard error of eps''"
+        ),
+        "mask": _describe(PLANE_DIMENSIONS, pixels.mask, "1", mask),
     }
     return xarray.Dataset(data, _make_axes(scan), provenance(scan))
 
@@ -352,10 +360,10 @@ def split_complex(dataset: xarray.Dataset) -> xarray.Dataset:
         if variable.dtype.kind != "c":
             variables[str(name)] = variable
             continue
-        about = variable.attrs.get("long_name", str(name))
+        long_name = variable.attrs.get("long_name", str(name))
         for suffix, part in (("real", "real"), ("imag", "imaginary")):
             values = getattr(variable, suffix)
-            attrs = {**variable.attrs, "long_name": f"{about}, {part} part", _PART: suffix}
+            attrs = {**variable.attrs, "long_name": f"{long_name}, {part} part", _PART: suffix}
             variables[f"{name}_{suffix}"] = values.copy().assign_attrs(attrs)
     return dataset.drop_vars(list(dataset.data_vars)).assign(variables)
 
@@ -572,13 +580,15 @@ def _convert_struct(node: Any) -> Any:
     Keys without a value (None) are left out. A dict without keys becomes an empty matrix.
     """
     if isinstance(node, dict):
-        return {_make_matlab_name(k): _convert_struct(v) for k, v in node.items() if v is not None} or np.zeros((0, 0))
+        return {
+            _make_matlab_name(k): _convert_struct(value) for k, value in node.items() if value is not None
+        } or np.zeros((0, 0))
     if isinstance(node, list | tuple):
-        if node and all(isinstance(v, int | float) and not isinstance(v, bool) for v in node):
+        if node and all(isinstance(value, int | float) and not isinstance(value, bool) for value in node):
             return np.array(node, np.float64)[None, :]
         cells = np.empty((1, len(node)), dtype=object)
-        for i, v in enumerate(node):
-            cells[0, i] = _convert_struct(v)
+        for i, value in enumerate(node):
+            cells[0, i] = _convert_struct(value)
         return cells
     if isinstance(node, int) and not isinstance(node, bool):
         return float(node)

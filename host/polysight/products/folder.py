@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from polysight.materials import PATCHES, Labels, read_labels
+from polysight.materials import PATCHES_FILE, Labels, read_labels
 from polysight.products.processed import (
     FINISHED,
     IMAGE,
@@ -40,12 +40,12 @@ from polysight_shared.files import require_writable_folder, sync_folder, write_a
 LABELS_PICTURE = "labels.png"
 SURFACES = (SURFACE, POINTS, "surface.png")
 # Files and folders that a folder of products may hold; anything else is not ours and is never replaced.
-PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES, LABELS, LABELS_PICTURE, REPORT, "figures", *SURFACES)
+PRODUCTS = (IMAGE, SCAN, QUALITY, MATERIALS, PATCHES_FILE, LABELS, LABELS_PICTURE, REPORT, "figures", *SURFACES)
 # Mark of a label file drawn by hand, which can be found in a damaged file, too.
-_BY_HAND = b'"by_hand": true'
+_BY_HAND_MARK = b'"by_hand": true'
 # AT_FDCWD and RENAME_EXCHANGE of renameat2(2): paths start at the current folder, and the two are swapped.
-_HERE = -100
-_EXCHANGE = 2
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
 # Time between two attempts to lock a folder that another program has locked, seconds; chosen.
 _TRY_AGAIN_S = 0.5
 
@@ -97,21 +97,21 @@ def check_products_folder(out: Path, scan_id: str) -> None:
     """
     try:
         require_writable_folder(out.resolve().parent)
-        foreign = sorted(p.name for p in out.iterdir() if not (_is_product(p.name) or p.name.startswith(".")))
+        foreign_files = sorted(p.name for p in out.iterdir() if not (_is_product(p.name) or p.name.startswith(".")))
     except FileNotFoundError:
         return
     except OSError as e:
         raise _no_folder_error(out, e) from None
-    if foreign:
+    if foreign_files:
         raise ConfigError(
-            f"{out} is not empty: it contains {foreign[0]}",
+            f"{out} is not empty: it contains {foreign_files[0]}",
             "products need a folder of their own",
             "give another --out",
             code=ErrorCode.FILE_EXISTS,
         )
-    place = out.resolve()
-    if Path.cwd().is_relative_to(place) or place.is_mount():
-        kind = "a mount point" if place.is_mount() else "the current folder"
+    target = out.resolve()
+    if Path.cwd().is_relative_to(target) or target.is_mount():
+        kind = "a mount point" if target.is_mount() else "the current folder"
         raise ConfigError(
             f"{out} is {kind}",
             "products replace their whole folder",
@@ -129,7 +129,7 @@ def check_products_folder(out: Path, scan_id: str) -> None:
 
 
 @contextmanager
-def making_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Path]:
+def replace_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Path]:
     """Yield a new folder for products; it replaces `out` if the block ends without an error.
 
     After an error `out` is unchanged. Hidden files of other programs, and boxes drawn by hand for this scan, are kept.
@@ -144,12 +144,12 @@ def making_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Pat
         if the new folder cannot replace `out`; the error names the new folder, which is kept.
     """
     # If the folder is a link, its target is replaced.
-    place = out.resolve()
-    new = place.with_name(f".{place.name}.new")
-    old = place.with_name(f".{place.name}.old")
-    if old.exists() and not place.exists():
+    target = out.resolve()
+    new = target.with_name(f".{target.name}.new")
+    old = target.with_name(f".{target.name}.old")
+    if old.exists() and not target.exists():
         # A program was killed between the first two renames of `_replace`.
-        old.rename(place)
+        old.rename(target)
     # It may also have been killed after them.
     shutil.rmtree(old, ignore_errors=True)
     check_products_folder(out, scan_id)
@@ -157,10 +157,10 @@ def making_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Pat
     keep = False
     try:
         yield new
-        for name, content in _read_hand_labels(place, scan_id).items():
+        for name, content in _read_hand_labels(target, scan_id).items():
             write_atomically(new / name, content)
         try:
-            _replace(new, place, old)
+            _replace(new, target, old)
         except OSError as e:
             keep = True
             raise DeviceError(
@@ -175,10 +175,10 @@ def making_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Pat
 
 
 @contextmanager
-def products_locked(out: Path) -> Iterator[None]:
-    """Keep other programs from replacing the products in `out`. Raises ConfigError as :func:`making_products`."""
-    place = out.resolve()
-    new = place.with_name(f".{place.name}.new")
+def lock_products(out: Path) -> Iterator[None]:
+    """Keep other programs from replacing the products in `out`. Raises ConfigError as :func:`replace_products`."""
+    target = out.resolve()
+    new = target.with_name(f".{target.name}.new")
     lock = _lock(out, new)
     try:
         yield
@@ -240,26 +240,26 @@ def _create_locked(new: Path) -> FolderLock:
     return lock
 
 
-def _replace(new: Path, place: Path, old: Path) -> None:
-    """Put the folder `new` in the place of `place`, then move files of other programs from the old folder to it.
+def _replace(new: Path, target: Path, old: Path) -> None:
+    """Put the folder `new` in the place of `target`, then move files of other programs from the old folder to it.
 
     Where both cannot be swapped in one step, `old` is the name of the old folder for a moment. The old products end up
     in the folder `new`.
     """
     sync_folder(new)
-    if not place.exists():
-        new.rename(place)
-        sync_folder(place.parent)
+    if not target.exists():
+        new.rename(target)
+        sync_folder(target.parent)
         return
-    if not _exchange(new, place):
-        place.rename(old)
-        new.rename(place)
+    if not _exchange(new, target):
+        target.rename(old)
+        new.rename(target)
         old.rename(new)
-    sync_folder(place.parent)
+    sync_folder(target.parent)
     for entry in new.iterdir():
         # `write_atomically` left files `.part` if it was killed.
         if not _is_product(entry.name) and not entry.name.endswith(".part"):
-            entry.rename(place / entry.name)
+            entry.rename(target / entry.name)
 
 
 def _exchange(a: Path, b: Path) -> bool:
@@ -272,7 +272,7 @@ def _exchange(a: Path, b: Path) -> bool:
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if renameat2 is None:
         return False
-    if renameat2(_HERE, os.fsencode(a), _HERE, os.fsencode(b), _EXCHANGE) == 0:
+    if renameat2(_AT_FDCWD, os.fsencode(a), _AT_FDCWD, os.fsencode(b), _RENAME_EXCHANGE) == 0:
         return True
     code = ctypes.get_errno()
     if code in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
@@ -338,4 +338,4 @@ def _is_by_hand(path: Path) -> bool:
     try:
         return read_labels(path).by_hand
     except DataError:
-        return _BY_HAND in path.read_bytes()
+        return _BY_HAND_MARK in path.read_bytes()

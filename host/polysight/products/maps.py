@@ -19,7 +19,7 @@ import numpy.typing as npt
 from msgspec import UnsetType
 
 from polysight.imaging import Images
-from polysight.materials import incidence_std_rad, permittivity_slope
+from polysight.materials import find_permittivity_slope, incidence_std_rad
 from polysight.polarimetry import (
     correct_leakage,
     fresnel,
@@ -37,7 +37,7 @@ Mask = npt.NDArray[np.bool_]
 # Lower and upper end.
 Limits = tuple[float, float]
 
-# What maps show: a channel and a quantity of it.
+# A map shows one quantity of one channel.
 CHANNELS = ("h", "v", "p")
 QUANTITIES = ("amplitude", "phase")
 # Amplitudes are shown down to this far below the upper end of their colours; chosen.
@@ -209,15 +209,15 @@ def map_permittivity(scan: ProcessedScan) -> PermittivityMap:
         inverse, least_real_std, least_loss_std = _match_patches(scan, inverse, angle_rad)
         value = permittivity_from_ratio(1 / inverse, angle_rad)
         value = np.where(np.isfinite(value), value, complex(np.nan, np.nan))
-        by_ratio = np.abs(permittivity_slope(inverse, angle_rad))
-        by_angle = (permittivity_from_ratio(1 / inverse, angle_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
+        slope_of_ratio = np.abs(find_permittivity_slope(inverse, angle_rad))
+        slope_of_angle = (permittivity_from_ratio(1 / inverse, angle_rad + _ANGLE_STEP_RAD) - value) / _ANGLE_STEP_RAD
         inverse_std = np.full(value.shape, np.nan)
         if scan.images.p_sigma is not None:
             # d (1 / P) = -dP / P^2.
             inverse_std = scan.images.p_sigma.astype(np.float64) * np.abs(measured) ** 2
         angle_std_rad = incidence_std_rad(scan.materials)
-        real_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.real * angle_std_rad), least_real_std)
-        loss_std = np.fmax(np.hypot(by_ratio * inverse_std, by_angle.imag * angle_std_rad), least_loss_std)
+        real_std = np.fmax(np.hypot(slope_of_ratio * inverse_std, slope_of_angle.real * angle_std_rad), least_real_std)
+        loss_std = np.fmax(np.hypot(slope_of_ratio * inverse_std, slope_of_angle.imag * angle_std_rad), least_loss_std)
         return PermittivityMap(value, real_std, loss_std, _is_known_half_space(value, real_std, loss_std))
 
 
@@ -280,9 +280,9 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
         value = patch.permittivity_value
         if value is None:
             continue
-        of_patch = scan.labels == patch.label
-        pixels = of_patch & np.isfinite(inverse)
-        # Of patches with a known interior, that alone: pixels at the edges hold the neighbours, too.
+        is_of_patch = scan.labels == patch.label
+        pixels = is_of_patch & np.isfinite(inverse)
+        # Only the known interiors of patches count: pixels at the edges contain echoes of the neighbours, too.
         if scan.interior is not None:
             pixels &= scan.interior
         if not pixels.any():
@@ -290,9 +290,9 @@ def _match_patches(scan: ProcessedScan, inverse: Complex, angle_rad: Real) -> tu
         patch_angle = float(np.broadcast_to(angle_rad, inverse.shape)[pixels].mean())
         r_s, r_p = fresnel(value, patch_angle)
         median = complex(np.median(inverse[pixels].real), np.median(inverse[pixels].imag))
-        matched[of_patch] += complex(r_p / r_s) - median
-        real_std[of_patch] = np.nan if patch.permittivity_real_std is None else patch.permittivity_real_std
-        loss_std[of_patch] = np.nan if patch.permittivity_loss_std is None else patch.permittivity_loss_std
+        matched[is_of_patch] += complex(r_p / r_s) - median
+        real_std[is_of_patch] = np.nan if patch.permittivity_real_std is None else patch.permittivity_real_std
+        loss_std[is_of_patch] = np.nan if patch.permittivity_loss_std is None else patch.permittivity_loss_std
     return matched, real_std, loss_std
 
 

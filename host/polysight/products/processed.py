@@ -22,7 +22,7 @@ from msgspec import UNSET
 
 from polysight.imaging import Image, Images
 from polysight.materials import (
-    PATCHES,
+    PATCHES_FILE,
     UNKNOWN,
     MaterialsResult,
     ScanPatches,
@@ -42,11 +42,11 @@ from polysight.results import (
     ScanQuality,
     Verdict,
     damage_error,
-    json_text,
+    encode_json,
 )
 from polysight.store import open_npz
 from polysight_shared.config import Instrument
-from polysight_shared.errors import ConfigError, DataError, ErrorCode, no_such
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, make_missing_path_error
 from polysight_shared.files import write_atomically
 from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode
@@ -110,11 +110,11 @@ def write_image(path: Path, images: Images, simulated: bool = False) -> None:
             code=ErrorCode.MISMATCH,
         ) from None  # fmt: skip
     buffer = io.BytesIO()
-    stored: dict[str, Any] = {name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()}
+    arrays_to_store: dict[str, Any] = {name: np.asarray(array, _ARRAYS[name]) for name, array in arrays.items()}
     if simulated:
-        # Else images that are taken from here as given ones would be processed as measured ones.
-        stored["simulated"] = np.bool_(True)
-    np.savez_compressed(buffer, **stored)
+        # Without this mark, images that are taken from this file as given ones would count as measured.
+        arrays_to_store["simulated"] = np.bool_(True)
+    np.savez_compressed(buffer, **arrays_to_store)
     write_atomically(path, buffer.getvalue())
 
 
@@ -151,13 +151,13 @@ def _check_image(arrays: dict[str, npt.NDArray]) -> None:
 
 def write_json(path: Path, content: Any) -> None:
     """Write a value as a JSON file, see :func:`polysight.results.to_plain`."""
-    write_atomically(path, json_text(content).encode("utf-8"))
+    write_atomically(path, encode_json(content).encode("utf-8"))
 
 
 def rx_gains(images: Images) -> dict[str, list[RxGain]]:
     """Return gain and phase of each RX relative to its board's first, by board, as divided out of the images.
 
-    None for a dead RX; the first one with a signal replaces a dead first one.
+    The value is None for a dead RX. If the first RX is dead, the first one with a signal replaces it.
     """
     gains = {}
     for board, values in images.rx_gains.items():
@@ -190,7 +190,7 @@ class Rows:
         return tuple(sorted(set(self.indices) - set(self.committed)))
 
 
-class Computed(TypedDict, total=False):
+class ComputedContent(TypedDict, total=False):
     """Content of a result that was just computed, see the properties of :class:`ProcessedScan`."""
 
     images: Required[Images]
@@ -221,7 +221,7 @@ class ProcessedScan:
     folder: Path
 
     @classmethod
-    def from_results(cls, folder: Path, **content: Unpack[Computed]) -> Self:
+    def from_results(cls, folder: Path, **content: Unpack[ComputedContent]) -> Self:
         """Return a result that was just computed; `folder` is where its data were read.
 
         What is not given in `content` has the value of a scan of which only images were made, or is read from the
@@ -303,7 +303,7 @@ class ProcessedScan:
     @cached_property
     def patches(self) -> ScanPatches:
         """Pixels of the patches, from patches.npz. Raises DataError without the file."""
-        return read_patches(self.folder / PATCHES)
+        return read_patches(self.folder / PATCHES_FILE)
 
     @cached_property
     def analysis(self) -> MaterialsResult | None:
@@ -343,8 +343,8 @@ class ProcessedScan:
         non_metal_patches = [patch for patch in self.segments if not patch.metal_reference]
         judged = [(patch.name, patch.truth) for patch in non_metal_patches if patch.truth and patch.truth.permittivity]
         right = sum(name == truth.name for name, truth in judged)
-        strange = sum(name == UNKNOWN and not truth.in_library for name, truth in judged)
-        return PlatesNamed(right, plates - strange, strange)
+        unknown_strangers = sum(name == UNKNOWN and not truth.in_library for name, truth in judged)
+        return PlatesNamed(right, plates - unknown_strangers, unknown_strangers)
 
     @property
     def segments(self) -> list[PatchFigures]:
@@ -406,10 +406,10 @@ class ProcessedScan:
         if self.rig is None or not recorded or len(indices) < len(recorded):
             return None
         if self.by_columns:
-            planned = self.rig.grid.columns
+            planned_columns = self.rig.grid.columns
         else:
-            planned = self.rig.grid.rows
-        return Rows(planned, tuple(sorted(set.intersection(*indices))))
+            planned_columns = self.rig.grid.rows
+        return Rows(planned_columns, tuple(sorted(set.intersection(*indices))))
 
     @property
     def by_columns(self) -> bool:
@@ -434,10 +434,10 @@ class ProcessedScan:
         points = np.stack(np.meshgrid(axis_mm(x_m), axis_mm(y_m)), axis=-1).reshape(-1, 2)
         for patch in self.segments:
             if patch.outline_mm:
-                inside = skimage.measure.points_in_poly(points, patch.outline_mm).reshape(labels.shape)
+                is_inside = skimage.measure.points_in_poly(points, patch.outline_mm).reshape(labels.shape)
             else:
-                inside = box_mask(patch.box_mm, x_m, y_m)
-            labels[inside] = patch.label
+                is_inside = box_mask(patch.box_mm, x_m, y_m)
+            labels[is_inside] = patch.label
         if self._has_pixels:
             for pixels in self.patches.patches:
                 labels[self._find_pixels(pixels.places_mm)] = pixels.label
@@ -460,7 +460,7 @@ class ProcessedScan:
     @property
     def _has_pixels(self) -> bool:
         """True if the products hold the pixels of the patches (patches.npz)."""
-        return self.materials is not None and (self.folder / PATCHES).exists()
+        return self.materials is not None and (self.folder / PATCHES_FILE).exists()
 
     def _find_pixels(self, places_mm: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
         """Return rows and columns of the pixels at places x, y [n, 2]."""
@@ -475,9 +475,9 @@ def _find_nearest(axis: npt.NDArray[np.float64], places: npt.NDArray[np.float64]
 
 def find_products(folder: Path, needs: str = IMAGE) -> ProcessedScan | None:
     """Find products in a folder, or in `products` of a scan folder; None if the file `needs` is in neither."""
-    for place in (folder, folder / _PRODUCTS):
-        if (place / needs).exists():
-            return ProcessedScan(place)
+    for candidate in (folder, folder / _PRODUCTS):
+        if (candidate / needs).exists():
+            return ProcessedScan(candidate)
     return None
 
 
@@ -486,7 +486,7 @@ def read_products(folder: Path, needs: str = IMAGE) -> ProcessedScan:
     if products := find_products(folder, needs):
         return products
     if not folder.exists():
-        raise no_such(folder)
+        raise make_missing_path_error(folder)
     cause = "the folder is wrong, the scan was not processed, or only to images"
     remedy = "give a folder that polysight process wrote"
     if needs == IMAGE:

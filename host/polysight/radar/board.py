@@ -38,10 +38,10 @@ _MAX_EVENTS = 1000
 # Temperature sensors in the order of the device's answer.
 _SENSORS = ("rx1", "rx2", "rx3", "rx4", "tx1", "tx2", "tx3", "pm", "digital")
 # Remedies for missing firmware and for a board that does not start.
-_FIRMWARE = (
+_FIRMWARE_REMEDY = (
     "set radar.firmware to TI's image, or write it once: `polysight radar firmware` (docs/how-to/radar-bring-up.md)"
 )
-_JUMPERS = "SOP0 set, SOP1 and SOP2 open; see docs/how-to/radar-bring-up.md"
+_JUMPERS_REMEDY = "SOP0 set, SOP1 and SOP2 open; see docs/how-to/radar-bring-up.md"
 
 
 class State(Enum):
@@ -58,7 +58,7 @@ class State(Enum):
 
 
 class BoardFacts(msgspec.Struct, omit_defaults=True):
-    """What a board reported about itself since its last bring-up began; the keys of its entry in the manifest.
+    """Reports of a board on its own state since its last bring-up began: the keys of its entry in the manifest.
 
     `boot` and `calibration` are values of events (`messages.Event`), `rf_tests_passed` bits of event 0x5001; `hardware`
     and firmware are versions. Temperatures are by sensor, read at `device_ms` of the device's own clock.
@@ -97,7 +97,8 @@ class BringUp:
         self._link = board.link
         # Reported errors that are ignored, because healthy boards report them, too.
         self._ignored: list[str] = []
-        # What the last boot status calls for: "firmware" (none in the flash), "hardware" (replace the board), or "".
+        # Remedy for the last boot status: "firmware" (the flash has none), "hardware" (replace the board), or "" for
+        # none.
         self._cure = ""
         # The main core's patch before anything was downloaded.
         self._flash_patch = ""
@@ -110,14 +111,14 @@ class BringUp:
         """Return the steps in order: both cores run, the RF core is calibrated, chirp and data path are configured."""
         program = self._board.program
         waits = "the main core's power-up event within a second"
-        in_place = "the image is in RAM, or already in the flash"
+        image_in_place = "the image is in RAM, or already in the flash"
         basic = f"{len(program.basic)} acknowledgements"
         calibrated = "every calibration that the board needs passed"
         waveform = f"{len(program.waveform)} acknowledgements"
         exchange = "exchange the boards, or correct die_id"
         return [
-            Step("reset", waits, f"power, reset, {_JUMPERS}", self._reset, State.OFF),
-            Step("firmware", in_place, _FIRMWARE, self._load_firmware, State.OFF),
+            Step("reset", waits, f"power, reset, {_JUMPERS_REMEDY}", self._reset, State.OFF),
+            Step("firmware", image_in_place, _FIRMWARE_REMEDY, self._load_firmware, State.OFF),
             Step(
                 "RF power-up",
                 "the RF core's power-up event",
@@ -125,7 +126,7 @@ class BringUp:
                 self._power_up_rf,
                 State.POWERED,
             ),
-            Step("versions", "both cores with a patch", _FIRMWARE, self._check_versions, State.POWERED),
+            Step("versions", "both cores with a patch", _FIRMWARE_REMEDY, self._check_versions, State.POWERED),
             Step("settings", basic, "compare with `plan`", partial(self._send, program.basic), State.POWERED),
             Step("RF init", calibrated, "clock, RF supplies; power-cycle it", self._calibrate_rf, State.RF_READY),
             Step("chirp", waveform, "compare with `plan`", partial(self._send, program.waveform), State.RF_READY),
@@ -176,7 +177,7 @@ class BringUp:
         except NotReportedError as error:
             raise NotReportedError(
                 error.what,
-                f"no power on the radar board, jumpers not in functional mode ({_JUMPERS}), or {error.why}",
+                f"no power on the radar board, jumpers not in functional mode ({_JUMPERS_REMEDY}), or {error.why}",
                 f"check the 5 V supply of the radar board, the jumpers, then the reset; {error.remedy}",
                 code=error.code,
             ) from None
@@ -255,7 +256,7 @@ class BringUp:
         require_rom(self._board.name, answer, image)
         return _format_patch(answer)
 
-    def _verify(self, patch: str, before: str, image: Image) -> None:
+    def _verify(self, patch: str, patch_before: str, image: Image) -> None:
         """Raise DeviceError if the patch is still the old one; warn if it is not the file's.
 
         Its place in the file is not documented by TI, so the latter is not an error.
@@ -265,7 +266,7 @@ class BringUp:
         )
         if patch == image.patches[0]:
             return
-        if patch in (before, _NO_PATCH):
+        if patch in (patch_before, _NO_PATCH):
             raise DeviceError(
                 mismatch,
                 "it did not start from the download",
@@ -313,7 +314,7 @@ class BringUp:
                 raise DeviceError(
                     f"{self._board.name}: its {core} firmware has no patch (version {version})",
                     "the flash of this board contains no firmware, and none was downloaded",
-                    _FIRMWARE,
+                    _FIRMWARE_REMEDY,
                     code=ErrorCode.RADAR_NO_FIRMWARE,
                 )
             if self._board.firmware is not None and core == "RF":
@@ -348,9 +349,9 @@ class BringUp:
         self._link.call(c.RF_INIT)
         event = self._link.wait_for((e.RF_INIT_DONE,), _CALIBRATION_TIMEOUT_S, self.note)
         self._board.facts.calibration = dict(event.values)
-        requested = calibration_data.ALL
+        requested = calibration_data.ALL_CALIBRATIONS
         if restored:
-            requested = calibration_data.ALL & ~calibration_data.RESTORED
+            requested = calibration_data.ALL_CALIBRATIONS & ~calibration_data.RESTORED_CALIBRATIONS
         if failed := e.list_failed_calibrations(event, self._board.program.transmits, requested):
             raise DeviceError(
                 f"{self._board.name}: RF init failed: {', '.join(failed)} ({event})",
@@ -558,7 +559,7 @@ class RadarBoard:
             return str(self._wait(e.FRAME_END, _READY_TIMEOUT_S + self.program.frame_period_us * 1e-6))
 
     def _set_frames(self, frames: int, trigger: int) -> None:
-        self._sent_frames = self.program.frames(frames, trigger)
+        self._sent_frames = self.program.make_frame_commands(frames, trigger)
         for command in self._sent_frames:
             self.link.call(command)
 
@@ -572,9 +573,9 @@ class RadarBoard:
             read = b""
             if blocks:
                 read = blocks[0].data
-            sent = sent_blocks[setting.ID]
-            if read != sent:
-                differences.append(f"0x{setting.ID:04X}: sent {sent.hex()}, read back {read.hex()}")
+            sent_data = sent_blocks[setting.ID]
+            if read != sent_data:
+                differences.append(f"0x{setting.ID:04X}: sent {sent_data.hex()}, read back {read.hex()}")
         return differences
 
     def reconnect(self, words: WordLink) -> None:
@@ -585,7 +586,7 @@ class RadarBoard:
         self.link.warnings += warnings
         self.fail("its link was reopened")
 
-    def pulses_begin(self) -> None:
+    def note_pulses(self) -> None:
         """Note that pulses may come from now on, which the radar does not report."""
         if self._state is State.ARMED:
             self._state = State.RUNNING

@@ -24,9 +24,9 @@ from polysight_shared.files import read_bounded
 PARTS = 3
 PART_BYTES = 224
 # Masks of calibrations. Restored: ADC offset, both filters, RX gain, I/Q, which TI recommends (ICD 72).
-RESTORED = 0x14E0
+RESTORED_CALIBRATIONS = 0x14E0
 # Calibrations of the RF init (ICD 63).
-ALL = 0x1FF0
+ALL_CALIBRATIONS = 0x1FF0
 # Die ids that do not identify a board: zeros, and that of firmware that cannot report it.
 NO_DIE = "-".join(["00000000"] * 4)
 UNKNOWN_DIE = "unknown"
@@ -43,7 +43,7 @@ class InitCalibrations(Command):
     """Select the calibrations of the next RF init; the others must have been restored (ICD 63)."""
 
     ID = 0x0089
-    mask: int = ALL
+    mask: int = ALL_CALIBRATIONS
 
     def data(self) -> bytes:
         """Pack the mask, and two reserved words."""
@@ -167,18 +167,18 @@ def restore_calibration(
     `note` is called with every event until the board has taken it over, for at most `timeout_s`. Raises DeviceError if
     the board does not accept it.
     """
-    # The first two words select calibrations: of all that were saved only those that TI recommends.
-    selected_data = struct.pack("<2I", RESTORED, RESTORED) + data[8:]
+    # The first two words select the calibrations to restore: only those that TI recommends.
+    selected_data = struct.pack("<2I", RESTORED_CALIBRATIONS, RESTORED_CALIBRATIONS) + data[8:]
     for part in range(PARTS):
         link.call(RestoreCalibration(part, selected_data[PART_BYTES * part : PART_BYTES * (part + 1)]))
     event = link.wait_for((messages.RF_INIT_DONE,), timeout_s, note)
     passed = event.values.get("passed")
-    if not isinstance(passed, int) or passed & RESTORED != RESTORED:
+    if not isinstance(passed, int) or passed & RESTORED_CALIBRATIONS != RESTORED_CALIBRATIONS:
         raise DeviceError(
             f"{name}: does not accept its calibration data: {event}",
             "the firmware has changed since",
             _REMEDY,
             code=ErrorCode.REFUSED_BY_PEER,
         )
-    link.call(InitCalibrations(ALL & ~RESTORED))
+    link.call(InitCalibrations(ALL_CALIBRATIONS & ~RESTORED_CALIBRATIONS))
     return f"calibration restored, made at {_read_temperature_c(data)} C"

@@ -32,7 +32,7 @@ FRAME_TICK_US = 0.005
 STOP_AT_FRAME_END = 0
 START = 1
 STOP_WHILE_WAITING = 4
-# What starts a frame (ICD 92).
+# Triggers that start a frame (ICD 92).
 SOFTWARE_TRIGGER = 1
 HARDWARE_TRIGGER = 2
 IfMode = Literal["complex1x", "complex2x"]
@@ -77,7 +77,7 @@ def gain_code(rx_gain_db: int, rf_gain_target_db: int) -> int:
 
 
 @dataclass(frozen=True)
-class Fixed(Command):
+class ConstantCommand(Command):
     """A command with constant data."""
 
     ID: int  # type: ignore[misc]
@@ -98,36 +98,36 @@ class Fixed(Command):
 
 
 # ICD 269; must never be sent again (ICD 20)
-RF_POWER_UP = Fixed(0x4000, "RfPowerUp")
-RF_INIT = Fixed(0x00C0, "RfInit")
-GET_RF_VERSION = Fixed(0x0220, "GetRfVersion")
+RF_POWER_UP = ConstantCommand(0x4000, "RfPowerUp")
+RF_INIT = ConstantCommand(0x00C0, "RfInit")
+GET_RF_VERSION = ConstantCommand(0x0220, "GetRfVersion")
 # ICD 188
-GET_DIE_ID = Fixed(0x0223, "GetDieId")
-GET_MAIN_VERSION = Fixed(0x40E0, "GetMainVersion")
-GET_TEMPERATURES = Fixed(0x02EA, "GetTemperatures")
+GET_DIE_ID = ConstantCommand(0x0223, "GetDieId")
+GET_MAIN_VERSION = ConstantCommand(0x40E0, "GetMainVersion")
+GET_TEMPERATURES = ConstantCommand(0x02EA, "GetTemperatures")
 # Read back profile 0, chirp 0 and the frame; the answers have the form of Profile, Chirp and Frame (ICD 175-176).
-READ_PROFILE = Fixed(0x0120, "ReadProfile", struct.pack("<2H", 0, 0))
-READ_CHIRP = Fixed(0x0121, "ReadChirp", struct.pack("<2H", 0, 0))
-READ_FRAME = Fixed(0x0122, "ReadFrame")
+READ_PROFILE = ConstantCommand(0x0120, "ReadProfile", struct.pack("<2H", 0, 0))
+READ_CHIRP = ConstantCommand(0x0121, "ReadChirp", struct.pack("<2H", 0, 0))
+READ_FRAME = ConstantCommand(0x0122, "ReadFrame")
 
 # Regular ADC mode; low power would limit the IF to 7.5 MHz (ICD 54).
-LOW_POWER_OFF = Fixed(0x0083, "LowPower", struct.pack("<2H", 0, 0))
+LOW_POWER_OFF = ConstantCommand(0x0083, "LowPower", struct.pack("<2H", 0, 0))
 # Clock of the data lanes: code 9 is 600 Mbit/s at both edges (ICD 56).
-HSI_CLOCK = Fixed(0x0085, "HsiClock", struct.pack("<2H", 9, 0))
+HSI_CLOCK = ConstantCommand(0x0085, "HsiClock", struct.pack("<2H", 9, 0))
 # Faults (1) and monitoring (1 << 2) reported to the host with a 32-bit CRC, also start and end of frames; no watchdog,
 # as hardware triggers require (ICD 57-58).
-RF_DEVICE = Fixed(0x0086, "RfDevice", struct.pack("<I6BH", 1 | 1 << 2, 0, 0, 0, 0, 1, 0, 0))
+RF_DEVICE = ConstantCommand(0x0086, "RfDevice", struct.pack("<I6BH", 1 | 1 << 2, 0, 0, 0, 0, 1, 0, 0))
 # Bandwidth of synthesizer (icp 1, rz 8) and clock PLL (icp 0x26, rz 9): default row of table 5.15, 266 MHz/us (ICD 69).
-APLL_BANDWIDTH = Fixed(0x008D, "ApllBandwidth", struct.pack("<6B5H", 1, 8, 0x26, 9, 0, 0, 0, 0, 0, 0, 0))
+APLL_BANDWIDTH = ConstantCommand(0x008D, "ApllBandwidth", struct.pack("<6B5H", 1, 8, 0x26, 9, 0, 0, 0, 0, 0, 0, 0))
 # LVDS with ADC data in packet 0, packet 1 suppressed (ICD 272).
-DATA_PATH = Fixed(0x4042, "DataPath", struct.pack("<8B", 1, 1, 0, 2, 0, 0, 0, 0))
+DATA_PATH = ConstantCommand(0x4042, "DataPath", struct.pack("<8B", 1, 1, 0, 2, 0, 0, 0, 0))
 # Four lanes, as a DCA1000 requires (ICD 275), 600 Mbit/s at both edges (ICD 276).
-LANE_ENABLE = Fixed(0x4043, "LaneEnable", struct.pack("<2H", 0b1111, 0))
-DATA_PATH_CLOCK = Fixed(0x4044, "DataPathClock", struct.pack("<BBH", 1, 1, 0))
+LANE_ENABLE = ConstantCommand(0x4043, "LaneEnable", struct.pack("<2H", 0b1111, 0))
+DATA_PATH_CLOCK = ConstantCommand(0x4044, "DataPathClock", struct.pack("<BBH", 1, 1, 0))
 # Lanes in the order of receivers, most significant bit first (ICD 277).
-LVDS_LANES = Fixed(0x4045, "LvdsLanes", struct.pack("<2H", 0, 1))
+LVDS_LANES = ConstantCommand(0x4045, "LvdsLanes", struct.pack("<2H", 0, 1))
 # Events of the main core with a 32-bit CRC from now on, no log (ICD 293).
-DEVICE_CONFIGURATION = Fixed(0x404C, "DeviceConfiguration", struct.pack("<BBHII", 1, 0, 0, 0, 0))
+DEVICE_CONFIGURATION = ConstantCommand(0x404C, "DeviceConfiguration", struct.pack("<BBHII", 1, 0, 0, 0, 0))
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class AdcOutput(Command):
 class LdoBypass(Command):
     """RF LDO bypass, which may damage a device with the usual 1.3 V RF supplies (ICD 202).
 
-    `constraints` refuses `bypass` without an acknowledgement for the board.
+    `list_constraints` refuses `bypass` without an acknowledgement for the board.
     """
 
     ID = 0x02CC
@@ -338,7 +338,7 @@ class Program:
     chirps: int = 1
     transmits: bool = False
 
-    def frames(self, count: int, trigger: int = HARDWARE_TRIGGER) -> tuple[Command, ...]:
+    def make_frame_commands(self, count: int, trigger: int = HARDWARE_TRIGGER) -> tuple[Command, ...]:
         """Return the frame commands: for the RF core, then for the main core."""
         frame = Frame(count, self.frame_period_us, self.samples, self.chirps, trigger=trigger)
         return (frame, FrameApply(self.samples, self.chirps))
@@ -361,7 +361,7 @@ def tx_mask(rig: Instrument, board: Board) -> int:
     return 0
 
 
-def program(rig: Instrument, board: Board) -> Program:
+def make_program(rig: Instrument, board: Board) -> Program:
     """Return the commands for a board. Raises ValueError if a value exceeds its field."""
     chirp = rig.chirp
     tx = tx_mask(rig, board)
@@ -427,7 +427,7 @@ PASSBAND = 0.9
 # 266 MHz/us, for which the bandwidth of the synthesizer is set (`APLL_BANDWIDTH`).
 MAX_SLOPE_CODE = 5510
 # No radar has such values, and sums and products of a few of them are finite.
-_LARGEST = 1e30
+_LARGEST_NUMBER = 1e30
 # Largest sample rates in regular ADC mode, with an IF of 20 MHz (ICD 85).
 MAX_RATE_HZ = {"complex1x": 22.5e6, "complex2x": 45e6}
 
@@ -475,20 +475,20 @@ def direct_if_hz(rig: Instrument, board: Board) -> float:
     return slope * sum(paths) / len(paths) / SPEED_OF_LIGHT_M_S + start - transmitted
 
 
-def constraints(rig: Instrument, frames: int) -> list[Constraint]:
+def list_constraints(rig: Instrument, frames: int) -> list[Constraint]:
     """Return every constraint on a rig for rows of `frames` frames; if values are not finite or huge, only those.
 
-    Raises nothing for any rig file. A rig file that keeps all constraints can be encoded by `program`.
+    Raises nothing for any rig file. A rig file that keeps all constraints can be encoded by `make_program`.
     """
     if unusable := list(_find_unusable_numbers(rig)):
         return unusable
-    of_boards = [constraint for board in rig.boards for constraint in _list_constraints_of_board(rig, board)]
-    return [*_list_timing_constraints(rig, frames), *_list_chirp_constraints(rig), *of_boards]
+    board_constraints = [constraint for board in rig.boards for constraint in _list_constraints_of_board(rig, board)]
+    return [*_list_timing_constraints(rig, frames), *_list_chirp_constraints(rig), *board_constraints]
 
 
-def require(rig: Instrument, frames: int) -> None:
+def check_constraints(rig: Instrument, frames: int) -> None:
     """Raise ConfigError if a constraint is broken, with each broken one and its remedy."""
-    broken = [c for c in constraints(rig, frames) if not c.holds]
+    broken = [c for c in list_constraints(rig, frames) if not c.holds]
     if broken:
         raise ConfigError(
             "the radars would refuse or misinterpret these settings: " + "; ".join(str(c) for c in broken),
@@ -499,18 +499,24 @@ def require(rig: Instrument, frames: int) -> None:
 
 
 def _find_unusable_numbers(rig: Instrument) -> Iterator[Constraint]:
-    """Yield a broken constraint for each value that is not a number, or beyond `_LARGEST`."""
+    """Yield a broken constraint for each value that is not a number, or beyond `_LARGEST_NUMBER`."""
     tables = {"chirp": rig.chirp, "burst": rig.burst, "radar": rig.radar}
     tables |= {f"boards.{b.name}": b for b in rig.boards}
     for table, part in tables.items():
         for key in part.__struct_fields__:
             value = getattr(part, key)
-            if isinstance(value, int | float) and not -_LARGEST <= value <= _LARGEST:
+            if isinstance(value, int | float) and not -_LARGEST_NUMBER <= value <= _LARGEST_NUMBER:
                 name = f"{table}.{key}"
                 # An integer may be too large for a float.
                 shown_value = value if isinstance(value, float) else inf
                 yield Constraint(
-                    name, "a number", shown_value, "", f"give a number in {name}", low=-_LARGEST, high=_LARGEST
+                    name,
+                    "a number",
+                    shown_value,
+                    "",
+                    f"give a number in {name}",
+                    low=-_LARGEST_NUMBER,
+                    high=_LARGEST_NUMBER,
                 )
 
 
@@ -544,31 +550,31 @@ def _list_timing_constraints(rig: Instrument, frames: int) -> Iterator[Constrain
 
 def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
     """Yield the rules on the chirp, its samples, filters and gains, which are the same on all boards."""
-    c = rig.chirp
+    chirp = rig.chirp
     end = inf
-    if c.sample_rate_hz:
-        end = c.adc_start_us + c.samples / c.sample_rate_hz * 1e6
+    if chirp.sample_rate_hz:
+        end = chirp.adc_start_us + chirp.samples / chirp.sample_rate_hz * 1e6
     ramp_remedy = "raise chirp.ramp_end_us"
-    yield Constraint("ADC window", "ADC start + samples / rate", end, "us", ramp_remedy, high=c.ramp_end_us)
-    memory = c.samples * len(rig.antennas.rx_mm) * 4
+    yield Constraint("ADC window", "ADC start + samples / rate", end, "us", ramp_remedy, high=chirp.ramp_end_us)
+    memory = chirp.samples * len(rig.antennas.rx_mm) * 4
     samples_remedy = "lower chirp.samples"
     yield Constraint("sample memory", "samples x RX x 4", memory, "bytes", samples_remedy, high=SAMPLE_MEMORY_BYTES)
     # Limits of the radar's error 1023 (docs/spec/mmwavelink.md).
-    yield Constraint("samples", "words a chirp", 2 * c.samples, "", "set chirp.samples", low=64, high=8192)
-    limit = MAX_RATE_HZ[c.if_mode]
-    yield Constraint("sample rate", "rate", c.sample_rate_hz, "Hz", "set chirp.sample_rate_hz", low=2e6, high=limit)
-    remainder = abs(c.sample_rate_hz / 1e3 - round(c.sample_rate_hz / 1e3)) * 1e3
+    yield Constraint("samples", "words a chirp", 2 * chirp.samples, "", "set chirp.samples", low=64, high=8192)
+    limit = MAX_RATE_HZ[chirp.if_mode]
+    yield Constraint("sample rate", "rate", chirp.sample_rate_hz, "Hz", "set chirp.sample_rate_hz", low=2e6, high=limit)
+    remainder = abs(chirp.sample_rate_hz / 1e3 - round(chirp.sample_rate_hz / 1e3)) * 1e3
     rate_remedy = "give whole kHz in sample_rate_hz"
     yield Constraint("sample rate step", "distance to whole kHz", remainder, "Hz", rate_remedy, high=1e-3)
-    slope = slope_code(c.slope_hz_per_s)
+    slope = slope_code(chirp.slope_hz_per_s)
     yield Constraint("slope", "code of the slope", slope, "", "lower chirp.slope_hz_per_s", low=1, high=MAX_SLOPE_CODE)
-    yield Constraint("ADC start", "ADC start", c.adc_start_us, "us", "lower chirp.adc_start_us", low=0, high=40.95)
-    yield Constraint("ramp", "ramp end", c.ramp_end_us, "us", "lower chirp.ramp_end_us", low=0, high=5000)
+    yield Constraint("ADC start", "ADC start", chirp.adc_start_us, "us", "lower chirp.adc_start_us", low=0, high=40.95)
+    yield Constraint("ramp", "ramp end", chirp.ramp_end_us, "us", "lower chirp.ramp_end_us", low=0, high=5000)
     yield Constraint("idle", "idle time", rig.radar.idle_us, "us", "lower radar.idle_us", low=0, high=5242.87)
     simulated = all(n.place.startswith("tcp://127.") for n in rig.radar.native.values())
     # Only simulated radars work without filters.
-    if not simulated or (c.hpf1_khz and c.hpf2_khz):
-        lowest = min(c.hpf1_khz, c.hpf2_khz)
+    if not simulated or (chirp.hpf1_khz and chirp.hpf2_khz):
+        lowest = min(chirp.hpf1_khz, chirp.hpf2_khz)
         filter_remedy = "set corners of the devices: chirp.hpf1_khz of at least 175 and hpf2_khz of at least 350"
         yield Constraint("high-pass filters", "lower corner", lowest, "kHz", filter_remedy, low=HPF_FIRST_KHZ[0])
     gain = rig.radar.rx_gain_db
@@ -581,40 +587,40 @@ def _list_chirp_constraints(rig: Instrument) -> Iterator[Constraint]:
 
 def _list_constraints_of_board(rig: Instrument, board: Board) -> Iterator[Constraint]:
     """Yield the rules on one board: its frequencies, its LDO bypass, and of a receiver the IF of the direct path."""
-    c = rig.chirp
-    of_board = f" of {board.name}"
-    start = start_code(c.start_hz + board.start_offset_hz) * START_HZ_PER_CODE
-    top = start + slope_code(c.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE * c.ramp_end_us * 1e-6
-    offset_remedy = f"change start_offset_hz{of_board}, or the chirp"
+    chirp = rig.chirp
+    suffix = f" of {board.name}"
+    start = start_code(chirp.start_hz + board.start_offset_hz) * START_HZ_PER_CODE
+    top = start + slope_code(chirp.slope_hz_per_s) * SLOPE_HZ_PER_S_PER_CODE * chirp.ramp_end_us * 1e-6
+    offset_remedy = f"change start_offset_hz{suffix}, or the chirp"
     low, high = BAND_HZ
-    yield Constraint(f"start frequency{of_board}", "start + offset", start, "Hz", offset_remedy, low=low, high=high)
+    yield Constraint(f"start frequency{suffix}", "start + offset", start, "Hz", offset_remedy, low=low, high=high)
     sweep_formula = "start + offset + slope x ramp end"
-    yield Constraint(f"sweep{of_board}", sweep_formula, top, "Hz", offset_remedy, low=low, high=high)
+    yield Constraint(f"sweep{suffix}", sweep_formula, top, "Hz", offset_remedy, low=low, high=high)
     if board.name in rig.radar.native:
         native = rig.radar.native[board.name]
         # A USB path does not identify a board.
         acknowledged = native.usb_serial and native.ldo_bypass_acknowledged == native.usb_serial
         yield Constraint(
-            f"LDO bypass{of_board}",
+            f"LDO bypass{suffix}",
             "bypass without this board's acknowledgement",
             int(native.ldo_bypass and not acknowledged),
             "",
-            f"disable ldo_bypass{of_board}: with the 1.3 V RF supplies of most TI boards it may destroy the device."
+            f"disable ldo_bypass{suffix}: with the 1.3 V RF supplies of most TI boards it may destroy the device."
             " Only if you measured 1.0 V, write the board's USB serial number into ldo_bypass_acknowledged",
             high=0,
         )
     if board.role != "transmit":
-        yield _limit_if(rig, board)
+        yield _make_if_constraint(rig, board)
 
 
-def _limit_if(rig: Instrument, board: Board) -> Constraint:
+def _make_if_constraint(rig: Instrument, board: Board) -> Constraint:
     """Return the rule that the direct path lies in the IF band, also with the trigger's uncertainty."""
-    c = rig.chirp
+    chirp = rig.chirp
     direct_hz = direct_if_hz(rig, board)
-    spread = c.slope_hz_per_s * TRIGGER_UNCERTAINTY_S
-    width = PASSBAND * c.sample_rate_hz
+    spread = chirp.slope_hz_per_s * TRIGGER_UNCERTAINTY_S
+    width = PASSBAND * chirp.sample_rate_hz
     low = 0.0
-    if c.if_mode != "complex1x":
+    if chirp.if_mode != "complex1x":
         low = -width / 2
     centred = board.start_offset_hz + low + width / 2 - direct_hz
     return Constraint(

@@ -29,11 +29,11 @@ from typing import Any, NamedTuple
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.calibration_data import NO_DIE, CalibrationFiles
-from polysight.radar.commands import constraints, direct_if_hz, program, require
+from polysight.radar.commands import check_constraints, direct_if_hz, list_constraints, make_program
 from polysight.radar.diagnosis import TracedWords, new_trace, trace_words
 from polysight.radar.firmware import Image, read_image
 from polysight.radar.messages import command, encode
-from polysight.radar.usb import SCHEME, Clock, SystemClock, WordLink, open_tcp, open_usb
+from polysight.radar.usb import TCP_PREFIX, Clock, SystemClock, WordLink, open_tcp, open_usb
 from polysight_shared.closing import Closing
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
@@ -70,7 +70,7 @@ class RadarControl(Closing):
     def states(self) -> dict[str, BoardState]:
         """Return the states by board name, without waiting; boards without any information may be missing."""
 
-    def row_begins(self) -> None:
+    def note_row_start(self) -> None:
         """Note that pulses may come from now on."""
 
     def wait_done(self, timeout_s: float) -> list[str]:
@@ -91,7 +91,7 @@ _POLL_S = 0.005
 # USB needs some time to find a chip again that was reset or replugged. Both times are chosen.
 _REOPEN_TIMEOUT_S = 5.0
 _REOPEN_INTERVAL_S = 0.25
-# What the state of a board means for a row; a board in another state is not armed.
+# State of the radar in a row, by the state of its board; a board in another state is not armed.
 _STATES = {
     State.ARMED: RadarState.ARMED,
     State.RUNNING: RadarState.ARMED,
@@ -105,7 +105,7 @@ def open_board(place: str, slow: bool = False) -> WordLink:
 
     `slow`: send words one by one at 1 MHz. Raises ConfigError, DeviceError.
     """
-    if place.startswith(SCHEME):
+    if place.startswith(TCP_PREFIX):
         return open_tcp(place, slow)
     return open_usb(place, slow)
 
@@ -113,9 +113,9 @@ def open_board(place: str, slow: bool = False) -> WordLink:
 def make_radar_board(rig: Instrument, name: str, words: WordLink, clock: Clock, firmware: Image | None) -> RadarBoard:
     """Create a board of a rig with its word link and firmware."""
     native = rig.radar.native[name]
-    commands = program(rig, rig.by_name(name))
+    commands = make_program(rig, rig.by_name(name))
     # Calibration data is kept for one chip with the same settings.
-    settings = b"".join(sent.block().data for sent in (*commands.basic, *commands.waveform))
+    settings = b"".join(command.block().data for command in (*commands.basic, *commands.waveform))
     folder = rig.radar.calibration_dir
     calibration = None
     if folder:
@@ -129,19 +129,19 @@ def plan_lines(rig: Instrument) -> tuple[list[str], bool]:
     Power-up, RF init, queries and the start of frames are not among the commands.
     """
     frames = rig.grid.columns * rig.burst.pulses
-    checked = constraints(rig, frames)
+    checked_constraints = list_constraints(rig, frames)
     lines = []
-    for constraint in checked:
+    for constraint in checked_constraints:
         if constraint.holds:
             lines.append(f"holds   {constraint}")
         else:
             lines.append(f"BROKEN  {constraint}\n        do: {constraint.remedy}")
-    if not all(c.holds for c in checked):
+    if not all(c.holds for c in checked_constraints):
         return [*lines, "\nnothing would be sent"], False
     for board in rig.boards:
         lines.append(f"\n{board.name}, its settings, with sequence numbers as if only they were sent:")
-        commands = program(rig, board)
-        for number, sent in enumerate((*commands.basic, *commands.waveform, *commands.frames(frames))):
+        commands = make_program(rig, board)
+        for number, sent in enumerate((*commands.basic, *commands.waveform, *commands.make_frame_commands(frames))):
             # Sequence numbers have four bits.
             raw = encode(command((sent.block(),), sequence=number % 16))
             lines.append(f"  {sent.name:19} {raw.hex()}")
@@ -219,8 +219,8 @@ class NativeRadars(RadarControl):
         self._clock = clock or SystemClock()
         self._open_words = open_words or partial(open_board, slow=rig.radar.slow_spi)
         frames = rig.grid.columns * rig.burst.pulses
-        require(rig, frames)
-        self._constraints = [str(c) for c in constraints(rig, frames)]
+        check_constraints(rig, frames)
+        self._constraints = [str(c) for c in list_constraints(rig, frames)]
         self._boards: dict[str, RadarBoard] = {}
         self._traces: list[TracedWords] = []
         if rig.radar.trace_dir:
@@ -242,7 +242,7 @@ class NativeRadars(RadarControl):
         `states` reports a failed board, which costs one take of the row (it is retaken), not the scan. Raises
         ConfigError.
         """
-        require(self._rig, frames)
+        check_constraints(self._rig, frames)
         for board in self._boards.values():
             try:
                 board.arm(frames)
@@ -297,10 +297,10 @@ class NativeRadars(RadarControl):
                     return False
             self._clock.sleep(_REOPEN_INTERVAL_S)
 
-    def row_begins(self) -> None:
+    def note_row_start(self) -> None:
         """Note that pulses may come from now on."""
         for board in self._boards.values():
-            board.pulses_begin()
+            board.note_pulses()
 
     def wait_done(self, timeout_s: float) -> list[str]:
         """Wait for the end of all frames; return the boards that missed pulses or failed."""
@@ -341,11 +341,11 @@ class NativeRadars(RadarControl):
         self._boards = {}
 
 
-# What the servers of the published rig expect.
-LINE = b"Retrigger\n"
+# The line that the servers of the published rig expect.
+RETRIGGER_LINE = b"Retrigger\n"
 # Time between two looks whether a line was acknowledged (chosen).
 _POLL_MS = 5
-_START_SERVER = (
+_SERVER_REMEDY = (
     "start the control server of this board (on the computer of mmWave Studio), or correct radar.servers in"
     " instrument.toml (then continue the scan: `polysight resume SCAN --config instrument.toml`)"
 )
@@ -383,7 +383,7 @@ class LineServers(RadarControl):
                 self._connect(board)
             self._reset.discard(board)
             try:
-                self._sockets[board].sendall(LINE)
+                self._sockets[board].sendall(RETRIGGER_LINE)
             except BlockingIOError:
                 raise DeviceError(
                     f"{board}: its control server at {self._servers[board]} does not read its lines",
@@ -473,7 +473,7 @@ class LineServers(RadarControl):
             reason = f": {e.strerror or e}"
             cause = "the address is wrong, or there is no route to it"
         message = f"{board}: cannot reach its control server at {self._servers[board]}{reason}"
-        return DeviceError(message, cause, _START_SERVER, code=ErrorCode.NO_ANSWER)
+        return DeviceError(message, cause, _SERVER_REMEDY, code=ErrorCode.NO_ANSWER)
 
 
 def _count_unacknowledged(connection: socket.socket) -> int:
@@ -496,7 +496,7 @@ class Endless(RadarControl):
         return {}
 
 
-def radar_control(instrument: Instrument) -> RadarControl:
+def open_radar_control(instrument: Instrument) -> RadarControl:
     """Connect to the radars of a rig with the backend of its file. Raises ConfigError, DeviceError."""
     if instrument.radar.control == "line_server":
         return LineServers(instrument.radar.servers, instrument.limits.command_timeout_s)

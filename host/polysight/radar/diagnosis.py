@@ -81,10 +81,10 @@ def check_board(
         return None
     on_result(StepResult("USB", True, opening, "opened"))
     board = make_board(words)
-    done: list[Step] = []
+    steps_done: list[Step] = []
 
     def on_step(step: Step, outcome: str) -> None:
-        done.append(step)
+        steps_done.append(step)
         on_result(StepResult(step.name, True, step.expected, outcome))
         if step.name == "reset":
             on_result(_judge_supplies(board))
@@ -93,8 +93,8 @@ def check_board(
         board.configure(on_step)
     except PolysightError as error:
         failed_step = None
-        if len(done) < len(board.steps):
-            failed_step = board.steps[len(done)]
+        if len(steps_done) < len(board.steps):
+            failed_step = board.steps[len(steps_done)]
         on_result(_describe_failure(failed_step, error))
         return board
     _check_frame(board, transmits, on_result)

@@ -45,10 +45,10 @@ _REMEDY = "check the board's power, the 60-pin connector and the USB cable, then
 
 
 # Causes of a lost message, as errors name them.
-_SILENT = "the board has no power, hangs, or its interrupt line is not connected"
-_NOT_CLOCKED = "the board gets no SPI clock or chip select, or its interrupt line is stuck"
-_NO_MISO = "the board's data line (MISO) is not connected, or SPI is disturbed"
-_DISTURBED = "disturbed SPI lines: noise, a loose 60-pin connector, or a clock that is too fast"
+_SILENT_CAUSE = "the board has no power, hangs, or its interrupt line is not connected"
+_NO_CLOCK_CAUSE = "the board gets no SPI clock or chip select, or its interrupt line is stuck"
+_NO_MISO_CAUSE = "the board's data line (MISO) is not connected, or SPI is disturbed"
+_DISTURBED_CAUSE = "disturbed SPI lines: noise, a loose 60-pin connector, or a clock that is too fast"
 
 
 class NotReportedError(DeviceError):
@@ -125,7 +125,7 @@ class Link:
                 continue
             self.sequence = (self.sequence + 1) % 16
             if answer.kind is messages.Kind.NACK:
-                problems.append(_make_problem("the device received a damaged message", _DISTURBED))
+                problems.append(_make_problem("the device received a damaged message", _DISTURBED_CAUSE))
                 retry = False
                 continue
             if problems:
@@ -184,7 +184,7 @@ class Link:
             if is_over:
                 names = ", ".join(f"0x{i:04X}" for i in ids)
                 problem = f"{self._name}: the radar did not report {names} within {timeout_s:g} s"
-                cause = f"it was reset, or: {_SILENT}"
+                cause = f"it was reset, or: {_SILENT_CAUSE}"
                 if lost_message:
                     problem += f"; a message was lost meanwhile: {lost_message.what}"
                     cause = lost_message.why
@@ -210,7 +210,7 @@ class Link:
     def _await_answer(self, request: messages.Message, timeout_s: float) -> tuple[messages.Message | None, Finding]:
         """Return the answer to the last message, or None and the reason; keep events that arrive before it."""
         deadline = self._clock.now() + timeout_s
-        problem = _make_problem(f"no answer within {timeout_s:g} s", _SILENT)
+        problem = _make_problem(f"no answer within {timeout_s:g} s", _SILENT_CAUSE)
         parts: list[messages.Message] = []
         is_over = False
         while not is_over:
@@ -227,13 +227,13 @@ class Link:
             elif not _is_answer(message, request):
                 self._warn(f"late answer to an earlier message (sequence {message.sequence})")
             elif parts and message.remaining_chunks != parts[-1].remaining_chunks - 1:
-                return None, _make_problem("parts of the answer are missing", _DISTURBED)
+                return None, _make_problem("parts of the answer are missing", _DISTURBED_CAUSE)
             else:
                 parts.append(message)
                 if message.remaining_chunks == 0:
                     return _join_chunks(parts), problem
         if parts:
-            problem = _make_problem("parts of the answer are missing", _DISTURBED)
+            problem = _make_problem("parts of the answer are missing", _DISTURBED_CAUSE)
         return None, problem
 
     def _receive(self) -> tuple[messages.Message | None, Finding]:
@@ -243,7 +243,7 @@ class Link:
         if not self._wait_for_low():
             self._write(messages.READY_TO_READ)
             if not self._wait_for_low():
-                return None, _make_problem("the host interrupt stays high", _NOT_CLOCKED)
+                return None, _make_problem("the host interrupt stays high", _NO_CLOCK_CAUSE)
         self._clock.sleep(DATA_DELAY_S)
         head = self._read(messages.SYNC_BYTES)
         searched = 0
@@ -251,7 +251,7 @@ class Link:
             if searched >= _SYNC_SEARCH_BYTES:
                 # A line that nothing drives gives the same byte again and again.
                 is_constant = len(set(head)) == 1
-                cause = _NO_MISO if is_constant else _DISTURBED
+                cause = _NO_MISO_CAUSE if is_constant else _DISTURBED_CAUSE
                 return None, _make_problem(f"no sync word in {searched} bytes", cause)
             head += self._read(2)
             searched += 2
@@ -260,12 +260,12 @@ class Link:
             header = messages.decode_header(head)
         except ProtocolError as e:
             self._read(_FLUSH_BYTES)
-            return None, _make_problem(e.what, _DISTURBED)
+            return None, _make_problem(e.what, _DISTURBED_CAUSE)
         body = self._read(header.body_bytes)
         try:
             return messages.decode(head + body), _make_problem("", "")
         except ProtocolError as e:
-            return None, _make_problem(e.what, _DISTURBED)
+            return None, _make_problem(e.what, _DISTURBED_CAUSE)
 
     def _wait_for_low(self) -> bool:
         """Wait until the interrupt line is low; return False after the timeout."""
@@ -283,7 +283,7 @@ class Link:
             return
         for event in map(messages.decode_event, message.blocks):
             self._events.append(event)
-            if event.id in messages.RESTARTED:
+            if event.id in messages.START_EVENTS:
                 if not self.may_start:
                     self._warn(str(event))
                     raise UnexpectedRestartError(self._name)

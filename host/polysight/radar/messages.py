@@ -46,8 +46,8 @@ _RETRY = 0x0003
 _NO_CRC = 0x0300
 _CRC32 = 0x0400
 # Cause and remedy of a message that cannot be decoded.
-_WHY = "noise on the SPI lines, or a device out of step"
-_DO = "retried automatically; check the 60-pin connector and the USB cable if it happens again"
+_DECODING_CAUSE = "noise on the SPI lines, or a device out of step"
+_DECODING_REMEDY = "retried automatically; check the 60-pin connector and the USB cable if it happens again"
 
 # Sub-block numbers of events; 0x10.. are those of the RF core, 0x50.. those of the main core.
 RF_CPU_FAULT = 0x1002
@@ -67,7 +67,7 @@ RF_ERROR = 0x5008
 
 
 # Events of a start: if none is expected, the board has started by itself and lost its settings.
-RESTARTED = frozenset({MAIN_POWER_UP})
+START_EVENTS = frozenset({MAIN_POWER_UP})
 
 
 class Direction(IntEnum):
@@ -161,7 +161,9 @@ class Header:
             return 0
         bits = self.flags >> 10 & 3
         if bits > 1:
-            raise ProtocolError(f"a message with CRC length code {bits}; only 0 and 1 are known", _WHY, _DO)
+            raise ProtocolError(
+                f"a message with CRC length code {bits}; only 0 and 1 are known", _DECODING_CAUSE, _DECODING_REMEDY
+            )
         return 2 << bits
 
     @property
@@ -231,11 +233,11 @@ def encode(message: Message) -> bytes:
 def decode_header(raw: bytes) -> Header:
     """Decode the first 16 bytes of a message, sync word and header. Raises ProtocolError."""
     if len(raw) < SYNC_BYTES + HEADER_BYTES or raw[:SYNC_BYTES] not in (HOST_SYNC, DEVICE_SYNC):
-        raise ProtocolError(f"no sync word in {raw[:16].hex()}", _WHY, _DO)
+        raise ProtocolError(f"no sync word in {raw[:16].hex()}", _DECODING_CAUSE, _DECODING_REMEDY)
     head = raw[SYNC_BYTES : SYNC_BYTES + HEADER_BYTES]
     opcode, length, flags, remaining, count, expected = _HEADER.unpack(head)
     if checksum(head[:-2]) != expected:
-        raise ProtocolError(f"header {head.hex()}: checksum {expected:04x} is wrong", _WHY, _DO)
+        raise ProtocolError(f"header {head.hex()}: checksum {expected:04x} is wrong", _DECODING_CAUSE, _DECODING_REMEDY)
     header = Header(
         direction=opcode & 0xF,
         kind=Kind(opcode >> 4 & 3),
@@ -246,7 +248,7 @@ def decode_header(raw: bytes) -> Header:
         block_count=count,
     )
     if not HEADER_BYTES + header.crc_bytes <= length <= MESSAGE_LIMIT - SYNC_BYTES:
-        raise ProtocolError(f"header {head.hex()}: invalid length of {length} bytes", _WHY, _DO)
+        raise ProtocolError(f"header {head.hex()}: invalid length of {length} bytes", _DECODING_CAUSE, _DECODING_REMEDY)
     return header
 
 
@@ -255,14 +257,16 @@ def decode(raw: bytes) -> Message:
     header = decode_header(raw)
     inner = raw[SYNC_BYTES:]
     if len(inner) != header.length:
-        raise ProtocolError(f"{len(inner)} bytes of a message of {header.length}", _WHY, _DO)
+        raise ProtocolError(f"{len(inner)} bytes of a message of {header.length}", _DECODING_CAUSE, _DECODING_REMEDY)
     end = header.length - header.crc_bytes
     if crc(inner[:end], header.crc_bytes) != inner[end:]:
-        raise ProtocolError(f"message {inner.hex()}: its CRC is wrong", _WHY, _DO)
+        raise ProtocolError(f"message {inner.hex()}: its CRC is wrong", _DECODING_CAUSE, _DECODING_REMEDY)
     try:
         direction = Direction(header.direction)
     except ValueError:
-        raise ProtocolError(f"message {inner.hex()}: unknown direction {header.direction}", _WHY, _DO) from None
+        raise ProtocolError(
+            f"message {inner.hex()}: unknown direction {header.direction}", _DECODING_CAUSE, _DECODING_REMEDY
+        ) from None
     block_count = header.block_count
     if header.is_bare_refusal:
         block_count = 0
@@ -294,14 +298,18 @@ def _split_blocks(body: bytes, count: int) -> tuple[SubBlock, ...]:
     start = 0
     for _ in range(count):
         if start + _BLOCK.size > len(body):
-            raise ProtocolError(f"{count} sub-blocks announced, {len(blocks)} found", _WHY, _DO)
+            raise ProtocolError(f"{count} sub-blocks announced, {len(blocks)} found", _DECODING_CAUSE, _DECODING_REMEDY)
         number, length = _BLOCK.unpack_from(body, start)
         if length < _BLOCK.size or start + length > len(body):
-            raise ProtocolError(f"sub-block 0x{number:04X} with a length of {length} bytes", _WHY, _DO)
+            raise ProtocolError(
+                f"sub-block 0x{number:04X} with a length of {length} bytes", _DECODING_CAUSE, _DECODING_REMEDY
+            )
         blocks.append(SubBlock(number, body[start + _BLOCK.size : start + length]))
         start += length
     if len(body) - start >= 4:
-        raise ProtocolError(f"{len(body) - start} bytes after the last of {count} sub-blocks", _WHY, _DO)
+        raise ProtocolError(
+            f"{len(body) - start} bytes after the last of {count} sub-blocks", _DECODING_CAUSE, _DECODING_REMEDY
+        )
     return tuple(blocks)
 
 
@@ -368,7 +376,7 @@ _RF_CODES = (
 )
 _RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
 # ICD 223
-_ANALOG = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}
+_ANALOG_NAMES = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}
 # Bits 0..26 of 0x5001, 1 = passed
 _RF_TESTS = 0x07FFFFFF
 # Bits of group 1 that are fatal. RF core: the programmable filter's double bit error (ICD 216, which reserves the bit
@@ -454,7 +462,7 @@ REFUSALS = {
     1013: "data rate and clock edges do not go together",
     1023: "words per chirp outside 64..8192",
 }
-# What is read from the data of an event: description, True if it is fatal, and numbers for the manifest.
+# Decoded data of an event: description, True if it is fatal, and numbers for the manifest.
 _Read = tuple[str, bool, Mapping[str, object]]
 
 
@@ -566,7 +574,7 @@ def _read_init_done(data: bytes) -> _Read:
 def _read_analog(data: bytes) -> _Read:
     """Read the supplies that failed; fatal unless the event's type is 0."""
     kind, _, _, signals = struct.unpack_from("<BBHI", data)
-    return _name_bits(_ANALOG, signals) or "no signal reported", bool(kind), {"signals": signals}
+    return _name_bits(_ANALOG_NAMES, signals) or "no signal reported", bool(kind), {"signals": signals}
 
 
 def _read_boot(data: bytes) -> _Read:

@@ -21,14 +21,14 @@ from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 VENDOR = 0x0451
 PRODUCT = 0xFD03
 # A place begins with this prefix if it is a path, such as "usb:1-4.2"; without it, it is a serial number.
-PATH = "usb:"
+PATH_PREFIX = "usb:"
 # Longest wait for the answer to a command, and after how long the chip sends a packet that is not full; chosen.
 _READ_TIMEOUT_S = 0.5
 _LATENCY_MS = 1
-_CHECK = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
+_CHECK_REMEDY = "check the cable and the board's power; `lsusb -v -d 0451:fd03 | grep iSerial` lists the chips"
 
 # Channels over TCP: a request has channel, W or R, and the number of bytes. The timeout is chosen.
-SCHEME = "tcp://"
+TCP_PREFIX = "tcp://"
 _HEAD = struct.Struct("<ccH")
 _TIMEOUT_S = 30.0
 
@@ -53,13 +53,13 @@ SENSE_DIRECTION = 0b1111_1111
 FUNCTIONAL_MODE = 0b0001_0000
 # Directions of channels A to D, and True for bit-bang mode.
 _CHANNELS = ((SPI_DIRECTION, False), (INTERRUPT_DIRECTION, False), (RESET_DIRECTION, True), (SENSE_DIRECTION, True))
-# MPSSE commands: set or read pins, shift bytes, answer at once, and the settings of the clock.
-_PINS = 0x80
+# MPSSE commands: set or read pins, shift bytes, answer immediately, and the settings of the clock.
+_SET_PINS = 0x80
 _READ_PINS = 0x81
 # Before the bytes: their number less one, 16 bits, the lower byte first.
 _WRITE_BYTES = 0x11
 _READ_BYTES = 0x20
-_NOW = 0x87
+_SEND_IMMEDIATELY = 0x87
 _FULL_SPEED = 0x8A
 _NO_ADAPTIVE = 0x97
 _NO_THREE_PHASE = 0x8D
@@ -74,7 +74,7 @@ _SELECT_COMMANDS = 2
 _IDLE_COMMANDS = 3
 # Pause between two words of a slow link; chosen.
 _SLOW_GAP_S = 100e-6
-_DESELECT = bytes((_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
+_DESELECT = bytes((_SET_PINS, IDLE, SPI_DIRECTION)) * _IDLE_COMMANDS
 # For how long the reset line is left to settle; chosen.
 _RESET_S = 0.01
 
@@ -146,27 +146,29 @@ class Port(Protocol):
 def encode_spi_setup(divisor: int = SPI_DIVISOR) -> bytes:
     """Return the initial commands of channel A."""
     clock = bytes((_FULL_SPEED, _NO_ADAPTIVE, _NO_THREE_PHASE, _DIVISOR, divisor, 0))
-    return clock + bytes((_PINS, IDLE, SPI_DIRECTION, _NO_LOOPBACK))
+    return clock + bytes((_SET_PINS, IDLE, SPI_DIRECTION, _NO_LOOPBACK))
 
 
 def encode_interrupt_setup() -> bytes:
     """Return the initial commands of channel B."""
-    return bytes((_FULL_SPEED, _NO_ADAPTIVE, _THREE_PHASE, _PINS, INTERRUPT_IDLE, INTERRUPT_DIRECTION, _NO_LOOPBACK))
+    return bytes(
+        (_FULL_SPEED, _NO_ADAPTIVE, _THREE_PHASE, _SET_PINS, INTERRUPT_IDLE, INTERRUPT_DIRECTION, _NO_LOOPBACK)
+    )
 
 
 def encode_writes(words: Sequence[int]) -> bytes:
     """Return commands that shift words out: for each, chip select low, two bytes on the falling edge, select high."""
-    select = bytes((_PINS, SELECTED_WRITE, SPI_DIRECTION)) * _SELECT_COMMANDS
+    select = bytes((_SET_PINS, SELECTED_WRITE, SPI_DIRECTION)) * _SELECT_COMMANDS
     parts = bytearray()
     for word in words:
         parts += select + bytes((_WRITE_BYTES, 1, 0, word >> 8, word & 0xFF)) + _DESELECT
-    return bytes(parts) + bytes((_NOW,))
+    return bytes(parts) + bytes((_SEND_IMMEDIATELY,))
 
 
 def encode_reads(count: int) -> bytes:
     """Return commands that shift words in: for each, chip select low, two bytes on the rising edge, select high."""
-    select = bytes((_PINS, SELECTED_READ, SPI_DIRECTION)) * _SELECT_COMMANDS
-    return (select + bytes((_READ_BYTES, 1, 0)) + _DESELECT) * count + bytes((_NOW,))
+    select = bytes((_SET_PINS, SELECTED_READ, SPI_DIRECTION)) * _SELECT_COMMANDS
+    return (select + bytes((_READ_BYTES, 1, 0)) + _DESELECT) * count + bytes((_SEND_IMMEDIATELY,))
 
 
 class UsbWords:
@@ -223,7 +225,7 @@ class UsbWords:
 
     def interrupt(self) -> bool:
         """Return True if the host interrupt is high. Raises DeviceError."""
-        self._interrupt.write(bytes((_READ_PINS, _NOW)))
+        self._interrupt.write(bytes((_READ_PINS, _SEND_IMMEDIATELY)))
         return bool(_read_exactly(self._interrupt, 1)[0] >> INTERRUPT_BIT & 1)
 
     def reset(self, held: bool) -> None:
@@ -282,7 +284,7 @@ class FtdiPort:
         try:
             self._ftdi.write_data(data)
         except self._library.errors as e:
-            raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
+            raise _usb_error(f"{self._place}: {e}", e, _PULLED_CAUSE) from None
 
     def read(self, size: int) -> bytes:
         """Receive up to `size` bytes within half a second, by 4 reads in a row (chosen). Raises DeviceError."""
@@ -292,7 +294,7 @@ class FtdiPort:
             while len(received) < size and time.monotonic() < deadline:
                 received += self._ftdi.read_data_bytes(size - len(received), attempt=4)
         except self._library.errors as e:
-            raise _usb_error(f"{self._place}: {e}", e, _PULLED) from None
+            raise _usb_error(f"{self._place}: {e}", e, _PULLED_CAUSE) from None
         return bytes(received)
 
     def close(self) -> None:
@@ -306,7 +308,7 @@ class FtdiPort:
 
 
 # Usual cause of an error while the link is in use.
-_PULLED = "the cable was pulled, or the board lost power"
+_PULLED_CAUSE = "the cable was pulled, or the board lost power"
 # Causes of an error of libusb by its number.
 _CAUSES = {
     errno.EBUSY: "another program uses this chip: mmWave Studio, or a second polysight; end it",
@@ -323,7 +325,7 @@ def _usb_error(what: str, e: BaseException | None, otherwise: str) -> DeviceErro
         e = e.__cause__ or e.__context__
     number = getattr(e, "errno", 0)
     code = ErrorCode.BUSY if number == errno.EBUSY else ErrorCode.NO_ANSWER
-    return DeviceError(f"radar USB {what}", _CAUSES.get(number, otherwise), _CHECK, code=code)
+    return DeviceError(f"radar USB {what}", _CAUSES.get(number, otherwise), _CHECK_REMEDY, code=code)
 
 
 def open_usb(place: str, slow: bool = False) -> UsbWords:
@@ -361,15 +363,15 @@ class _Library(NamedTuple):
 
     def find_chip(self, place: str) -> Any:
         """Return the chip with this serial number or path. Raises DeviceError if there is none, or more than one."""
-        name = place.removeprefix(PATH)
+        name = place.removeprefix(PATH_PREFIX)
         try:
             # The backends of pyftdi, in its order of preference.
             backends = (import_module(name).get_backend() for name in self.tools.BACKENDS)
             backend = next((b for b in backends if b is not None), None)
             chips = list(self.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend))
             paths = {f"{d.bus}-{'.'.join(map(str, d.port_numbers or ()))}": d for d in chips}
-            by_path = place.startswith(PATH)
-            if by_path:
+            is_path = place.startswith(PATH_PREFIX)
+            if is_path:
                 matching = [path for path in paths if path == name]
             else:
                 matching = [path for path, chip in paths.items() if self._read_serial(chip) == name]
@@ -379,11 +381,11 @@ class _Library(NamedTuple):
         if paths:
             on_the_bus = f"chips at {', '.join(sorted(paths))}"
         if not matching:
-            kind_of_place = "at this path" if by_path else "with this serial number"
+            kind_of_place = "at this path" if is_path else "with this serial number"
             raise DeviceError(
                 f"radar USB {place}: cannot be opened: no chip 0451:fd03 {kind_of_place}; {on_the_bus}",
                 "unplugged, another serial number or path, or no permission (a udev rule for 0451:fd03)",
-                _CHECK,
+                _CHECK_REMEDY,
                 code=ErrorCode.NO_ANSWER,
             )
         if len(matching) > 1:
@@ -485,7 +487,7 @@ class _TcpPort:
 
 def open_tcp(address: str, slow: bool = False) -> UsbWords:
     """Open a board by `tcp://address:port`. Raises DeviceError if there is no server."""
-    host, _, port = address.removeprefix(SCHEME).rpartition(":")
+    host, _, port = address.removeprefix(TCP_PREFIX).rpartition(":")
     try:
         connection = socket.create_connection((host, int(port)), _TIMEOUT_S)
     except (OSError, ValueError) as e:

@@ -33,7 +33,7 @@ from polysight.surfaces import Segment, Surface, describe_form, describe_materia
 from polysight_shared.raster import RasterPlan
 
 # Axis of the points along which the rig looks.
-Z = 2
+DEPTH_AXIS = 2
 # Axis numbers of a view (horizontal, vertical), its title, and the names of the axes.
 VIEWS = (
     ((0, 1), "From the rig", ("x (mm)", "y (mm)")),
@@ -58,7 +58,7 @@ FIGURES: dict[str, str] = {
     "phase_p": "Phase of P = H / V",
 }
 # Pixels further out than this share of a patch's box belong to its edge, where two materials mix; chosen.
-_INSIDE = 0.6
+_INSIDE_SHARE = 0.6
 # Range of the phase of P that the colours span: percentiles of the pixels, at least and at most this wide; chosen.
 _PERCENTILES = (5.0, 95.0)
 _LEAST_DEG = 20.0
@@ -75,7 +75,7 @@ _UPPER_ROOM_MM = 24
 # Share of a map's height that a label needs; chosen by eye.
 _LABEL_HEIGHT = 0.05
 # Share of a map's width between two maps: a colour bar's and an axis's numbers stand there.
-_BETWEEN = 0.26
+_GAP_SHARE = 0.26
 # Positions with data are light, masked ones dark, so that the map is readable without colour.
 _POSITION_COLOURS = ("#dfe5ec", "#882255")
 
@@ -87,21 +87,21 @@ def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     does not count; if no other patch was judged, all patches do. The range is taken around the circular mean, so that
     values on both sides of 180 degrees lie side by side: limits may pass 180.
     """
-    inside: list[npt.NDArray] = []
+    inner_pixels: list[npt.NDArray] = []
     judged_patches = [patch for patch in scan.segments if patch.refused is None and not patch.metal_reference]
     for patch in judged_patches or scan.segments:
-        near_x = np.abs(scan.x_mm - patch.centre_x_mm) <= _INSIDE * patch.width_mm / 2
-        near_y = np.abs(scan.y_mm - patch.centre_y_mm) <= _INSIDE * patch.height_mm / 2
-        part = scan.p[np.ix_(near_y, near_x)]
-        part = part[np.isfinite(part) & (part != 0)]
-        if part.size:
-            inside.append(part / np.abs(part))
-    if not inside:
+        near_x = np.abs(scan.x_mm - patch.centre_x_mm) <= _INSIDE_SHARE * patch.width_mm / 2
+        near_y = np.abs(scan.y_mm - patch.centre_y_mm) <= _INSIDE_SHARE * patch.height_mm / 2
+        patch_p = scan.p[np.ix_(near_y, near_x)]
+        patch_p = patch_p[np.isfinite(patch_p) & (patch_p != 0)]
+        if patch_p.size:
+            inner_pixels.append(patch_p / np.abs(patch_p))
+    if not inner_pixels:
         return None
-    # Every patch counts alike, for any size.
-    middle = np.angle(sum(part.mean() for part in inside))
-    from_middle = np.degrees(np.angle(np.concatenate(inside) * np.exp(-1j * middle)))
-    low, high = np.percentile(from_middle, _PERCENTILES) + np.degrees(middle)
+    # Every patch has the same weight, whatever its size.
+    middle = np.angle(sum(patch_p.mean() for patch_p in inner_pixels))
+    deviations_deg = np.degrees(np.angle(np.concatenate(inner_pixels) * np.exp(-1j * middle)))
+    low, high = np.percentile(deviations_deg, _PERCENTILES) + np.degrees(middle)
     # Room of 15 % on either side, and limits in steps of 5 degrees: chosen for readable numbers at the colour bar.
     margin = max(0.15 * (high - low), (_LEAST_DEG - (high - low)) / 2)
     low = float(np.floor((low - margin) / 5) * 5)
@@ -296,15 +296,15 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     errors: dict[int, float] = {}
     texts: dict[int, str] = {}
     for patch in scan.segments:
-        e = patch.permittivity
-        if e is not None and e.spread is not None:
-            real[patch.label] = e.real
-            size = abs(e.value)
+        estimate = patch.permittivity
+        if estimate is not None and estimate.spread is not None:
+            real[patch.label] = estimate.real
+            size = abs(estimate.value)
             if size:
-                errors[patch.label] = 100 * math.hypot(e.spread.real_std, e.spread.loss_std) / size
+                errors[patch.label] = 100 * math.hypot(estimate.spread.real_std, estimate.spread.loss_std) / size
             else:
                 errors[patch.label] = 0.0
-            texts[patch.label] = f"{e.real:.2f}\n± {e.spread.real_std:.2f}"
+            texts[patch.label] = f"{estimate.real:.2f}\n± {estimate.spread.real_std:.2f}"
     if not real:
         return None
     fig = style.new_figure(9.4, 4.6, style.BAR_IN)
@@ -312,7 +312,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     low = min(real.values())
     high = max(real.values())
     margin = max(0.1 * (high - low), 0.25)
-    value_axes, error_axes = fig.subplots(1, 2, gridspec_kw={"wspace": _BETWEEN})
+    value_axes, error_axes = fig.subplots(1, 2, gridspec_kw={"wspace": _GAP_SHARE})
     _fill_patches(fig, value_axes, scan, real, texts, ("viridis", low - margin, high + margin, "real part ε′"))
     _fill_patches(
         fig, error_axes, scan, errors, percents, ("YlOrBr", 0.0, max(*errors.values(), 5.0), "percent of |ε|")
@@ -535,7 +535,7 @@ def focus_figure(
         ax.set_xlabel("x (mm)", fontsize=9, color=style.MUTED)
         style.colour_bar(fig, ax, mesh, "dB")
     if simulated:
-        fig.suptitle("SIMULATED", fontsize=9, color=style.STAMP, fontweight="bold", x=0.99, ha="right")
+        fig.suptitle("SIMULATED", fontsize=9, color=style.STAMP_COLOUR, fontweight="bold", x=0.99, ha="right")
     return style.png(fig)
 
 
@@ -549,10 +549,10 @@ def surface_figure(surface: Surface) -> bytes:
     colours = colormaps["viridis"].with_extremes(bad=NO_PERMITTIVITY)
     coloured = None
     for ax, ((across, up), title, (label_x, label_y)) in zip(panels, VIEWS, strict=True):
-        # What is nearer to the eye is drawn last: the rig looks along +z, the other two against x and y.
+        # Nearer points are drawn last: the rig looks along +z, the other two views look against x and y.
         depth_axis = 3 - across - up
         depth = points_mm[:, depth_axis]
-        order = np.argsort(-depth if depth_axis == Z else depth, kind="stable")
+        order = np.argsort(-depth if depth_axis == DEPTH_AXIS else depth, kind="stable")
         coloured = ax.scatter(
             points_mm[order, across], points_mm[order, up], s=6, c=colour[order],
             cmap=colours, vmin=low, vmax=high, plotnonfinite=True,

@@ -67,17 +67,17 @@ def fit_ellipse(matrix: Array, share: float) -> tuple[float, float, float]:
     return float(width), float(height), math.degrees(math.atan2(vectors[1, 0], vectors[0, 0]))
 
 
-def region_matrix(e: PermittivityFigures, share: float) -> Array | None:
+def region_matrix(estimate: PermittivityFigures, share: float) -> Array | None:
     """Return the covariance [2, 2] of (eps', eps'') whose :func:`fit_ellipse` holds a share; None if no error is known.
 
     The standard errors are such that their ellipse of 95 % holds 95 %. Errors have long tails, so that 68 % lie closer
     than in a normal distribution: `half_widths_68` says how close.
     """
-    if e.spread is None:
+    if estimate.spread is None:
         return None
-    matrix = e.spread.matrix
-    if share == min(SHARES) and e.half_widths_68 is not None:
-        shrinkage = np.array(e.half_widths_68) / np.sqrt(np.diag(matrix))
+    matrix = estimate.spread.matrix
+    if share == min(SHARES) and estimate.half_widths_68 is not None:
+        shrinkage = np.array(estimate.half_widths_68) / np.sqrt(np.diag(matrix))
         matrix = matrix * np.outer(shrinkage, shrinkage)
     return matrix
 
@@ -96,16 +96,16 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
     -------
     [n, 2]: the labels' middles, in the same unit: for each the nearest free place, else the one that covers least.
     """
-    taken: list[Array] = []
+    taken_places: list[Array] = []
     keep_clear = np.concatenate([points, obstacles.reshape(-1, 2)])
-    turns = np.radians(45 + np.arange(_ANGLES) * 360 / _ANGLES)
-    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    angles_rad = np.radians(45 + np.arange(_ANGLES) * 360 / _ANGLES)
+    ring = np.stack([np.cos(angles_rad), np.sin(angles_rad)], axis=1)
     candidates = np.concatenate([radius * ring for radius in _RADII_PT])
     for point in points:
         best = point + candidates[0]
         least_cost = math.inf
         for place in point + candidates:
-            labels_covered = sum(bool((np.abs(place - taken_place) < _LABEL_PT).all()) for taken_place in taken)
+            labels_covered = sum(bool((np.abs(place - taken_place) < _LABEL_PT).all()) for taken_place in taken_places)
             points_covered = (np.abs(keep_clear - place) < np.array(_LABEL_PT) / 2 + _POINT_PT / 2).all(axis=1).sum()
             # A number on another one cannot be read; one on a point can.
             cost = 2.0 * labels_covered + points_covered
@@ -114,8 +114,8 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
                 least_cost = cost
             if least_cost == 0:
                 break
-        taken.append(best)
-    return np.array(taken).reshape(-1, 2)
+        taken_places.append(best)
+    return np.array(taken_places).reshape(-1, 2)
 
 
 def permittivity_figure(scan: ProcessedScan) -> bytes | None:
@@ -142,9 +142,9 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     ax.set_axisbelow(True)
     ax.set_xlabel("real part ε′", fontsize=9, color=MUTED)
     ax.set_ylabel("loss ε″", fontsize=9, color=MUTED)
-    for patch, e in estimates:
-        _draw_estimate(ax, e, _find_truth(patch), patch_colour(patch, colours))
-    _set_limits(ax, [e for _, e in estimates], truths)
+    for patch, estimate in estimates:
+        _draw_estimate(ax, estimate, _find_truth(patch), patch_colour(patch, colours))
+    _set_limits(ax, [estimate for _, estimate in estimates], truths)
     low = ax.get_ylim()[0]
     ax.axhspan(low, 0, color="#f0e7e6", zorder=0)
     ax.annotate(
@@ -165,10 +165,10 @@ def _find_truth(patch: PatchFigures) -> Point | None:
     return truth.real, -truth.imag
 
 
-def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour: str) -> None:
+def _draw_estimate(ax: Axes, estimate: PermittivityFigures, truth: Point | None, colour: str) -> None:
     """Draw a permittivity with its confidence regions (old products: percentiles of pixels), and the truth."""
-    centre = (e.real, e.loss)
-    regions = {share: matrix for share in _STYLES if (matrix := region_matrix(e, share)) is not None}
+    centre = (estimate.real, estimate.loss)
+    regions = {share: matrix for share in _STYLES if (matrix := region_matrix(estimate, share)) is not None}
     if regions:
         for share, matrix in regions.items():
             style = _STYLES[share]
@@ -181,14 +181,14 @@ def _draw_estimate(ax: Axes, e: PermittivityFigures, truth: Point | None, colour
                 # Only the inner region is filled.
                 area = Ellipse(centre, width, height, angle=angle, facecolor=colour, alpha=0.18, linewidth=0, zorder=2)
                 ax.add_patch(area)
-    elif e.real_p30_p70 and e.imag_p30_p70:
-        real_p30, real_p70 = e.real_p30_p70
-        imag_p30, imag_p70 = e.imag_p30_p70
+    elif estimate.real_p30_p70 and estimate.imag_p30_p70:
+        real_p30, real_p70 = estimate.real_p30_p70
+        imag_p30, imag_p70 = estimate.imag_p30_p70
         # The loss is minus the imaginary part: its lower end is at -imag_p70.
         ax.errorbar(
             *centre, color=colour, linewidth=1.2, zorder=3,
-            xerr=[[max(e.real - real_p30, 0)], [max(real_p70 - e.real, 0)]],
-            yerr=[[max(e.loss + imag_p70, 0)], [max(-imag_p30 - e.loss, 0)]],
+            xerr=[[max(estimate.real - real_p30, 0)], [max(real_p70 - estimate.real, 0)]],
+            yerr=[[max(estimate.loss + imag_p70, 0)], [max(-imag_p30 - estimate.loss, 0)]],
         )  # fmt: skip
     ax.plot(*centre, "o", color=colour, markersize=6, markeredgecolor=INK, markeredgewidth=0.6, zorder=3)
     if truth:
@@ -214,13 +214,13 @@ def _set_limits(ax: Axes, estimates: Sequence[PermittivityFigures], truths: Sequ
     ax.set_ylim(min(low[1], -0.1), high[1])
 
 
-def _measure_half_size(e: PermittivityFigures) -> Point:
+def _measure_half_size(estimate: PermittivityFigures) -> Point:
     """Return how far the drawing of an estimate reaches in (real part, loss): its 95 % ellipse, or its bars."""
-    if e.spread is not None:
+    if estimate.spread is not None:
         radius = math.sqrt(SHARES[0.95])
-        return radius * e.spread.real_std, radius * e.spread.loss_std
-    real = max(abs(end - e.real) for end in e.real_p30_p70 or (e.real,))
-    return real, max(abs(end - e.imag) for end in e.imag_p30_p70 or (e.imag,))
+        return radius * estimate.spread.real_std, radius * estimate.spread.loss_std
+    real = max(abs(end - estimate.real) for end in estimate.real_p30_p70 or (estimate.real,))
+    return real, max(abs(end - estimate.imag) for end in estimate.imag_p30_p70 or (estimate.imag,))
 
 
 def _draw_legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, str], with_truth: bool) -> Legend:
@@ -251,18 +251,18 @@ def _draw_legend(fig: Figure, estimates: Sequence[Estimate], colours: dict[str, 
 def _write_numbers(fig: Figure, ax: Axes, estimates: Sequence[Estimate], truths: Sequence[Point]) -> None:
     """Write the patches' numbers beside their points, with a line to numbers that are further away."""
     per_point = fig.dpi / 72
-    values = np.array([(e.real, e.loss) for _, e in estimates])
+    values = np.array([(estimate.real, estimate.loss) for _, estimate in estimates])
     points = ax.transData.transform(values) / per_point
     crosses = ax.transData.transform(np.array(truths, float).reshape(-1, 2)) / per_point
     places = place_numbers(points, crosses)
     leader_line = {"arrowstyle": "-", "color": MUTED, "linewidth": 0.6, "shrinkA": 3, "shrinkB": 3}
-    for (patch, e), place, point in zip(estimates, places, points, strict=True):
+    for (patch, estimate), place, point in zip(estimates, places, points, strict=True):
         offset = place - point
         arrow = None
         if np.hypot(*offset) > _LINE_FROM_PT:
             arrow = leader_line
         ax.annotate(
-            str(patch.label), (e.real, e.loss), textcoords="offset points",
+            str(patch.label), (estimate.real, estimate.loss), textcoords="offset points",
             xytext=(float(offset[0]), float(offset[1])), ha="center", va="center", fontsize=8, color=INK, zorder=5,
             fontweight="bold", path_effects=[withStroke(linewidth=2, foreground="white")],
             arrowprops=arrow,

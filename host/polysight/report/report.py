@@ -66,7 +66,7 @@ ALTERNATIVE_TEXTS = {
     "coverage": "Masked positions",
     "surface": "Surfaces from three sides",
 }
-# Figures of a board that have a table or a map of their own, or that only programs read.
+# Figures of a board that are shown in another table or in a map, or that only programs read.
 _NOT_LISTED = ("synchronisation", "raw_crc32", "masked_columns", "rows_recorded")
 # Last word of a key to the unit that it means.
 UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm", "m": "m", "bytes": "bytes"}
@@ -238,7 +238,7 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
     that the operator drew, `do` the measurement that would shrink the error most.
     """
     truth = patch.truth
-    e = patch.permittivity
+    estimate = patch.permittivity
     name = patch.name or f"patch {patch.label}"
     if patch.metal_reference and not patch.name:
         name = "metal reference"
@@ -276,32 +276,32 @@ def _format_patch_row(patch: PatchFigures, colours: dict[str, str]) -> dict[str,
         row["right"] = truth.name == patch.name or (patch.metal_reference and truth.metal)
         if truth.metal:
             row["true_real"] = "metal"
-    if e is not None:
-        row |= _format_estimate(e)
+    if estimate is not None:
+        row |= _format_estimate(estimate)
     if patch.true_permittivity is not None:
         row["true_real"] = f"{patch.true_permittivity.real:.2f}"
         row["true_loss"] = f"{-patch.true_permittivity.imag:z.2f}"
-        if e is not None:
-            row["relative_error"] = e.real / patch.true_permittivity.real - 1
+        if estimate is not None:
+            row["relative_error"] = estimate.real / patch.true_permittivity.real - 1
             # Adding zero after rounding removes the sign of a negative zero.
             row["error"] = f"{round(100 * row['relative_error'], 1) + 0.0:+z.1f} %"
     return row
 
 
-def _format_estimate(e: PermittivityFigures) -> dict[str, str]:
+def _format_estimate(estimate: PermittivityFigures) -> dict[str, str]:
     """Format a permittivity with its errors, the 30th and 70th percentile of its pixels, and the main error source."""
-    row = {"real": f"{e.real:z.2f}", "loss": f"{e.loss:z.2f}"}
-    if e.spread is not None:
-        row["real_error"] = f"± {e.spread.real_std:.2f}"
-        row["loss_error"] = f"± {e.spread.loss_std:.2f}"
-    if e.real_p30_p70 and e.imag_p30_p70:
-        real_p30, real_p70 = e.real_p30_p70
-        imag_p30, imag_p70 = e.imag_p30_p70
+    row = {"real": f"{estimate.real:z.2f}", "loss": f"{estimate.loss:z.2f}"}
+    if estimate.spread is not None:
+        row["real_error"] = f"± {estimate.spread.real_std:.2f}"
+        row["loss_error"] = f"± {estimate.spread.loss_std:.2f}"
+    if estimate.real_p30_p70 and estimate.imag_p30_p70:
+        real_p30, real_p70 = estimate.real_p30_p70
+        imag_p30, imag_p70 = estimate.imag_p30_p70
         row["real_range"] = f"({real_p30:.2f} … {real_p70:.2f})"
         row["loss_range"] = f"({-imag_p70:.2f} … {-imag_p30:.2f})"
-    row["dominated_by"] = e.dominated_by or ""
-    row["do"] = e.do or ""
-    share = e.shares.get(row["dominated_by"])
+    row["dominated_by"] = estimate.dominated_by or ""
+    row["do"] = estimate.do or ""
+    share = estimate.shares.get(row["dominated_by"])
     row["share"] = "" if share is None else f"{100 * share:.0f} %"
     return row
 
@@ -368,16 +368,16 @@ def format_value(value: Any) -> str:
             return str(int(value))
         return f"{int(value):,}".replace(",", "\u202f")
     if isinstance(value, float | np.floating):
-        v = float(value)
-        if v == int(v) and abs(v) < 1e15:
-            return format_value(int(v))
-        if abs(v) < 1000:
-            return f"{v:.3g}"
-        return f"{v:,.0f}".replace(",", "\u202f")
+        number = float(value)
+        if number == int(number) and abs(number) < 1e15:
+            return format_value(int(number))
+        if abs(number) < 1000:
+            return f"{number:.3g}"
+        return f"{number:,.0f}".replace(",", "\u202f")
     if isinstance(value, dict):
-        return ", ".join(f"{k}: {format_value(v)}" for k, v in value.items()) or DASH
+        return ", ".join(f"{k}: {format_value(number)}" for k, number in value.items()) or DASH
     if isinstance(value, list | tuple):
-        return ", ".join(format_value(v) for v in value) or "none"
+        return ", ".join(format_value(number) for number in value) or "none"
     return str(value)
 
 
@@ -399,19 +399,19 @@ def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[st
         out.append({"value": value, "text": what})
 
     if count := scan.named_plates:
-        aside = ""
+        note = ""
         if count.strange:
-            aside = f", {count.strange} recognised as not in the library"
-        add(f"{count.right} of {count.plates}", f"plates named right{aside}")
+            note = f", {count.strange} recognised as not in the library"
+        add(f"{count.right} of {count.plates}", f"plates named right{note}")
     elif rows:
         add(str(len(rows)), "patches found")
     accuracy = None if scan.materials is None else scan.materials.pixel_accuracy
     if accuracy is not None:
         expected = scan.expected_accuracy
-        aside = ""
+        note = ""
         if expected is not None:
-            aside = f"; their own confidence expects {_format_share(expected, 1)}"
-        add(_format_share(accuracy, 1), f"of interior pixels named right{aside}")
+            note = f"; their own confidence expects {_format_share(expected, 1)}"
+        add(_format_share(accuracy, 1), f"of interior pixels named right{note}")
     errors = [abs(r["relative_error"]) for r in rows if r["relative_error"] is not None]
     if errors:
         add(f"{100 * float(np.median(errors)):.1f} %", f"median error of ε′, worst {100 * max(errors):.1f} %")
@@ -452,9 +452,9 @@ def quality_tables(quality: dict[str, Any]) -> list[Table]:
         _tabulate_seconds(quality.get("seconds_per_stage")),
     )
     out = [part for part in parts if part]
-    if rest := {k: v for k, v in quality.items() if k not in shown_elsewhere}:
-        flat = _flatten(rest, nested=False)
-        rows = [_format_cells(format_heading(k), format_value(v)) for k, v in flat.items()]
+    if other_entries := {k: v for k, v in quality.items() if k not in shown_elsewhere}:
+        flat_entries = _flatten(other_entries, nested=False)
+        rows = [_format_cells(format_heading(k), format_value(v)) for k, v in flat_entries.items()]
         out.append({"caption": "Rows, masked data and other figures.", "head": [], "rows": rows})
     return out
 
@@ -542,9 +542,11 @@ def _tabulate_boards(boards: Any) -> Table | None:
     """Return a table of a line for each figure and a column for each board, narrow enough for a phone; None without."""
     if not isinstance(boards, dict) or not boards:
         return None
-    flat = {name: _flatten_board(board) for name, board in boards.items()}
-    keys = dict.fromkeys(k for board in flat.values() for k in board)
-    rows = [_format_cells(format_heading(k), *(format_value(board.get(k)) for board in flat.values())) for k in keys]
+    flat_boards = {name: _flatten_board(board) for name, board in boards.items()}
+    keys = dict.fromkeys(k for board in flat_boards.values() for k in board)
+    rows = [
+        _format_cells(format_heading(k), *(format_value(board.get(k)) for board in flat_boards.values())) for k in keys
+    ]
     caption = "Frames by board, of the recorded rows. Missing data are masked, never interpolated."
     return {"caption": caption, "head": ["Board", *map(str, boards)], "rows": rows}
 
@@ -571,14 +573,17 @@ def _tabulate_residuals(boards: Any) -> Table | None:
     """Return a table of `synchronisation`: a line for each stage, a column for each board's quantity; None without."""
     if not isinstance(boards, dict):
         return None
-    flat: dict[str, dict[str, Any]] = {}
+    flat_residuals: dict[str, dict[str, Any]] = {}
     for name, board in boards.items():
         for stage, quantities in (board.get("synchronisation") or {}).items():
-            flat.setdefault(stage, {}).update(_flatten({name: quantities}))
-    if not flat:
+            flat_residuals.setdefault(stage, {}).update(_flatten({name: quantities}))
+    if not flat_residuals:
         return None
-    keys = list(dict.fromkeys(k for v in flat.values() for k in v))
-    rows = [_format_cells(format_heading(stage), *(format_value(v.get(k)) for k in keys)) for stage, v in flat.items()]
+    keys = list(dict.fromkeys(k for v in flat_residuals.values() for k in v))
+    rows = [
+        _format_cells(format_heading(stage), *(format_value(v.get(k)) for k in keys))
+        for stage, v in flat_residuals.items()
+    ]
     # The caption says that the figures are standard deviations.
     head = ["After stage", *(format_heading(key.replace("_std", "")) for key in keys)]
     caption = (

@@ -37,7 +37,7 @@ from polysight.results import PatchFigures
 # Colours of a figure's text: titles, axes, and the word SIMULATED.
 INK = "#1b2330"
 MUTED = "#5b6675"
-STAMP = "#b3261e"
+STAMP_COLOUR = "#b3261e"
 PALETTE = (
     "#332288", "#88CCEE", "#44AA99", "#117733", "#999933", "#DDCC77", "#CC6677", "#882255", "#AA4499",
     "#77AADD", "#EE8866", "#EEDD88", "#FFAABB", "#99DDFF", "#44BB99", "#BBCC33", "#AAAA00",
@@ -112,7 +112,7 @@ def figure_label(name: str, number: str) -> str:
 def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     """Return the colour of each material in the results or the truth, the same in all figures."""
     names = {patch.name for patch in scan.segments if patch.name} | {plate.name for plate in scan.plates}
-    # Of each patch: the names of its pixels, and the mask of these.
+    # `pixel_names` has for each patch the names of its pixels, and the mask of these.
     for names_of_pixels, _ in scan.pixel_names.values():
         names |= set(np.unique(names_of_pixels).tolist())
     names.discard("unknown")
@@ -150,7 +150,7 @@ def style_axes(ax: Axes, title: str, simulated: bool) -> None:
     if simulated:
         ax.text(
             1.0, 1.015, "SIMULATED", transform=ax.transAxes, ha="right", va="bottom",
-            fontsize=8, color=STAMP, fontweight="bold",
+            fontsize=8, color=STAMP_COLOUR, fontweight="bold",
         )  # fmt: skip
     ax.set_xlabel("x (mm)", fontsize=9, color=MUTED)
     ax.set_ylabel("y (mm)", fontsize=9, color=MUTED)
@@ -261,9 +261,9 @@ def shorten_labels(fig: Figure, labels: Sequence[MapLabel]) -> list[MapLabel]:
     boxes = [label.text.get_window_extent() for label in labels]
     frames = [(label.text.axes or fig).bbox for label in labels]
     # A pixel beyond the frame does not show.
-    outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
+    is_outside = any(b.x0 < f.x0 - 1 or b.x1 > f.x1 + 1 for b, f in zip(boxes, frames, strict=True))
     touching = any(a.overlaps(b) for a, b in combinations([_widen(b, gap) for b in boxes], 2))
-    if not outside and not touching:
+    if not is_outside and not touching:
         return []
     for label in labels:
         replacement = label.number

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from polysight.products import write_json
-from polysight.report.style import INK, MUTED, STAMP, png
+from polysight.report.style import INK, MUTED, STAMP_COLOUR, png
 from polysight.sync import PUBLISHED_STD, STAGES, SyncedRow
 from polysight_shared.files import write_atomically
 
@@ -24,7 +24,7 @@ _LABELS = ("frequency (Hz)", "phase (rad)", "amplitude / mean - 1")
 # Bins of a histogram (chosen): an odd number, so that one is centred at zero.
 _BINS = 121
 # Histograms reach this many standard deviations of the first row to either side; chosen.
-_REACH = 5.0
+_RANGE_STDS = 5.0
 
 
 @dataclass
@@ -63,7 +63,7 @@ class SyncReport:
         self.stages: dict[str, _Stage] = {}
         self.positions = 0
         self.chirps = 0
-        # Of each row: power ratio as of `snr`, and its number of positions, the weight.
+        # For each row its power ratio (see `snr`) and its weight, the number of positions.
         self._snr: list[tuple[float, int]] = []
 
     def add(self, row: SyncedRow) -> None:
@@ -73,7 +73,7 @@ class SyncReport:
         for name, values in row.errors.items():
             if values.size:
                 if name not in self.stages:
-                    reach = _REACH * np.maximum(np.sqrt((values**2).mean(axis=1)), 1e-12)
+                    reach = _RANGE_STDS * np.maximum(np.sqrt((values**2).mean(axis=1)), 1e-12)
                     self.stages[name] = _Stage(reach)
                 self.stages[name].add(values)
         # One chirp alone has no noise estimate.
@@ -135,7 +135,7 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
     """Return a PNG: histograms of errors after each stage, the bounds as normal distributions, the paper's values."""
     fig = Figure(figsize=(11, 9), dpi=110, layout="constrained", facecolor="white")
     if simulated:
-        fig.suptitle(f"{title}   SIMULATED", color=STAMP, fontsize=12)
+        fig.suptitle(f"{title}   SIMULATED", color=STAMP_COLOUR, fontsize=12)
     else:
         fig.suptitle(title, color=INK, fontsize=12)
     bounds = report.bounds()
@@ -159,9 +159,9 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
             density = stage.counts[i] / max(stage.counts[i].sum(), 1) / (2 * reach / _BINS)
             ax.fill_between(x, density, step="mid", color="#88CCEE", label=f"std {std:.3g}")
             if name in bounds:
-                b = bounds[name][i]
-                normal = np.exp(-(x**2) / (2 * b**2)) / (b * np.sqrt(2 * np.pi))
-                ax.plot(x, normal, color="#CC6677", lw=1.2, label=f"Cramér-Rao, one tone {b:.3g}")
+                bound = bounds[name][i]
+                normal = np.exp(-(x**2) / (2 * bound**2)) / (bound * np.sqrt(2 * np.pi))
+                ax.plot(x, normal, color="#CC6677", lw=1.2, label=f"Cramér-Rao, one tone {bound:.3g}")
             if name == "referenced" and i < 2:
                 for sign in (-1, 1):
                     ax.axvline(sign * PUBLISHED_STD[QUANTITIES[i]], color=INK, lw=0.8, ls=":")
@@ -179,12 +179,12 @@ def format_report(boards: dict[str, dict[str, Any]], simulated: bool) -> str:
     if simulated:
         heading += ", simulated data"
     lines = [heading, ""]
-    for board, s in boards.items():
+    for board, stages in boards.items():
         snr = ""
-        if s["direct_snr_db"] is not None:
-            snr = f", direct path {s['direct_snr_db']} dB over noise a channel"
-        lines.append(f"{board}: {s['chirps']} chirps at {s['positions']} positions{snr}")
-        for name, stage in s["stages"].items():
+        if stages["direct_snr_db"] is not None:
+            snr = f", direct path {stages['direct_snr_db']} dB over noise a channel"
+        lines.append(f"{board}: {stages['chirps']} chirps at {stages['positions']} positions{snr}")
+        for name, stage in stages["stages"].items():
             values = f"{stage['frequency_hz_std']:10.2f} Hz {stage['phase_rad_std']:9.5f} rad"
             values += f" {stage['amplitude_std']:9.5f}"
             bound = ""

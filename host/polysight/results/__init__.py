@@ -17,8 +17,8 @@ from polysight.results.check_plate import (
 )
 from polysight.results.json_files import (
     damage_error as damage_error,
+    encode_json as encode_json,
     format_one_line as format_one_line,
-    json_text as json_text,
     read_object as read_object,
     to_plain as to_plain,
 )

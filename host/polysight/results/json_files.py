@@ -53,7 +53,7 @@ def format_one_line(finding: Finding) -> str:
     return "; ".join(part for part in (head, finding.do) if part)
 
 
-def json_text(content: Any) -> str:
+def encode_json(content: Any) -> str:
     """Return a value as the text of a JSON file, see :func:`to_plain`."""
     return json.dumps(to_plain(content), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 

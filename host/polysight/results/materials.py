@@ -38,7 +38,7 @@ _positions = count()
 
 @dataclass(frozen=True)
 class Column:
-    """How a figure of a patch is named and shown.
+    """Name and presentation of a figure of a patch.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ class ComplexNumber(msgspec.Struct, frozen=True):
 
     @property
     def value(self) -> complex:
-        """As a complex number; NaN for unknown parts."""
+        """The value as a complex number; unknown parts are NaN."""
         parts = [math.nan if part is None else part for part in (self.real, self.imag)]
         return complex(*parts)
 
@@ -570,7 +570,7 @@ class ErrorBudget(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MetalSource(msgspec.Struct, frozen=True, kw_only=True):
-    """How the metal reference was chosen, in one sentence, and whether it is certainly metal."""
+    """Origin of the metal reference in one sentence, and whether it is certainly metal."""
 
     how: str = ""
     certain: bool = False

@@ -183,7 +183,7 @@ class CalibrationSource(msgspec.Struct, frozen=True):
 
 
 class Recording(msgspec.Struct, frozen=True, kw_only=True):
-    """How published data were recorded: direction of the rows, losses by board, state of the data cubes by board,
+    """Recording of published data: direction of the rows, losses by board, state of the data cubes by board,
     notices.
     """
 
@@ -242,8 +242,8 @@ class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
             if self.pixel_accuracy is not UNSET:
                 msgspec.structs.force_setattr(self, "pixel_accuracy", None)
             if self.incidence is not UNSET:
-                bare = msgspec.structs.replace(self.incidence, largest_permittivity_change=UNSET)
-                msgspec.structs.force_setattr(self, "incidence", bare)
+                angles_only = msgspec.structs.replace(self.incidence, largest_permittivity_change=UNSET)
+                msgspec.structs.force_setattr(self, "incidence", angles_only)
 
     @classmethod
     def read(cls, path: Path) -> ScanQuality:

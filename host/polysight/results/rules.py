@@ -1,8 +1,9 @@
 """The rules of the verdict: each function turns one kind of evidence into findings, none if the evidence is good.
 
-A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. All limits are
-constants of this module, chosen where no source is given. The last argument of `reason` is the finding's weight, which
-orders the findings of one level, largest first. P is H / V relative to metal.
+A finding says what was found, why it matters and what to do; `join_reasons` joins them to a verdict. Its level is
+`none`, no result (limits with NONE), or `care`, use the result with care (limits with CARE). All limits are constants
+of this module, chosen where no source is given. The last argument of `reason` is the finding's weight, which orders the
+findings of one level, largest first. P is H / V relative to metal.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from polysight.results.verdict import Coverage, is_known, reason
 from polysight_shared.findings import Finding
 
-FILLED = 0.5
+FILLED_SHARE = 0.5
 """Share of the image's pixels in one region that is no patch, above which it fills the image."""
 FEW_POSITIONS = 0.5
 """Share of positions that are absent, masked or without a direct path, above which there is no result."""
@@ -28,7 +29,7 @@ below twice the expected ones (tests/imaging/test_sparse.py); of nine simulated 
 DIRECT_SNR_NONE_DB = -14.0
 """Direct path over noise in one sample of one chirp and channel, below which it counts as missing."""
 DIRECT_SNR_CARE_DB = 0.0
-"""The same ratio, below which the direct path counts as weak. The simulated rig has 5.5 dB, as the phase errors of the
+"""Ratio below which the direct path counts as weak. The simulated rig has 5.5 dB, as the phase errors of the
 POLySIGHT paper suggest."""
 DIRECT_LEVELS = (0.4, 3.0)
 """Range of metal's brightness relative to the direct path; in published data both are equal within a factor of 1.5."""
@@ -39,7 +40,7 @@ PLANE_TILT_DEG = 0.5
 """Distance and tilt of the plates' plane against the rig file, above which the result needs care."""
 PLANE_GATE_MM = 13.0
 """Distance at which the plates lie at the edge of the range gate."""
-APART_MM = 1.0
+IMAGE_SHIFT_MM = 1.0
 """Distance of the images of H and V above which boards are out of place; undisturbed scenes have up to 0.6 mm."""
 DRIFT_CARE = 0.035
 """Drift of ln(V / H) between plates above which the result needs care, each part."""
@@ -71,7 +72,7 @@ LEAKAGE_SHARE = 0.02
 """Relative error of permittivities by leakage, above which the result needs care."""
 LIBRARY_ANGLE_DEG = 0.3
 """Difference from the library's angle; the ratio of a material changes by 3 % in 0.3 degrees."""
-PAINT_TOLD = 0.2
+PAINT_REPORTED = 0.2
 """Probability of a painted metal reference from which on the verdict reports it; chosen."""
 MOST_OUTSHINING_DB = 6.0
 """Largest level of a plate relative to metal: a factor of two by thickness, tilt and illumination (published
@@ -183,9 +184,9 @@ def judge_rx_order(board: str, order: Sequence[int]) -> list[Finding]:
     """Judge a board's RX: `order` are the places in the rig file, from 1, of those recorded in another order."""
     if not order:
         return []
-    moved = [f"RX{k} is RX{place}" for k, place in enumerate(order, 1) if k != place]
+    moved_rx = [f"RX{k} is RX{place}" for k, place in enumerate(order, 1) if k != place]
     return [reason(
-        "none", f"the RX of {board} are recorded in another order than the rig file's: {', '.join(moved)}",
+        "none", f"the RX of {board} are recorded in another order than the rig file's: {', '.join(moved_rx)}",
         "the phases of direct path and echo fit these places; lanes are exchanged, or a program lists the RX in its own"
         " order; the image of the board is wrong",
         f"write rx_order = {list(order)} for {board} ([[boards]] of the rig file, and of the scan's own copy), or"
@@ -256,7 +257,7 @@ def judge_patches(
     `left_out` bright regions of a plate's size do not stand out enough to be patches, or touch a larger patch;
     `filled_share` is the share of the image's pixels in the largest of them.
     """
-    if patches == 0 and filled_share > FILLED:
+    if patches == 0 and filled_share > FILLED_SHARE:
         return [reason(
             "none", f"one region fills {100 * filled_share:.0f} % of the image: no edge of a plate is in it",
             "a plate as large as the image has nothing beside it from which it could stand out; a table, a wall or"
@@ -276,9 +277,9 @@ def judge_patches(
             "there is no flat object on the plane, or the data are noise",
             "look at the images; check the direct path and the range profile (polysight doctor)", 9.0,
         )]  # fmt: skip
-    by_reason: dict[str, list[int]] = {}
+    patches_by_reason: dict[str, list[int]] = {}
     for label, fault in refused.items():
-        by_reason.setdefault(fault, []).append(label)
+        patches_by_reason.setdefault(fault, []).append(label)
     if left_out:
         left_out_notes = [
             reason(
@@ -299,14 +300,14 @@ def judge_patches(
             "move the plates apart, or draw their boxes (polysight label; process --labels)",
             2.0,
         )
-        for fault, labels in by_reason.items()
+        for fault, labels in patches_by_reason.items()
     ]
 
 
 def judge_metal(
     patch: str,
-    likely: bool,
-    certain: bool,
+    is_likely: bool,
+    is_certain: bool,
     is_given: bool,
     contradicted: bool,
     only_patch: bool,
@@ -316,19 +317,19 @@ def judge_metal(
 ) -> list[Finding]:
     """Judge the metal reference `patch` ("patch 3").
 
-    By the other patches it is `likely` or `certain` to be metal; `contradicted`: by its own V / H against the direct
-    path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against it.
-    `is_given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
+    By the other patches it is `is_likely` or `is_certain` to be metal; `contradicted`: by its own V / H against the
+    direct path; `only_patch`: there are no others; `culprit`: the other patch that fits it least, if they speak against
+    it. `is_given`: the user chose it. `painted` is the probability that it is metal with a coating, `paint_mm` thick.
     """
     do = "lay a metal plate into the scene and name it (--metal-box X0,Y0,X1,Y1), or use `polysight calibrate metal`"
     if is_given and contradicted:
         return [reason(
-            "care" if likely or only_patch else "none",
+            "care" if is_likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
             "relative to the direct path it reflects less of V than of H, as no metal does", do, 8.0,
         )]  # fmt: skip
     # Before paint: where other patches speak against the metal, a dielectric explains them better than a coating does.
-    if is_given and culprit is not None and not likely:
+    if is_given and culprit is not None and not is_likely:
         return [reason(
             "care",
             f"the given metal reference ({patch}) may be no metal: patch {culprit} and others look odd beside it",
@@ -336,7 +337,7 @@ def judge_metal(
             " places",
             f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
         )]  # fmt: skip
-    if (is_given or certain) and painted > PAINT_TOLD:
+    if (is_given or is_certain) and painted > PAINT_REPORTED:
         given = "given " if is_given else ""
         return [reason(
             "care",
@@ -345,9 +346,9 @@ def judge_metal(
             " plate in the place of metal; permittivities are corrected for a coating, with its error",
             f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
-    if is_given or certain:
+    if is_given or is_certain:
         return []
-    if likely:
+    if is_likely:
         return [reason(
             "care", f"the metal reference ({patch}) is likely metal, not certainly",
             "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
@@ -391,14 +392,14 @@ def judge_leakage(measured: bool, estimated: bool, relative_error: float) -> lis
 
 
 def judge_plane(
-    known: bool,
+    is_known_plane: bool,
     offset_mm: float,
     tilt_deg: tuple[float, float],
     theta_std_deg: float,
     tilt_std_deg: tuple[float, float] = (0.0, 0.0),
 ) -> list[Finding]:
     """Judge the position of the plates' plane against the rig file; a tilt counts beyond its standard deviation."""
-    if not known or not all(map(is_known, (offset_mm, *tilt_deg))):
+    if not is_known_plane or not all(map(is_known, (offset_mm, *tilt_deg))):
         error = ""
         if is_known(theta_std_deg):
             error = f", +-{theta_std_deg:.2f} degrees"
@@ -440,15 +441,15 @@ def judge_copies(
     """
     if not labels:
         return []
-    place = f"x {shift_mm[0]:+z.0f}, y {shift_mm[1]:+z.0f} mm away and {-level_db:.0f} dB weaker"
+    place_text = f"x {shift_mm[0]:+z.0f}, y {shift_mm[1]:+z.0f} mm away and {-level_db:.0f} dB weaker"
     if has_gaps:
         return [reason(
-            "care", f"patches {', '.join(map(str, labels))} may repeat the plates, {place}",
+            "care", f"patches {', '.join(map(str, labels))} may repeat the plates, {place_text}",
             "positions without data repeat the plates in the image; these patches may be plates that are distorted",
             f"record the missing positions; {RECONSTRUCT}", 3.5,
         )]  # fmt: skip
     return [reason(
-        "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place}",
+        "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place_text}",
         "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
         "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
     )]  # fmt: skip
@@ -457,7 +458,7 @@ def judge_copies(
 def judge_image_shift(apart_mm: tuple[float, float]) -> list[Finding]:
     """Judge where the image of V lay relative to that of H (x, y)."""
     distance = float(np.hypot(*apart_mm))
-    if not is_known(distance) or distance <= APART_MM:
+    if not is_known(distance) or distance <= IMAGE_SHIFT_MM:
         return []
     return [reason(
         "care",
@@ -512,28 +513,28 @@ def judge_disturbed_plates(errors: Mapping[int, float], has_gaps: bool = False) 
 
     `has_gaps` as in :func:`judge_copies`.
     """
-    worst = {label: error for label, error in errors.items() if is_known(error) and error > DISTURBED_CARE}
-    if not worst:
+    above = {label: error for label, error in errors.items() if is_known(error) and error > DISTURBED_CARE}
+    if not above:
         return []
-    patches = f"patch {min(worst)}" if len(worst) == 1 else f"patches {', '.join(map(str, sorted(worst)))}"
+    patches = f"patch {min(above)}" if len(above) == 1 else f"patches {', '.join(map(str, sorted(above)))}"
     cause = "they are uneven, or copies of other plates lie there: a second path beside the direct path, or clipping"
     action = "use even plates; take reflectors away from the line between transmitter and receivers"
     if has_gaps:
         cause = "positions without data lay weak copies of the plates over them"
         action = f"record the missing positions; {RECONSTRUCT}"
     return [reason(
-        "care", f"V / H changes within {patches}: an error of up to {100 * max(worst.values()):.0f} % in permittivity",
+        "care", f"V / H changes within {patches}: an error of up to {100 * max(above.values()):.0f} % in permittivity",
         cause, action, 2.5,
     )]  # fmt: skip
 
 
 def judge_reference_tilt(tilt_deg: tuple[float, float]) -> list[Finding]:
     """Judge the tilt of a metal plate that was scanned separately, along the plane of incidence and across it."""
-    worst = max(tilt_deg, key=abs)
-    if not is_known(worst) or abs(worst) <= PLATE_ACROSS_DEG:
+    largest_tilt_deg = max(tilt_deg, key=abs)
+    if not is_known(largest_tilt_deg) or abs(largest_tilt_deg) <= PLATE_ACROSS_DEG:
         return []
     return [reason(
-        "care", f"the metal plate of the reference scan was tilted by {worst:+z.1f} degrees",
+        "care", f"the metal plate of the reference scan was tilted by {largest_tilt_deg:+z.1f} degrees",
         "the polarisation turns with it, in all plates alike, as if the boards had turned; corrected to a quarter",
         "lay the metal plate parallel to the stage, and scan it again", 4.1,
     )]  # fmt: skip
@@ -610,12 +611,12 @@ def judge_tilts(across_deg: Mapping[int, float]) -> list[Finding]:
     tilted = {label: angle for label, angle in across_deg.items() if is_known(angle) and abs(angle) > PLATE_ACROSS_DEG}
     if not tilted:
         return []
-    worst = max(tilted, key=lambda label: abs(tilted[label]))
+    steepest = max(tilted, key=lambda label: abs(tilted[label]))
     remark = ""
     if len(tilted) != 1:
         remark = f" ({len(tilted)} patches in all)"
     return [reason(
-        "care", f"patch {worst} rises by {tilted[worst]:+z.1f} degrees across the plane of incidence{remark}",
+        "care", f"patch {steepest} rises by {tilted[steepest]:+z.1f} degrees across the plane of incidence{remark}",
         "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
         "lay plates and metal flat; shim the tilted one", 1.3,
     )]  # fmt: skip

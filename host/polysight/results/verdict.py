@@ -61,17 +61,17 @@ class Verdict(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         return "\n".join(self.lines())
 
-    def lines(self, most: int | None = None) -> list[str]:
-        """Return text for a terminal: the level, then each reason and remedy; at most `most` reasons."""
-        shown_reasons = self.reasons[:most]
+    def lines(self, max_reasons: int | None = None) -> list[str]:
+        """Return text for a terminal: the level, then each reason and remedy; at most `max_reasons` reasons."""
+        shown_reasons = self.reasons[:max_reasons]
         lines = [f"verdict:  {self.text}"]
-        for r in shown_reasons:
+        for reason in shown_reasons:
             cause = ""
-            if r.why:
-                cause = f": {r.why}"
-            lines.append(f"  - {r.what}{cause}")
-            if r.do:
-                lines.append(f"    do: {r.do}")
+            if reason.why:
+                cause = f": {reason.why}"
+            lines.append(f"  - {reason.what}{cause}")
+            if reason.do:
+                lines.append(f"    do: {reason.do}")
         if len(shown_reasons) < len(self.reasons):
             lines.append(f"  - and {len(self.reasons) - len(shown_reasons)} more, see the report")
         return lines

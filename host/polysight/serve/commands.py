@@ -21,20 +21,29 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from polysight.catalogue import NOTES, PROGRAM, Notes, Summary, find_program, find_programs, is_plain, write_notes
+from polysight.catalogue import (
+    NOTES_FILE,
+    PROGRAM_FOLDER,
+    Notes,
+    Summary,
+    find_program,
+    find_programs,
+    is_plain,
+    write_notes,
+)
 from polysight.jobs.label import remove_labels, save_labels
 from polysight.materials import LAYER_FORMS, Labels, parse_layer
-from polysight.planning import Changes, forecast, forecast_values
+from polysight.planning import PlanChanges, forecast, forecast_values
 from polysight.products import LABELS, find_labels, label_folder, read_products
-from polysight.serve.reading import json_answer
+from polysight.serve.reading import make_json_answer
 from polysight.serve.site import LIBRARIES, Site
 from polysight.store import ScanFolder
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 from polysight_shared.tables import decode, to_builtins
 
-RIG = "instrument.toml"
-REQUEST = "request.json"
+RIG_FILE = "instrument.toml"
+REQUEST_FILE = "request.json"
 # Bytes of the file of a request that are read; a request itself cannot be longer (`guard.BODY_BYTES`).
 MAX_REQUEST_BYTES = 1 << 16
 Format = Literal["csv", "mat", "netcdf"]
@@ -65,9 +74,9 @@ class PlanRequest(Body, frozen=True):
     speed_mm_s: Size | None = None
     pulses: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None
 
-    def changes(self) -> Changes:
-        """Return the same numbers as changes of a plan."""
-        return Changes(**msgspec.structs.asdict(self))
+    def changes(self) -> PlanChanges:
+        """Return the numbers as changes of a plan."""
+        return PlanChanges(**msgspec.structs.asdict(self))
 
     def apply(self, config: Path) -> Instrument:
         """Return the rig file with these numbers. Raises ConfigError."""
@@ -162,7 +171,7 @@ Words = list[str | Path]
 """Words of a `polysight` command line, after the program's name."""
 
 
-class Named(NamedTuple):
+class RequestedScan(NamedTuple):
     """The scan that a request names, and its folder."""
 
     name: str
@@ -174,21 +183,23 @@ def command_routes(site: Site) -> list[Route]:
 
     async def show_request(request: Request) -> Response:
         name = site.name(request)
-        return json_answer(await site.read_scan(request, lambda folder: read_request(folder, name)))
+        return make_json_answer(await site.read_scan(request, lambda folder: read_request(folder, name)))
 
     def make_route(path: str, kind: type[Body], work: Callable[[Site, Any], object]) -> Route:
         async def endpoint(request: Request) -> Response:
             body = decode_body(await request.body(), kind)
-            return json_answer(await site.act(lambda: work(site, body)))
+            return make_json_answer(await site.run_command(lambda: work(site, body)))
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
 
-    def make_scan_route(path: str, kind: type[Body], work: Callable[[Site, Named, Any], object]) -> Route:
+    def make_scan_route(path: str, kind: type[Body], work: Callable[[Site, RequestedScan, Any], object]) -> Route:
         async def endpoint(request: Request) -> Response:
             body = decode_body(await request.body(), kind)
             name = site.name(request)
             # Commands use a scan's folder like reads: in a thread, with a time limit.
-            return json_answer(await site.read_scan(request, lambda folder: work(site, Named(name, folder), body)))
+            return make_json_answer(
+                await site.read_scan(request, lambda folder: work(site, RequestedScan(name, folder), body))
+            )
 
         return Route(f"/api/{path}", endpoint, methods=["POST"])
 
@@ -274,7 +285,7 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     # Raises if there is no such library.
     _list_processing_options(site, body.library, body.metal)
     folder = site.scans.folder(body.name, new=True)
-    if folder.exists() and any(p.name not in (PROGRAM, NOTES) for p in folder.iterdir()):
+    if folder.exists() and any(p.name not in (PROGRAM_FOLDER, NOTES_FILE) for p in folder.iterdir()):
         raise ConfigError(
             f"{body.name} exists already", "scans are never overwritten", "give another name",
             code=ErrorCode.NAME_TAKEN,
@@ -282,15 +293,15 @@ def check_request(site: Site, body: StartRequest) -> Instrument:
     return rig
 
 
-def _start_again(site: Site, scan: Named, body: Body) -> None:
-    """Start a scan once more that could not start; its saved request is checked as if it came from the page."""
+def _start_again(site: Site, scan: RequestedScan, body: Body) -> None:
+    """Repeat the start of a scan that could not start; its saved request is checked as if it came from the page."""
     del body
     start_scan(site, read_request(scan.folder, scan.name))
 
 
 def read_request(folder: Path, name: str) -> StartRequest:
     """Return the request that started a scan, or one made from its plan. Raises PolysightError if it has neither."""
-    path = folder / PROGRAM / REQUEST
+    path = folder / PROGRAM_FOLDER / REQUEST_FILE
     if is_plain(path) and not path.parent.is_symlink():
         request = decode_body(path.read_bytes()[:MAX_REQUEST_BYTES], StartRequest)
         return msgspec.structs.replace(request, name=name)
@@ -312,19 +323,19 @@ def _enqueue_scan(site: Site, body: StartRequest) -> None:
     site.queue.add(body.name, msgspec.json.encode(body))
 
 
-def _archive_scan(site: Site, scan: Named, body: ScanName) -> None:
+def _archive_scan(site: Site, scan: RequestedScan, body: ScanName) -> None:
     """Move a scan out of the list; its files are kept in the hidden archive."""
     _put_away(site, scan, body.name)
 
 
-def _delete(site: Site, scan: Named, body: ScanName) -> None:
+def _delete(site: Site, scan: RequestedScan, body: ScanName) -> None:
     """Move a scan out of the list, and delete its files in the background."""
     # The scan leaves the list immediately; its files may take longer.
-    place = _put_away(site, scan, body.name)
-    threading.Thread(target=shutil.rmtree, args=(place, True), name="delete").start()
+    archive_folder = _put_away(site, scan, body.name)
+    threading.Thread(target=shutil.rmtree, args=(archive_folder, True), name="delete").start()
 
 
-def _put_away(site: Site, scan: Named, typed: str) -> Path:
+def _put_away(site: Site, scan: RequestedScan, typed: str) -> Path:
     """Move a scan into the hidden archive; returns its new place. Raises PolysightError."""
     name, folder = scan
     if typed != name:
@@ -337,10 +348,10 @@ def _put_away(site: Site, scan: Named, typed: str) -> Path:
         summary = site.scans.summary(name)
         if working or summary.state in ("running", "paused", "frozen"):
             raise ScanError(f"{name} is in use", "its files are being written", "wait, or stop it", code=ErrorCode.BUSY)
-        place = site.logs / "archive" / f"{time.time_ns()}" / folder.name
-        place.parent.mkdir(parents=True)
-        folder.rename(place)
-    return place
+        archive_folder = site.logs / "archive" / f"{time.time_ns()}" / folder.name
+        archive_folder.parent.mkdir(parents=True)
+        folder.rename(archive_folder)
+    return archive_folder
 
 
 def _check_free(site: Site) -> None:
@@ -358,13 +369,13 @@ def _check_free(site: Site) -> None:
     )
 
 
-def _is_starting(site: Site, s: Summary) -> bool:
+def _is_starting(site: Site, summary: Summary) -> bool:
     """True if the program of a scan runs, but has not yet given a sign of life.
 
     Such a scan is listed as `begun` (a folder without rows), or when it is resumed still as `lost`.
     """
-    if s.state in ("begun", "lost"):
-        program = find_program(site.scans.root / s.name, "scan")
+    if summary.state in ("begun", "lost"):
+        program = find_program(site.scans.root / summary.name, "scan")
     else:
         program = None
     return program is not None and program.running
@@ -372,18 +383,21 @@ def _is_starting(site: Site, s: Summary) -> bool:
 
 def _write_files(folder: Path, rig: Instrument, request: StartRequest) -> Path:
     """Write a scan's rig file, and its request for another start; returns the rig file's path. Raises ConfigError."""
-    place = folder / PROGRAM
-    if place.is_symlink():
-        raise ConfigError(f"{place} is a link", "the folder was made by another program", "give another name")
-    place.mkdir(parents=True, exist_ok=True)
-    for name, content in ((RIG, tomli_w.dumps(to_builtins(rig)).encode()), (REQUEST, msgspec.json.encode(request))):
+    program_folder = folder / PROGRAM_FOLDER
+    if program_folder.is_symlink():
+        raise ConfigError(f"{program_folder} is a link", "the folder was made by another program", "give another name")
+    program_folder.mkdir(parents=True, exist_ok=True)
+    for name, content in (
+        (RIG_FILE, tomli_w.dumps(to_builtins(rig)).encode()),
+        (REQUEST_FILE, msgspec.json.encode(request)),
+    ):
         # Through a link there, another file would be written.
-        (place / name).unlink(missing_ok=True)
-        (place / name).write_bytes(content)
-    return place / RIG
+        (program_folder / name).unlink(missing_ok=True)
+        (program_folder / name).write_bytes(content)
+    return program_folder / RIG_FILE
 
 
-def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
+def _resume(site: Site, scan: RequestedScan, body: ResumeRequest) -> None:
     """Start `polysight resume` for a scan, unless the rig is in use."""
     words: Words = ["resume", scan.folder.absolute(), *_list_processing_options(site, body.library, None)]
     if body.keep_incomplete:
@@ -393,7 +407,7 @@ def _resume(site: Site, scan: Named, body: ResumeRequest) -> None:
         site.programs.start(scan.folder, "scan", words)
 
 
-def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
+def _process(site: Site, scan: RequestedScan, body: ProcessRequest) -> None:
     """Start `polysight process` for a scan; its products go into the scan's folder.
 
     Raises ConfigError if the scan's boxes are asked for, and there are none.
@@ -414,7 +428,7 @@ def _process(site: Site, scan: Named, body: ProcessRequest) -> None:
     site.programs.start(folder, "process", words)
 
 
-def _fit_layers(site: Site, scan: Named, body: LayersRequest) -> None:
+def _fit_layers(site: Site, scan: RequestedScan, body: LayersRequest) -> None:
     """Start `polysight permittivity` for a stack of layers, after a check of their texts."""
     for text in body.layers:
         try:
@@ -436,7 +450,7 @@ class SavedLabels(msgspec.Struct, frozen=True):
     notes: list[str] = []
 
 
-def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
+def _save_labels(site: Site, scan: RequestedScan, body: LabelRequest) -> SavedLabels:
     """Save the boxes drawn on the page in the folder of the products; without boxes the file is removed."""
     del site
     labels = Labels(body.boxes, "mm", body.metal or None, body.specimens, by_hand=True)
@@ -444,13 +458,13 @@ def _save_labels(site: Site, scan: Named, body: LabelRequest) -> SavedLabels:
         remove_labels(scan.folder)
         return SavedLabels("")
     products = read_products(scan.folder)
-    place = label_folder(products.folder)
-    _, notes = save_labels(place, products, labels)
-    return SavedLabels(str(place / LABELS), notes)
+    labels_folder = label_folder(products.folder)
+    _, notes = save_labels(labels_folder, products, labels)
+    return SavedLabels(str(labels_folder / LABELS), notes)
 
 
-def _save_notes(site: Site, scan: Named, body: NotesRequest) -> Notes:
-    """Save notes and tags of a scan; refused if somebody else has changed them meanwhile."""
+def _save_notes(site: Site, scan: RequestedScan, body: NotesRequest) -> Notes:
+    """Save notes and tags of a scan; refused if another person has changed them meanwhile."""
     del site
     return write_notes(scan.folder, Notes(body.notes, body.tags), body.base)
 
@@ -469,7 +483,7 @@ def _fit_concentration(site: Site, body: LibraryRequest) -> None:
     site.programs.start(site.logs, "concentration", ["concentration", _find_library(site, body.library)])
 
 
-def _export(site: Site, scan: Named, body: ExportRequest) -> None:
+def _export(site: Site, scan: RequestedScan, body: ExportRequest) -> None:
     """Start an export into the folder of the scan. Raises DataError if `export` is a link that leads out of it."""
     folder = scan.folder.absolute()
     out = folder / "export"

@@ -4,7 +4,7 @@ It looks at the first bytes of each connection. One that brings a command with t
 other one is handed to the process of the pages (`front`) as an open socket. Each connection carries one request, so
 that a command is always the first thing on its own.
 
-With TLS nobody can see what a connection brings: `front` accepts by itself then, and answers commands, too.
+With TLS the process cannot see the content of a connection: `front` accepts by itself then, and answers commands, too.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from polysight.serve.guard import HEAD_BYTES, TOKEN_HEADER
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # First bytes of a command to a scan.
-COMMAND = b"POST /api/control/"
+COMMAND_START = b"POST /api/control/"
 TOKEN_LINE = TOKEN_HEADER.lower().encode()
 # Connections that are accepted, or taken over, before other work of the process is done; chosen.
 ACCEPTED_AT_ONCE = 64
 # Connections that have not sent anything (chosen). With one more, the one that is silent for longest is closed.
 MOST_SILENT = 1024
-# Connections that the pages' process has not taken yet (chosen). With one more, the oldest is answered `BUSY`.
+# Connections that the pages' process has not taken yet (chosen). With one more, the oldest is answered `BUSY_ANSWER`.
 MOST_WAITING = 512
-BUSY = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+BUSY_ANSWER = b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
 
 
 class Door:
@@ -128,7 +128,7 @@ class Door:
 
 def is_command(head: bytes, token: bytes) -> bool:
     """True if these first bytes are the whole head of a command to a scan, with the right token."""
-    if not head.startswith(COMMAND) or b"\r\n\r\n" not in head:
+    if not head.startswith(COMMAND_START) or b"\r\n\r\n" not in head:
         return False
     lines, _, _ = head.partition(b"\r\n\r\n")
     for line in lines.split(b"\r\n"):
@@ -142,7 +142,7 @@ def _refuse(client: socket.socket) -> None:
     """Answer that the server is busy; the request is read, so that the client gets the answer and no reset."""
     with suppress(OSError):
         client.recv(HEAD_BYTES)
-        client.send(BUSY)
+        client.send(BUSY_ANSWER)
     client.close()
 
 
@@ -230,10 +230,10 @@ class PagesServer(EndingServer):
         )
         for _ in range(ACCEPTED_AT_ONCE):
             try:
-                sent, descriptors, _, _ = socket.recv_fds(self._door, 1, 1)
+                message, descriptors, _, _ = socket.recv_fds(self._door, 1, 1)
             except BlockingIOError:
                 return
-            if not sent:
+            if not message:
                 loop.remove_reader(self._door)
                 self.should_exit = True
                 return

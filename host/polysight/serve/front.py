@@ -32,7 +32,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from polysight.acquisition import BADGES, LAPSE_S, STATES, Life, ScanCommand, send_command
+from polysight.acquisition import BADGES, LAPSE_S, STATES, ScanCommand, SignOfLife, send_command
 from polysight.catalogue import Scans
 from polysight.serve.commands import decode_body
 from polysight.serve.guard import HANDLERS, Access, Guard, cookie_name, refuse, tell_no_page
@@ -69,7 +69,7 @@ T = TypeVar("T")
 
 
 class PageFacts(msgspec.Struct, frozen=True):
-    """What a page may show.
+    """Facts that decide what a page shows.
 
     `control`: scans may be commanded. `starts`: programs can be started. `known`: the page's token is right, or not
     needed. `only`: name of the one scan that is served; None for a folder of scans. `badges`: words and colour of each
@@ -225,7 +225,7 @@ def command_route(front: Front) -> Route:
 def stage_routes(stage: StageControl) -> list[Route]:
     """Return the routes of home and jog; all are POST, since even looking asks the Pi."""
     actions: dict[str, Callable[[bytes], StagePlace]] = {
-        "look": lambda _: stage.look(),
+        "look": lambda _: stage.read_position(),
         "home": lambda _: stage.home(),
         "stop": lambda _: stage.stop(),
         "jog": lambda body: stage.jog(decode_body(body, JogRequest)),
@@ -234,8 +234,8 @@ def stage_routes(stage: StageControl) -> list[Route]:
     def make_route(name: str, action: Callable[[bytes], StagePlace]) -> Route:
         async def endpoint(request: Request) -> Response:
             body = await request.body()
-            place = await run_in_own_thread(lambda: action(body))
-            return Response(msgspec.json.encode(place), media_type="application/json")
+            stage_place = await run_in_own_thread(lambda: action(body))
+            return Response(msgspec.json.encode(stage_place), media_type="application/json")
 
         return Route(f"/api/stage/{name}", endpoint, methods=["POST"])
 
@@ -266,14 +266,14 @@ class RunningScans:
         if time.monotonic() - self._listed_at < RUNNING_AGE_S or not self._lock.acquire(blocking=False):
             return self._running
         try:
-            described = [self._describe(name, life) for name, life in self._scans.lives()]
+            described = [self._describe(name, life) for name, life in self._scans.iterate_signs_of_life()]
             self._running = [scan for scan in described if scan is not None]
             self._listed_at = time.monotonic()
         finally:
             self._lock.release()
         return self._running
 
-    def _describe(self, name: str, life: Life) -> RunningScan | None:
+    def _describe(self, name: str, life: SignOfLife) -> RunningScan | None:
         """Return a scan for the header from its last sign of life; None if that is older than `KILLED_SHOWN_S`."""
         silent_s = time.time() - life.written_s
         if silent_s > KILLED_SHOWN_S:
@@ -391,8 +391,8 @@ class ConnectionLimit:
     # Connections with unread bytes that are passed over for one that is closed; chosen.
     MAX_PASSED = 8
 
-    def __init__(self, most: int) -> None:
-        self._most = most
+    def __init__(self, max_connections: int) -> None:
+        self._most = max_connections
         self._open = 0
         # Those that have never sent a whole request are closed first.
         self._silent: OrderedDict[CountedConnection, None] = OrderedDict()
@@ -508,6 +508,6 @@ class EndingServer(uvicorn.Server):
         await asyncio.sleep(0)
 
 
-def make_counting_protocol(most: int) -> Any:
+def make_counting_protocol(max_connections: int) -> Any:
     """Make uvicorn's protocol class for connections that share a limit."""
-    return partial(CountedConnection, limit=ConnectionLimit(most))
+    return partial(CountedConnection, limit=ConnectionLimit(max_connections))

@@ -24,7 +24,7 @@ from starlette.requests import ClientDisconnect, Request, cookie_parser
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError, os_error
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError, convert_os_error
 
 TOKEN_HEADER = "X-Polysight-Token"
 # Largest head (address and headers) and largest body of a request; chosen, far above what the page sends.
@@ -52,7 +52,7 @@ class Access:
     Attributes
     ----------
     token
-        Needed for control, and for reading below /api/ unless `loopback`; "": nobody controls, everybody reads.
+        Needed for control, and for reading below /api/ unless `loopback`; "": no one controls, everyone reads.
     loopback
         True if the server is bound to this machine only, and has no further names: behind a proxy, which needs one,
         requests of all machines come from this one.
@@ -218,7 +218,7 @@ def refuse_body() -> Response:
 
 
 def _close_after(answer: Response) -> Response:
-    """Return the same answer, after which the connection is closed: the rest of the request is not read."""
+    """Return the answer, after which the connection is closed: the rest of the request is not read."""
     answer.headers["Connection"] = "close"
     return answer
 
@@ -266,7 +266,7 @@ def refuse(status: int, code: ErrorCode, problem: str, why: str, do: str) -> Res
 async def tell_error(request: Request, e: Exception) -> Response:
     """Answer with an error that was raised. A file that cannot be written or read is not a defect of this program."""
     if isinstance(e, OSError):
-        error = os_error(e)
+        error = convert_os_error(e)
     else:
         error = e
     if not isinstance(error, PolysightError):

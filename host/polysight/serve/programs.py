@@ -26,13 +26,13 @@ from pathlib import Path
 import msgspec
 
 from polysight.acquisition import read_start_ticks
-from polysight.catalogue import PROGRAM, ProgramRecord, find_program, is_plain
+from polysight.catalogue import PROGRAM_FOLDER, ProgramRecord, find_program, is_plain
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, PolysightError, ScanError
 from polysight_shared.files import write_atomically
 
 OOM_SCORE = Path("/proc/self/oom_score_adj")
 # $0 is the path of log and status without their ends, $1 the kernel's score of the memory killer; the program follows.
-SHELL = (
+LAUNCH_SCRIPT = (
     '{ echo "$1" > /proc/self/oom_score_adj; } 2> /dev/null; shift;'
     ' "$@" >> "$0.log" 2>&1 < /dev/null; echo $? > "$0.status"'
 )
@@ -75,14 +75,14 @@ class Programs:
                 f"{folder}: {kind} runs already", "it was started before", "wait for it, or stop it",
                 code=ErrorCode.BUSY,
             )  # fmt: skip
-        place = (folder / PROGRAM).absolute()
-        _check_place(place, kind)
+        program_folder = (folder / PROGRAM_FOLDER).absolute()
+        _check_place(program_folder, kind)
         try:
-            self.launch([sys.executable, "-m", "polysight", *map(str, words)], place / kind)
+            self.launch([sys.executable, "-m", "polysight", *map(str, words)], program_folder / kind)
         except OSError as e:
             raise DeviceError(
                 # The error of a full disk has no file name.
-                f"{folder}: {kind} cannot be started: {e.filename or place}: {e.strerror or e}",
+                f"{folder}: {kind} cannot be started: {e.filename or program_folder}: {e.strerror or e}",
                 "no room, no permission, or no memory",
                 "remove the cause; or give the same command in a terminal",
             ) from None
@@ -96,7 +96,7 @@ class Programs:
         now = datetime.now(UTC).isoformat(timespec="seconds")
         with base.with_suffix(".log").open("a", encoding="utf-8") as log:
             log.write(f"--- {now} {' '.join(command)}\n")
-        shell = ["/bin/sh", "-c", SHELL, str(base), self._oom_score]
+        shell = ["/bin/sh", "-c", LAUNCH_SCRIPT, str(base), self._oom_score]
         pid = os.posix_spawn(shell[0], [*shell, *command], os.environ, setsid=True)
         self._running.append(pid)
         record = ProgramRecord(pid, read_start_ticks(pid) or 0, list(command), now)
@@ -117,11 +117,11 @@ class Programs:
         self._thread.shutdown()
 
 
-def _check_place(place: Path, kind: str) -> None:
+def _check_place(program_folder: Path, kind: str) -> None:
     """Refuse a folder of logs with links, through which other files would be overwritten. Raises DeviceError."""
-    files = [place / f"{kind}{suffix}" for suffix in (".json", ".log", ".status")]
-    for path in (place, *files):
-        if path.is_symlink() or (path != place and path.exists() and not is_plain(path)):
+    files = [program_folder / f"{kind}{suffix}" for suffix in (".json", ".log", ".status")]
+    for path in (program_folder, *files):
+        if path.is_symlink() or (path != program_folder and path.exists() and not is_plain(path)):
             raise DeviceError(
                 f"{path} is a link or not a regular file", "the folder was made by another program",
                 "remove it, and find out who made it", code=ErrorCode.PATH_OUTSIDE,
@@ -135,10 +135,10 @@ MAX_WAITING = 50
 # Time between two attempts to start the next scan; chosen.
 LOOK_S = 2.0
 # States of a scan (`page.status`) after which a person has to look at the rig.
-UNFINISHED = ("stopped", "failed", "lost", "frozen", "damaged")
+UNFINISHED_STATES = ("stopped", "failed", "lost", "frozen", "damaged")
 
 
-class Waiting(msgspec.Struct, frozen=True):
+class WaitingRequests(msgspec.Struct, frozen=True):
     """The names in the queue, the next one first. `held`: why the queue waits for a person, "" while it does not."""
 
     names: list[str]
@@ -164,9 +164,9 @@ class Queue:
         self._thread = threading.Thread(target=self._run, name="queue", daemon=True)
         self._thread.start()
 
-    def waiting(self) -> Waiting:
+    def waiting(self) -> WaitingRequests:
         """Return the names in the queue, and why it is held."""
-        return Waiting([name for name, _ in self._list_requests()], self._held)
+        return WaitingRequests([name for name, _ in self._list_requests()], self._held)
 
     def add(self, name: str, request: bytes) -> None:
         """Add a request at the end. Raises ConfigError if its name waits already, or the queue is full."""
@@ -221,12 +221,12 @@ class Queue:
         try:
             states = self._list_states()
             unfinished = self._find_unfinished(states)
-            seen = self._seen
-            if seen is None:
-                seen = unfinished - set(list(states)[:1])
+            seen_scans = self._seen
+            if seen_scans is None:
+                seen_scans = unfinished - set(list(states)[:1])
             self._seen = unfinished
-            # Also if a person started it: the cause of its stop may stop all of them.
-            for new in sorted(unfinished - seen):
+            # This applies to a scan that a person started, too: the cause of its stop may stop all scans.
+            for new in sorted(unfinished - seen_scans):
                 self._held = f"{new}: {states[new]}"
                 return
             self._start(path.read_bytes())
@@ -242,7 +242,7 @@ class Queue:
     @staticmethod
     def _find_unfinished(states: dict[str, str]) -> set[str]:
         """Return the scans after which a person has to look at the rig."""
-        return {name for name, state in states.items() if state in UNFINISHED}
+        return {name for name, state in states.items() if state in UNFINISHED_STATES}
 
     def close(self) -> None:
         """Stop starting scans; those in the queue stay there."""

@@ -25,7 +25,7 @@ from polysight.page import Watch
 from polysight.products import REPORT, read_products
 from polysight.results import ACTION_SIGMAS, WARNING_SIGMAS, CheckResult
 from polysight.serve.guard import refuse
-from polysight.serve.programs import Waiting
+from polysight.serve.programs import WaitingRequests
 from polysight.serve.site import THUMBNAIL, ListChanges, ListedScan, Site, check_products, compare_products, draw_map
 from polysight_shared.errors import DataError, ErrorCode, PolysightError, ScanError
 
@@ -71,7 +71,7 @@ def reading_routes(site: Site) -> list[Route]:
     return [make_route(path, answer) for path, answer in endpoints.items()]
 
 
-def json_answer(content: object) -> Response:
+def make_json_answer(content: object) -> Response:
     """Return an answer in JSON from structs, dataclasses or plain data; numbers that are not finite become null."""
     return Response(msgspec.json.encode(content), media_type="application/json")
 
@@ -114,10 +114,10 @@ async def _send_scans(site: Site, request: Request) -> Response:
             unread=site.scans.unread,
             free_bytes=free_bytes,
             libraries=list(site.libraries()),
-            left_out=list(site.scans.left_out()),
+            left_out=list(site.scans.list_left_out()),
         )
 
-    return json_answer(await site.read("", list_scans))
+    return make_json_answer(await site.read("", list_scans))
 
 
 async def _send_scan(site: Site, request: Request) -> Response:
@@ -126,18 +126,18 @@ async def _send_scan(site: Site, request: Request) -> Response:
 
     def read_details(folder: Path) -> ScanDetails:
         facts = asdict(site.scans.summary(name)) | asdict(catalogue.read_notes(folder))
-        place = str(folder.absolute())
-        return ScanDetails(**facts, bytes=site.size(name), folder=place, programs=catalogue.find_programs(folder))
+        folder_text = str(folder.absolute())
+        return ScanDetails(**facts, bytes=site.size(name), folder=folder_text, programs=catalogue.find_programs(folder))
 
-    return json_answer(await site.read_scan(request, read_details))
+    return make_json_answer(await site.read_scan(request, read_details))
 
 
 async def _send_queue(site: Site, request: Request) -> Response:
     """Answer with the names that wait for the rig; none if no scan can be started here."""
     del request
     if not site.starts:
-        return json_answer(Waiting([]))
-    return json_answer(await site.read("", site.queue.waiting))
+        return make_json_answer(WaitingRequests([]))
+    return make_json_answer(await site.read("", site.queue.waiting))
 
 
 async def _send_thumbnail(site: Site, request: Request) -> Response:
@@ -161,8 +161,8 @@ async def _send_program(site: Site, request: Request) -> Response:
     """Answer with the state of a program that belongs to no scan; null for any other."""
     kind = request.path_params["kind"]
     if kind not in ("doctor", "train", "concentration"):
-        return json_answer(None)
-    return json_answer(await site.read("", lambda: catalogue.find_program(site.logs, kind)))
+        return make_json_answer(None)
+    return make_json_answer(await site.read("", lambda: catalogue.find_program(site.logs, kind)))
 
 
 # --- the live view ---
@@ -199,8 +199,8 @@ async def _send_colour_bar(site: Site, request: Request) -> Response:
     """Answer with the colours of a kind of map as a picture."""
     del site
     kind = request.path_params["kind"]
-    colours = {"phase": catalogue.PHASE, "amplitude": catalogue.AMPLITUDE}.get(kind, str(kind))
-    if colours not in (catalogue.AMPLITUDE, catalogue.PHASE, catalogue.DIFFERENCE):
+    colours = {"phase": catalogue.PHASE_COLOURS, "amplitude": catalogue.AMPLITUDE_COLOURS}.get(kind, str(kind))
+    if colours not in (catalogue.AMPLITUDE_COLOURS, catalogue.PHASE_COLOURS, catalogue.DIFFERENCE_COLOURS):
         return refuse(404, ErrorCode.VALUE_INVALID, "There are no such colours", "", "use the page")
     return Response(catalogue.colour_bar(colours), media_type="image/png")
 
@@ -210,7 +210,7 @@ async def _send_colour_bar(site: Site, request: Request) -> Response:
 
 async def _send_result(site: Site, request: Request) -> Response:
     """Answer with the results of a scan's products."""
-    return json_answer(await _read_products(site, request, catalogue.read_result))
+    return make_json_answer(await _read_products(site, request, catalogue.read_result))
 
 
 async def _read_products(site: Site, request: Request, work: Callable[[Path], T]) -> T:
@@ -260,7 +260,7 @@ async def _send_probe(site: Site, request: Request) -> Response:
     y_mm = _parse_number(request, "y")
     name = request.query_params.get("library", "")
     # The libraries are read in the thread, too: their drive may be gone.
-    return json_answer(
+    return make_json_answer(
         await _read_products(
             site, request, lambda folder: catalogue.probe(folder, x_mm, y_mm, site.libraries().get(name))
         )
@@ -278,8 +278,8 @@ async def _send_file(site: Site, request: Request) -> Response:
                 f"no file is called {name[:80]!r}", "it was not made, or the name is wrong", "see the scan's page",
                 code=ErrorCode.FILE_MISSING,
             )  # fmt: skip
-        if kind == catalogue.EXPORT:
-            return folder.name, folder / catalogue.EXPORT / name
+        if kind == catalogue.EXPORT_FOLDER:
+            return folder.name, folder / catalogue.EXPORT_FOLDER / name
         return folder.name, read_products(folder).folder / name
 
     scan, path = await site.read_scan(request, find_file)
@@ -371,7 +371,7 @@ async def _send_control_chart(site: Site, request: Request) -> Response:
         scans.sort(key=lambda scan: (scan.seconds, scan.name))
         return ControlChart(scans=scans, unreadable=unreadable)
 
-    return json_answer(await site.read("", read_checks))
+    return make_json_answer(await site.read("", read_checks))
 
 
 # --- comparisons ---
@@ -390,7 +390,7 @@ async def _use_comparison(site: Site, request: Request, use: Callable[[catalogue
 
 async def _send_comparison(site: Site, request: Request) -> Response:
     """Answer with the differences of two scans as numbers."""
-    return json_answer(await _use_comparison(site, request, lambda comparison: comparison.figures))
+    return make_json_answer(await _use_comparison(site, request, lambda comparison: comparison.figures))
 
 
 async def _send_comparison_map(site: Site, request: Request) -> Response:

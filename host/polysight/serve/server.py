@@ -33,7 +33,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.types import ASGIApp
 
-from polysight.catalogue import NOTES, Scans, is_scan
+from polysight.catalogue import NOTES_FILE, Scans, is_scan
 from polysight.page import Watch
 from polysight.serve.commands import command_routes, start_waiting
 from polysight.serve.door import PagesServer, close_after_each, open_door
@@ -51,7 +51,7 @@ from polysight.serve.programs import Programs
 from polysight.serve.reading import reading_routes
 from polysight.serve.site import HIDDEN, Site, Watches
 from polysight.serve.stage import StageControl
-from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, did_you_mean, quote
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, quote, suggest_word
 from polysight_shared.program import delay_interrupts, ignore_interrupts
 
 # Nice value of the reading process, chosen: capture and scan have priority over it.
@@ -73,7 +73,7 @@ TOKEN_BYTES = 18
 
 
 @dataclass(frozen=True)
-class Place:
+class ServerAddress:
     """Address of a server: port 0 is any free one, `hosts` are further names, `certificate` and `key` PEM files."""
 
     host: str = "127.0.0.1"
@@ -115,7 +115,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ServedScans:
     """Served scans: a folder of scans, or `only` one in it; programs are started with the rig file `config`."""
 
     root: Path
@@ -129,7 +129,7 @@ class Shown:
         return self.control and self.only is None and self.config is not None
 
 
-def serve(root: Path, place: Place, config: Path | None, control: bool = True) -> int:
+def serve(root: Path, address: ServerAddress, config: Path | None, control: bool = True) -> int:
     """Serve all scans under a folder until Ctrl-C; returns the exit status.
 
     Raises
@@ -141,8 +141,8 @@ def serve(root: Path, place: Place, config: Path | None, control: bool = True) -
         _make_folder(root, control)
     if config is not None:
         config = config.absolute()
-    shown_scans = Shown(root.absolute(), None, control, config)
-    return _run(shown_scans, place, f"scans in {root}")
+    shown_scans = ServedScans(root.absolute(), None, control, config)
+    return _run(shown_scans, address, f"scans in {root}")
 
 
 def _make_folder(root: Path, control: bool) -> None:
@@ -163,14 +163,14 @@ def _make_folder(root: Path, control: bool) -> None:
     sys.stderr.write(f"polysight serve: made the folder {root}\n")
 
 
-def preview(folder: Path, place: Place, control: bool) -> int:
+def preview(folder: Path, address: ServerAddress, control: bool) -> int:
     """Serve the live view of one scan folder, which may not exist yet, until Ctrl-C; returns the exit status.
 
     Raises as :func:`serve`; DataError for a folder that holds something else than a scan.
     """
     _check_scan_folder(folder)
     folder = folder.absolute()
-    return _run(Shown(folder.parent, folder.name, control), place, f"live view of {folder}")
+    return _run(ServedScans(folder.parent, folder.name, control), address, f"live view of {folder}")
 
 
 def _check_scan_folder(folder: Path) -> None:
@@ -180,12 +180,12 @@ def _check_scan_folder(folder: Path) -> None:
     if not folder.exists():
         note = f"note: {folder} does not exist yet"
         try:
-            question = did_you_mean(folder.name, [path.name for path in folder.absolute().parent.iterdir()])
+            question = suggest_word(folder.name, [path.name for path in folder.absolute().parent.iterdir()])
         except OSError:
             question = f"{folder.parent} does not exist either"
         sys.stderr.write(f"{note}; {question or 'the page waits for a scan to begin there'}\n")
         return
-    other_files = [path.name for path in folder.iterdir() if path.name != NOTES and not path.name.startswith(".")]
+    other_files = [path.name for path in folder.iterdir() if path.name != NOTES_FILE and not path.name.startswith(".")]
     if not other_files:
         sys.stderr.write(f"note: no scan is in {folder} yet; the page waits for it to begin\n")
         return
@@ -200,12 +200,12 @@ def _check_scan_folder(folder: Path) -> None:
     )  # fmt: skip
 
 
-def _run(shown: Shown, place: Place, what: str) -> int:
+def _run(shown: ServedScans, address: ServerAddress, what: str) -> int:
     """Serve until Ctrl-C: bind, start the other processes, print the address of `what`; return 0."""
-    place.check()
-    listener = _bind(place)
+    address.check()
+    listener = _bind(address)
     try:
-        access = make_access(place, listener, shown.control)
+        access = make_access(address, listener, shown.control)
         with contextlib.ExitStack() as stack:
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="polysight-"))
             stage = None
@@ -223,7 +223,7 @@ def _run(shown: Shown, place: Place, what: str) -> int:
             stack.enter_context(_keep_reading_process(reading, shown, Path(folder) / "reader"))
             sys.stderr.write(describe_server(access, what, listener.getsockname()[:2]))
             sys.stderr.flush()
-            server = make_server(front, place, door)
+            server = make_server(front, address, door)
             # By itself it handles signals only once its event loop runs: Ctrl-C before that would interrupt the
             # creation of the loop, and leave it unfinished.
             with server.capture_signals():
@@ -233,17 +233,17 @@ def _run(shown: Shown, place: Place, what: str) -> int:
     return 0
 
 
-def make_access(place: Place, listener: socket.socket, control: bool) -> Access:
+def make_access(address: ServerAddress, listener: socket.socket, control: bool) -> Access:
     """Return the access rules of the page; a token is required for control and for other machines."""
     # Behind a reverse proxy all clients have this machine's address.
-    is_private = place.loopback and not place.hosts
+    is_private = address.loopback and not address.hosts
     token = ""
     if control or not is_private:
         token = load_token()
-    hosts = set(place.hosts)
-    if not place.loopback:
-        hosts |= {place.host, socket.gethostname(), str(listener.getsockname()[0])} - {"0.0.0.0", "::"}
-    return Access(token, is_private, tuple(hosts), control, secure=place.certificate is not None)
+    hosts = set(address.hosts)
+    if not address.loopback:
+        hosts |= {address.host, socket.gethostname(), str(listener.getsockname()[0])} - {"0.0.0.0", "::"}
+    return Access(token, is_private, tuple(hosts), control, secure=address.certificate is not None)
 
 
 def load_token() -> str:
@@ -261,7 +261,7 @@ def load_token() -> str:
         descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
         with os.fdopen(descriptor, "w", encoding="ascii") as f:
             f.write(secrets.token_urlsafe(TOKEN_BYTES))
-        # Of two servers that start at the same time one makes the file, complete; the other one's link fails.
+        # If two servers start at the same time, one of them makes the complete file, and the link of the other fails.
         try:
             os.link(part, path)
         finally:
@@ -269,7 +269,7 @@ def load_token() -> str:
     status = path.lstat()
     token = path.read_text(encoding="ascii", errors="replace").strip()
     is_safe = stat.S_ISREG(status.st_mode) and not status.st_mode & 0o077 and status.st_uid == os.getuid()
-    # Of the 24 characters of a token this many at least; a shorter one was edited.
+    # A token has 24 characters. One with fewer than `TOKEN_BYTES` was edited.
     if not is_safe or len(token) < TOKEN_BYTES:
         raise ConfigError(
             f"{path} cannot be used as a token", "other users may read it, another user owns it, or it was edited",
@@ -278,18 +278,18 @@ def load_token() -> str:
     return token
 
 
-def _bind(place: Place) -> socket.socket:
+def _bind(address: ServerAddress) -> socket.socket:
     """Open the socket that listens. Raises DeviceError if the port is taken or not allowed."""
-    family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
+    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
     listener = socket.socket(family, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((place.host, place.port))
+        listener.bind((address.host, address.port))
         listener.listen(BACKLOG)
     except OSError as e:
         listener.close()
         raise DeviceError(
-            f"{place.host}:{place.port} cannot be served: {e.strerror}",
+            f"{address.host}:{address.port} cannot be served: {e.strerror}",
             "another program holds this port, the address is not this machine's, or the port is below 1024",
             "give another --port; `ss -ltnp` shows who holds it",
         ) from None
@@ -297,7 +297,7 @@ def _bind(place: Place) -> socket.socket:
 
 
 @contextlib.contextmanager
-def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Iterator[None]:
+def _keep_reading_process(first: BaseProcess, shown: ServedScans, path: Path) -> Iterator[None]:
     """Keep the reading process running for the block: the `first` one, which runs already, and others after it."""
     ended = threading.Event()
     # Threads do not survive a fork, and there are some now.
@@ -329,7 +329,7 @@ def _keep_reading_process(first: BaseProcess, shown: Shown, path: Path) -> Itera
 
 
 @contextlib.contextmanager
-def fork_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Iterator[BaseProcess]:
+def fork_first_reader(shown: ServedScans, path: Path, listener: socket.socket) -> Iterator[BaseProcess]:
     """Fork the reading process for the block: it has what this process has loaded, and answers two seconds sooner.
 
     To be called before there are threads. The server's address is not its own: it closes `listener`. It ends before the
@@ -351,7 +351,7 @@ def fork_first_reader(shown: Shown, path: Path, listener: socket.socket) -> Iter
             process.join()
 
 
-def run_reader(shown: Shown, path: Path) -> None:
+def run_reader(shown: ServedScans, path: Path) -> None:
     """Run the reading process until it is ended, or the process that started it has ended."""
     # Ctrl-C ends the server, which ends this process; without this line it would end first, with a traceback.
     ignore_interrupts(signal.SIGINT)
@@ -420,7 +420,7 @@ def _configure(app: ASGIApp, **more: object) -> uvicorn.Config:
     )
 
 
-def make_server(front: Front, place: Place, door: socket.socket | None = None) -> uvicorn.Server:
+def make_server(front: Front, address: ServerAddress, door: socket.socket | None = None) -> uvicorn.Server:
     """Build the server of the pages: it accepts connections, or takes them from the `door`."""
     app: ASGIApp = make_app(front)
     if door is not None:
@@ -434,8 +434,8 @@ def make_server(front: Front, place: Place, door: socket.socket | None = None) -
         limit_concurrency=MAX_CONNECTIONS + 2 * ACCEPTED_AT_ONCE,
         backlog=ACCEPTED_AT_ONCE,
         timeout_keep_alive=KEEP_ALIVE_S,
-        ssl_certfile=place.certificate,
-        ssl_keyfile=place.key,
+        ssl_certfile=address.certificate,
+        ssl_keyfile=address.key,
     )
     if door is not None:
         return PagesServer(config, door, protocol)
@@ -448,8 +448,8 @@ def _allow_files() -> None:
         # A module of POSIX systems: the page's results are read on laptops, too.
         import resource
 
-        _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, 1 << 16), most))
+        _, max_files = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(max_files, 1 << 16), max_files))
 
 
 # --- the text that a server prints when it starts ---
@@ -457,7 +457,7 @@ def _allow_files() -> None:
 # linux/sockios.h
 SIOCGIFADDR = 0x8915
 # A documentation address (RFC 5737) and any port: it represents every network that is reached by the default route.
-ELSEWHERE = ("203.0.113.1", 9)
+REMOTE_ADDRESS = ("203.0.113.1", 9)
 # One character shows two modules of the code, the keys say whether the upper and the lower one are dark. Colours are
 # given, black on white, since the terminal's own may be either way round and a camera reads no inverted code.
 HALF_BLOCKS = {(0, 0): " ", (1, 0): "\u2580", (0, 1): "\u2584", (1, 1): "\u2588"}
@@ -501,7 +501,7 @@ def find_addresses() -> list[str]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         with contextlib.suppress(OSError):
             # A datagram socket that is connected sends nothing, and gets the address it would send from.
-            probe.connect(ELSEWHERE)
+            probe.connect(REMOTE_ADDRESS)
             addresses.append(probe.getsockname()[0])
         with contextlib.suppress(OSError, ModuleNotFoundError):
             # A module of POSIX systems; this file is imported on others, too.

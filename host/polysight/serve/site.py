@@ -136,7 +136,7 @@ class Site:
         name = self.name(request)
         return await self.read(name, lambda: work(self.scans.folder(name)))
 
-    async def act(self, work: Callable[[], T]) -> T:
+    async def run_command(self, work: Callable[[], T]) -> T:
         """Run a command in a thread that no read can have taken."""
         return await anyio.to_thread.run_sync(work)
 
@@ -455,17 +455,17 @@ class ChangingList:
             shown_state = self._find_state(stamp)
             if shown_state is None:
                 return ListChanges(stamp=reached, whole=True, scans=list(self._scans.values()), gone=[])
-            changed = [scan for name, scan in self._scans.items() if self._changed_in[name] > shown_state]
+            changed_scans = [scan for name, scan in self._scans.items() if self._changed_in[name] > shown_state]
             removed = [name for name, number in self._gone_in.items() if number > shown_state]
-        return ListChanges(stamp=reached, whole=False, scans=changed, gone=removed)
+        return ListChanges(stamp=reached, whole=False, scans=changed_scans, gone=removed)
 
     def _take_over(self, scans: dict[str, ListedScan]) -> None:
         """Make this the newest list; note in which state each scan changed or went. The lock is held."""
-        changed = [name for name, scan in scans.items() if self._scans.get(name) != scan]
+        changed_names = [name for name, scan in scans.items() if self._scans.get(name) != scan]
         removed = [name for name in self._scans if name not in scans]
-        if changed or removed:
+        if changed_names or removed:
             self._number += 1
-        for name in changed:
+        for name in changed_names:
             self._changed_in[name] = self._number
             self._gone_in.pop(name, None)
         for name in removed:

@@ -30,9 +30,9 @@ class JogRequest(Body, frozen=True):
 
 
 class StagePlace(msgspec.Struct, frozen=True):
-    """Where the stage is, and its limits: 0 and `travel_x_mm`, `travel_y_mm`.
+    """Position of the stage; its limits are 0 and `travel_x_mm`, `travel_y_mm`.
 
-    `state`, the scan under way and the `reason` of the state are the Pi's.
+    `state`, the running scan `scan_id`, and the `reason` of the state come from the Pi.
     """
 
     state: str
@@ -53,8 +53,8 @@ class StageControl:
         self._owner = secrets.token_hex(16)
         self._jogging = threading.Lock()
 
-    def look(self) -> StagePlace:
-        """Return the position of the stage. Raises PolysightError, as all of these."""
+    def read_position(self) -> StagePlace:
+        """Return the position of the stage. Raises PolysightError, as the other commands do."""
         return self._ask(lambda _pi, _rig: None)
 
     def home(self) -> StagePlace:
@@ -77,7 +77,7 @@ class StageControl:
             self._jogging.release()
 
     def _ask(self, work: Callable[[PiClient, Instrument], object]) -> StagePlace:
-        """Do something with the Pi, and ask it for the place afterwards."""
+        """Execute `work` with a connection to the Pi, and return the position of the stage after it."""
         rig = load_instrument(self._config)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:

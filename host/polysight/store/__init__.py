@@ -34,7 +34,7 @@ from polysight.store.published_rig import COLLECTION, build_rig, mirror_rig, rea
 from polysight.store.raw import (
     Digests,
     PlacedAgain,
-    Replaced,
+    ReplacedRow,
     drop,
     find_droppable,
     place_again,
@@ -44,7 +44,7 @@ from polysight.store.raw import (
 from polysight.store.scan_folder import (
     EVENTS,
     MAX_BYTES,
-    PART,
+    PART_SUFFIX,
     SAMPLE_ROWS,
     SAMPLES,
     TRUTH,

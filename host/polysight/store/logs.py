@@ -18,7 +18,7 @@ from pathlib import Path
 import msgpack
 import msgspec
 
-from polysight.capture import write_error
+from polysight.capture import make_write_error
 from polysight_shared.errors import DataError, DeviceError, ErrorCode, ProtocolError
 from polysight_shared.files import open_to_write, sync_folder
 from polysight_shared.messages import AnyEvent, pack_with_crc, unpack_with_crc
@@ -53,7 +53,7 @@ class AppendFile:
                 self.length = os.fstat(self._file.fileno()).st_size
                 stack.pop_all()
         except OSError as e:
-            raise write_error(path, "created" if fresh else "opened", e) from None
+            raise make_write_error(path, "created" if fresh else "opened", e) from None
 
     def fileno(self) -> int:
         """Return the descriptor of the open file, to lock it."""
@@ -65,7 +65,7 @@ class AppendFile:
             os.ftruncate(self._file.fileno(), length)
             os.fsync(self._file.fileno())
         except OSError as e:
-            raise write_error(self.path, "cut at its last complete record", e) from None
+            raise make_write_error(self.path, "cut at its last complete record", e) from None
         self.length = length
 
     def append(self, data: bytes) -> None:
@@ -81,7 +81,7 @@ class AppendFile:
         except OSError as e:
             with suppress(OSError):
                 os.ftruncate(self._file.fileno(), self.length)
-            raise write_error(self.path, "written", e) from None
+            raise make_write_error(self.path, "written", e) from None
         self.length = end
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class AppendFile:
 
 
 # Suffix of the file with the data that was cut off.
-DAMAGED = ".damaged"
+DAMAGED_SUFFIX = ".damaged"
 
 
 @dataclass
@@ -187,7 +187,7 @@ class EventWriter:
     def __init__(self, path: Path) -> None:
         log = read_events(path)
         if log.damage or log.torn:
-            copy = AppendFile(path.with_name(path.name + DAMAGED), create=True)
+            copy = AppendFile(path.with_name(path.name + DAMAGED_SUFFIX), create=True)
             try:
                 copy.append(_read_bytes(path)[log.length :])
             finally:

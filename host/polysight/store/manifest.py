@@ -24,7 +24,7 @@ import msgspec
 
 from polysight.store.logs import AppendFile, LogDigest
 from polysight_shared.closing import Closing
-from polysight_shared.errors import DataError, DeviceError, ErrorCode, PolysightError, no_such, quote
+from polysight_shared.errors import DataError, DeviceError, ErrorCode, PolysightError, make_missing_path_error, quote
 from polysight_shared.files import MAX_JSON_BYTES, open_regular, read_bounded
 from polysight_shared.findings import Finding
 from polysight_shared.raster import RasterPlan
@@ -216,7 +216,7 @@ class ScanEnded(Fact, frozen=True, kw_only=True, tag="scan_ended"):
     """A run ended; `lost_mm` are the steps that the drives lost in x and y, None if they were not measured.
 
     `exit_status` is success, abort or fail, `reason` a sentence; `why` and `remedy` are those of an error. `asked` is
-    the command that ended it, `stop` or `abort`, and `asker` who sent it; "" where nobody did. `events_refetched` is
+    the command that ended it, `stop` or `abort`, and `asker` who sent it; "" if no one did. `events_refetched` is
     the number of events that had to be fetched from the Pi's journal.
     """
 
@@ -341,9 +341,9 @@ def _decode_fact(kind: str, line: bytes) -> Fact:
 
 
 def manifest_fault(line: int, what: str, lost: int = 0) -> Finding:
-    """Return a fault of the manifest at a line (from 1), by which so many facts are lost."""
-    place = f"{MANIFEST} line {line}"
-    return Finding("error", what, where=place, code=ErrorCode.FILE_DAMAGED, facts={"line": line, "lost": lost})
+    """Return a fault of the manifest at a line (from 1); `lost` facts are missing because of it."""
+    line_text = f"{MANIFEST} line {line}"
+    return Finding("error", what, where=line_text, code=ErrorCode.FILE_DAMAGED, facts={"line": line, "lost": lost})
 
 
 @dataclass
@@ -474,10 +474,10 @@ class Manifest:
         """State of the scan according to its last run."""
         if self.ended is None:
             return "paused" if self.paused else "open"
-        planned = 0
+        planned_rows = 0
         if self.started is not None:
-            planned = self.started.plan.rows
-        if self.ended.exit_status == "success" and len(self.rows) >= planned:
+            planned_rows = self.started.plan.rows
+        if self.ended.exit_status == "success" and len(self.rows) >= planned_rows:
             return "finished"
         return "stopped" if self.ended.exit_status == "abort" else "failed"
 
@@ -505,7 +505,7 @@ def read(path: Path) -> Manifest:
         return parse(read_bounded(path, MAX_JSON_BYTES))
     except OSError as e:
         if not path.parent.exists():
-            raise no_such(path.parent) from None
+            raise make_missing_path_error(path.parent) from None
         raise DataError(
             f"{path}: cannot be read: {e.strerror}",
             f"{path.parent} is not a scan folder",

@@ -11,7 +11,7 @@ from polysight.store.raw import require_raw
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.source import Source
 from polysight_shared.config import Instrument, load_instrument
-from polysight_shared.errors import DataError, ErrorCode, no_such
+from polysight_shared.errors import DataError, ErrorCode, make_missing_path_error
 
 
 def is_source(path: Path) -> bool:
@@ -45,7 +45,7 @@ def open_source(path: Path, base: Instrument | Path | None = None, dropped: bool
             require_raw(scan)
         return scan
     if not path.exists():
-        raise no_such(path)
+        raise make_missing_path_error(path)
     if not is_source(path):
         raise DataError(
             f"{path}: not a scan: contains no {MANIFEST}, {COLLECTION} or *{SYNCED}",

@@ -28,7 +28,7 @@ Gaps = list[tuple[int, int]]
 # Payload of a full packet in bytes, where no log of the packets gives it.
 PACKET_BYTES = 1456
 # Largest deviation of a pause from a whole number of periods between positions, as a share of a period (chosen).
-_UNEVEN = 0.25
+_MAX_UNEVENNESS = 0.25
 
 
 class PacketLog(NamedTuple):
@@ -172,7 +172,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     arrived_packets[start // full_size] = True
     if zero_filled:
         arrived_packets &= ~_find_silent(data, full_size)
-        # What the log has beyond the file's end is not there.
+        # Packets that the log lists beyond the file's end are missing.
         packets_in_file = -(-raw.size // full_size)
         arrived_packets[packets_in_file:] = False
     arrived = arrived_packets[start // full_size]
@@ -206,25 +206,26 @@ def _find_silent(data: NDArray[np.uint8], packet: int) -> NDArray[np.bool_]:
     return np.append(~np.any(words, axis=1), np.array(tail, bool))
 
 
-def _find_first_sequence(log: PacketLog, shape: RowShape, full: int, zeroed_raw: NDArray[np.uint8] | None) -> int:
+def _find_first_sequence(log: PacketLog, shape: RowShape, full_bytes: int, zeroed_raw: NDArray[np.uint8] | None) -> int:
     """Return the sequence number of the row's first packet, which may be lost.
 
-    `full` is the payload of a full packet, bytes, `zeroed_raw` the file's bytes if it is zero-filled, otherwise None.
+    `full_bytes` is the payload of a full packet, bytes, `zeroed_raw` the file's bytes if it is zero-filled, otherwise
+    None.
 
     With zero filling: the first packet that arrived, minus the packets of zeros at the file's beginning. Without:
     counted back from a short last packet if no position is missing and the packet is as short as that of a complete row
     (a row that lacks a frame ends elsewhere), otherwise the first packet that arrived. If the result is neither 0 nor 1
     but the numbers fit a record from 1, it is 1, or 0 if that packet arrived: cards count from 1, a log may from 0.
     """
-    expected = -(-shape.bytes // full)
+    expected = -(-shape.bytes // full_bytes)
     first_arrived = int(log.sequence[0])
     last = int(log.sequence[-1])
     begin = first_arrived
     last_size = int(log.size[-1])
-    ends_complete = last_size < full and last_size == shape.bytes - (expected - 1) * full
+    ends_complete = last_size < full_bytes and last_size == shape.bytes - (expected - 1) * full_bytes
     if zeroed_raw is not None:
-        silent_packets = _find_silent(zeroed_raw, full)
-        # Index of the first packet that is not silent: so many are before it.
+        silent_packets = _find_silent(zeroed_raw, full_bytes)
+        # The index of the first packet that is not silent is the number of packets before it.
         begin -= int(np.argmin(np.append(silent_packets, False)))
     elif ends_complete and _find_pauses(log.at_s, shape.positions - 1).size == shape.positions - 1:
         begin = min(first_arrived, last - expected + 1)
@@ -298,7 +299,7 @@ def find_positions(
     # Bursts of several boards at one time are one event: a position.
     events = times[np.concatenate([[True], np.diff(times) > period / 2])]
     steps = np.diff(events) / period
-    if np.any(np.abs(steps - np.round(steps)) > _UNEVEN):
+    if np.any(np.abs(steps - np.round(steps)) > _MAX_UNEVENNESS):
         return None
     index = np.concatenate([[0], np.cumsum(np.round(steps).astype(np.int64))])
     position = index[np.searchsorted(events, bursts.at_s, side="right") - 1]
@@ -579,8 +580,8 @@ class PublishedCubes(_Published):
             cause = "the download is not complete"
             raise DataError(problem, cause, "download it again", code=ErrorCode.FILE_DAMAGED) from None
         rig = self._instrument
-        s = self._settings
-        shape = (len(rig.antennas.rx_mm), s.total_y, s.total_x, rig.chirp.samples)
+        settings = self._settings
+        shape = (len(rig.antennas.rx_mm), settings.total_y, settings.total_x, rig.chirp.samples)
         if cube.shape != shape:
             problem = f"{file}: shape {cube.shape}, {shape} in its settings"
             raise DataError(problem, "not the settings of this scan", "download both again", code=ErrorCode.MISMATCH)

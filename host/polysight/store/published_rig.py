@@ -131,12 +131,12 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     table["burst"] |= {"pulses": settings.num_trigger, "period_us": settings.period_frame * 1e3}
     table["geometry"]["object_distance_mm"] = settings.object_distance
     table["chirp"] |= {
-        "start_hz": _scale_if_below(chirp.f0, least=1e6, factor=1e9),
-        "slope_hz_per_s": _scale_if_below(chirp.slope, least=1e6, factor=1e12),
-        "ramp_end_us": _scale_if_below(chirp.ramp_time, least=1, factor=1e6),
-        "adc_start_us": _scale_if_below(chirp.adc_start_time, least=1e-2, factor=1e6),
+        "start_hz": _scale_if_below(chirp.f0, limit=1e6, factor=1e9),
+        "slope_hz_per_s": _scale_if_below(chirp.slope, limit=1e6, factor=1e12),
+        "ramp_end_us": _scale_if_below(chirp.ramp_time, limit=1, factor=1e6),
+        "adc_start_us": _scale_if_below(chirp.adc_start_time, limit=1e-2, factor=1e6),
         "samples": chirp.num_adc,
-        "sample_rate_hz": _scale_if_below(chirp.Fs, least=1e5, factor=1e3),
+        "sample_rate_hz": _scale_if_below(chirp.Fs, limit=1e5, factor=1e3),
         "linear_samples": [min(n, chirp.num_adc) for n in base.chirp.linear_samples],
     }
     rig = decode(table, Instrument, f"the rig that {path / COLLECTION} describes", keys=_KEYS)
@@ -145,13 +145,13 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
     return Rig(msgspec.structs.replace(rig, boards=boards), tuple(notices))
 
 
-def _scale_if_below(value: float, least: float, factor: float) -> float:
+def _scale_if_below(value: float, limit: float, factor: float) -> float:
     """Return a value in the wanted unit: the authors' files have some in SI, some in the units of TI's tools.
 
-    No chirp has a value below `least` in the wanted unit, but for 0; such a value is in the other unit and is
+    No chirp has a value below `limit` in the wanted unit, but for 0; such a value is in the other unit and is
     multiplied.
     """
-    if value < least:
+    if value < limit:
         return value * factor
     return value
 

@@ -30,7 +30,7 @@ Digests = dict[str, dict[int, str]]
 
 
 @dataclass(frozen=True)
-class Droppable:
+class DroppableFiles:
     """Raw files that may be deleted."""
 
     # Files by row and board, and their bytes together.
@@ -52,7 +52,7 @@ def require_raw(scan: ScanFolder) -> None:
         )
 
 
-def find_droppable(scan: ScanFolder, processed: Digests) -> Droppable:
+def find_droppable(scan: ScanFolder, processed: Digests) -> DroppableFiles:
     """Find the files that may be deleted: unchanged since their commit, and processed with the same digest.
 
     Parameters
@@ -93,7 +93,7 @@ def find_droppable(scan: ScanFolder, processed: Digests) -> Droppable:
                 cause = "not processed" if digest is None else "differs from the data of the products"
                 kept_files.append(f"{board.file}: {cause}")
     paths = [path for boards in files.values() for path in boards.values()]
-    return Droppable(files, sum(path.stat().st_size for path in paths), kept_files)
+    return DroppableFiles(files, sum(path.stat().st_size for path in paths), kept_files)
 
 
 def drop(scan: ScanFolder, processed: Digests, products: Path) -> None:
@@ -146,7 +146,7 @@ def _make_durable(folder: Path) -> None:
             with path.open("rb") as file:
                 os.fsync(file.fileno())
         except OSError as e:
-            raise capture.write_error(path, "made durable", e) from None
+            raise capture.make_write_error(path, "made durable", e) from None
     sync_folder(folder)
 
 
@@ -159,7 +159,7 @@ def _describe_dropped_row(row: RowCommitted, boards: list[str], products: str) -
 
 
 @dataclass(frozen=True)
-class Replaced:
+class ReplacedRow:
     """Report on one board's row that was placed again."""
 
     row: int
@@ -180,7 +180,7 @@ class PlacedAgain:
 
     # Other data that the placement used than the packets.
     evidence: capture.Evidence
-    placed: capture.Placed
+    placed: capture.PlacedRecord
     # uint8: the payload as placed now.
     payload: np.ndarray
     # Missing byte ranges [start, stop) when the row was committed.
@@ -199,7 +199,7 @@ def place_again(path: Path) -> PlacedAgain:
         remedy = "give SCAN/raw/BOARD/ROW.bin"
         raise DataError(problem, cause, remedy, code=ErrorCode.FILE_UNREADABLE) from None
     index, _ = capture.read_index(path.with_suffix(".idx"))
-    evidence, log = capture.read_packets(path.with_suffix(capture.PACKETS), row)
+    evidence, log = capture.read_packets(path.with_suffix(capture.PACKETS_SUFFIX), row)
     placed, payload = capture.place_record(
         log, evidence.frame_bytes, evidence.past, evidence.not_before_ns, evidence.dropped_by_card
     )
@@ -207,7 +207,7 @@ def place_again(path: Path) -> PlacedAgain:
     return PlacedAgain(evidence, placed, payload, missing, by_pulses="frames" in index)
 
 
-def replace_rows(scan: ScanFolder) -> list[Replaced]:
+def replace_rows(scan: ScanFolder) -> list[ReplacedRow]:
     """Place every committed row again, and commit those with a different result.
 
     Raises
@@ -221,22 +221,22 @@ def replace_rows(scan: ScanFolder) -> list[Replaced]:
         for row in scan.committed_rows().values():
             boards = {name: _place_row_again(scan, row, board) for name, board in row.boards.items()}
             reports += [report for report, _ in boards.values()]
-            changed = {
+            changed_rows = {
                 name: placed_again
                 for name, (report, placed_again) in boards.items()
                 if report.changed and placed_again is not None
             }
-            if changed:
-                _commit_changed_boards(scan, writer, row, changed)
+            if changed_rows:
+                _commit_changed_boards(scan, writer, row, changed_rows)
     scan.reload()
     return reports
 
 
-def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[Replaced, PlacedAgain | None]:
+def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tuple[ReplacedRow, PlacedAgain | None]:
     """Place one board's row again; None with the report if that cannot be done."""
     name = Path(board.file).parent.name
     path = scan.path / board.file
-    unchanged = Replaced(row.row, name, board.missing_bytes, board.missing_bytes)
+    unchanged = ReplacedRow(row.row, name, board.missing_bytes, board.missing_bytes)
     if not board.packets_crc32:
         return replace(unchanged, why_unchanged="its packets were not kept"), None
     try:
@@ -250,19 +250,19 @@ def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tu
     missing_now = sum(stop - start for start, stop in placed.placed.missing)
     same_gaps = placed.missing_before == placed.placed.missing
     same_payload = f"{crc32(placed.payload.tobytes()):08x}" == board.crc32
-    changed = not (same_gaps and same_payload)
-    return replace(unchanged, missing_after=missing_now, changed=changed), placed
+    has_changed = not (same_gaps and same_payload)
+    return replace(unchanged, missing_after=missing_now, changed=has_changed), placed
 
 
 def _commit_changed_boards(
-    scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed: dict[str, PlacedAgain]
+    scan: ScanFolder, writer: ManifestWriter, row: RowCommitted, changed_boards: dict[str, PlacedAgain]
 ) -> None:
     """Write the new files, then the line, then delete the old files."""
     boards = dict(row.boards)
     old_files: list[Path] = []
-    for name, placed in changed.items():
+    for name, placed in changed_boards.items():
         path = scan.path / boards[name].file
-        old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", capture.PACKETS)]
+        old_files += [path.with_suffix(suffix) for suffix in (".bin", ".idx", capture.PACKETS_SUFFIX)]
         boards[name] = _write_new_files(scan, boards[name], placed)
     kept_incomplete = row.kept_incomplete
     faults = row.faults
@@ -285,11 +285,13 @@ def _write_new_files(scan: ScanFolder, board: BoardRow, placed_again: PlacedAgai
     frame_bytes = scan.instrument.frame_bytes
     path = scan.path / board.file
     index, _ = capture.read_index(path.with_suffix(".idx"))
-    _, log = capture.read_packets(path.with_suffix(capture.PACKETS), np.fromfile(path, dtype=np.uint8))
+    _, log = capture.read_packets(path.with_suffix(capture.PACKETS_SUFFIX), np.fromfile(path, dtype=np.uint8))
     new_path = _find_free_name(path)
     crc = capture.write_durably(new_path, placed_again.payload.tobytes())
     index_crc = capture.write_index(new_path.with_suffix(".idx"), {**index, **placed.facts()}, placed.arrivals)
-    packets_crc = capture.write_packets(new_path.with_suffix(capture.PACKETS), log, placed_again.evidence, placed)
+    packets_crc = capture.write_packets(
+        new_path.with_suffix(capture.PACKETS_SUFFIX), log, placed_again.evidence, placed
+    )
     sync_folder(new_path.parent)
     frames = placed.expected // frame_bytes
     counts = {name: n for name, n in vars(placed.counts).items() if name in Reception.__struct_fields__}

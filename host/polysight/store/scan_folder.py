@@ -60,10 +60,10 @@ from polysight_shared.raster import RasterPlan
 from polysight_shared.tables import decode, to_builtins
 
 # Sections of the rig file that may change when a scan is resumed.
-SECTIONS = ("pi", "limits")
-ADDRESSES = ("card_address", "host_address", "command_port", "data_port")
+CHANGEABLE_SECTIONS = ("pi", "limits")
+CHANGEABLE_BOARD_KEYS = ("card_address", "host_address", "command_port", "data_port")
 """Keys of each board that may change; `radar.servers` has the addresses of their control servers."""
-SERIAL = ("port", "baud")
+UNCOMPARED_STAGE_KEYS = ("port", "baud")
 """Keys of the stage that are not compared: the Pi has its own. Nor is calibration, of which a scan keeps copies."""
 # Format of the folder, in `scan_started`.
 FORMAT = 1
@@ -75,7 +75,7 @@ TRUTH = "truth.json"
 SAMPLES = "samples"
 SAMPLE_ROWS = "rows.jsonl"
 # Suffix of a row during reception.
-PART = ".part"
+PART_SUFFIX = ".part"
 
 # The one entry of a scan folder that may be a link out of it, see `check_links`.
 _MAY_BE_LINK = "products"
@@ -87,8 +87,8 @@ def extract_connection(rig: Instrument) -> dict[str, Any]:
     """Return the connection settings of a rig file, as `scan_resumed` stores them."""
     table = to_builtins(rig)
     return {
-        **{section: table[section] for section in SECTIONS},
-        "boards": {b["name"]: {key: b[key] for key in ADDRESSES} for b in table["boards"]},
+        **{section: table[section] for section in CHANGEABLE_SECTIONS},
+        "boards": {b["name"]: {key: b[key] for key in CHANGEABLE_BOARD_KEYS} for b in table["boards"]},
         "servers": table["radar"]["servers"],
     }
 
@@ -108,7 +108,7 @@ def check_same_scan(begun: Instrument, rig_file: Instrument, name: str) -> None:
     """
     table = to_builtins(begun)
     given_table = _replace_connection(to_builtins(rig_file), extract_connection(begun))
-    given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in SERIAL}}
+    given_table["stage"] = {**given_table["stage"], **{key: table["stage"][key] for key in UNCOMPARED_STAGE_KEYS}}
     given_table["calibration"] = table["calibration"]
     differences = list(_list_differences(table, given_table, ""))
     if differences:
@@ -124,7 +124,12 @@ def _replace_connection(table: dict[str, Any], connection: Mapping[str, Any]) ->
     """Return the rig's table with other connection settings, as of :func:`extract_connection`."""
     boards = [{**b, **connection["boards"].get(b["name"], {})} for b in table["boards"]]
     radar = {**table["radar"], "servers": connection["servers"]}
-    return {**table, **{section: connection[section] for section in SECTIONS}, "boards": boards, "radar": radar}
+    return {
+        **table,
+        **{section: connection[section] for section in CHANGEABLE_SECTIONS},
+        "boards": boards,
+        "radar": radar,
+    }
 
 
 def _list_differences(begun: Any, rig_value: Any, key: str) -> Iterator[str]:
@@ -172,7 +177,8 @@ class ScanFolder:
     of the last resume.
     """
 
-    # As every `Source` says: rows are lines of the stage's x, and the chirps are there as the boards recorded them.
+    # Attributes that every `Source` has: rows run along the stage's x, and the chirps are those that the boards
+    # recorded.
     mirrored = False
     synchronised = False
 
@@ -487,9 +493,11 @@ def find_damaged_samples(scan: ScanFolder) -> dict[int, list[str]]:
         if any(name not in saved or saved[name]["raw"] != raw_digest(committed.boards[name]) for name in boards):
             damaged[row] = [f"{SAMPLES}/{SAMPLE_ROWS}"]
             continue
-        bad = [name for name in boards if not _is_whole(records[name], scan.plan.rows, row, saved[name]["crc32"])]
-        if bad:
-            damaged[row] = [f"{SAMPLES}/{name}.npy" for name in bad]
+        damaged_boards = [
+            name for name in boards if not _is_whole(records[name], scan.plan.rows, row, saved[name]["crc32"])
+        ]
+        if damaged_boards:
+            damaged[row] = [f"{SAMPLES}/{name}.npy" for name in damaged_boards]
     return damaged
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from polysight.capture import PACKETS, read_index
+from polysight.capture import PACKETS_SUFFIX, read_index
 from polysight.store import manifest, scan_folder
 from polysight.store.logs import LogDigest, crc32, read_events
 from polysight.store.manifest import MANIFEST, BoardRow, RowCommitted, ScanEnded
@@ -19,9 +19,9 @@ from polysight_shared.raster import plan_raster
 # Bytes of a file that are in memory at a time (chosen).
 _CHUNK = 1 << 22
 # Remedies of a damaged file, a damaged manifest and a damaged event log.
-_COPY = "restore it from a copy, or resume takes its row again"
+_COPY_REMEDY = "restore it from a copy, or resume takes its row again"
 _ALL_THERE = "every row is committed"
-_FETCHED = "resume fetches the rest from the Pi's journal"
+_FETCH_REMEDY = "resume fetches the rest from the Pi's journal"
 
 
 def to_text(finding: Finding) -> str:
@@ -144,19 +144,19 @@ def _describe_loss(scan: scan_folder.ScanFolder) -> str:
 
 def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
     """Compare a committed row with the plan, and its files with the manifest."""
-    place = f"row {row.row}"
+    row_text = f"row {row.row}"
     if not 0 <= row.row < scan.plan.rows:
-        return [_make_error(place, f"outside the plan's {scan.plan.rows} rows")]
+        return [_make_error(row_text, f"outside the plan's {scan.plan.rows} rows")]
     findings = []
-    planned = scan.plan.row(row.row)
-    pulses = planned.points * scan.instrument.burst.pulses
-    if row.direction != planned.direction:
-        findings.append(_make_error(place, f"direction {row.direction}, planned {planned.direction}"))
+    planned_row = scan.plan.row(row.row)
+    pulses = planned_row.points * scan.instrument.burst.pulses
+    if row.direction != planned_row.direction:
+        findings.append(_make_error(row_text, f"direction {row.direction}, planned {planned_row.direction}"))
     if row.pulses != pulses:
-        findings.append(_make_error(place, f"{row.pulses} pulses, {pulses} planned"))
+        findings.append(_make_error(row_text, f"{row.pulses} pulses, {pulses} planned"))
     boards = {board.name for board in scan.instrument.recorded}
     if set(row.boards) != boards:
-        findings.append(_make_error(place, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
+        findings.append(_make_error(row_text, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
         findings += board_faults(scan, board, pulses)
     return findings
@@ -164,13 +164,13 @@ def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]
 
 def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     """Compare the files of one board's committed row of `frames` frames with the manifest."""
-    place = board.file
+    file_name = board.file
     path = scan.path / board.file
     findings = []
     expected = frames * scan.instrument.frame_bytes
     if (board.bytes, board.frames_expected) != (expected, frames):
         findings.append(
-            _make_error(place, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}")
+            _make_error(file_name, f"{board.bytes} bytes of {board.frames_expected} frames, planned {expected}")
         )
     is_kept = board.file not in scan_folder.dropped_files(scan) or path.exists()
     try:
@@ -181,35 +181,35 @@ def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> 
             size = board.bytes
             crc = int(board.crc32, 16)
     except OSError as e:
-        return [*findings, _make_read_error(place, e)]
+        return [*findings, _make_read_error(file_name, e)]
     if size != board.bytes:
-        findings.append(_make_error(place, f"{size} bytes, {board.bytes} were committed", _COPY))
+        findings.append(_make_error(file_name, f"{size} bytes, {board.bytes} were committed", _COPY_REMEDY))
     elif f"{crc:08x}" != board.crc32:
-        findings.append(_make_error(place, "differs from the committed data (CRC)", _COPY))
+        findings.append(_make_error(file_name, "differs from the committed data (CRC)", _COPY_REMEDY))
     # The index says which byte ranges of the row are missing; a row without it misses none.
     index = path.with_suffix(".idx")
-    findings += _check_packets(scan, board, path.with_suffix(PACKETS))
-    place = str(index.relative_to(scan.path))
+    findings += _check_packets(scan, board, path.with_suffix(PACKETS_SUFFIX))
+    file_name = str(index.relative_to(scan.path))
     if not index.exists():
         is_needed = board.missing_bytes > 0 or board.index_crc32 != ""
         if is_needed:
-            return [*findings, _make_error(place, "absent", _COPY)]
+            return [*findings, _make_error(file_name, "absent", _COPY_REMEDY)]
         return findings
     try:
         index_crc = crc32(index.read_bytes())
     except OSError as e:
-        return [*findings, _make_read_error(place, e)]
+        return [*findings, _make_read_error(file_name, e)]
     if board.index_crc32 and f"{index_crc:08x}" != board.index_crc32:
-        return [*findings, _make_error(place, "differs from the committed data (CRC)", _COPY)]
+        return [*findings, _make_error(file_name, "differs from the committed data (CRC)", _COPY_REMEDY)]
     try:
         facts, _ = read_index(index)
         gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
     except (PolysightError, TypeError, ValueError) as e:
-        return [*findings, _make_error(place, str(e))]
+        return [*findings, _make_error(file_name, str(e))]
     ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
     is_inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
     if not ordered or not is_inside or sum(b - a for a, b in gaps) != board.missing_bytes:
-        findings.append(_make_error(place, f"its gaps do not make the {board.missing_bytes} missing bytes"))
+        findings.append(_make_error(file_name, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return findings
 
 
@@ -217,16 +217,16 @@ def _check_packets(scan: scan_folder.ScanFolder, board: BoardRow, path: Path) ->
     """Compare the row's packet file with its digest; rows of earlier releases have none."""
     if not board.packets_crc32:
         return []
-    place = str(path.relative_to(scan.path))
+    file_name = str(path.relative_to(scan.path))
     try:
         _, crc = _compute_digest(path)
     except FileNotFoundError:
-        return [_make_error(place, "absent", _COPY)]
+        return [_make_error(file_name, "absent", _COPY_REMEDY)]
     except OSError as e:
-        return [_make_read_error(place, e)]
+        return [_make_read_error(file_name, e)]
     if f"{crc:08x}" == board.packets_crc32:
         return []
-    return [_make_error(place, "differs from the committed data (CRC)", _COPY)]
+    return [_make_error(file_name, "differs from the committed data (CRC)", _COPY_REMEDY)]
 
 
 def _make_read_error(where: str, e: OSError) -> Finding:
@@ -235,7 +235,7 @@ def _make_read_error(where: str, e: OSError) -> Finding:
         code = ErrorCode.FILE_MISSING
     else:
         code = ErrorCode.FILE_UNREADABLE
-    return _make_error(where, f"cannot be read: {e.strerror}", _COPY, code)
+    return _make_error(where, f"cannot be read: {e.strerror}", _COPY_REMEDY, code)
 
 
 def _compute_digest(path: Path) -> tuple[int, int]:
@@ -275,11 +275,13 @@ def _check_dropped(scan: scan_folder.ScanFolder) -> list[Finding]:
 def _find_strays(scan: scan_folder.ScanFolder, rows: dict[int, RowCommitted]) -> list[Finding]:
     """Return a note for each file in `raw` that belongs to no committed row."""
     committed_files = {scan.path / b.file for r in rows.values() for b in r.boards.values()}
-    committed_files |= {p.with_suffix(suffix) for p in committed_files for suffix in (".idx", PACKETS)}
+    committed_files |= {p.with_suffix(suffix) for p in committed_files for suffix in (".idx", PACKETS_SUFFIX)}
     return [
         _note(str(p.relative_to(scan.path)), "belongs to no committed row", "resume replaces it")
         for p in sorted((scan.path / "raw").rglob("*"))
-        if p.is_file() and p not in committed_files and p.suffix in (".bin", ".idx", PACKETS, scan_folder.PART)
+        if p.is_file()
+        and p not in committed_files
+        and p.suffix in (".bin", ".idx", PACKETS_SUFFIX, scan_folder.PART_SUFFIX)
     ]
 
 
@@ -292,7 +294,7 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
         return [_make_error(scan_folder.EVENTS, e.what, e.remedy)]
     findings = []
     if log.torn:
-        findings.append(_note(scan_folder.EVENTS, "the last event is torn by a kill or power cut", _FETCHED))
+        findings.append(_note(scan_folder.EVENTS, "the last event is torn by a kill or power cut", _FETCH_REMEDY))
     commits = [(fact.row, fact.events) for fact in scan.facts(RowCommitted) if fact.events is not None]
     if commits:
         row, committed = commits[-1]
@@ -305,9 +307,9 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     is_known = bool(commits) or not scan.facts(RowCommitted)
     is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
     if is_committed_damage:
-        findings.append(_make_error(scan_folder.EVENTS, log.damage, _FETCHED))
+        findings.append(_make_error(scan_folder.EVENTS, log.damage, _FETCH_REMEDY))
     elif log.damage:
-        findings.append(_note(scan_folder.EVENTS, log.damage, _FETCHED))
+        findings.append(_note(scan_folder.EVENTS, log.damage, _FETCH_REMEDY))
     if {e.scan_id for e in log.events} - {scan.scan_id}:
         findings.append(_make_error(scan_folder.EVENTS, "holds events of another scan"))
     if [e.seq for e in log.events] != list(range(1, len(log.events) + 1)):
@@ -322,7 +324,7 @@ def _check_committed_events(path: Path, length: int, row: int, committed: LogDig
     size = committed.bytes
     when = f"row {row} was committed"
     if length < size:
-        return [_make_error(scan_folder.EVENTS, f"{length} bytes of events, {size} when {when}", _FETCHED)]
+        return [_make_error(scan_folder.EVENTS, f"{length} bytes of events, {size} when {when}", _FETCH_REMEDY)]
     with path.open("rb") as f:
         is_whole = f"{crc32(f.read(size)):08x}" == committed.crc32
     problem = f"not the events that were there when {when} (CRC)"

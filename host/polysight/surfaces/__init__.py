@@ -8,7 +8,7 @@ files. In order: `window` (fit of one echo), `joint` (of several), `paths` (sear
 """
 
 from polysight.surfaces.gains import Gains, find_voltages, learn_gains
-from polysight.surfaces.measure import Seen, find_shape, see_points
+from polysight.surfaces.measure import SeenEchoes, find_shape, see_points
 from polysight.surfaces.optics import (
     Optics,
     VisibleNormals,

@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.surfaces.measure import Seen, Shape, find_shape
+from polysight.surfaces.measure import SeenEchoes, Shape, find_shape
 from polysight.surfaces.optics import (
     Optics,
     compute_polarisation_row,
@@ -25,7 +25,13 @@ from polysight.surfaces.optics import (
     reflect_spherical,
     resolve_curvature,
 )
-from polysight.surfaces.points import find_normals, find_offset_that_sees, predict_echo, spreading, unit_legs
+from polysight.surfaces.points import (
+    compute_spreading,
+    compute_unit_legs,
+    find_normals,
+    find_offset_that_sees,
+    predict_echo,
+)
 from polysight.surfaces.window import WINDOW_M
 
 Array = NDArray[np.float64]
@@ -41,9 +47,9 @@ class Voltages:
 
     Attributes
     ----------
-    b, std
+    voltage, std
         Voltages of H and V without path and spreading, complex [n, 2], and the standard deviations of either part.
-    m
+    response
         Rows of the coefficients of r_s, r_p, s to p and p to s, complex [n, 2 receivers, 4 coefficients].
     theta
         Incidence at H and V, [n, 2], radians: V sees a point from elsewhere, some 0.1 degrees steeper. Near Brewster's
@@ -60,9 +66,9 @@ class Voltages:
         Stage offsets of H's echoes, x and y, [n, 2].
     """
 
-    b: Complex
+    voltage: Complex
     std: Array
-    m: Complex
+    response: Complex
     theta: Array
     path_m: Array
     bend_inside: Array
@@ -80,16 +86,16 @@ class Voltages:
         return Voltages(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
-def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Voltages:
+def find_voltages(seen: SeenEchoes, optics: Optics, shape: Shape | None = None) -> Voltages:
     """Return the voltages of points; their `shape` is found from H's echoes unless given."""
     if shape is None:
         shape = find_shape(seen.h, optics)
     tx_m = optics.tx.at_m
     k = optics.wave_number
-    solid = (shape.points, shape.normals, shape.curvature)
+    surface = (shape.points, shape.normals, shape.curvature)
     # Stage offsets: those of H's echoes, and those from which V sees the same points, to which its echoes are moved.
-    seen_from = {"h": seen.h.at_m, "v": find_offset_that_sees(*solid[:2], seen.v.at_m, tx_m, optics.v.at_m)}
-    b = []
+    seen_from = {"h": seen.h.at_m, "v": find_offset_that_sees(*surface[:2], seen.v.at_m, tx_m, optics.v.at_m)}
+    voltages = []
     std = []
     rows = []
     theta = []
@@ -97,55 +103,57 @@ def find_voltages(seen: Seen, optics: Optics, shape: Shape | None = None) -> Vol
     for channel, echoes in (("h", seen.h), ("v", seen.v)):
         receiver = optics.receiver(channel)
         at_m = seen_from[channel]
-        path, _, _ = predict_echo(*solid, at_m, tx_m, receiver.at_m)
-        spread = spreading(*solid, at_m, tx_m, receiver.at_m)
-        b.append(echoes.move(at_m, k).amplitude * np.exp(1j * k * path) / spread)
+        path, _, _ = predict_echo(*surface, at_m, tx_m, receiver.at_m)
+        spread = compute_spreading(*surface, at_m, tx_m, receiver.at_m)
+        voltages.append(echoes.move(at_m, k).amplitude * np.exp(1j * k * path) / spread)
         std.append(echoes.amplitude_std / spread)
         rows.append(compute_polarisation_row(shape.points, shape.normals, at_m, optics.tx, receiver))
         _, cos = find_normals(shape.points, at_m, tx_m, receiver.at_m)
         theta.append(np.arccos(np.clip(cos, 0, 1)))
         paths.append(path)
-    _, back, *_ = unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
-    out, *_ = unit_legs(shape.points, seen_from["h"], tx_m, optics.h.at_m)
-    inside, across, twist = resolve_curvature(*solid, seen.h.at_m, tx_m)
+    _, arrival_leg, *_ = compute_unit_legs(shape.points, seen_from["v"], tx_m, optics.v.at_m)
+    departure_leg, *_ = compute_unit_legs(shape.points, seen_from["h"], tx_m, optics.h.at_m)
+    bend_inside, bend_across, twist = resolve_curvature(*surface, seen.h.at_m, tx_m)
     return Voltages(
-        b=np.stack(b, axis=1),
+        voltage=np.stack(voltages, axis=1),
         std=np.stack(std, axis=1),
-        m=np.stack(rows, axis=1),
+        response=np.stack(rows, axis=1),
         theta=np.stack(theta, axis=1),
         path_m=np.stack(paths, axis=1),
-        bend_inside=inside,
-        bend_across=across,
+        bend_inside=bend_inside,
+        bend_across=bend_across,
         twist=twist,
-        arrival=back[:, :2],
-        departure=out[:, :2],
+        arrival=arrival_leg[:, :2],
+        departure=departure_leg[:, :2],
         band_rise=np.stack([seen.h.band_rise, seen.v.band_rise], axis=1),
         at_m=seen.h.at_m[:, :2],
     )
 
 
-def reflect_points(eps: NDArray | complex, v: Voltages, wave_number: float) -> Complex:
-    """Coefficients (r_s, r_p, s to p, p to s) of the curved surface at each point for H and V, [n, 2, 4]."""
+def reflect_points(eps: NDArray | complex, points: Voltages, wave_number: float) -> Complex:
+    """Return coefficients (r_s, r_p, s to p, p to s) of the curved surface at each point for H and V, [n, 2, 4]."""
     eps_of_receivers = np.asarray(eps)[..., None]
-    r_s, r_p = reflect_curved(eps_of_receivers, v.theta, v.bend_inside[:, None], v.bend_across[:, None], wave_number)
-    mixed = mix_twisted(eps_of_receivers, v.theta, v.twist[:, None], wave_number)
+    r_s, r_p = reflect_curved(
+        eps_of_receivers, points.theta, points.bend_inside[:, None], points.bend_across[:, None], wave_number
+    )
+    mixed = mix_twisted(eps_of_receivers, points.theta, points.twist[:, None], wave_number)
     # The antennas are near: a spherical wave is reflected a little differently than a plane one.
-    more_s, more_p = reflect_spherical(eps_of_receivers, v.theta, v.path_m, wave_number)
+    more_s, more_p = reflect_spherical(eps_of_receivers, points.theta, points.path_m, wave_number)
     return np.stack([r_s + more_s, r_p + more_p, mixed, mixed], axis=2)
 
 
-def receive(v: Voltages, coefficients: Complex) -> Complex:
-    """Voltages of H and V [n, 2] that coefficients [n, 2, 4] give with gains of 1."""
-    return np.sum(v.m * coefficients, axis=2)
+def predict_voltages(points: Voltages, coefficients: Complex) -> Complex:
+    """Return voltages of H and V [n, 2] that coefficients [n, 2, 4] give with gains of 1."""
+    return np.sum(points.response * coefficients, axis=2)
 
 
-def expansion_parameter(v: Voltages, wave_number: float) -> Array:
+def compute_expansion_parameter(points: Voltages, wave_number: float) -> Array:
     """Return K / (k cos^3 theta) of each point [n]: ratio of successive orders of reflection at a curved surface.
 
     K is the mean of both curvatures' sizes, k the wave number.
     """
-    bend = (np.abs(v.bend_inside) + np.abs(v.bend_across)) / 2
-    return bend / (wave_number * np.cos(v.theta[:, 0]) ** 3)
+    bend = (np.abs(points.bend_inside) + np.abs(points.bend_across)) / 2
+    return bend / (wave_number * np.cos(points.theta[:, 0]) ** 3)
 
 
 def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOCK_M) -> NDArray[np.int_]:
@@ -157,13 +165,13 @@ def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOC
 
 # Degree of the gains' polynomials in the direction of arrival or departure, if the reference covers directions; chosen.
 DEGREE = 2
-# A reference whose directions span no more than this, in radians, is taken for a plate, which has one direction;
-# chosen.
+# A reference whose directions span no more than this, in radians, counts as a plate, which has one direction; chosen.
 LEAST_SPAN_RAD = 0.1
 # Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
 # pattern cos^2 differ by 0.7.
 UNKNOWN_SLOPE = 0.7
-# The same beyond the directions of a sphere, over that of a plate: its polynomial continues the pattern. Chosen.
+# Share of `UNKNOWN_SLOPE` beyond the directions that a sphere covers. It is less than 1, because the polynomial that is
+# fitted to a sphere continues the pattern. Chosen.
 SHARE_BEYOND_SPHERE = 0.25
 
 
@@ -189,7 +197,8 @@ class Gains:
     covered
         Smallest and largest direction, [2] each.
     terms_root, cell
-        Root of the covariance of each part of `ratio_terms`, [terms, blocks]; directions so close [2] have one misfit.
+        Square root of the covariance of each part of `ratio_terms`, [terms, blocks]; size of a cell of directions [2]
+        within which the misfit is the same.
     """
 
     ratio_terms: Complex
@@ -212,20 +221,20 @@ class Gains:
         """Return the gain of H over that of V for directions of arrival [n, 2], [n]."""
         return np.exp(self._make_basis(arrival) @ self.ratio_terms)
 
-    def level(self, v: Voltages) -> Array:
+    def level(self, points: Voltages) -> Array:
         """Return ln|gain of H|, [n]: the mean of the estimates from arrival and departure."""
-        return np.mean(self._find_levels(v), axis=0)
+        return np.mean(self._find_levels(points), axis=0)
 
-    def estimate_level_std(self, v: Voltages) -> Array:
+    def estimate_level_std(self, points: Voltages) -> Array:
         """Return the standard deviation of the level, [n], also where arrival and departure disagree."""
-        by_arrival, by_departure = self._find_levels(v)
-        return np.hypot(np.abs(by_arrival - by_departure) / 2, self.estimate_unknown_std(v.arrival))
+        level_by_arrival, level_by_departure = self._find_levels(points)
+        return np.hypot(np.abs(level_by_arrival - level_by_departure) / 2, self.estimate_unknown_std(points.arrival))
 
-    def _find_levels(self, v: Voltages) -> tuple[Array, Array]:
+    def _find_levels(self, points: Voltages) -> tuple[Array, Array]:
         """Return ln|gain of H| by the direction of arrival, and by that of departure, [n] each."""
         arrival_terms, departure_terms = self.level_terms
-        departure = _evaluate_polynomials(v.departure - self.departure_middle, self.degree)
-        return self._make_basis(v.arrival) @ arrival_terms, departure @ departure_terms
+        departure = _evaluate_polynomials(points.departure - self.departure_middle, self.degree)
+        return self._make_basis(points.arrival) @ arrival_terms, departure @ departure_terms
 
     def estimate_unknown_std(self, arrival: Array) -> Array:
         """Return the standard deviation of ln(H / V), [n], also of directions that the reference does not cover."""
@@ -234,10 +243,10 @@ class Gains:
     def _extrapolate_std(self, arrival: Array) -> Array:
         """Return the standard deviation of ln(H / V) by the distance from the directions covered, [n]; 0 within."""
         low, high = self.covered
-        beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
+        distance_beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
         if self.degree == 0:
-            return UNKNOWN_SLOPE * beyond
-        return SHARE_BEYOND_SPHERE * UNKNOWN_SLOPE * beyond
+            return UNKNOWN_SLOPE * distance_beyond
+        return SHARE_BEYOND_SPHERE * UNKNOWN_SLOPE * distance_beyond
 
     def list_errors(self, arrival: Array) -> Array:
         """Return independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
@@ -246,20 +255,20 @@ class Gains:
         Errors of the polynomials' terms are common to all directions, and so are those of directions that are not
         covered.
         """
-        of_terms = self._make_basis(arrival) @ self.terms_root
+        term_errors = self._make_basis(arrival) @ self.terms_root
         cells = np.floor((arrival - self.middle) / self.cell)
         number = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
-        of_cells = self.std * (number == np.arange(number.max() + 1)[:, None])
-        return np.concatenate([of_terms.T, of_cells, self._extrapolate_std(arrival)[None]])
+        cell_errors = self.std * (number == np.arange(number.max() + 1)[:, None])
+        return np.concatenate([term_errors.T, cell_errors, self._extrapolate_std(arrival)[None]])
 
     def _make_basis(self, arrival: Array) -> Array:
         """Return the polynomials of `ratio_terms` at directions of arrival, [n, terms]."""
         return _evaluate_polynomials(arrival - self.middle, self.degree)
 
 
-def _evaluate_polynomials(d: Array, degree: int) -> Array:
-    """Return all products of powers of both parts of `d` [n, 2] up to a degree in all, [n, terms]."""
-    terms = [d[:, 0] ** i * d[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
+def _evaluate_polynomials(directions: Array, degree: int) -> Array:
+    """Return the products of powers of both columns of `directions` [n, 2] up to a total degree, [n, terms]."""
+    terms = [directions[:, 0] ** i * directions[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
     return np.stack(terms, axis=1)
 
 
@@ -284,13 +293,13 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     `wave_number` is that at the middle of the band, 1 / m.
     """
     coefficients = reflect_points(np.inf, metal, wave_number)
-    gain = metal.b / receive(metal, coefficients)
+    gain = metal.voltage / predict_voltages(metal, coefficients)
     is_valid = np.asarray(np.isfinite(gain).all(axis=1) & (np.abs(gain) > 0).all(axis=1))
     metal = metal[is_valid]
     gain = gain[is_valid]
     ratio = gain[:, 0] / gain[:, 1]
     # No point counts as better than 1 % (chosen).
-    weight = 1 / (np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1) + 1e-4)
+    weight = 1 / (np.sum((metal.std / np.abs(metal.voltage)) ** 2, axis=1) + 1e-4)
     middle = np.average(metal.arrival, axis=0, weights=weight)
     departure_middle = np.average(metal.departure, axis=0, weights=weight)
     # Few points of wrong directions do not widen the covered range.
@@ -301,13 +310,13 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
     log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
     ratio_terms, residual = _fit_robustly(basis, log_ratio, weight)
-    of_departure = _evaluate_polynomials(metal.departure - departure_middle, degree)
+    departure_basis = _evaluate_polynomials(metal.departure - departure_middle, degree)
     level = np.log(np.abs(gain[:, 0]))
-    level_terms = np.stack([_fit_robustly(terms, level, weight)[0] for terms in (basis, of_departure)])
+    level_terms = np.stack([_fit_robustly(terms, level, weight)[0] for terms in (basis, departure_basis)])
     # The next order of metal's own correction, r_p / r_s = 1 + first order.
     first_order = np.abs(coefficients[is_valid, 0, 1] / coefficients[is_valid, 0, 0] - 1)
-    next_order = float(np.median(first_order * expansion_parameter(metal, wave_number)))
-    noise2 = np.sum((metal.std / np.abs(metal.b)) ** 2, axis=1)
+    next_order = float(np.median(first_order * compute_expansion_parameter(metal, wave_number)))
+    noise2 = np.sum((metal.std / np.abs(metal.voltage)) ** 2, axis=1)
     misfit_std, noise_std = _compute_misfit_std(residual, noise2, metal.at_m)
     std = float(np.hypot(np.sqrt(max(0.0, misfit_std**2 - noise_std**2)), next_order))
     # A cell is as wide as the direction changes while the stage moves by a block; a plate has one direction.
@@ -315,7 +324,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
     block = number_blocks(metal.at_m, (0.0, 0.0))
     # Errors are independent from block to block: each block's shifts the terms by its column of the inverse.
-    of_blocks = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
+    block_means = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
     return Gains(
         ratio_terms=ratio_terms,
         level_terms=level_terms,
@@ -325,7 +334,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
         degree=degree,
         std=std,
         covered=(low, high),
-        terms_root=np.asarray(np.hypot(misfit_std, next_order) * np.linalg.pinv(of_blocks), np.float64),
+        terms_root=np.asarray(np.hypot(misfit_std, next_order) * np.linalg.pinv(block_means), np.float64),
         cell=np.asarray(cell, np.float64),
     )
 

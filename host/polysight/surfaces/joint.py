@@ -37,10 +37,10 @@ JOINT_GAIN = 3e-3
 MOST_DAMPING = 10
 # The RX are added with phases for the current paths (`steering`). Largest number of rounds with new phases; another
 # round follows only if the last one left less than the share STEERING_GAIN of the residual's energy; chosen.
-STEERINGS = 4
+STEERING_ROUNDS = 4
 STEERING_GAIN = 0.9
-# Widening of the amplitude above which two fitted echoes are one and the same, or two halves of a wave that an edge
-# cuts. Echoes 150 mm apart in x have 1.4, 50 mm apart in range 2.8. A plate of 200 mm keeps 524 points with a limit of
+# Widening of the amplitude above which two fitted echoes are a single one, or two halves of a wave that an edge cuts.
+# Echoes 150 mm apart in x have 1.4, 50 mm apart in range 2.8. A plate of 200 mm keeps 524 points with a limit of
 # 2, 488 with 3, and 120 with 12 (simulated).
 MERGED_WIDENING = 2
 # Pairs of the six values of a path, each once.
@@ -95,10 +95,10 @@ class JointFit:
         self.rest = windows.samples.copy()
 
     def run(self) -> None:
-        """Fit in up to `STEERINGS` rounds, each with the RX added for the paths of the round before."""
+        """Fit in up to `STEERING_ROUNDS` rounds, each with the RX added for the paths of the round before."""
         members = np.arange(len(self.values))
         energy = np.full(len(self.values), np.inf)
-        for _ in range(STEERINGS):
+        for _ in range(STEERING_ROUNDS):
             self.subtract(members)
             self._descend(members)
             new_energy = find_energy(self.rest[members])
@@ -112,7 +112,7 @@ class JointFit:
         """Set the phases of the RX of windows `members` for the current paths, and subtract the echoes from samples."""
         for index in range(self.values.shape[1]):
             path, slope, _ = unpack_values(self.values[members, index])
-            self.steering[members, index] = self.fit.steer(self.windows.at_m[members], path, slope)
+            self.steering[members, index] = self.fit.compute_steering(self.windows.at_m[members], path, slope)
         self.waves[members], self.rest[members] = self._subtract(members, self.values[members], self.amplitude[members])
 
     def synthesise(self, index: int) -> NDArray[np.complex64]:
@@ -175,7 +175,7 @@ class JointFit:
         rows = np.arange(merged.size)
         middle = (self.values[merged, pair[:, 0]] + self.values[merged, pair[:, 1]]) / 2
         middle[:, 3:] = [START_BEND, 0, START_BEND]
-        part = select_windows(self.windows, merged)
+        merged_windows = select_windows(self.windows, merged)
         path_cell_m = SPEED_OF_LIGHT_M_S / np.ptp(self.fit.board.frequencies_hz)
         slope_cell = 2 * np.pi / self.fit.middle / WINDOW_M
         for parameter, cell in enumerate([path_cell_m, slope_cell, slope_cell]):
@@ -186,7 +186,7 @@ class JointFit:
                 start[:, parameter] += side * cell
                 values[rows, echo] = start
                 amplitude[rows, echo] = 0
-            refit = JointFit(self.fit, part, values, amplitude)
+            refit = JointFit(self.fit, merged_windows, values, amplitude)
             refit.run()
             better = find_energy(refit.rest) < find_energy(self.rest[merged])
             for name in ("values", "amplitude", "steering", "waves", "rest"):
@@ -223,10 +223,10 @@ class JointFit:
     def _project(self, members: NDArray, index: int) -> NDArray[np.complex128]:
         """Return the products of an echo's wave, and of its 6 derivatives, with the residual `rest`, [window, 7]."""
         added = add_rx(self.steering[members, index] / len(self.fit.lever), self.rest[members])
-        turned = self.waves[members, index].conj() * added
+        turned_samples = self.waves[members, index].conj() * added
         # Sums over the frequencies with the powers 0 and 1 of nu, [window, 2, position].
-        by_power = np.stack([np.ones_like(self.nu), self.nu]).astype(np.complex64) @ turned
-        sums = _multiply_parts(by_power * self.windows.valid[members, None], self.basis[members])
+        sums_by_power = np.stack([np.ones_like(self.nu), self.nu]).astype(np.complex64) @ turned_samples
+        sums = _multiply_parts(sums_by_power * self.windows.valid[members, None], self.basis[members])
         return np.einsum("wpb,wb->wp", self.steady[members], sums[:, 0]) + sums[:, 1] @ self.changing.T
 
     def _multiply(self, members: NDArray, first: int, second: int) -> NDArray[np.complex128]:
@@ -240,8 +240,8 @@ class JointFit:
         if first == second:
             sums = factors.sum(axis=2)[..., None] * self.product_sums[members, None]
         else:
-            turned = self.waves[members, first].conj() * self.waves[members, second]
-            sums = _multiply_parts(factors.astype(np.complex64) @ turned, self.products[members])
+            turned_waves = self.waves[members, first].conj() * self.waves[members, second]
+            sums = _multiply_parts(factors.astype(np.complex64) @ turned_waves, self.products[members])
         grams = np.empty((len(members), 3, 6, 6), complex)
         rows, columns = PAIRS
         grams[..., rows, columns] = sums
@@ -279,10 +279,10 @@ class JointFit:
         widening = np.empty((count, echoes, 7))
         for index in range(echoes):
             unknowns = slice(8 * index, 8 * index + 8)
-            alone = np.einsum("wii->wi", np.linalg.inv(scaled[:, unknowns, unknowns]))
-            ratio = together[:, index] / alone
+            inverse_diagonal = np.einsum("wii->wi", np.linalg.inv(scaled[:, unknowns, unknowns]))
+            ratio = together[:, index] / inverse_diagonal
             # Rounding can make the inverse of a nearly singular matrix negative: the value is then not determined.
-            ratio = np.where((together[:, index] > 0) & (alone > 0), ratio, NO_INFORMATION)
+            ratio = np.where((together[:, index] > 0) & (inverse_diagonal > 0), ratio, NO_INFORMATION)
             widening[:, index, 0] = np.sqrt(ratio[:, :2].max(axis=1))
             widening[:, index, 1:] = np.sqrt(ratio[:, 2:])
         return np.maximum(widening, 1)

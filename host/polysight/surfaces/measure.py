@@ -62,20 +62,20 @@ FARTHEST_M = 1.4
 MAX_SLOPE = 0.6
 # Offsets of the stage closer than this are of one window.
 SAME_WINDOW_M = 1e-4
-# An echo below so many standard deviations of its noise has no usable slope.
+# Least amplitude of an echo with a usable slope, in standard deviations of its noise.
 MIN_AMPLITUDE_STDS = 5
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenEchoes:
     """Echoes of H and V of the same points [n], and the number of the segment of each (-1: none)."""
 
     h: Echoes
     v: Echoes
     segment: NDArray[np.int_]
 
-    def __getitem__(self, keep: NDArray) -> Seen:
-        return Seen(self.h[keep], self.v[keep], self.segment[keep])
+    def __getitem__(self, keep: NDArray) -> SeenEchoes:
+        return SeenEchoes(self.h[keep], self.v[keep], self.segment[keep])
 
     def __len__(self) -> int:
         return len(self.h)
@@ -107,7 +107,7 @@ def find_shape(echoes: Echoes, optics: Optics) -> Shape:
     return Shape(points, normals, cos, curvature)
 
 
-def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, float]) -> Seen:
+def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, float]) -> SeenEchoes:
     """Find the specular points of a scan in H, and measure the same points in V.
 
     `h` and `v` are the boards' samples, `gate_m` the smallest and the largest path that is searched, metres. The points
@@ -126,18 +126,18 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
     # V distinguishes the echoes of one window of H by their paths: number the windows.
     window = np.unique(np.round(echoes.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
-    # V's echoes are those of the points `inside` V's scan only.
-    seen_by_v, inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
-    return Seen(echoes[inside], seen_by_v, segment[inside])
+    # V's echoes are those of the points `is_inside` V's scan only.
+    seen_by_v, is_inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
+    return SeenEchoes(echoes[is_inside], seen_by_v, segment[is_inside])
 
 
 def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
     """True for echoes that a surface can give: within range, not too steep, well above the noise."""
     z_m = shape.points[:, 2]
-    in_range = np.isfinite(shape.points).all(axis=1) & (z_m > NEAREST_M) & (z_m < FARTHEST_M)
-    in_view = np.abs(echoes.slope).max(axis=1) < MAX_SLOPE
-    above_noise = np.abs(echoes.amplitude) > MIN_AMPLITUDE_STDS * echoes.amplitude_std
-    return in_range & in_view & above_noise
+    is_in_range = np.isfinite(shape.points).all(axis=1) & (z_m > NEAREST_M) & (z_m < FARTHEST_M)
+    is_in_view = np.abs(echoes.slope).max(axis=1) < MAX_SLOPE
+    is_above_noise = np.abs(echoes.amplitude) > MIN_AMPLITUDE_STDS * echoes.amplitude_std
+    return is_in_range & is_in_view & is_above_noise
 
 
 def _is_wide(shape: Shape) -> NDArray[np.bool_]:
@@ -195,21 +195,21 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
         at_m = echoes.at_m[members, :2]
         tree = scipy.spatial.KDTree(at_m)
         neighbours = tree.query_ball_point(at_m, NEIGHBOURHOOD_M)
-        around = tree.query_ball_point(at_m, RIPPLE_REACH_M)
+        neighbours_around = tree.query_ball_point(at_m, RIPPLE_REACH_M)
         ripple_variance = np.zeros((len(members), 2))
-        is_fitted = np.array([len(near) >= MIN_NEIGHBOURS for near in neighbours])
-        for place in np.flatnonzero(is_fitted):
-            near = neighbours[place]
-            fit = _find_fit(fits, at_m[near] - at_m[place], may_change=False)
-            bend[members[place]], ripple_variance[place] = fit.apply(echoes, members[near])
-            if len(around[place]) >= MIN_AROUND:
-                near = around[place]
-                fit = _find_fit(fits, at_m[near] - at_m[place], may_change=True)
-                _, ripple_variance[place] = fit.apply(echoes, members[near])
-        for place in np.flatnonzero(is_fitted):
-            near = [neighbour for neighbour in neighbours[place] if is_fitted[neighbour]]
-            slope_std[members[place]] = np.hypot(
-                slope_std[members[place]], np.sqrt(np.maximum(0, ripple_variance[near].mean(axis=0)))
+        is_fitted = np.array([len(near_points) >= MIN_NEIGHBOURS for near_points in neighbours])
+        for point in np.flatnonzero(is_fitted):
+            near_points = neighbours[point]
+            fit = _find_fit(fits, at_m[near_points] - at_m[point], may_change=False)
+            bend[members[point]], ripple_variance[point] = fit.apply(echoes, members[near_points])
+            if len(neighbours_around[point]) >= MIN_AROUND:
+                near_points = neighbours_around[point]
+                fit = _find_fit(fits, at_m[near_points] - at_m[point], may_change=True)
+                _, ripple_variance[point] = fit.apply(echoes, members[near_points])
+        for point in np.flatnonzero(is_fitted):
+            near_points = [neighbour for neighbour in neighbours[point] if is_fitted[neighbour]]
+            slope_std[members[point]] = np.hypot(
+                slope_std[members[point]], np.sqrt(np.maximum(0, ripple_variance[near_points].mean(axis=0)))
             )
     return replace(echoes, bend=bend, slope_std=slope_std)
 
@@ -289,7 +289,7 @@ def correlate_windows(d: Array) -> tuple[Array, Array]:
 
 
 def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Array:
-    """Share [2] of the variance of errors of both slopes that a fit leaves as residuals.
+    """Return the share [2] of the variance of errors of both slopes that a fit leaves as residuals.
 
     trace((1 - S) C (1 - S)') / n, with S = `matrix` `inverse` `matrix`' the smoother and C the correlation [2, n, n].
     `matrix` [2, n, p]: both slopes in terms of the unknown; `inverse` [p, p]: of the normal matrix.
@@ -297,9 +297,9 @@ def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Arra
     """
     transposed = np.swapaxes(matrix, 1, 2)
     common = transposed @ correlation @ matrix
-    taken = 2 * np.trace(inverse @ common, axis1=1, axis2=2)
+    share_taken = 2 * np.trace(inverse @ common, axis1=1, axis2=2)
     fitted = np.trace(inverse @ common.sum(axis=0) @ inverse @ transposed @ matrix, axis1=1, axis2=2)
-    return 1 + (fitted - taken) / matrix.shape[1]
+    return 1 + (fitted - share_taken) / matrix.shape[1]
 
 
 def share_curvatures(echoes: Echoes, segment: NDArray[np.int_], optics: Optics) -> Echoes:
@@ -322,7 +322,7 @@ def share_curvatures(echoes: Echoes, segment: NDArray[np.int_], optics: Optics) 
         weights = np.bincount(cell, weight[members])
         sums = np.zeros((len(cells), 2, 2))
         np.add.at(sums, cell, weight[members, None, None] * motion[members])
-        near = scipy.spatial.KDTree(cells * CELL_M).query_ball_point(cells * CELL_M, SAME_CURVATURE_M)
-        means = np.array([sums[group].sum(axis=0) / weights[group].sum() for group in near])
+        near_cells = scipy.spatial.KDTree(cells * CELL_M).query_ball_point(cells * CELL_M, SAME_CURVATURE_M)
+        means = np.array([sums[group].sum(axis=0) / weights[group].sum() for group in near_cells])
         motion[members] = means[cell]
     return replace(echoes, bend=find_bend(*geometry, motion))

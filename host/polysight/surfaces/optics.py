@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.polarimetry import fresnel
-from polysight.surfaces.points import find_normals, tangents, unit_legs
+from polysight.surfaces.points import compute_tangents, compute_unit_legs, find_normals
 from polysight_shared.config import Board, Instrument
-from polysight_shared.geometry import place, rx_positions_m, tx_position_m
+from polysight_shared.geometry import rx_positions_m, transform_to_rig, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Antenna:
     leakage: complex = 0j
 
     def field(self, directions: Array) -> Complex:
-        """Field vectors [n, 3] in unit directions [n, 3]."""
+        """Return the field vectors [n, 3] in unit directions [n, 3]."""
         vector = self.wanted + self.leakage * self.other
         return _carry_along_arc(self.boresight, directions, vector)
 
@@ -60,8 +60,8 @@ class Antenna:
         """Return the antenna with its polarisation turned about the boresight, right-handed."""
         cos = np.cos(angle_rad)
         sin = np.sin(angle_rad)
-        turned = [cos * v + sin * np.cross(self.boresight, v) for v in (self.wanted, self.other)]
-        return replace(self, wanted=turned[0], other=turned[1])
+        turned_vectors = [cos * v + sin * np.cross(self.boresight, v) for v in (self.wanted, self.other)]
+        return replace(self, wanted=turned_vectors[0], other=turned_vectors[1])
 
 
 def _carry_along_arc(start: Array, ends: Array, vector: NDArray) -> NDArray:
@@ -112,8 +112,10 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
 
 def _compute_boresight(board: Board) -> Array:
     """Return the unit vector in which a board looks, rig frame, [3]."""
-    ahead = np.array(place((0.0, 0.0, 1000.0), board.mount)) - np.array(place((0.0, 0.0, 0.0), board.mount))
-    return ahead / np.linalg.norm(ahead)
+    forward_m = np.array(transform_to_rig((0.0, 0.0, 1000.0), board.mount)) - np.array(
+        transform_to_rig((0.0, 0.0, 0.0), board.mount)
+    )
+    return forward_m / np.linalg.norm(forward_m)
 
 
 def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts: tuple[float, float]) -> Antenna:
@@ -133,8 +135,8 @@ def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float,
     p_axis *= np.sign(p_axis[0])
     s_share, p_share = parts
     vectors = (s_share * s_axis + p_share * p_axis, p_share * s_axis + s_share * p_axis)
-    at_boresight = [_carry_along_arc(direction, boresight[None], vector)[0] for vector in vectors]
-    return Antenna(at_m, boresight, at_boresight[0], at_boresight[1])
+    boresight_vectors = [_carry_along_arc(direction, boresight[None], vector)[0] for vector in vectors]
+    return Antenna(at_m, boresight, boresight_vectors[0], boresight_vectors[1])
 
 
 @dataclass(frozen=True)
@@ -183,24 +185,24 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
 
 
 def compute_polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:
-    """Coefficients [n, 4] of r_s and r_p in a voltage, and of the reflections from s to p and from p to s.
+    """Return coefficients [n, 4] of r_s and r_p in a voltage, and of the reflections from s to p and from p to s.
 
     `points` and `normals` [n, 3] are seen from stage offsets `at_m` [n, 3].
     """
     # Unit vectors from TX and from RX to the points.
-    t, r, *_ = unit_legs(points, at_m, tx.at_m, rx.at_m)
+    t, r, *_ = compute_unit_legs(points, at_m, tx.at_m, rx.at_m)
     s_axis = np.cross(normals, t)
     s_axis /= np.maximum(np.linalg.norm(s_axis, axis=1, keepdims=True), 1e-12)
     p_in = np.cross(s_axis, t)
     p_out = np.cross(s_axis, r)
-    sent = tx.field(t)
+    sent_field = tx.field(t)
     received = rx.field(r)
 
     def dot(a: NDArray, b: NDArray) -> NDArray:
         return np.einsum("ni,ni->n", a, b)
 
-    sent_s = dot(sent, s_axis)
-    sent_p = dot(sent, p_in)
+    sent_s = dot(sent_field, s_axis)
+    sent_p = dot(sent_field, p_in)
     received_s = dot(received, s_axis)
     received_p = dot(received, p_out)
     rows = [sent_s * received_s, sent_p * received_p, sent_s * received_p, sent_p * received_s]
@@ -208,17 +210,17 @@ def compute_polarisation_row(points: Array, normals: Array, at_m: Array, tx: Ant
 
 
 def resolve_curvature(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> Array:
-    """Curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m.
+    """Return the curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m.
 
-    `curvature` [n, 2, 2] is that along the `tangents` of the `normals`; `points`, `normals` and the stage offsets
-    `at_m` are [n, 3].
+    `curvature` [n, 2, 2] is that along the `compute_tangents` of the `normals`; `points`, `normals` and the stage
+    offsets `at_m` are [n, 3].
     """
     ray = points - at_m - tx_m
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    inside = np.einsum("nij,ni->nj", tangents(normals), ray)
-    inside /= np.maximum(np.linalg.norm(inside, axis=1, keepdims=True), 1e-12)
-    across = np.stack([-inside[:, 1], inside[:, 0]], axis=1)
-    pairs = ((inside, inside), (across, across), (inside, across))
+    ray_in_plane = np.einsum("nij,ni->nj", compute_tangents(normals), ray)
+    ray_in_plane /= np.maximum(np.linalg.norm(ray_in_plane, axis=1, keepdims=True), 1e-12)
+    ray_across = np.stack([-ray_in_plane[:, 1], ray_in_plane[:, 0]], axis=1)
+    pairs = ((ray_in_plane, ray_in_plane), (ray_across, ray_across), (ray_in_plane, ray_across))
     return np.stack([np.einsum("ni,nij,nj->n", first, curvature, second) for first, second in pairs])
 
 
@@ -231,7 +233,7 @@ def reflect_flat(eps: NDArray | complex, theta: Array) -> tuple[Complex, Complex
 def reflect_curved(
     eps: NDArray | complex, theta: Array, bend_inside: Array, bend_across: Array, wave_number: float
 ) -> tuple[Complex, Complex]:
-    """Coefficients (r_s, r_p) [n] at a curved surface, to first order in curvature / wave number.
+    """Return coefficients (r_s, r_p) [n] at a curved surface, to first order in curvature / wave number.
 
     `eps` is the permittivity, infinite for metal, `theta` the incidence angle in radians. `bend_inside`, `bend_across`:
     curvature (1 / m, convex positive) in the plane of incidence and across it.
@@ -251,30 +253,30 @@ def reflect_curved(
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
-    # s, then p. `inside` is half the variance of the angle times r''. For `across`, the angle grows by half the
-    # squared deviation over tan(theta), and the plane turns by the deviation over sin(theta).
+    # s, then p. `change_inside` is half the variance of the angle times r''. For `change_across`, the angle grows by
+    # half the squared deviation over tan(theta), and the plane turns by the deviation over sin(theta).
     for local, r, other, up, down in zip(single_wave, middle, middle[::-1], above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
-        inside = 1j * bend_inside / (4 * wave_number * cos) * second
-        across = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
-        coefficients.append(local + inside + across)
+        change_inside = 1j * bend_inside / (4 * wave_number * cos) * second
+        change_across = 1j * bend_across / (2 * wave_number * cos) * (first * cos / sin / 2 + (other - r) / sin**2)
+        coefficients.append(local + change_inside + change_across)
     return coefficients[0], coefficients[1]
 
 
 def reflect_spherical(
     eps: NDArray | complex, theta: Array, path_m: Array, wave_number: float
 ) -> tuple[Complex, Complex]:
-    """Additions to (r_s, r_p) [n] for a spherical wave of a finite path, to first order in 1 / (k path).
+    """Return additions to (r_s, r_p) [n] for a spherical wave of a finite path, to first order in 1 / (k path).
 
     The sum over directions of a plane: <d theta^2> = j / (k path), in the plane of incidence and across it.
     """
-    flat = reflect_flat(eps, theta)
+    flat_coefficients = reflect_flat(eps, theta)
     above = reflect_flat(eps, theta + ANGLE_STEP)
     below = reflect_flat(eps, theta - ANGLE_STEP)
     spread = 1j / (2 * wave_number * path_m)
     additions = []
-    for r, up, down in zip(flat, above, below, strict=True):
+    for r, up, down in zip(flat_coefficients, above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
         additions.append(spread * (second + first / np.tan(theta)))
@@ -290,9 +292,9 @@ def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number:
     cos = np.cos(theta)
     sin = np.sin(theta)
     r_s, r_p = reflect_flat(eps, theta)
-    above_s, above_p = reflect_flat(eps, theta + ANGLE_STEP)
-    below_s, below_p = reflect_flat(eps, theta - ANGLE_STEP)
-    first = ((above_s - above_p) - (below_s - below_p)) / (2 * ANGLE_STEP)
+    next_s, next_p = reflect_flat(eps, theta + ANGLE_STEP)
+    previous_s, previous_p = reflect_flat(eps, theta - ANGLE_STEP)
+    first = ((next_s - next_p) - (previous_s - previous_p)) / (2 * ANGLE_STEP)
     # The sum over directions: with the angle of incidence its plane turns.
     directions = first / (2 * sin * cos) - (r_s - r_p) / (2 * sin**2)
     # The wave of a cylinder: its logarithmic derivative differs from a plane wave's, in air and in the medium. The
@@ -312,7 +314,7 @@ def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number:
 def _reflect_local(
     eps: NDArray | complex, theta: Array, bends: tuple[Array, Array], wave_number: float
 ) -> tuple[Complex, Complex]:
-    """Coefficients (r_s, r_p) [n] of a single cylindrical wave, without the sum over directions.
+    """Return coefficients (r_s, r_p) [n] of a single cylindrical wave, without the sum over directions.
 
     `bends` are the curvatures in the plane of incidence and across it. Both cylinders change the flat coefficients
     independently, to first order.
@@ -331,15 +333,15 @@ def _reflect_local(
     r_s, r_p = reflect_flat(eps, theta)
 
     # Cylinder across the plane of incidence. Logarithmic derivatives along the normal, over k: of the waves towards the
-    # surface and away from it in air (`into`, `out`), and of the wave in the medium (`behind`). `outer` and `inner` are
-    # the changes by curvature outside and inside.
+    # surface and away from it in air (`into`, `out`), and of the wave in the medium (`inside_term`). `outer` and
+    # `inner` are the changes by curvature outside and inside.
     outer = bend_inside / (2 * wave_number * cos**2)
     inner = bend_inside / (2 * wave_number * cos_medium**2)
     into = 1j * cos - outer
     out = -1j * cos - outer
-    behind = 1j * root * cos_medium - inner
-    local_s = -(into - behind) / (out - behind)
-    local_p = (into - behind / eps) / (out - behind / eps)
+    inside_term = 1j * root * cos_medium - inner
+    local_s = -(into - inside_term) / (out - inside_term)
+    local_p = (into - inside_term / eps) / (out - inside_term / eps)
     # Cylinder along the plane of incidence: the same of the fields along its axis, over the square of the normal wave
     # numbers (`k_out`, `k_in`, over k), since so the fields around it follow from these.
     k_out = cos
@@ -348,7 +350,7 @@ def _reflect_local(
     inner = bend_across / (2 * wave_number * k_in)
     into = (1j - outer) / k_out
     out = (-1j - outer) / k_out
-    behind = (1j - inner) / k_in
-    across_s = (into - behind) / (out - behind)
-    across_p = -(into - eps * behind) / (out - eps * behind)
+    inside_term = (1j - inner) / k_in
+    across_s = (into - inside_term) / (out - inside_term)
+    across_p = -(into - eps * inside_term) / (out - eps * inside_term)
     return local_s + across_s - r_s, local_p + across_p - r_p

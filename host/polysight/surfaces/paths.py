@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.surfaces.joint import MERGED_WIDENING, START_BEND, JointFit
-from polysight.surfaces.points import locate, unit_legs
+from polysight.surfaces.points import compute_unit_legs, locate
 from polysight.surfaces.window import (
     WINDOW_M,
     Array,
@@ -52,9 +52,9 @@ MIN_SHARE = 0.05
 # Least share of the power for the echoes after the strongest: a sphere in front of a table that is 16 dB brighter has
 # 0.025.
 MIN_LEFT = 0.012
-# Echoes that a fit to some of the positions makes so much less certain have merged in a fit to all, too.
+# If a fit to some of the positions makes echoes less certain by this factor, they merge in a fit to all, too.
 THINNED_WIDENING = 5 * MERGED_WIDENING
-# An echo this far below the strongest of the scan, 32 dB in power, is taken for a side lobe or the echo of an edge;
+# An echo this far below the strongest of the scan, 32 dB in power, counts as a side lobe or the echo of an edge;
 # chosen.
 MIN_POWER = 10 ** (-3.2)
 # Echoes whose windows are in memory together while they are measured; chosen.
@@ -87,7 +87,7 @@ class _Search:
         slope = np.stack([gx.ravel(), gy.ravel()], axis=1)
         zero = np.zeros((slope.shape[0], 3))
         points = locate(path.ravel(), slope, zero, board.tx_m, board.middle_m)
-        _, back, *_ = unit_legs(points, zero, board.tx_m, board.middle_m)
+        _, back, *_ = compute_unit_legs(points, zero, board.tx_m, board.middle_m)
         # `back` are unit vectors from the board's middle to the points, `lever` the places of the RX from that middle:
         # an RX is nearer to a point by back . lever, and has so much less path.
         lead = np.exp(1j * fit.middle * (back @ fit.lever.T))
@@ -101,16 +101,16 @@ class _Search:
         count, rx = samples.shape[:2]
         total = np.zeros((count, *self.lead.shape[1:]), np.complex64)
         for index in range(rx):
-            by_path = (self.along_f[index] @ samples[:, index]).reshape(count, -1, *self.shape)
-            by_y = np.swapaxes(by_path, -1, -2) @ self.along_y
-            by_slope = np.swapaxes(by_y, -1, -2) @ self.along_x
-            total += self.lead[index] * by_slope
+            spectrum_by_path = (self.along_f[index] @ samples[:, index]).reshape(count, -1, *self.shape)
+            spectrum_by_y = np.swapaxes(spectrum_by_path, -1, -2) @ self.along_y
+            spectrum_by_slope = np.swapaxes(spectrum_by_y, -1, -2) @ self.along_x
+            total += self.lead[index] * spectrum_by_slope
         power = total.real**2 + total.imag**2
         best = power.reshape(count, -1).argmax(axis=1)
         path, gy, gx = np.unravel_index(best, power.shape[1:])
         bends = np.full(count, START_BEND)
-        flat = np.zeros(count)
-        return np.stack([self.paths[path], self.slopes[gx], self.slopes[gy], bends, flat, bends], axis=1)
+        flat_power = np.zeros(count)
+        return np.stack([self.paths[path], self.slopes[gx], self.slopes[gy], bends, flat_power, bends], axis=1)
 
 
 def _fit_echo(fit: BoardFit, windows: Windows, values: Array) -> Maximum:
@@ -169,9 +169,9 @@ def _separate_echoes(fit: BoardFit, search: _Search, windows: Windows) -> list[E
     active = np.arange(len(windows.valid))
     energy = np.sum(np.abs(residual) ** 2, axis=(1, 2, 3))
     for rank in range(MAX_ECHOES):
-        part = select_windows(replace_samples(windows, residual), active)
-        first = _fit_echo(fit, part, search.find(part))
-        share = _compute_power_share(fit, part, first, energy[active])
+        active_windows = select_windows(replace_samples(windows, residual), active)
+        first = _fit_echo(fit, active_windows, search.find(active_windows))
+        share = _compute_power_share(fit, active_windows, first, energy[active])
         keep = share > (MIN_LEFT if rank else MIN_SHARE)
         if not keep.any():
             break
@@ -203,15 +203,17 @@ def _refine(
     members = echoes[-1][0][is_likely]
     weakest = select_maxima(echoes[-1][1], is_likely)
     echoes[-1] = (members, weakest)
-    part = select_windows(windows, members)
-    joint = _fit_apart(fit, part, _select_echoes(echoes, members))
+    member_windows = select_windows(windows, members)
+    joint = _fit_apart(fit, member_windows, _select_echoes(echoes, members))
     widening = joint.find_widening()
     is_separate = widening[..., 0].max(axis=1) < MERGED_WIDENING
     for index, (windows_of_rank, maximum) in enumerate(echoes):
         values = joint.values[:, index]
-        alone = replace_samples(part, joint.rest + joint.synthesise(index))
+        single_echo = replace_samples(member_windows, joint.rest + joint.synthesise(index))
         # Without iterations the path of the joint fit stays, and only the amplitude is measured.
-        better = maximise(fit, add_up(fit, alone, values), part.valid, part.offsets, values, iterations=0)
+        better = maximise(
+            fit, add_up(fit, single_echo, values), member_windows.valid, member_windows.offsets, values, iterations=0
+        )
         # The other echoes make an echo's amplitude and path less certain.
         better.amplitude_std = better.amplitude_std * widening[:, index, 0]
         better.std = better.std * widening[:, index, 1:]
@@ -233,8 +235,8 @@ def _may_be_separate(fit: BoardFit, windows: Windows, echoes: list[tuple[NDArray
     thinned = choose_thinned(shape)
     if thinned.size == shape[0] * shape[1]:
         return np.ones(members.size, bool)
-    part = select_windows(select_positions(windows, thinned), members)
-    joint = _fit_apart(fit, part, _select_echoes(echoes, members))
+    thinned_windows = select_windows(select_positions(windows, thinned), members)
+    joint = _fit_apart(fit, thinned_windows, _select_echoes(echoes, members))
     return joint.find_widening()[..., 0].max(axis=1) < THINNED_WIDENING
 
 
@@ -286,24 +288,24 @@ def measure_echoes(
     columns = np.round(np.interp(at_m[:, 0], x, np.arange(x.size)) - (width - 1) / 2).astype(int)
     starts = pack_values(path_m, slope, bend)
     is_known = np.isfinite(at_m).all(axis=1) & np.isfinite(starts).all(axis=1)
-    inside = is_known & (rows >= 0) & (columns >= 0) & (rows <= y.size - height) & (columns <= x.size - width)
+    is_inside = is_known & (rows >= 0) & (columns >= 0) & (rows <= y.size - height) & (columns <= x.size - width)
     if is_measured is not None:
-        inside &= is_measured
+        is_inside &= is_measured
     if window is None:
         window = np.arange(len(at_m))
     known_of_window: dict[int, list[int]] = {}
     for index in np.flatnonzero(is_known):
         known_of_window.setdefault(int(window[index]), []).append(int(index))
-    chosen = np.flatnonzero(inside)
+    chosen = np.flatnonzero(is_inside)
     # Each measured echo first, then the others of its window.
     members = [[index, *(o for o in known_of_window[int(window[index])] if o != index)] for index in chosen.tolist()]
     counts = np.array([len(group) for group in members], int)
     parts: list[Echoes] = []
     order: list[NDArray] = []
     for count in np.unique(counts):
-        of_count = np.flatnonzero(counts == count)
-        for first in range(0, of_count.size, _ECHOES_AT_A_TIME):
-            part = of_count[first : first + _ECHOES_AT_A_TIME]
+        windows_of_count = np.flatnonzero(counts == count)
+        for first in range(0, windows_of_count.size, _ECHOES_AT_A_TIME):
+            part = windows_of_count[first : first + _ECHOES_AT_A_TIME]
             group = np.array([members[index] for index in part])
             measured = group[:, 0]
             windows = gather_windows(board, rows[measured], columns[measured], at_m[measured])
@@ -311,8 +313,8 @@ def measure_echoes(
             parts.append(_measure_windows(fit, windows, values))
             order.append(part)
     if not parts:
-        return no_echoes(), inside
-    return Echoes.join(parts)[np.argsort(np.concatenate(order))], inside
+        return no_echoes(), is_inside
+    return Echoes.join(parts)[np.argsort(np.concatenate(order))], is_inside
 
 
 def _move_starts(values: Array, offsets_m: Array) -> Array:

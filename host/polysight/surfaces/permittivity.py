@@ -7,8 +7,10 @@ squares over its points (`fit_permittivity`) of the equation
     b_H (M r)_V = b_V (M r)_H
 
 * r: reflection coefficients of the curved surface at the point, which depend on eps; [n, 2 receivers, 4].
-* M: effect of the antennas' polarisations on r (`Voltages.m`); (M r)_H and (M r)_V are the voltages for gains of 1.
-* b_H, b_V: measured voltages of H and V (`Voltages.b`), divided by the receivers' gains (`Gains`). These depend on the
+* M: effect of the antennas' polarisations on r (`Voltages.response`); (M r)_H and (M r)_V are the voltages for gains of
+  1.
+* b_H, b_V: measured voltages of H and V (`Voltages.voltage`), divided by the receivers' gains (`Gains`). These depend
+  on the
   direction in which V sees the point (`Voltages.arrival`).
 
 Receivers are in the order H, V. The four coefficients are r_s, r_p, s to p, p to s. The last two are 0 without a
@@ -43,21 +45,21 @@ from polysight.surfaces.gains import (
     UNKNOWN_SLOPE,
     Gains,
     Voltages,
-    expansion_parameter,
+    compute_expansion_parameter,
     find_voltages,
     number_blocks,
-    receive,
+    predict_voltages,
     reflect_points,
 )
-from polysight.surfaces.measure import Seen
+from polysight.surfaces.measure import SeenEchoes
 from polysight.surfaces.optics import ANGLE_STEP, Antenna, Optics, reflect_flat
 from polysight.surfaces.paths import STRIDE_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# A point is left out of the fit if its miss, over its own standard deviation, is more than so many times the median of
-# the segment; chosen.
-OUTLIER = 4.0
+# A point is left out of the fit if its misfit, over its own standard deviation, exceeds the median of the segment by
+# more than this factor; chosen.
+OUTLIER_RATIO = 4.0
 # Radius in metres of the neighbourhood whose scatter a point is given; chosen: ripples by edges and by other echoes
 # change over such a distance.
 RIPPLE_M = 0.04
@@ -70,8 +72,8 @@ RIPPLE_OF_PLATES_M = 0.024
 # chosen.
 USUAL_RIPPLE = 0.02
 # A small segment has few blocks, whose scatter is uncertain. So it is averaged with a second estimate: the ripple of
-# the single points, taken as common to a square of `ripple_m`. The second estimate has the weight of so many blocks;
-# chosen.
+# the single points, taken as common to a square of `ripple_m`. The second estimate has the weight of this number
+# of blocks; chosen.
 EXPECTED_BLOCKS = 2.0
 # Relative error of the curvature; chosen: the curvatures of 14 spheres and cylinders (50 to 190 mm, simulated) were
 # measured 0.4 to 3 % too large, 1.6 % in the root mean square, because a window is not small compared with such bodies.
@@ -140,16 +142,16 @@ class PermittivityFit:
     answer: Complex
 
 
-def point_ratio(v: Voltages, gains: Gains) -> Complex:
+def point_ratio(points: Voltages, gains: Gains) -> Complex:
     """Return the measured r_s / r_p of each point, complex [n], neglecting the twist that mixes s and p."""
-    b = v.b.copy()
-    b[:, 0] /= gains.ratio(v.arrival)
-    return _unmix(v, b)
+    b = points.voltage.copy()
+    b[:, 0] /= gains.ratio(points.arrival)
+    return _unmix(points, b)
 
 
-def _unmix(v: Voltages, b: Complex) -> Complex:
-    """Return r_s / r_p [n] of a surface without twist that gives the voltages `b` [n, 2]."""
-    r = np.linalg.solve(v.m[..., :2], b[..., None])[..., 0]
+def _unmix(points: Voltages, voltage: Complex) -> Complex:
+    """Return r_s / r_p [n] of a surface without twist that gives the voltages `voltage` [n, 2]."""
+    r = np.linalg.solve(points.response[..., :2], voltage[..., None])[..., 0]
     return r[:, 0] / np.where(r[:, 1] == 0, 1e-30, r[:, 1])
 
 
@@ -160,13 +162,13 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
     of the curvature (`curved` over flat) at the last permittivity.
     """
     ratio = point_ratio(v, gains)
-    # Incidence at H; that at V differs by some 0.1 degrees, which `receive` accounts for.
+    # Incidence at H; that at V differs by some 0.1 degrees, which `predict_voltages` accounts for.
     theta = v.theta[:, 0]
     eps = clip_permittivity(permittivity_from_ratio(ratio, theta))
     # A fixed number of iterations; chosen.
     for _ in range(4):
         r_s, r_p = reflect_flat(eps, theta)
-        curved = _unmix(v, receive(v, reflect_points(eps, v, wave_number)))
+        curved = _unmix(v, predict_voltages(v, reflect_points(eps, v, wave_number)))
         eps = clip_permittivity(permittivity_from_ratio(ratio * (r_s / r_p) / curved, theta))
     return eps
 
@@ -186,13 +188,13 @@ def find_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Complex:
     Symbols are those of the module's docstring, except that only the ratio of the gains matters: b_H is divided by the
     gain of H over that of V, b_V by nothing. A miss is 0 where the coefficients explain H / V.
     """
-    expected = receive(v, coefficients)
-    return v.b[:, 0] / gains.ratio(v.arrival) * expected[:, 1] - v.b[:, 1] * expected[:, 0]
+    expected = predict_voltages(v, coefficients)
+    return v.voltage[:, 0] / gains.ratio(v.arrival) * expected[:, 1] - v.voltage[:, 1] * expected[:, 0]
 
 
 def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Array:
     """Return the standard deviation of the real part, and of the imaginary part, of each miss by noise alone, [n]."""
-    expected = np.abs(receive(v, coefficients))
+    expected = np.abs(predict_voltages(v, coefficients))
     std_h = v.std[:, 0] / np.abs(gains.ratio(v.arrival))
     return np.hypot(std_h * expected[:, 1], v.std[:, 1] * expected[:, 0])
 
@@ -227,25 +229,25 @@ def _linearise(
     miss = find_misses(v, gains, coefficients)
     rates = []
     for step in (EPS_STEP, 1j * EPS_STEP):
-        moved = reflect_points(eps + step, v, wave_number)
-        rates.append((find_misses(v, gains, moved) - miss) / EPS_STEP)
+        stepped_coefficients = reflect_points(eps + step, v, wave_number)
+        rates.append((find_misses(v, gains, stepped_coefficients) - miss) / EPS_STEP)
     jacobian = np.stack(rates, axis=1)
     noise = _compute_noise_of_misses(v, gains, coefficients)
     scale = np.hypot(noise, ripple)
     size = np.abs(miss) / scale
-    usual = float(np.median(size)) + 1e-12
+    median_size = float(np.median(size)) + 1e-12
     # If all points fit far better than their errors, good ones must not become outliers (0.3 is chosen).
-    used = size < OUTLIER * max(usual, 0.3)
+    is_used = size < OUTLIER_RATIO * max(median_size, 0.3)
     # Misses of more than twice the usual size lose most of their weight (chosen).
-    falloff = 1 / (1 + (size / (2 * usual)) ** 2)
-    weights = share * used / scale**2 * falloff
+    falloff = 1 / (1 + (size / (2 * median_size)) ** 2)
+    weights = share * is_used / scale**2 * falloff
     # A miss that grows loses weight. On average over the phases of its change, it counts by the square of the falloff.
     rate_weights = weights * falloff
     information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, rate_weights).real
     inverse = np.linalg.inv(information + 1e-15 * np.eye(2))
     influence = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), weights)
     answer = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), rate_weights)
-    return _Step(miss, noise, weights, used, influence, answer)
+    return _Step(miss, noise, weights, is_used, influence, answer)
 
 
 def fit_permittivity(
@@ -256,11 +258,11 @@ def fit_permittivity(
     `share` [n] is a factor of each point's weight, in addition to noise and ripple; see `find_shares`. `ripple_m` is
     the length over which the ripple of the misses is alike, metres; it widens the covariance.
     """
-    of_points = point_permittivity(v, gains, wave_number)
+    point_values = point_permittivity(v, gains, wave_number)
     # The iteration starts at a small loss at least: an imaginary part of -0.01 or below (chosen).
-    eps = complex(np.median(of_points.real), min(np.median(of_points.imag), -0.01))
+    eps = complex(np.median(point_values.real), min(np.median(point_values.imag), -0.01))
     # Level of H in the unit of a miss: b_H times what V receives of r_p = 1.
-    level = np.abs(v.b[:, 0] / gains.ratio(v.arrival) * v.m[:, 1, 1])
+    level = np.abs(v.voltage[:, 0] / gains.ratio(v.arrival) * v.response[:, 1, 1])
     # Without ripple, points of little noise would outweigh all others.
     ripple = USUAL_RIPPLE * level
     step = _linearise(eps, v, gains, wave_number, ripple=ripple, share=share)
@@ -371,8 +373,8 @@ def disturb_optics(optics: Optics, uncertainty: Uncertainty) -> list[tuple[str, 
     for name in ("tx", "h", "v"):
         antenna: Antenna = getattr(optics, name)
         for axis in np.eye(3):
-            moved = replace(antenna, at_m=antenna.at_m + uncertainty.place_m * axis)
-            rigs.append(("places", replace_antenna(name, moved)))
+            moved_antenna = replace(antenna, at_m=antenna.at_m + uncertainty.place_m * axis)
+            rigs.append(("places", replace_antenna(name, moved_antenna)))
         rigs.append(("axes", replace_antenna(name, antenna.turn(uncertainty.axis_rad))))
     for name in ("h", "v"):
         antenna = getattr(optics, name)
@@ -398,7 +400,9 @@ class DisturbedScan:
     gains: Gains
 
 
-def disturb_scan(seen: Seen, optics: Optics, reference: Reference, uncertainty: Uncertainty) -> list[DisturbedScan]:
+def disturb_scan(
+    seen: SeenEchoes, optics: Optics, reference: Reference, uncertainty: Uncertainty
+) -> list[DisturbedScan]:
     """Return the measured scan evaluated with each rig of `disturb_optics`.
 
     Voltages and gains use the same rig, so that an error of the rig that object and reference share cancels.
@@ -425,14 +429,14 @@ def add_common_errors(
     for scan in disturbed:
         add(scan.source, find_common_error(fit, miss, scan, wave_number))
 
-    # An error of ln(H / V) of the reference changes b_H in proportion, and with it the first term of the miss, `of_h`.
-    # `list_errors` are real, [errors, n]: one standard deviation of either part of ln(H / V).
-    of_h = miss + v.b[:, 1] * receive(v, coefficients)[:, 0]
-    reference_changes = (fit.answer * of_h) @ gains.list_errors(v.arrival).T
+    # An error of ln(H / V) of the reference changes b_H in proportion, and with it the first term of the miss,
+    # `h_misfit`. `list_errors` are real, [errors, n]: one standard deviation of either part of ln(H / V).
+    h_misfit = miss + v.voltage[:, 1] * predict_voltages(v, coefficients)[:, 0]
+    reference_changes = (fit.answer * h_misfit) @ gains.list_errors(v.arrival).T
     flat_s, flat_p = reflect_flat(fit.eps, v.theta)
     flat = np.stack([flat_s, flat_p, 0 * flat_s, 0 * flat_s], axis=2)
     first_order = find_misses(v, gains, flat) - miss
-    second_order = 1j * SECOND_ORDER * expansion_parameter(v, wave_number) * first_order
+    second_order = 1j * SECOND_ORDER * compute_expansion_parameter(v, wave_number) * first_order
     for change in (CURVATURE_ERROR * first_order, second_order):
         add("model", (fit.answer @ change).real)
     for change in find_pattern_changes(fit.eps, v, wave_number):
@@ -471,7 +475,9 @@ def find_common_error(fit: PermittivityFit, miss: Complex, scan: DisturbedScan, 
 def find_reflection(v: Voltages, gains: Gains) -> Array:
     """Return the amplitude of H over that of flat metal at the same point, [n]."""
     metal = np.array([-1.0, -1.0, 0.0, 0.0])
-    return np.abs(v.b[:, 0]) / np.exp(gains.level(v)) / np.maximum(np.abs(receive(v, metal)[:, 0]), 1e-30)
+    return (
+        np.abs(v.voltage[:, 0]) / np.exp(gains.level(v)) / np.maximum(np.abs(predict_voltages(v, metal)[:, 0]), 1e-30)
+    )
 
 
 def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
@@ -486,7 +492,7 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
     that level is too low for any medium (`MIN_REFLECTION`). If `gains` is None, levels are not relative to metal: the
     second test is left out, and the tolerance of the first is larger.
     """
-    level = np.log(np.maximum(np.abs(voltages.b[:, 0]), 1e-30))
+    level = np.log(np.maximum(np.abs(voltages.voltage[:, 0]), 1e-30))
     tolerance = LEVEL_TOLERANCE_WITHOUT_GAINS
     reflection = np.ones(len(level))
     if gains is not None:
@@ -498,11 +504,11 @@ def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.in
         members = np.flatnonzero(segment == number)
         order = members[np.argsort(level[members])]
         power = np.cumsum(amplitude[order] ** 2)
-        usual = level[order[np.searchsorted(power, power[-1] / 2)]]
-        at_level = np.abs(level[members] - usual) < tolerance
-        share = np.sum(amplitude[members[at_level]] ** 2) / power[-1]
-        is_surface = share > MIN_SHARE_AT_LEVEL and np.median(reflection[members[at_level]]) > MIN_REFLECTION
-        reflecting[members] = at_level & is_surface
+        usual_level = level[order[np.searchsorted(power, power[-1] / 2)]]
+        is_at_level = np.abs(level[members] - usual_level) < tolerance
+        share = np.sum(amplitude[members[is_at_level]] ** 2) / power[-1]
+        is_surface = share > MIN_SHARE_AT_LEVEL and np.median(reflection[members[is_at_level]]) > MIN_REFLECTION
+        reflecting[members] = is_at_level & is_surface
     return reflecting
 
 
@@ -523,12 +529,12 @@ def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, 
     low, high = extent_m
     slack_m = 0.1 * stride_m
     places = at_m[:, None] + disc
-    scanned = np.all((places > low - slack_m) & (places < high + slack_m), axis=2).sum(axis=1)
+    scanned_places = np.all((places > low - slack_m) & (places < high + slack_m), axis=2).sum(axis=1)
     for number in np.unique(segment):
         members = np.flatnonzero(segment == number)
         tree = scipy.spatial.KDTree(at_m[members])
         filled = tree.query_ball_point(at_m[members], BORDER_DISC_M, return_length=True)
-        filling[members] = filled / scanned[members]
+        filling[members] = filled / scanned_places[members]
     return filling
 
 
@@ -567,17 +573,17 @@ def judge_medium(
     its standard deviation, of H or of V, whichever is larger. It is negative where there is nothing but errors.
     `fit`, `v` and `disturbed` hold the same points.
     """
-    used = fit.share > 0
-    blocks = int(number_blocks(v.at_m[used], (0.0, 0.0)).max()) + 1
+    is_used = fit.share > 0
+    blocks = int(number_blocks(v.at_m[is_used], (0.0, 0.0)).max()) + 1
 
     def find_levels(eps: complex, voltages: Voltages, gains: Gains) -> Array:
-        expected = receive(voltages, reflect_points(eps, voltages, wave_number))
-        levels = np.log(np.abs(voltages.b[:, 0])) - gains.level(voltages) - np.log(np.abs(expected[:, 0]))
-        return levels[used]
+        expected = predict_voltages(voltages, reflect_points(eps, voltages, wave_number))
+        levels = np.log(np.abs(voltages.voltage[:, 0])) - gains.level(voltages) - np.log(np.abs(expected[:, 0]))
+        return levels[is_used]
 
     levels = find_levels(fit.eps, v, gains)
     # Ripples by a plate's edges change levels by 10 %. They cancel in the mean weighted by `share`, not in the median.
-    level = float(np.average(levels, weights=fit.share[used]))
+    level = float(np.average(levels, weights=fit.share[is_used]))
     # Includes the error in directions that the reference does not cover.
     unknown_std = float(np.median(gains.estimate_level_std(v)))
     variance = _spread(levels) ** 2 / blocks + unknown_std**2
@@ -585,10 +591,10 @@ def judge_medium(
     miss = find_misses(v, gains, reflect_points(fit.eps, v, wave_number))
     for scan in disturbed:
         real, imaginary = find_common_error(fit, miss, scan, wave_number)
-        moved = find_levels(fit.eps + complex(real, imaginary), scan.voltages, scan.gains)
-        variance += (float(np.average(moved, weights=fit.share[used])) - level) ** 2
+        moved_levels = find_levels(fit.eps + complex(real, imaginary), scan.voltages, scan.gains)
+        variance += (float(np.average(moved_levels, weights=fit.share[is_used])) - level) ** 2
 
-    rises = v.band_rise[used] - gains.band_rise
+    rises = v.band_rise[is_used] - gains.band_rise
     rise = np.abs(np.median(rises, axis=0)) - 2 * np.array([_spread(column) for column in rises.T]) / np.sqrt(blocks)
     return float(np.sqrt(max(0.0, level**2 - 4 * variance))), float(np.max(rise))
 
@@ -604,14 +610,14 @@ def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_numbe
     Ripple by edges and other echoes is not part of a point's noise, and differs over a segment. So the noise's variance
     is multiplied by the mean of `fit.excess2` over the points within `RIPPLE_M`, outliers included.
     """
-    around = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)
-    excess2 = np.array([fit.excess2[near].mean() for near in around])
-    noise2 = np.sum((v.std / np.maximum(np.abs(v.b), 1e-30)) ** 2, axis=1)
+    neighbours = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)
+    excess2 = np.array([fit.excess2[near_points].mean() for near_points in neighbours])
+    noise2 = np.sum((v.std / np.maximum(np.abs(v.voltage), 1e-30)) ** 2, axis=1)
     # Relative change of b_H for a numerical derivative; chosen.
     step = 1e-3
-    changed = replace(v, b=v.b * np.array([1 + step, 1.0]))
-    rate = (point_permittivity(changed, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step
-    # The permittivity is an analytic function of H / V, whose error is alike in all phases. So the real and the
+    stepped_voltages = replace(v, voltage=v.voltage * np.array([1 + step, 1.0]))
+    rate = (point_permittivity(stepped_voltages, gains, wave_number) - point_permittivity(v, gains, wave_number)) / step
+    # The permittivity is an analytic function of H / V, whose error is equal in all phases. So the real and the
     # imaginary part have equal, independent errors.
     variance = np.abs(rate) ** 2 * noise2 * excess2
     return variance[:, None, None] * np.eye(2)

@@ -29,11 +29,11 @@ SHORTEST_STEP_M = 1e-9
 START_RANGE_M = 0.5
 NEAREST_M = 0.05
 # Keeps a singular matrix solvable. Entries are about 1, so that the added share lies far below the steps' precision.
-SOLVABLE = 1e-12
+REGULARISATION = 1e-12
 
 
-def unit_legs(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array, Array, Array]:
-    """Unit vectors from TX and RX to points [n, 3] and the distances [n], with the stage at `at_m` [n, 3]."""
+def compute_unit_legs(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array, Array, Array]:
+    """Return unit vectors from TX and RX to points [n, 3] and the distances [n], with the stage at `at_m` [n, 3]."""
     out = points_m - at_m - tx_m
     back = points_m - at_m - rx_m
     out_m = np.linalg.norm(out, axis=-1)
@@ -41,7 +41,7 @@ def unit_legs(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[A
     return out / out_m[:, None], back / back_m[:, None], out_m, back_m
 
 
-def bend_of_legs(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
+def compute_leg_bend(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
     """H: second derivative of the path by the point, [n, 3, 3]."""
     eye = np.eye(3)
     out = (eye - t[:, :, None] * t[:, None, :]) / out_m[:, None, None]
@@ -50,18 +50,18 @@ def bend_of_legs(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
 
 
 def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
-    """Specular points [n, 3] of echoes with a path [n] and its slope [n, 2], by Newton's method."""
+    """Return the specular points [n, 3] of echoes with a path [n] and its slope [n, 2], by Newton's method."""
     points = at_m + (tx_m + rx_m) / 2
     points = points + np.stack(
         [np.zeros_like(path_m), np.zeros_like(path_m), np.full_like(path_m, START_RANGE_M)], axis=-1
     )
     for _ in range(NEWTON_STEPS):
-        t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
+        t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
         bisector = t + r
         miss = np.concatenate([(out_m + back_m - path_m)[:, None], bisector[:, :2] + slope], axis=1)
-        bend = bend_of_legs(t, r, out_m, back_m)
+        bend = compute_leg_bend(t, r, out_m, back_m)
         matrix = np.concatenate([bisector[:, None], bend[:, :2]], axis=1)
-        step = np.linalg.solve(matrix + SOLVABLE * np.eye(3), miss[..., None])[..., 0]
+        step = np.linalg.solve(matrix + REGULARISATION * np.eye(3), miss[..., None])[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points = points - step * np.minimum(1, LONGEST_STEP_M / np.maximum(length, 1e-30))
         # A point that a step moved behind the antennas is put back in front of them.
@@ -72,14 +72,14 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
 
 
 def find_normals(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tuple[Array, Array]:
-    """Normals towards the antennas [n, 3], and cosines of incidence [n]."""
-    t, r, *_ = unit_legs(points_m, at_m, tx_m, rx_m)
+    """Return normals towards the antennas [n, 3], and cosines of incidence [n]."""
+    t, r, *_ = compute_unit_legs(points_m, at_m, tx_m, rx_m)
     bisector = t + r
     length = np.linalg.norm(bisector, axis=1)
     return -bisector / length[:, None], length / 2
 
 
-def tangents(normals: Array) -> Array:
+def compute_tangents(normals: Array) -> Array:
     """Orthonormal tangents, columns of [n, 3, 2]: the first across y, near x where a surface faces the antennas."""
     first = np.cross(normals, np.array([0.0, 1.0, 0.0]))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -90,32 +90,32 @@ def _compute_second_derivatives(
     points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Return H in the stage's plane, X, E' H E and 2 cos(theta) of the module's formulas."""
-    t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    bend = bend_of_legs(t, r, out_m, back_m)
-    basis = tangents(normals)
+    t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
+    bend = compute_leg_bend(t, r, out_m, back_m)
+    basis = compute_tangents(normals)
     cross = -np.swapaxes(basis, 1, 2) @ bend[:, :, :2]
-    along = np.swapaxes(basis, 1, 2) @ bend @ basis
-    return bend[:, :2, :2], cross, along, np.linalg.norm(t + r, axis=1)
+    along_surface = np.swapaxes(basis, 1, 2) @ bend @ basis
+    return bend[:, :2, :2], cross, along_surface, np.linalg.norm(t + r, axis=1)
 
 
 def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
-    """Curvature K [n, 2, 2] in the basis of `tangents`, 1 / m, of echoes whose path has the curvature Q, `bend`."""
-    plane, cross, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
+    """Curvature K [n, 2, 2] in the basis of `compute_tangents`, 1 / m, of echoes with the path's curvature `bend`."""
+    plane, cross, along_surface, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     difference = plane - bend
     # The small part keeps the matrix solvable where the path bends as that of a point.
     surface_part = cross @ np.linalg.solve(difference + 1e-9 * np.eye(2), np.swapaxes(cross, 1, 2))
-    return (surface_part - along) / twice_cosine[:, None, None]
+    return (surface_part - along_surface) / twice_cosine[:, None, None]
 
 
 def find_motion(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
-    """P^-1 [n, 2, 2], metres, of echoes whose path has the curvature `bend`."""
+    """Return P^-1 [n, 2, 2], metres, of echoes whose path has the curvature `bend`."""
     plane, cross, _, _ = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     inverse = np.linalg.inv(cross)
     return np.swapaxes(inverse, 1, 2) @ (plane - bend) @ inverse
 
 
 def find_bend(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, motion: Array) -> Array:
-    """Curvature [n, 2, 2] of the paths of echoes with a P^-1 of `motion`."""
+    """Return the curvature [n, 2, 2] of the paths of echoes with a P^-1 of `motion`."""
     plane, cross, _, _ = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     return plane - np.swapaxes(cross, 1, 2) @ motion @ cross
 
@@ -124,21 +124,21 @@ def predict_echo(
     points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array
 ) -> tuple[Array, Array, Array]:
     """Return path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
-    t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    plane, cross, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
-    second = along + twice_cosine[:, None, None] * curvature
+    t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
+    plane, cross, along_surface, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
+    second = along_surface + twice_cosine[:, None, None] * curvature
     bend = plane - np.swapaxes(cross, 1, 2) @ np.linalg.solve(second, cross)
     return out_m + back_m, -(t + r)[:, :2], bend
 
 
-def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
-    """cos(theta) / (r1 r2 sqrt |det P|): echo amplitude of a surface that reflects everything, [n]; 1 / m.
+def compute_spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
+    """Return cos(theta) / (r1 r2 sqrt |det P|): echo amplitude of a surface that reflects everything, [n]; 1 / m.
 
     A mirror gives 1 / path.
     """
-    _, _, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-    _, _, along, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
-    second = along + twice_cosine[:, None, None] * curvature
+    _, _, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
+    _, _, along_surface, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
+    second = along_surface + twice_cosine[:, None, None] * curvature
     root = np.sqrt(np.abs(np.linalg.det(second)))
     # 1e-9 keeps a focus, where det P is 0, finite.
     return twice_cosine / (2 * out_m * back_m * np.maximum(root, 1e-9))
@@ -146,11 +146,11 @@ def spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m
 
 def find_offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
     """Stage offsets [n, 3] from which TX and RX see a point as a mirror with the given normal; starts at `at_m`."""
-    basis = np.swapaxes(tangents(normals), 1, 2)
+    basis = np.swapaxes(compute_tangents(normals), 1, 2)
     at_m = at_m.copy()
     for _ in range(NEWTON_STEPS):
-        t, r, out_m, back_m = unit_legs(points, at_m, tx_m, rx_m)
-        bend = bend_of_legs(t, r, out_m, back_m)
+        t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
+        bend = compute_leg_bend(t, r, out_m, back_m)
         matrix = (basis @ bend)[:, :, :2]
         step = np.linalg.solve(matrix, basis @ (t + r)[..., None])[..., 0]
         at_m[:, :2] += np.clip(step, -LONGEST_STEP_M, LONGEST_STEP_M)

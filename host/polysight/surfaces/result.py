@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from polysight.store import open_npz
 from polysight.surfaces.gains import Gains, Voltages, find_voltages
-from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS, SAME_WINDOW_M, Seen, Shape, find_shape
+from polysight.surfaces.measure import MIN_POINTS as LEAST_POINTS, SAME_WINDOW_M, SeenEchoes, Shape, find_shape
 from polysight.surfaces.optics import Optics
 from polysight.surfaces.permittivity import (
     FRESNEL_ZONE_M,
@@ -40,7 +40,7 @@ from polysight.surfaces.permittivity import (
     point_permittivity,
     point_ratio,
 )
-from polysight.surfaces.points import tangents
+from polysight.surfaces.points import compute_tangents
 from polysight.surfaces.window import Echoes
 from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import write_atomically
@@ -58,8 +58,8 @@ MIN_POINTS = 20
 # A segment whose ratio r_s / r_p is nearer to 1 is metal. Metal has 1; a permittivity of 40 without loss has 1.5 at 55
 # degrees.
 METAL_RATIO = 0.15
-# A loss below zero by so many standard deviations is not a property of one medium, nor is a real part beyond these: the
-# fit ends at 1.2 and at 40.
+# A loss that is below zero by more than `MAX_GAIN_SIGMA` standard deviations is not a property of one medium, nor is a
+# real part beyond `LEAST_REAL` and `MOST_REAL`: the fit ends at 1.2 and at 40.
 MAX_GAIN_SIGMA = 3.0
 LEAST_REAL = 1.25
 MOST_REAL = 39.0
@@ -69,12 +69,12 @@ MOST_REAL = 39.0
 MAX_LEVEL_MISS = 0.05
 MAX_BAND_RISE = 0.01
 NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
-# A segment of which so many points lie at least so far behind another surface may be an echo from inside a body. Less
-# far, a window does not resolve both.
+# A segment may be an echo from inside a body if this share of its points lies at least this far behind another surface.
+# At a smaller distance a window does not resolve both.
 MIN_SHARE_BEHIND = 0.8
 MIN_DEPTH_M = 0.03
-BEHIND_ANOTHER = "it lies behind another surface: an echo from inside a body, whose place and form are not these"
-# What an edge diffracts changes the slopes of windows near the border of the zone that its surface reflects to: by up
+BEHIND_ANOTHER_REASON = "it lies behind another surface: an echo from inside a body, whose place and form are not these"
+# Diffraction at an edge changes the slopes of windows near the border of the zone that its surface reflects to: by up
 # to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065
 # Both faces of a wall make one echo, whose path is that of neither: it is the farther off the more its level changes
@@ -148,7 +148,7 @@ class Surface:
     points_m, normals
         float64 [n, 3]: points, and unit vectors towards the antennas.
     curvature
-        float64 [n, 2, 2] in 1 / m in the basis of `tangents` [n, 3, 2]; positive for convex bodies.
+        float64 [n, 2, 2] in 1 / m in the basis of `compute_tangents` [n, 3, 2]; positive for convex bodies.
     incidence_deg
         float64 [n], of H.
     permittivity, covariance
@@ -174,7 +174,7 @@ class Surface:
 
 
 def analyse_surface(
-    echoes: Seen,
+    echoes: SeenEchoes,
     optics: Optics,
     reference: Reference | None,
     *,
@@ -204,13 +204,13 @@ def analyse_surface(
         for index, segment in enumerate(segments):
             members = (echoes.segment == segment.number) & interior
             own_voltages = voltages[members]
-            of_members = [replace(d, voltages=d.voltages[members]) for d in disturbed]
+            disturbed_members = [replace(d, voltages=d.voltages[members]) for d in disturbed]
             segments[index], fit = judge_segment(
-                segment, own_voltages, gains, of_members, optics.wave_number, share=share[members]
+                segment, own_voltages, gains, disturbed_members, optics.wave_number, share=share[members]
             )
             if fit is None:
                 continue
-            sources = add_common_errors(fit, own_voltages, gains, of_members, optics.wave_number)
+            sources = add_common_errors(fit, own_voltages, gains, disturbed_members, optics.wave_number)
             segments[index] = add_permittivity(segments[index], fit.eps, sources)
             if segments[index].permittivity is None:
                 continue
@@ -219,8 +219,8 @@ def analyse_surface(
             permittivity[members] = point_permittivity(own_voltages, gains, optics.wave_number)
             covariance[members] = point_covariance(own_voltages, gains, fit, optics.wave_number) + common
     edge_std = np.where(interior, 0.0, EDGE_SLOPE_STD)[:, None]
-    of_h = replace(echoes.h, slope_std=np.hypot(echoes.h.slope_std, edge_std))
-    position_std_m, normal_std_rad = find_shape_errors(of_h, shape, optics, uncertainty)
+    h_echoes = replace(echoes.h, slope_std=np.hypot(echoes.h.slope_std, edge_std))
+    position_std_m, normal_std_rad = find_shape_errors(h_echoes, shape, optics, uncertainty)
     if gains is not None:
         segments, unknown_m = doubt_places(segments, echoes, shape, voltages, gains)
         position_std_m = np.hypot(position_std_m, unknown_m)
@@ -257,25 +257,25 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
         back = np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
         normals = surface.normals @ back.T
         # Curvatures are given in tangents that follow from the normal: they turn with these.
-        change = np.swapaxes(tangents(normals), 1, 2) @ (back @ tangents(surface.normals))
+        change = np.swapaxes(compute_tangents(normals), 1, 2) @ (back @ compute_tangents(surface.normals))
         # Behind the highest number, which may exceed the count of segments: edges that were dropped leave gaps.
         first = max((segment.number for segment in segments), default=-1) + 1
-        part = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name not in NOT_POINTS}
-        part["points_m"] = (surface.points_m - axis) @ back.T + axis
-        part["normals"] = normals
-        part["curvature"] = change @ surface.curvature @ np.swapaxes(change, 1, 2)
-        part["segment"] = surface.segment + first
-        parts.append(part)
+        shared_fields = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name not in NOT_POINTS}
+        shared_fields["points_m"] = (surface.points_m - axis) @ back.T + axis
+        shared_fields["normals"] = normals
+        shared_fields["curvature"] = change @ surface.curvature @ np.swapaxes(change, 1, 2)
+        shared_fields["segment"] = surface.segment + first
+        parts.append(shared_fields)
         for segment in surface.segments:
-            moved = replace(
+            moved_segment = replace(
                 segment,
                 number=segment.number + first,
                 centre_m=_convert_triple(back @ (np.array(segment.centre_m) - axis) + axis),
                 normal=_convert_triple(back @ np.array(segment.normal)),
                 turned_deg=float(angle_deg),
             )
-            segments.append(moved)
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            segments.append(moved_segment)
+    joined = {name: np.concatenate([shared_fields[name] for shared_fields in parts]) for name in parts[0]}
     return Surface(
         scan_id="+".join(surface.scan_id for surface in surfaces),
         simulated=any(surface.simulated for surface in surfaces),
@@ -284,7 +284,7 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
     )
 
 
-def drop_edges(seen: Seen, optics: Optics, gains: Gains | None) -> tuple[Seen, Array]:
+def drop_edges(seen: SeenEchoes, optics: Optics, gains: Gains | None) -> tuple[SeenEchoes, Array]:
     """Return the points at which surfaces reflect, and what each counts for a permittivity, [n]: 0 near edges.
 
     Flat surfaces end before the zone that their edges disturb. Segments that lie in it altogether are edges, unless
@@ -321,7 +321,7 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
     The error of a normal is its turn beyond that of the surface between the two places: a point that only slides along
     a bent surface has none.
     """
-    tangent = tangents(shape.normals)
+    tangent = compute_tangents(shape.normals)
 
     def find_changes(moved: Shape) -> tuple[Array, Array]:
         """Return how far points moved along the normal, m [n], and how normals turned from the surface, rad [n, 2]."""
@@ -358,7 +358,7 @@ def estimate_wall_std(reflection: float, rise: float) -> float:
 
 
 def doubt_places(
-    segments: Sequence[Segment], echoes: Seen, shape: Shape, voltages: Voltages, gains: Gains
+    segments: Sequence[Segment], echoes: SeenEchoes, shape: Shape, voltages: Voltages, gains: Gains
 ) -> tuple[list[Segment], Array]:
     """Return the segments with their reasons, and the standard errors of points by what no single medium explains, [n].
 
@@ -384,13 +384,13 @@ def doubt_places(
             )
             judged[index] = add_bend_error(segment, WALL_BEND_ERROR)
         else:
-            judged[index] = add_bend_error(replace(segment, reason=BEHIND_ANOTHER), 1.0)
-            # That of an even distribution as far as the surface before.
+            judged[index] = add_bend_error(replace(segment, reason=BEHIND_ANOTHER_REASON), 1.0)
+            # Standard deviation of a uniform distribution between this segment and the surface in front of it.
             unknown_m[members] = depth_m / np.sqrt(3)
     return judged, unknown_m
 
 
-def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:
+def find_depth_behind(echoes: SeenEchoes, shape: Shape, number: int) -> float | None:
     """Return how far a segment's points lie behind another surface that the same windows see, metres, or None.
 
     What comes back from inside a body has no place of its own: rays bend where they enter, and are slow inside. It is
@@ -404,12 +404,12 @@ def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:
     windows, first = np.unique(window[other_points], return_index=True)
     if not windows.size:
         return None
-    place = np.minimum(np.searchsorted(windows, window[members]), windows.size - 1)
-    front = other_points[first[place]]
-    is_shared = windows[place] == window[members]
-    from_front = shape.points[members] - shape.points[front]
-    depth_m = -np.einsum("ni,ni->n", from_front, shape.normals[front])
-    beside_m = np.sqrt(np.maximum(0, np.sum(from_front**2, axis=1) - depth_m**2))
+    window_index = np.minimum(np.searchsorted(windows, window[members]), windows.size - 1)
+    front = other_points[first[window_index]]
+    is_shared = windows[window_index] == window[members]
+    distance_from_front = shape.points[members] - shape.points[front]
+    depth_m = -np.einsum("ni,ni->n", distance_from_front, shape.normals[front])
+    beside_m = np.sqrt(np.maximum(0, np.sum(distance_from_front**2, axis=1) - depth_m**2))
     is_behind = is_shared & (depth_m > MIN_DEPTH_M) & (beside_m < depth_m)
     if is_behind.mean() < MIN_SHARE_BEHIND:
         return None
@@ -419,8 +419,8 @@ def find_depth_behind(echoes: Seen, shape: Shape, number: int) -> float | None:
 def describe_segment(number: int, shape: Shape) -> Segment:
     """Return a segment with its place, normal, radius and incidence angle by the shape of its points."""
     # The median of the matrices, for noise spreads the two curvatures of each point.
-    usual = np.median(shape.curvature, axis=0)
-    bends, axes = np.linalg.eigh((usual + usual.T) / 2)
+    usual_curvature = np.median(shape.curvature, axis=0)
+    bends, axes = np.linalg.eigh((usual_curvature + usual_curvature.T) / 2)
     largest = int(np.abs(bends).argmax())
     bend = float(np.abs(bends[largest]))
     normal = shape.normals.mean(axis=0)
@@ -450,12 +450,12 @@ def estimate_bend_std(shape: Shape, axis: Array, bend: float) -> float:
     """
     bends = np.einsum("i,nij,j->n", axis, shape.curvature, axis)
     low, high = np.percentile(bends, [16, 84])
-    tangent = np.median(tangents(shape.normals), axis=0)
-    moved = (shape.points - shape.points.mean(axis=0)) @ tangent
-    turned = (shape.normals - shape.normals.mean(axis=0)) @ tangent @ axis
-    across = np.array([-axis[1], axis[0]])
-    # How fast normals turn per metre along the axis, and across it.
-    rates = np.linalg.lstsq(np.stack([moved @ axis, moved @ across], axis=1), turned, rcond=None)[0]
+    tangent = np.median(compute_tangents(shape.normals), axis=0)
+    offset = (shape.points - shape.points.mean(axis=0)) @ tangent
+    turned_normal = (shape.normals - shape.normals.mean(axis=0)) @ tangent @ axis
+    axis_across = np.array([-axis[1], axis[0]])
+    # Rotation of the normals per metre along the axis, and across it.
+    rates = np.linalg.lstsq(np.stack([offset @ axis, offset @ axis_across], axis=1), turned_normal, rcond=None)[0]
     return float(np.hypot((high - low) / 2, rates[0] - bend))
 
 
@@ -492,7 +492,7 @@ def judge_segment(
     ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
         return replace(segment, reason="its ratio is that of metal", name="metal"), None
-    # Length over which neighbours' errors by edges and other echoes are alike.
+    # Length over which edges and other echoes cause similar errors in neighbours.
     ripple_m = RIPPLE_OF_PLATES_M if segment.radius_mm is None else FRESNEL_ZONE_M
     fit = fit_permittivity(voltages, gains, wave_number, share, ripple_m)
     level, rise = judge_medium(fit, voltages, gains, disturbed, wave_number)
@@ -585,9 +585,9 @@ def summary_lines(surface: Surface) -> list[str]:
     for segment in surface.segments:
         x_mm, y_mm, z_mm = 1e3 * np.array(segment.centre_m)
         tilts_deg = [np.degrees(np.arctan2(part, -segment.normal[2])) for part in segment.normal[:2]]
-        turned = f", turned by {segment.turned_deg:g} degrees" if segment.turned_deg else ""
+        turned_text = f", turned by {segment.turned_deg:g} degrees" if segment.turned_deg else ""
         lines.append(
-            f"  {segment.number}: {segment.points} points at ({x_mm:+z.0f}, {y_mm:+z.0f}, {z_mm:.0f}) mm{turned}, "
+            f"  {segment.number}: {segment.points} points at ({x_mm:+z.0f}, {y_mm:+z.0f}, {z_mm:.0f}) mm{turned_text}, "
             f"{describe_form(segment)}, tilt {tilts_deg[0]:+z.1f}, {tilts_deg[1]:+z.1f} degrees, "
             f"incidence {segment.incidence_deg:.1f}: {describe_material(segment)}"
         )

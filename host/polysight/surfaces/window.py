@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.surfaces.points import locate, unit_legs
+from polysight.surfaces.points import compute_unit_legs, locate
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Side of a window. Chosen: a larger one resolves echoes better and averages more, but bent surfaces leave the parabola.
@@ -196,14 +196,14 @@ class BoardFit:
         self.mean_square = float(self.weights @ self.omega**2)
         self.model = model
 
-    def steer(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
+    def compute_steering(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
         """Return the phase factors [window, rx, frequency] with which the RX add in phase for given echoes.
 
         One echo per window: its stage offset, `offsets` [window, 3], path [window], both in metres; slope [window, 2].
         """
         board = self.board
         points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)
-        _, back, *_ = unit_legs(points, offsets, board.tx_m, board.middle_m)
+        _, back, *_ = compute_unit_legs(points, offsets, board.tx_m, board.middle_m)
         # `back` points from the RX to the echo's point: an RX displaced that way has a shorter path.
         excess = -back @ self.lever.T - board.direct_m
         return np.exp(-1j * excess[:, :, None] * self.omega)
@@ -239,7 +239,7 @@ def pack_values(path_m: Array, slope: Array, bend: Array) -> Array:
 
 
 def unpack_values(values: Array) -> tuple[Array, Array, Array]:
-    """Paths [n], slopes [n, 2] and curvatures [n, 2, 2] of values [n, 6]."""
+    """Return paths [n], slopes [n, 2] and curvatures [n, 2, 2] of values [n, 6]."""
     bend = np.stack([values[:, [3, 4]], values[:, [4, 5]]], axis=1)
     return values[:, 0], values[:, 1:3], bend
 
@@ -336,13 +336,13 @@ def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
     path, slope, bend = unpack_values(maximum.values)
     # The matched filter has taken exp(+j k path) out of the samples. It is put back at the weighted middle of the band,
     # where an error of the path does not matter; echoes have the other sign.
-    turned = maximum.amplitude * np.exp(1j * fit.middle * path)
+    turned_amplitude = maximum.amplitude * np.exp(1j * fit.middle * path)
     return Echoes(
         at_m=windows.at_m,
         path_m=path,
         slope=slope,
         bend=bend,
-        amplitude=turned.conj(),
+        amplitude=turned_amplitude.conj(),
         amplitude_std=maximum.amplitude_std,
         path_std_m=maximum.std[:, 0],
         slope_std=maximum.std[:, 1:3],
@@ -352,7 +352,7 @@ def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
 
 
 def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array) -> Windows:
-    """Windows whose first positions are at (rows, columns), each [window]; `at_m` as of `Windows`."""
+    """Return windows whose first positions are at (rows, columns), each [window]; `at_m` as of `Windows`."""
     height, width = board.window_shape()
     r = rows[:, None, None] + np.arange(height)[:, None]
     c = columns[:, None, None] + np.arange(width)
@@ -364,20 +364,20 @@ def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array)
 
 
 def add_up(fit: BoardFit, windows: Windows, values: Array) -> NDArray:
-    """Mean of all RX's samples, in phase for echoes of the given values: [window, frequency, position]."""
+    """Return the mean of all RX's samples, in phase for echoes of the given values: [window, frequency, position]."""
     path, slope, _ = unpack_values(values)
-    return add_rx(fit.steer(windows.at_m, path, slope) / len(fit.lever), windows.samples)
+    return add_rx(fit.compute_steering(windows.at_m, path, slope) / len(fit.lever), windows.samples)
 
 
 def add_rx(factors: NDArray, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Sum over the RX of factors [window, rx, frequency] times samples [window, rx, frequency, position]."""
     # For each window and frequency: [1, rx] @ [rx, position].
-    by_frequency = np.moveaxis(factors, 1, 2).astype(np.complex64)[:, :, None]
-    return (by_frequency @ np.moveaxis(samples, 1, 2))[:, :, 0]
+    factors_by_frequency = np.moveaxis(factors, 1, 2).astype(np.complex64)[:, :, None]
+    return (factors_by_frequency @ np.moveaxis(samples, 1, 2))[:, :, 0]
 
 
 def make_waves(fit: BoardFit, paths: Array) -> NDArray[np.complex64]:
-    """exp(j omega path) of paths [..., position]: [..., frequency, position].
+    """Return exp(j omega path) of paths [..., position]: [..., frequency, position].
 
     The frequencies are evenly spaced: each wave is the one before, turned by the same phase.
     """
@@ -393,7 +393,7 @@ def make_waves(fit: BoardFit, paths: Array) -> NDArray[np.complex64]:
 def synthesise(
     fit: BoardFit, valid: Array, waves: NDArray, amplitude: NDArray, steering: NDArray
 ) -> NDArray[np.complex64]:
-    """Samples of all echoes together, [window, rx, frequency, position].
+    """Return samples of all echoes together, [window, rx, frequency, position].
 
     `waves` [window, echo, frequency, position], `amplitude` [window, echo], `steering` [window, echo, rx, frequency].
     """
@@ -430,7 +430,7 @@ def select_windows(windows: Windows, keep: NDArray) -> Windows:
 
 
 def choose_thinned(shape: tuple[int, int]) -> NDArray[np.int_]:
-    """Return about `THINNED_POSITIONS` of the positions of a window of so many rows and columns, evenly spread.
+    """Return about `THINNED_POSITIONS` of the positions of a window of `rows` and `columns`, evenly spread.
 
     They are indices into the flattened window, row by row.
     """

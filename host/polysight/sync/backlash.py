@@ -23,7 +23,7 @@ _GROUPS = 10
 # Number of Gauss-Newton steps (chosen).
 _STEPS = 3
 # Largest share of power in the upper fifth of the spectrum; more means aliasing: positions too far apart (chosen).
-_ALIASED = 0.02
+_ALIASED_SHARE = 0.02
 
 
 def object_filter(rig: Instrument, board: Board, sweep_hz: NDArray[np.float64]) -> NDArray[np.complex64]:
@@ -107,7 +107,7 @@ def estimate_backlash(rows: dict[int, NDArray[np.complex64]], rig: Instrument) -
         product, slope2, power, power_at_high_k = sums.sum(axis=0)
         # Jackknife (Efron 1982): sums without one group, for each group.
         product_without, slope2_without, _, _ = (sums.sum(axis=0) - sums).T
-        if slope2 == 0 or slope2_without.min() <= 0 or power_at_high_k > _ALIASED * power:
+        if slope2 == 0 or slope2_without.min() <= 0 or power_at_high_k > _ALIASED_SHARE * power:
             return None
         shift_without_group = shift + product_without / slope2_without
         shift += float(np.clip(product / slope2, -plan.step_x_mm / 2, plan.step_x_mm / 2))

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.capture import raw_words, row_words, valid_frames
+from polysight.capture import encode_row_words, valid_frames, view_row_words
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import high_pass_filter as hpf, loops
 from polysight.sync.cubes import CubeForm, detect_form
@@ -32,7 +32,7 @@ from polysight.sync.loops import Complex, Real, block_edges, block_times, cis, c
 from polysight.sync.offsets import (
     AlignedRow,
     Errors,
-    Referenced,
+    ReferencedSamples,
     SyncedRow,
     align_pieces,
     find_dead_rx,
@@ -58,7 +58,7 @@ PUBLISHED_STD = {"frequency_hz": 138.0, "phase_rad": 0.022}
 _CUBE_ROWS = 7
 # Positions read at a time: 2 MB, which stay in the processor's cache.
 _POSITIONS = 32
-EXAMINED = 32
+EXAMINED_POSITIONS = 32
 """Positions per row used for residuals: standard deviations within 13 % for a row, 1 % for 150 rows."""
 
 # Largest int16: a sample with this value was clipped.
@@ -77,7 +77,7 @@ class BoardSetup:
     pulses: int
     equaliser: hpf.Equaliser | None
     path: DirectPath
-    examined: int = EXAMINED
+    examined: int = EXAMINED_POSITIONS
 
     @classmethod
     def from_rig(
@@ -101,7 +101,7 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
     Parameters
     ----------
     frames
-        int16 [frame, sample, 2, rx] from `row_words`, or complex64 [rx, frame, sample] in ADC counts, which are
+        int16 [frame, sample, 2, rx] from `view_row_words`, or complex64 [rx, frame, sample] in ADC counts, which are
         converted first; positions in order of recording, `setup.pulses` frames each (single chirps here).
     valid
         bool [frame]: frames received whole.
@@ -113,7 +113,7 @@ def synchronise_row(frames: NDArray[Any], valid: NDArray[np.bool_], setup: Board
     DataError
         if the frames are not whole bursts of the configured chirp.
     """
-    words = raw_words(frames) if np.iscomplexobj(frames) else frames
+    words = encode_row_words(frames) if np.iscomplexobj(frames) else frames
     return synchronise_pieces(lambda: [words], valid, setup)
 
 
@@ -243,15 +243,15 @@ class RowSynchroniser:
             return synced, int(synced.valid.sum())
         # Chirps count as frames here, in `frames_expected` too.
         valid = valid_frames(recorded.missing, recorded.frames_expected, rig.frame_bytes // rig.burst.chirps)
-        return synchronise_pieces(lambda: self._words(recorded), valid, self.setups[board]), int(valid.sum())
+        return synchronise_pieces(lambda: self._iterate_words(recorded), valid, self.setups[board]), int(valid.sum())
 
-    def _words(self, recorded: RowData) -> Iterator[NDArray[np.int16]]:
+    def _iterate_words(self, recorded: RowData) -> Iterator[NDArray[np.int16]]:
         """Iterate over the words of a row, [chirp, sample, 2, rx], some positions at a time."""
         rig = self._source.instrument
         chirp_bytes = rig.frame_bytes // rig.burst.chirps
         for piece in recorded.pieces(_POSITIONS * rig.burst.chirps_a_position * chirp_bytes):
             # Without a list of missing bytes: `synchronise` finds the valid chirps.
-            yield row_words(piece, (), piece.size // chirp_bytes, rig.chirp.samples, len(rig.antennas.rx_mm))[0]
+            yield view_row_words(piece, (), piece.size // chirp_bytes, rig.chirp.samples, len(rig.antennas.rx_mm))[0]
 
     @property
     def direct_path_known(self) -> bool:
@@ -278,23 +278,27 @@ class RowSynchroniser:
 
 
 def errors(
-    aligned: AlignedRow, referenced: Referenced, path: DirectPath, sample_rate_hz: float, most: int = EXAMINED
+    aligned: AlignedRow,
+    referenced: ReferencedSamples,
+    path: DirectPath,
+    sample_rate_hz: float,
+    max_positions: int = EXAMINED_POSITIONS,
 ) -> Errors:
     """Return the errors after each stage, float64 [3, n]: Hz, rad, and amplitude relative to its mean.
 
-    At most `most` valid positions are used, evenly spaced. Empty if no position is valid. The stage "referenced" has
-    only positions with an echo.
+    At most `max_positions` valid positions are used, evenly spaced. Empty if no position is valid. The stage
+    "referenced" has only positions with an echo.
     """
     if not referenced.found.any():
         return {}
     referenced_positions = np.flatnonzero(referenced.found)
-    examined = referenced_positions[_spread_evenly(referenced_positions.size, most)]
+    examined = referenced_positions[_spread_evenly(referenced_positions.size, max_positions)]
     good = aligned.good[examined]
     amplitude = referenced.amplitude[examined, None]
     relative_amplitude = aligned.amplitude[examined]
 
-    # As received: offsets of the chirps, with those of their positions added, from their mean. Amplitudes are without
-    # the gain that compensated the receiver's filter.
+    # Errors of the received chirps: their offsets, plus those of their positions, from the mean. The gain that
+    # compensated the receiver's filter is removed from the amplitudes.
     frequency = (referenced.frequency[examined, None] + aligned.frequency[examined])[good]
     phase = (np.angle(amplitude) + aligned.phase[examined])[good]
     size = (np.abs(amplitude) * relative_amplitude / aligned.gain[examined])[good]
@@ -306,15 +310,17 @@ def errors(
     # `aligned.error` has frequency and phase on its second axis; the masks leave [2, n] and [n].
     chirp_errors = np.array([*aligned.error[examined].swapaxes(0, 1)[:, good], amplitude_error[good]])
 
-    with_several_chirps = examined[good.sum(axis=1) > 1]
+    positions_with_several_chirps = examined[good.sum(axis=1) > 1]
     # A dead RX has no direct path: its figures are not finite.
     with np.errstate(divide="ignore", invalid="ignore"):
         out = {
             "received": received,
             "aligned": chirp_errors,
             "averaged": _estimate_direct_path_errors(referenced.samples[:, examined], path),
-            "referenced": _estimate_object_errors(_reference_halves(aligned, referenced, with_several_chirps), path)
-            if with_several_chirps.size
+            "referenced": _estimate_object_errors(
+                _reference_halves(aligned, referenced, positions_with_several_chirps), path
+            )
+            if positions_with_several_chirps.size
             else np.zeros((3, 0)),
         }
     for values in out.values():
@@ -323,18 +329,18 @@ def errors(
 
 
 @lru_cache(maxsize=8)
-def _spread_evenly(count: int, most: int) -> NDArray[np.intp]:
-    """Return at most `most` of `count` indices, evenly spaced."""
-    return np.linspace(0, count - 1, min(most, count)).astype(np.intp)
+def _spread_evenly(count: int, max_count: int) -> NDArray[np.intp]:
+    """Return at most `max_count` of `count` indices, evenly spaced."""
+    return np.linspace(0, count - 1, min(max_count, count)).astype(np.intp)
 
 
 def _reference_halves(
-    aligned: AlignedRow, referenced: Referenced, positions: NDArray[np.intp]
+    aligned: AlignedRow, referenced: ReferencedSamples, positions: NDArray[np.intp]
 ) -> NDArray[np.complex64]:
     """Return the halves of some positions' bursts as averages, referenced like `samples`: [position, 2, rx, block]."""
     blocks = aligned.halves.shape[-1]
     frequency = referenced.frequency[positions] - aligned.centre[positions]
-    # What removes the rest of the direct path's frequency (cycles a sample) and its phase, [position, block].
+    # Factor that removes the rest of the direct path's frequency (cycles a sample) and its phase, [position, block].
     turn = phasor(-frequency * FOLD, -np.angle(referenced.amplitude[positions]), blocks, (blocks - 1) / 2)
     # Factors [position, 2] make each half the average of its chirps.
     scale = half_scale(aligned.good[positions].sum(axis=1))[..., None, None]

@@ -34,20 +34,20 @@ from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.geometry import rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# All numbers are chosen. About how many positions the form is detected from.
+# Approximate number of positions that the form is detected from; chosen, as are the following numbers.
 _FORM_POSITIONS = 300
 # Echoes come from within this distance of the mirror point; chosen.
 _SPREAD_M = 0.15
 # Noise power of a sample relative to the object, for the estimate of the direct path; chosen.
-_NOISE = 1e-3
+_NOISE_POWER = 1e-3
 # The simplest convention is kept if it explains this part of the best one's power.
-_PREFER_SIMPLE = 0.7
+_SIMPLE_SHARE = 0.7
 # Smallest constant share of the direct path's power if the cube is referenced to it.
-_COHERENT = 0.5
+_LEAST_CONSTANT_SHARE = 0.5
 # Smallest share of positions with a direct path; chosen.
 _MIN_FOUND = 0.5
 # Share of power at the object above which the cube contains nothing else: its direct path was removed.
-_ALONE = 0.8
+_ALONE_SHARE = 0.8
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class CubeForm:
     chirp
         Chirp of the scan.
     how
-        One sentence for quality.json.
+        Description of the conversion for quality.json, one sentence.
     """
 
     conjugate: bool
@@ -90,11 +90,11 @@ class CubeForm:
         samples = cube * self.turn[:, None]
         hz = np.zeros(valid.size)
         amplitude = hz
-        turned = samples
+        turned_samples = samples
         has_data = valid
         order: tuple[int, ...] = ()
         if self.path is not None:
-            samples, valid, hz, amplitude, order = _reference_cube(turned, has_data, self.path, self.chirp)
+            samples, valid, hz, amplitude, order = _reference_cube(turned_samples, has_data, self.path, self.chirp)
         # Neighbouring positions hold nearly the same signals.
         judged = JUDGED_POSITIONS
         if self.constant.any():
@@ -102,7 +102,7 @@ class CubeForm:
         dead = find_dead_rx(samples[:, :-1], samples[:, 1:], judged)
         if self.path is not None and dead.any():
             path = self.path.without_rx(dead)
-            samples, valid, hz, amplitude, _ = _reference_cube(turned, has_data, path, self.chirp)
+            samples, valid, hz, amplitude, _ = _reference_cube(turned_samples, has_data, path, self.chirp)
         samples += self.constant[:, None, None]
         samples[:, ~valid] = 0
         samples[dead] = 0
@@ -175,7 +175,7 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
     constant = np.zeros(len(rx))
     path = None
     mean, coherent = _average_direct_path(cube[..., a:b], gate)
-    if coherent > _COHERENT:
+    if coherent > _LEAST_CONSTANT_SHARE:
         lag = np.exp(2j * np.pi * np.outer(direct_m - direct_m[0], sweep) / SPEED_OF_LIGHT_M_S)
         # If all RX are referenced to the first, each keeps its delay relative to it: their phases agree only without
         # the delays (at the middle frequency). Otherwise they agree with them.
@@ -190,7 +190,7 @@ def detect_form(rows: Sequence[NDArray[np.complex64]], rig: Instrument, board: B
             cube.astype(np.complex64), np.ones(cube.shape[1], bool), direct_path, chirp
         )
         has_direct_path = is_found.mean() > _MIN_FOUND or bool(order)
-        if has_direct_path and _share(cube[..., a:b], gate) < _ALONE:
+        if has_direct_path and _share(cube[..., a:b], gate) < _ALONE_SHARE:
             path = direct_path
             form.append("not referenced to a direct path; referenced here")
         else:
@@ -218,12 +218,12 @@ def _find_sign_and_origin(
     readings = list(itertools.product((False, True), (False, True)))
     power = []
     for conjugate, counted_from_tx in readings:
-        part = cube.conj() if conjugate else cube
+        cube_part = cube.conj() if conjugate else cube
         if counted_from_tx:
-            part = part * undo_delay[:, None]
-        part = part[..., a:b]
-        power.append(float((np.abs((part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
-    if power[0] >= _PREFER_SIMPLE * max(power):
+            cube_part = cube_part * undo_delay[:, None]
+        cube_part = cube_part[..., a:b]
+        power.append(float((np.abs((cube_part * np.hanning(b - a)) @ gate.conj().T) ** 2).mean()))
+    if power[0] >= _SIMPLE_SHARE * max(power):
         return readings[0]
     return readings[int(np.argmax(power))]
 
@@ -236,7 +236,7 @@ def _average_direct_path(
     Each position's direct path is estimated by generalised least squares, which suppress the object.
     """
     samples = part.shape[-1]
-    covariance = gate.T @ gate.conj() / len(gate) + _NOISE * np.eye(samples)
+    covariance = gate.T @ gate.conj() / len(gate) + _NOISE_POWER * np.eye(samples)
     weights = scipy.linalg.solve(covariance, np.ones(samples), assume_a="pos").conj()
     # Complex [rx, position].
     direct = part @ (weights / weights.sum())
@@ -263,8 +263,8 @@ def _share(samples: NDArray[np.complexfloating], gate: NDArray[np.complex128]) -
     """Return the share of the power of samples [..., sample] explained by echoes in the gate."""
     _, strength, basis = np.linalg.svd(gate, full_matrices=False)
     # Weaker directions (by 40 dB, chosen) hold hardly any echo, only noise.
-    in_gate = samples @ basis[strength > 1e-2 * strength[0]].conj().T
-    return float((np.abs(in_gate) ** 2).sum() / (np.abs(samples) ** 2).sum())
+    gate_amplitudes = samples @ basis[strength > 1e-2 * strength[0]].conj().T
+    return float((np.abs(gate_amplitudes) ** 2).sum() / (np.abs(samples) ** 2).sum())
 
 
 def _reference_cube(

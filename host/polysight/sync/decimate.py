@@ -26,14 +26,14 @@ FOLD = 4
 """Samples of a block, which become one decimated sample."""
 TAPS = 10
 """Samples that `fold` weights for a block: three before it, its own, three after it."""
-FLAT = 9
+FLATTENED_BLOCKS = 9
 """Blocks that `flatten` weights."""
 SEARCH_FFT = 256
 """Size of the FFT that searches the direct path, over decimated samples; chosen."""
 
 # Samples that `fold` weights on either side of a block, and blocks that `flatten` weights on either side of one.
-_BESIDE = (TAPS - FOLD) // 2
-_EDGE = FLAT // 2
+_TAPS_EACH_SIDE = (TAPS - FOLD) // 2
+_BLOCKS_EACH_SIDE = FLATTENED_BLOCKS // 2
 # Half the passband, cycles per sample: 13 range bins of 192 samples, 1.1 m of path with the published chirp.
 _PASSBAND = 13 / 192
 # Within this distance of the middle, where the scene is, the filters are ten or twenty times as exact.
@@ -73,34 +73,34 @@ def decimator() -> Decimator:
     """Return the taps of both filters, fitted at the first call."""
     inner = _design_low_pass()
     first = np.zeros(TAPS)
-    first[_BESIDE:-_BESIDE] = 1 / FOLD
+    first[_TAPS_EACH_SIDE:-_TAPS_EACH_SIDE] = 1 / FOLD
     cycles = np.linspace(-_PASSBAND, _PASSBAND, 121)
     weight = np.where(np.abs(cycles) < _SCENE_BAND, 10.0, 1.0)
     # `phasors @ taps` is the response of `fold` [cycle]: its sum over the samples at each frequency.
     phasors = np.exp(2j * np.pi * np.outer(cycles, np.arange(TAPS) - (TAPS - 1) / 2))
-    # `flatten` of each of the first blocks, and of an inner one: taps over `FLAT` blocks whose response, together with
-    # that of `fold`, is 1 in the passband.
-    flat = []
-    for block in range(_EDGE + 1):
-        lags = FOLD * (np.arange(FLAT) - block)
+    # `flatten` of each of the first blocks, and of an inner one: taps over `FLATTENED_BLOCKS` blocks whose response,
+    # together with that of `fold`, is 1 in the passband.
+    flat_taps = []
+    for block in range(_BLOCKS_EACH_SIDE + 1):
+        lags = FOLD * (np.arange(FLATTENED_BLOCKS) - block)
         passed = np.exp(2j * np.pi * np.outer(cycles, lags)) * (phasors @ inner)[:, None]
-        if block < _EDGE:
+        if block < _BLOCKS_EACH_SIDE:
             passed[:, 0] *= (phasors @ first) / (phasors @ inner)
         model = weight[:, None] * passed
         # Real taps: real and imaginary parts are equations of their own. At the very end, large taps would raise noise.
         tap_weight = _TAP_WEIGHT if block == 0 else 0.0
-        small = tap_weight * np.eye(FLAT)
+        small = tap_weight * np.eye(FLATTENED_BLOCKS)
         equations = np.concatenate([model.real, model.imag, small])
-        target_response = np.concatenate([weight, np.zeros(cycles.size + FLAT)])
-        flat.append(np.linalg.lstsq(equations, target_response, rcond=None)[0])
+        target_response = np.concatenate([weight, np.zeros(cycles.size + FLATTENED_BLOCKS)])
+        flat_taps.append(np.linalg.lstsq(equations, target_response, rcond=None)[0])
     # Both filters of an inner block as one, over the samples: noise is amplified by the sum of its squares.
-    combined_taps = np.zeros(FOLD * (FLAT - 1) + TAPS)
-    for block, weight_of_block in enumerate(flat[-1]):
+    combined_taps = np.zeros(FOLD * (FLATTENED_BLOCKS - 1) + TAPS)
+    for block, weight_of_block in enumerate(flat_taps[-1]):
         combined_taps[FOLD * block : FOLD * block + TAPS] += weight_of_block * inner
     taps = np.stack([first, inner, first]).astype(np.float32)
     # The end of a chirp is its beginning in reverse.
-    flat += [part[::-1] for part in flat[-2::-1]]
-    return Decimator(taps, np.stack(flat).astype(np.float32), float((combined_taps**2).sum()))
+    flat_taps += [part[::-1] for part in flat_taps[-2::-1]]
+    return Decimator(taps, np.stack(flat_taps).astype(np.float32), float((combined_taps**2).sum()))
 
 
 def _design_low_pass() -> NDArray[np.float64]:
@@ -123,8 +123,8 @@ def _design_low_pass() -> NDArray[np.float64]:
 def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
     """Return one sample for each block of mixed samples: complex64 [..., sample] to [..., block]."""
     taps = decimator().taps
-    padded = np.zeros((*signal.shape[:-1], signal.shape[-1] + 2 * _BESIDE), np.complex64)
-    padded[..., _BESIDE:-_BESIDE] = signal
+    padded = np.zeros((*signal.shape[:-1], signal.shape[-1] + 2 * _TAPS_EACH_SIDE), np.complex64)
+    padded[..., _TAPS_EACH_SIDE:-_TAPS_EACH_SIDE] = signal
     blocks = signal.shape[-1] // FOLD
     folded = np.zeros((*signal.shape[:-1], blocks), np.complex64)
     weights = np.repeat(taps[1][:, None], blocks, axis=1)
@@ -136,9 +136,9 @@ def fold(signal: NDArray[np.complex64]) -> NDArray[np.complex64]:
 
 
 def flatten(folded: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """Undo the attenuation by :func:`fold` in averages over chirps [..., block]; leave fewer blocks than `FLAT`."""
+    """Undo the attenuation by :func:`fold` in averages over chirps [..., block], unless `FLATTENED_BLOCKS` are more."""
     blocks = folded.shape[-1]
-    if blocks < FLAT:
+    if blocks < FLATTENED_BLOCKS:
         return folded
     return (folded @ _make_flat_matrix(blocks)).astype(np.complex64)
 
@@ -150,8 +150,8 @@ def _make_flat_matrix(blocks: int) -> NDArray[np.float32]:
     matrix = np.zeros((blocks, blocks), np.float32)
     for block in range(blocks):
         # The nine blocks about this one, or those nearest to the end.
-        first = min(max(block - _EDGE, 0), blocks - FLAT)
-        matrix[first : first + FLAT, block] = flat[block - first]
+        first = min(max(block - _BLOCKS_EACH_SIDE, 0), blocks - FLATTENED_BLOCKS)
+        matrix[first : first + FLATTENED_BLOCKS, block] = flat[block - first]
     return matrix
 
 

@@ -25,7 +25,7 @@ _SPREAD_M = 0.1
 # Relative gain and phase differences of the RX that the nulls tolerate; chosen.
 _GAIN_SPREAD = 0.3
 # Noise power of a sample relative to an echo as strong as the direct path; chosen.
-_NOISE = 1e-2
+_NOISE_POWER = 1e-2
 # Clutter behind the object: largest excess path, and its total power relative to the direct path. With this power in R
 # the estimate holds a sixth of the clutter's power that it holds without it, and 0.5 % more noise.
 _CLUTTER_M = 1.5
@@ -71,17 +71,17 @@ class DirectPath(NamedTuple):
     geometry: tuple[Chirp, Vector, tuple[Vector, ...], Vector]
 
     def without_rx(self, dead: NDArray[np.bool_]) -> DirectPath:
-        """Return the same without the `dead` RX [rx], for which everything is 0."""
+        """Return the steering and estimators without the `dead` RX [rx]: their weights are 0."""
         return _prepare(*self.geometry, tuple(np.flatnonzero(dead).tolist()))
 
     def reorder_rx(self, order: Sequence[int]) -> DirectPath:
-        """Return the same for RX in another order: recorded RX k is the one at place `order[k]`, from 0."""
+        """Return them for another order of the RX: recorded RX k is the one at place `order[k]`, counted from 0."""
         places = list(order)
         blocks = self.folded_steering.shape[1]
 
         def reorder(estimator: NDArray[np.complex128]) -> NDArray[np.complex128]:
-            by_rx = estimator.reshape(*estimator.shape[:-1], len(places), blocks)
-            return by_rx[..., places, :].reshape(estimator.shape)
+            estimator_by_rx = estimator.reshape(*estimator.shape[:-1], len(places), blocks)
+            return estimator_by_rx[..., places, :].reshape(estimator.shape)
 
         chirp, tx_m, rx_m, specular_m = self.geometry
         return self._replace(
@@ -105,7 +105,7 @@ def excess_path_m(
 
 
 def prepare(rig: Instrument, board: Board) -> DirectPath:
-    """Return steering, search beam and estimators of a board, from geometry alone; not to be written to."""
+    """Return steering, search beam and estimators of a board, from geometry alone; callers must not change them."""
     return _prepare(rig.chirp, tx_position_m(rig), rx_positions_m(rig, board), specular_midpoint_m(rig, board))
 
 
@@ -132,13 +132,13 @@ def _prepare(
     n_rx = len(rx)
     n = middles.size
     all_rx = echoes.reshape(len(points), n_rx * n)
-    # A gain error is that of an RX: it adds echo power between samples of the same RX, none between two.
+    # All samples of an RX have the same gain error: it adds echo power between samples of one RX, not between two RX.
     same_rx = np.kron(np.eye(n_rx), np.ones((n, n)))
     nearest_m = excess_path_m(tx, rx, np.array([specular_m])).min()
     clutter = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(np.linspace(nearest_m, _CLUTTER_M, 8 * n), middles))
     clutter_of_rx = _CLUTTER_POWER / len(clutter) * (clutter.T @ clutter.conj())
     covariance = (all_rx.T @ all_rx.conj()) * (1 + _GAIN_SPREAD**2 * same_rx) + np.kron(np.eye(n_rx), clutter_of_rx)
-    covariance = (covariance + _NOISE / FOLD * np.eye(n_rx * n)).astype(np.complex128)
+    covariance = (covariance + _NOISE_POWER / FOLD * np.eye(n_rx * n)).astype(np.complex128)
     time = np.tile((np.arange(n) - (n - 1) / 2) * FOLD, n_rx)
     model = np.stack([np.ones(n_rx * n), 1j * time, 0.5j * time**2], axis=1).astype(np.complex128)
     samples_of_half = [np.flatnonzero(np.repeat(np.arange(n_rx) % 2 == h, n)) for h in (0, 1)]
@@ -148,33 +148,33 @@ def _prepare(
         s = samples_of_half[h]
         half_estimators[h][:, s] = _invert_model(model[s, :2], covariance[np.ix_(s, s)])
     centre = echoes[:, :, n // 2]
-    spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE * np.eye(n_rx)
+    spatial = (centre.T @ centre.conj()) * (1 + _GAIN_SPREAD**2 * np.eye(n_rx)) + _NOISE_POWER * np.eye(n_rx)
     beam = np.linalg.solve(spatial, np.ones(n_rx)).conj()
     beam = complex64(beam / beam.sum())
     folded_steering = cis(-2 * np.pi * middles * lag_s)
     bins_per_m = chirp.hz_per_sample * FOLD * SEARCH_FFT / SPEED_OF_LIGHT_M_S
     return DirectPath(
-        steering=_spread(cis(-2 * np.pi * sweep * lag_s), is_live),
-        folded_steering=_spread(folded_steering, is_live),
-        estimator=_spread(_invert_model(model[:, :2], covariance), is_live, n),
-        drift_estimator=_spread(_invert_model(model, covariance), is_live, n),
-        half_estimators=_spread(half_estimators, is_live, n),
-        beam=_spread(beam, is_live),
-        search_weights=_spread(complex64(beam[:, None] * folded_steering * search_window(n)), is_live),
+        steering=_fill_dead_rx(cis(-2 * np.pi * sweep * lag_s), is_live),
+        folded_steering=_fill_dead_rx(folded_steering, is_live),
+        estimator=_fill_dead_rx(_invert_model(model[:, :2], covariance), is_live, n),
+        drift_estimator=_fill_dead_rx(_invert_model(model, covariance), is_live, n),
+        half_estimators=_fill_dead_rx(half_estimators, is_live, n),
+        beam=_fill_dead_rx(beam, is_live),
+        search_weights=_fill_dead_rx(complex64(beam[:, None] * folded_steering * search_window(n)), is_live),
         object_bins=(float(excess.min() * bins_per_m), float(excess.max() * bins_per_m)),
         sweep_hz=middles,
         geometry=(chirp, tx_m, rx_m, specular_m),
     )
 
 
-def _spread(of_live: NDArray[Any], is_live: NDArray[np.bool_], blocks: int = 0) -> NDArray[Any]:
+def _fill_dead_rx(live_values: NDArray[Any], is_live: NDArray[np.bool_], blocks: int = 0) -> NDArray[Any]:
     """Return values of live RX for all RX, 0 for the others: [rx, ...], or [..., rx * block] if `blocks` is given."""
     if blocks:
-        by_rx = np.moveaxis(of_live.reshape(*of_live.shape[:-1], -1, blocks), -2, 0)
-        return np.moveaxis(_spread(by_rx, is_live), 0, -2).reshape(*of_live.shape[:-1], -1)
-    of_all = np.zeros((is_live.size, *of_live.shape[1:]), of_live.dtype)
-    of_all[is_live] = of_live
-    return of_all
+        values_by_rx = np.moveaxis(live_values.reshape(*live_values.shape[:-1], -1, blocks), -2, 0)
+        return np.moveaxis(_fill_dead_rx(values_by_rx, is_live), 0, -2).reshape(*live_values.shape[:-1], -1)
+    all_values = np.zeros((is_live.size, *live_values.shape[1:]), live_values.dtype)
+    all_values[is_live] = live_values
+    return all_values
 
 
 def _invert_model(model: NDArray[np.complex128], covariance: NDArray[np.complex128]) -> NDArray[np.complex128]:

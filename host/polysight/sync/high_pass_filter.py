@@ -37,11 +37,11 @@ class HighPass:
 
     def response(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the complex response at IF frequencies (Hz, any shape)."""
-        h = np.ones(np.shape(frequency_hz), complex)
+        response = np.ones(np.shape(frequency_hz), complex)
         for corner in self.corners_hz:
             x = 1j * np.asarray(frequency_hz) / corner
-            h *= x / (1 + x)
-        return h
+            response *= x / (1 + x)
+        return response
 
     def inverse(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return `conj(H) / max(|H|^2, 1/16)`, shape of the frequencies (Hz): 1/H, but at most fourfold noise."""

@@ -41,7 +41,7 @@ _log = logging.getLogger(__name__)
 _lock = threading.Lock()
 
 # Any array as an argument in C, made in a third of the time that `ctypes.data` takes.
-_POINTED = ctypes.c_char * 0
+_ANY_ARRAY = ctypes.c_char * 0
 Real = NDArray[np.floating]
 Complex = NDArray[np.complexfloating]
 
@@ -123,14 +123,14 @@ def refine(blocks: Complex, times: Real, steps: int = 3) -> Tone:
     """
     w = np.zeros(blocks.shape[:-1])
     limit = 2 * np.pi / (times[-1] - times[0])
-    turned, s0, s1, s2, step = blocks, w, w, w, w
+    turned_blocks, s0, s1, s2, step = blocks, w, w, w, w
     # Slope and curvature are half the derivatives of |s0|^2 by w; a step is at most a cycle per record.
     for i in range(steps):
         if i > 0:
-            turned = blocks * cis(-w[..., None] * times)
-        s0 = turned.sum(axis=-1)
-        s1 = turned @ times
-        s2 = turned @ times**2
+            turned_blocks = blocks * cis(-w[..., None] * times)
+        s0 = turned_blocks.sum(axis=-1)
+        s1 = turned_blocks @ times
+        s2 = turned_blocks @ times**2
         slope = (s0.conj() * s1).imag
         curvature = np.abs(s1) ** 2 - (s0.conj() * s2).real
         step = np.divide(-slope, curvature, out=np.zeros_like(slope), where=curvature < 0)
@@ -310,12 +310,12 @@ def against_others(
     sum_energy = np.add.reduceat((total.real**2 + total.imag**2).sum(axis=(1, 2)), starts, axis=-1).astype(np.float64)
     correlation = sums[0] + sums[1]
     # A good chirp c is in the total T: without it, c (T - c)* = c T* - |c|^2, |T - c|^2 = |T|^2 - 2 Re c T* + |c|^2.
-    with_others = correlation - np.where(good[..., None], own_energy, 0)
+    correlation_with_others = correlation - np.where(good[..., None], own_energy, 0)
     others_energy = sum_energy[:, None] - np.where(good[..., None], 2 * correlation.real - own_energy, 0)
     has_others = others_energy > 1e-30
-    explained = np.divide(np.abs(with_others) ** 2, others_energy, out=own_energy.copy(), where=has_others)
+    explained = np.divide(np.abs(correlation_with_others) ** 2, others_energy, out=own_energy.copy(), where=has_others)
     residual_energy = own_energy - explained
-    tone = refine(with_others, times, steps=2)
+    tone = refine(correlation_with_others, times, steps=2)
     split = refine(sums * cis(-2 * np.pi * tone.frequency[..., None] * times), times, steps=1)
     half_difference = split.frequency[0] - split.frequency[1], np.angle(split.amplitude[0] * split.amplitude[1].conj())
     return tone, own_energy.sum(axis=-1).astype(np.float32), sum_energy, np.stack(half_difference), residual_energy
@@ -552,9 +552,9 @@ class NumpyLoops:
         """
         n = halves.shape[-1]
         turn = phasor(-frequency * FOLD, -phase, n, (n - 1) / 2)
-        turned = (halves[:, 0] + halves[:, 1]) * steering * turn[:, None]
+        turned_sum = (halves[:, 0] + halves[:, 1]) * steering * turn[:, None]
         half_difference = complex64(halves[:, 0] * scale[:, 0, None, None] - halves[:, 1] * scale[:, 1, None, None])
-        return complex64(turned.swapaxes(0, 1)), signal_energy(half_difference)
+        return complex64(turned_sum.swapaxes(0, 1)), signal_energy(half_difference)
 
 
 class LoadError(Exception):
@@ -605,7 +605,7 @@ class Library:
         """Align positions into the fields of an `offsets.AlignedRow`; parameters as in `offsets.align_in_numpy`."""
         positions, chirps, samples, _, _ = words.shape
         a, b = linear
-        # Of `Equaliser`: sample rate, reach, sign, corners in Hz. Without corners no reach but 0 has an effect.
+        # Numbers of the `Equaliser`: sample rate, reach, sign, corners in Hz. Without corners the reach has no effect.
         filters = [1.0, 1 / 8 / FOLD, 0.0]
         if equaliser is not None:
             filters = [equaliser.sample_rate_hz, equaliser.reach, equaliser.signed, *equaliser.model.corners_hz]
@@ -677,7 +677,7 @@ def _convert_argument(value: NDArray[Any] | float) -> Any:
     if not isinstance(value, np.ndarray):
         return ctypes.c_int(int(value))
     if value.flags.writeable:
-        return _POINTED.from_buffer(value.data)
+        return _ANY_ARRAY.from_buffer(value.data)
     return ctypes.c_void_p(value.ctypes.data)
 
 

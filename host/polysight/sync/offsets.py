@@ -51,12 +51,12 @@ from polysight_shared.config import Chirp
 # Burst alignment: reference chirps tried per position; chosen.
 _REFERENCES = 4
 # A good chirp has at least this part of the coherence of the position's median chirp; chosen.
-_GOOD = 0.5
+_GOOD_COHERENCE = 0.5
 # A chirp is disturbed if, in one of its parts, the energy that the sum of the others does not explain is this many
 # times the usual (chosen); noise reaches twice the usual.
-_UNEXPLAINED = 8.0
+_UNEXPLAINED_RATIO = 8.0
 # Unexplained share of a part's energy that is never a disturbance: -30 dB, above the effect of 0.1 bins of frequency.
-_NEGLIGIBLE = 1e-3
+_NEGLIGIBLE_SHARE = 1e-3
 # Times that a burst is aligned, each without the chirps found disturbed before; chosen.
 _ROUNDS = 4
 # Clipping below full scale: smallest magnitude of the limit, and one in so many words of a chirp at it; chosen.
@@ -67,21 +67,21 @@ _AT_LIMIT = 32
 _STEPS = 3
 # If the strongest peak has a second one of this relative amplitude (chosen) below it, nearer by the object's distance
 # from the direct path (10 % less to 10 % more), then the second is the direct path.
-_COMPARABLE = 0.35
+_COMPARABLE_AMPLITUDE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median; chosen.
-_LOST = 0.3
+_LEAST_AMPLITUDE = 0.3
 # Standard deviations from the row's amplitude beyond which a position's second peak is tried; chosen.
-_OUTLIER = 5.0
+_OUTLIER_STDS = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
-_PRESENT = 30.0
+_LEAST_SNR = 30.0
 
 # An RX is dead if its power is this part (-23 dB, chosen) of the strongest one's, without its noise.
-_DEAD = 0.005
+_DEAD_SHARE = 0.005
 # The strongest RX says nothing about others if a smaller part of its power is signal, and not noise; chosen.
-_SIGNAL = 0.5
-# About so many positions are judged together; chosen.
+_LEAST_SIGNAL_SHARE = 0.5
+# About this number of positions is judged together; chosen.
 JUDGED_POSITIONS = 4
-# About so many are, if the direct path is not among the signals: echoes of several plates cancel at single positions.
+# The same number for signals without the direct path: the echoes of several plates cancel at single positions.
 JUDGED_ECHOES = 16
 
 Errors = dict[str, NDArray[np.float64]]
@@ -273,8 +273,8 @@ def find_clipped(words: NDArray[np.int16], valid: NDArray[np.bool_], full_scale:
     magnitude: NDArray[np.int32] = np.abs(words.reshape(*words.shape[:2], -1).astype(np.int32))
     peak = magnitude.max(axis=-1)
     highest = np.where(valid & (peak < full_scale), peak, 0).max(axis=1)
-    at_limit = (magnitude >= (highest - highest // 2048)[:, None, None]).sum(axis=-1)
-    piled: NDArray[np.bool_] = (highest >= _LEAST_LIMIT)[:, None] & (at_limit > magnitude.shape[-1] // _AT_LIMIT)
+    words_at_limit = (magnitude >= (highest - highest // 2048)[:, None, None]).sum(axis=-1)
+    piled: NDArray[np.bool_] = (highest >= _LEAST_LIMIT)[:, None] & (words_at_limit > magnitude.shape[-1] // _AT_LIMIT)
     return valid & ((peak >= full_scale) | piled)
 
 
@@ -340,7 +340,11 @@ def _find_disturbed(
     neighbour = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
     usual_level = np.maximum(median, np.where(np.isfinite(neighbour), neighbour, 0.0))
     enough = usable.sum(axis=1) >= 4
-    return usable & enough[:, None] & (left > _UNEXPLAINED * usual_level + _NEGLIGIBLE * level[:, None]).any(axis=2)
+    return (
+        usable
+        & enough[:, None]
+        & (left > _UNEXPLAINED_RATIO * usual_level + _NEGLIGIBLE_SHARE * level[:, None]).any(axis=2)
+    )
 
 
 def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -408,8 +412,8 @@ def _find_taps(equaliser: hpf.Equaliser | None, frequency: NDArray[np.float64]) 
 
 
 def _find_coherent(coherence: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the usable chirps with at least `_GOOD` of the median coherence of their position."""
-    return usable & (coherence >= _GOOD * _take_lower_median(coherence, usable)[:, None])
+    """Return the usable chirps with at least `_GOOD_COHERENCE` of the median coherence of their position."""
+    return usable & (coherence >= _GOOD_COHERENCE * _take_lower_median(coherence, usable)[:, None])
 
 
 def _subtract_mean(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -418,7 +422,7 @@ def _subtract_mean(values: NDArray[np.float64], good: NDArray[np.bool_]) -> NDAr
     return (values - mean[..., None]) * good
 
 
-class Referenced(NamedTuple):
+class ReferencedSamples(NamedTuple):
     """Samples referenced to the direct path.
 
     Attributes
@@ -525,7 +529,7 @@ def _spread(values: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(f), float(p), float(a)
 
 
-def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> Referenced:
+def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | None = None) -> ReferencedSamples:
     """Find the direct path of every position and remove its frequency and phase from all RX.
 
     Parameters
@@ -551,7 +555,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         weights=path.search_weights,
         size=SEARCH_FFT,
         object_bins=(int(path.object_bins[0] * 0.9), int(path.object_bins[1] * 1.1)),
-        comparable=_COMPARABLE,
+        comparable=_COMPARABLE_AMPLITUDE,
         steering=path.folded_steering,
         estimator=complex64(path.drift_estimator),
         steps=_STEPS,
@@ -574,25 +578,25 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     amplitude = estimate[:, 0]
     if_frequency = aligned.centre + frequency
     if_frequency = if_frequency % 1.0 if chirp.if_mode == "complex1x" else (if_frequency + 0.5) % 1.0 - 0.5
-    in_passband = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
+    is_in_passband = if_frequency < 0.9 if chirp.if_mode == "complex1x" else np.abs(if_frequency) < 0.45
     strength = np.abs(amplitude)
     chirps = np.maximum(good_chirps, 1)
     # All chirps of a row have the same noise; `averaged_noise` is the power in an averaged sample of one RX.
     floor = _find_middle((floor * chirps)[usable]) / chirps if usable.any() else floor
     averaged_noise = floor / (np.abs(path.beam) ** 2).sum()
-    present = strength**2 > _PRESENT * averaged_noise * (np.abs(path.estimator[0]) ** 2).sum()
-    is_found = usable & in_passband & present & (np.abs(step) < 0.02 / (b - a))
+    present = strength**2 > _LEAST_SNR * averaged_noise * (np.abs(path.estimator[0]) ** 2).sum()
+    is_found = usable & is_in_passband & present & (np.abs(step) < 0.02 / (b - a))
     if is_found.any():
-        is_found &= strength > _LOST * _find_middle(strength[is_found])
+        is_found &= strength > _LEAST_AMPLITUDE * _find_middle(strength[is_found])
 
     samples[:, ~is_found] = 0
     # Noise of one chirp: averages of the halves, of k and l of the K good chirps, differ by 1 / k + 1 / l of its power,
     # the sum of `scale` over K. `half_difference` is the difference's energy in all RX and blocks, after decimation.
-    two = good_chirps > 1
-    noise_power = np.full(len(two), np.nan)
+    has_two_halves = good_chirps > 1
+    noise_power = np.full(len(has_two_halves), np.nan)
     chirp_noise = half_difference * chirps / (np.count_nonzero(path.beam) * n) / decimator().noise
-    noise_power[two] = chirp_noise[two] / scale[two].sum(axis=1)
-    return Referenced(
+    noise_power[has_two_halves] = chirp_noise[has_two_halves] / scale[has_two_halves].sum(axis=1)
+    return ReferencedSamples(
         samples=samples,
         frequency=if_frequency,
         amplitude=amplitude,
@@ -616,20 +620,20 @@ def find_dead_rx(
     total = product.sum(axis=0)
     if not total.any():
         return np.zeros(len(product), bool)
-    in_phase = np.real(product * np.exp(-1j * np.angle(total)))
+    in_phase_power = np.real(product * np.exp(-1j * np.angle(total)))
     power = np.sqrt(np.vecdot(signal, signal).real * np.vecdot(again, again).real)
     width = min(judged, total.size)
-    in_phase, power = (_sum_neighbours(values, width) for values in (in_phase, power))
-    strongest = in_phase.max(axis=0)
-    has_signal = strongest > _SIGNAL * power[in_phase.argmax(axis=0), np.arange(power.shape[1])]
-    return ((in_phase < _DEAD * strongest) & has_signal).any(axis=1)
+    in_phase_power, power = (_sum_neighbours(values, width) for values in (in_phase_power, power))
+    strongest = in_phase_power.max(axis=0)
+    has_signal = strongest > _LEAST_SIGNAL_SHARE * power[in_phase_power.argmax(axis=0), np.arange(power.shape[1])]
+    return ((in_phase_power < _DEAD_SHARE * strongest) & has_signal).any(axis=1)
 
 
 def _sum_neighbours(values: NDArray[np.floating], width: int) -> NDArray[np.float64]:
     """Return sums [rx, start] of `width` neighbouring values [rx, position]."""
     sums = np.cumsum(values, axis=1, dtype=np.float64)
-    before = np.pad(sums, ((0, 0), (1, 0)))[:, :-width]
-    return sums[:, width - 1 :] - before
+    sums_before = np.pad(sums, ((0, 0), (1, 0)))[:, :-width]
+    return sums[:, width - 1 :] - sums_before
 
 
 def half_scale(good_chirps: NDArray[np.int_]) -> NDArray[np.float32]:
@@ -647,8 +651,9 @@ def _try_second_peaks(
 ) -> None:
     """Use the second peak where ln of the amplitude is an outlier in its row; changes `removed` in place.
 
-    `remove` repeats the estimate of given positions from given frequencies. An outlier is beyond `_OUTLIER` standard
-    deviations from the row's median; the amplitude of the second peak has to be nearer to the median, and no outlier.
+    `remove` repeats the estimate of given positions from given frequencies. An outlier is beyond `_OUTLIER_STDS`
+    standard deviations from the row's median; the amplitude of the second peak has to be nearer to the median, and no
+    outlier.
     """
     level = np.log(np.maximum(np.abs(removed.estimate[:, 0]), 1e-30))
     if not usable.any():
@@ -656,13 +661,13 @@ def _try_second_peaks(
     middle = _find_middle(level[usable])
     # 1.4826 turns the median deviation of a normal distribution into its standard deviation.
     spread = 1.4826 * _find_middle(np.abs(level[usable] - middle))
-    odd = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER * spread) & (peaks[0] != peaks[1]))
-    if odd.size == 0:
+    odd_positions = np.flatnonzero(usable & (np.abs(level - middle) > _OUTLIER_STDS * spread) & (peaks[0] != peaks[1]))
+    if odd_positions.size == 0:
         return
-    second_try = remove(odd, peaks[1, odd])
+    second_try = remove(odd_positions, peaks[1, odd_positions])
     other_level = np.log(np.maximum(np.abs(second_try.estimate[:, 0]), 1e-30))
-    better = np.abs(other_level - middle) < np.minimum(_OUTLIER * spread, np.abs(level[odd] - middle))
-    replaced = odd[better]
+    better = np.abs(other_level - middle) < np.minimum(_OUTLIER_STDS * spread, np.abs(level[odd_positions] - middle))
+    replaced = odd_positions[better]
     removed.frequency[replaced] = second_try.frequency[better]
     removed.estimate[replaced] = second_try.estimate[better]
     removed.step[replaced] = second_try.step[better]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polysight.sync.direct_path import DirectPath, excess_path_m
-from polysight.sync.offsets import AlignedRow, Referenced
+from polysight.sync.offsets import AlignedRow, ReferencedSamples
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Standard deviations of the phases of an RX, radians: of its channel, which only the direct path has (chosen; the
@@ -29,17 +29,17 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 _CHANNEL_RAD = np.radians(25)
 _ECHO_RAD = np.radians(12)
 # Smallest improvement of the sum of squares by another order, and largest sum that is left; chosen.
-_BETTER_BY = 14.0
-_LEFT_OVER = 12.0
-# Cost of an RX in another place: of orders that fit alike the one with fewest changes is told. Chosen.
-_MOVED = 0.5
-# The echo tells the places only if one direction dominates it; share of its power, chosen.
-_ONE_DIRECTION = 0.8
+_LEAST_IMPROVEMENT = 14.0
+_LARGEST_MISFIT = 12.0
+# Cost of an RX in another place: of orders that fit equally well, the one with fewest changes is reported. Chosen.
+_MOVE_COST = 0.5
+# Share of an echo's power in its strongest direction from which on the echo determines the places of the RX; chosen.
+_DOMINANT_SHARE = 0.8
 # Coherence of the direct path over the RX of a rig file's order that needs no search; chosen.
-_COHERENT = 0.97
+_ORDERED_COHERENCE = 0.97
 # Positions of a row that other orders are tried with, and share of them that must have a direct path; chosen.
-_TRIED = 12
-_FOUND = 0.75
+_TRIED_POSITIONS = 12
+_LEAST_FOUND_SHARE = 0.75
 # Largest number of RX: orders are tried one by one.
 _MOST_RX = 6
 
@@ -80,9 +80,9 @@ def judge_rx_order(
 
 def find_rx_order(
     aligned: AlignedRow,
-    referenced: Referenced,
+    referenced: ReferencedSamples,
     path: DirectPath,
-    reference_with: Callable[[AlignedRow, DirectPath], Referenced],
+    reference_with: Callable[[AlignedRow, DirectPath], ReferencedSamples],
 ) -> tuple[int, ...]:
     """Find the order in which a row's RX were recorded: number in the rig file of each recorded RX, counted from 1.
 
@@ -112,18 +112,18 @@ def find_rx_order(
         return _choose(vectors, expected)
 
     # Without a direct path the RX may be so far out of order that it cancels: other orders are tried on some positions.
-    chosen = usable[np.linspace(0, usable.size - 1, min(_TRIED, usable.size)).astype(int)]
-    part = _take_positions(aligned, chosen)
+    chosen = usable[np.linspace(0, usable.size - 1, min(_TRIED_POSITIONS, usable.size)).astype(int)]
+    chosen_positions = _take_positions(aligned, chosen)
     best: tuple[float, _Vectors] | None = None
     for order in itertools.permutations(range(count)):
-        tried = reference_with(part, path.reorder_rx(order))
-        if np.count_nonzero(tried.found) < _FOUND * chosen.size:
+        tried = reference_with(chosen_positions, path.reorder_rx(order))
+        if np.count_nonzero(tried.found) < _LEAST_FOUND_SHARE * chosen.size:
             continue
         vectors = _measure(tried, path, expected, order)
         coherence = abs(_normalise(vectors.direct * np.exp(-1j * expected.direct[list(order)])).mean())
         if best is None or coherence > best[0]:
             best = (float(coherence), vectors)
-    if best is None or best[0] < _COHERENT:
+    if best is None or best[0] < _ORDERED_COHERENCE:
         return ()
     return _choose(best[1], expected)
 
@@ -135,7 +135,7 @@ def _take_positions(aligned: AlignedRow, positions: NDArray[np.intp]) -> Aligned
 
 
 @lru_cache(16)
-def _phases_of(
+def _compute_phases(
     frequency_hz: float, tx_m: tuple[float, ...], rx_m: tuple[tuple[float, ...], ...], specular_m: tuple[float, ...]
 ) -> RxPhases:
     """Return the phases at the RX at one frequency."""
@@ -149,10 +149,10 @@ def _phases_of(
 def _expect_phases(path: DirectPath) -> RxPhases:
     """Return the phases at the RX by geometry, at the middle of the sweep."""
     _, tx_m, rx_m, specular_m = path.geometry
-    return _phases_of(float(path.sweep_hz.mean()), tx_m, rx_m, specular_m)
+    return _compute_phases(float(path.sweep_hz.mean()), tx_m, rx_m, specular_m)
 
 
-def _measure(referenced: Referenced, path: DirectPath, expected: RxPhases, order: Sequence[int]) -> _Vectors:
+def _measure(referenced: ReferencedSamples, path: DirectPath, expected: RxPhases, order: Sequence[int]) -> _Vectors:
     """Measure the phasors of a row that was steered by the places of `order` [rx]."""
     samples = referenced.samples[:, referenced.found]
     _, tx_m, rx_m, specular_m = path.geometry
@@ -172,10 +172,10 @@ def _relate(
     order: Sequence[int],
 ) -> _Vectors:
     """Return the phasors of a row from direct path [rx] and echo [rx, position], steered by the places of `order`."""
-    # What all positions have in common is the direct path; the echo is the direction of most power over positions.
+    # The part that all positions share is the direct path; the echo is the direction of most power over positions.
     power, directions = np.linalg.eigh(echo @ echo.conj().T)
     ratio = None
-    if power[-1] > _ONE_DIRECTION * power.sum() and np.abs(direct).all():
+    if power[-1] > _DOMINANT_SHARE * power.sum() and np.abs(direct).all():
         ratio = directions[:, -1] * direct.conj()
     return _Vectors(direct * np.exp(1j * expected.direct[list(order)]), ratio)
 
@@ -195,18 +195,20 @@ def _list_orders(count: int) -> NDArray[np.intp]:
 def _choose(vectors: _Vectors, expected: RxPhases) -> tuple[int, ...]:
     """Return the order that fits, from 1; empty if that of the rig file does, or none."""
     orders = _list_orders(vectors.direct.size)
-    costs = _misfit(vectors.direct, expected.direct[orders], _CHANNEL_RAD)
+    costs = _compute_misfit(vectors.direct, expected.direct[orders], _CHANNEL_RAD)
     if vectors.echo is not None:
-        costs += _misfit(vectors.echo, expected.echo[orders], _ECHO_RAD)
-    costs += _MOVED * np.count_nonzero(orders != orders[0], axis=1)
+        costs += _compute_misfit(vectors.echo, expected.echo[orders], _ECHO_RAD)
+    costs += _MOVE_COST * np.count_nonzero(orders != orders[0], axis=1)
     best = int(np.argmin(costs))
-    is_better = costs[0] - costs[best] > _BETTER_BY
-    if not is_better or costs[best] > _LEFT_OVER:
+    is_better = costs[0] - costs[best] > _LEAST_IMPROVEMENT
+    if not is_better or costs[best] > _LARGEST_MISFIT:
         return ()
     return tuple((orders[best] + 1).tolist())
 
 
-def _misfit(phasors: NDArray[np.complexfloating], phases: NDArray[np.float64], std_rad: float) -> NDArray[np.float64]:
+def _compute_misfit(
+    phasors: NDArray[np.complexfloating], phases: NDArray[np.float64], std_rad: float
+) -> NDArray[np.float64]:
     """Return the sum of squared deviations of phasors [rx] from phases [order, rx] of any common phase, [order].
 
     It is in units of the variance. Deviations count as 2 - 2 cos, which is their square where they are small.

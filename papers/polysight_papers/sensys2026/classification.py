@@ -19,7 +19,16 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from polysight.materials import CHANNELS, DISCRIMINANT, PAPER, REJECTED, Samples, Score, score, score_unseen_materials
+from polysight.materials import (
+    CHANNELS,
+    DISCRIMINANT_MODEL,
+    PAPER_MODEL,
+    REJECTED_SHARE,
+    Samples,
+    Score,
+    score,
+    score_unseen_materials,
+)
 from polysight.polarimetry import fresnel
 from polysight.report import INK, PALETTE
 from polysight_papers.sensys2026.item import (
@@ -106,7 +115,7 @@ def accuracy_over_draws(quick: bool) -> Table:
     rows = []
     for task in TASKS:
         name = task.partition(", ")[0]
-        scores = [score(task_samples(task, seed, quick), DISCRIMINANT) for seed in seeds]
+        scores = [score(task_samples(task, seed, quick), DISCRIMINANT_MODEL) for seed in seeds]
         errors = calibrated_errors(name, count_draws(quick))
         # In the order of the kinds below.
         limits = [
@@ -121,7 +130,7 @@ def accuracy_over_draws(quick: bool) -> Table:
     kinds = ("pixel alone", "pixel, scan known", "by patch, scan known")
     head = ("Task", *(f"{k}{w}" for k in kinds for w in (", found", ", bound")))
     caption = (
-        f"The {DISCRIMINANT} with scans left out, mean and spread over {len(seeds)} other draws;"
+        f"The {DISCRIMINANT_MODEL} with scans left out, mean and spread over {len(seeds)} other draws;"
         " the bound is the best any classifier can do that knows every material's mean and the errors' sizes"
         " (and, where the scan is known, the reference's error)"
     )
@@ -137,18 +146,18 @@ def unknowns(quick: bool) -> Table:
     for task in tasks:
         drawn = task_samples(task, RESULT_SEED, quick)
         # For each material left out of training: the share of its patches that is rightly called unknown.
-        called_unknown = score_unseen_materials(drawn, DISCRIMINANT)
+        called_unknown = score_unseen_materials(drawn, DISCRIMINANT_MODEL)
         mistaken = [n for n, share in called_unknown.items() if share < 0.5]
         rows.append(
             (
                 f"{len(called_unknown)} {task}",
-                percent(score_simulated(task, DISCRIMINANT, "H+V+P", False, quick).unknown),
+                percent(score_simulated(task, DISCRIMINANT_MODEL, "H+V+P", False, quick).unknown),
                 percent(float(np.mean(list(called_unknown.values())))),
                 ", ".join(mistaken) or "–",
             )
         )
     head = ("Task", "known, called unknown", "never learnt, called unknown", "taken for another more often than not")
-    return Table(f"Patches called unknown; {REJECTED:.0%} of the known ones are meant to be", head, tuple(rows))
+    return Table(f"Patches called unknown; {REJECTED_SHARE:.0%} of the known ones are meant to be", head, tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -170,7 +179,7 @@ class TaskScores:
         # In the order of the fields.
         scores = [
             score_simulated(task, model, channels, by_pixel, quick)
-            for model, channels in ((PAPER, "H+V+P"), (DISCRIMINANT, "H+V+P"), (PAPER, "H"))
+            for model, channels in ((PAPER_MODEL, "H+V+P"), (DISCRIMINANT_MODEL, "H+V+P"), (PAPER_MODEL, "H"))
             for by_pixel in (False, True)
         ]
         return TaskScores(task, *scores)
@@ -224,7 +233,7 @@ def published_percent(task: str) -> float:
 
 
 def fig18(run: Run) -> Item:
-    """Accuracy of the paper's KNN and of the discriminant under both splits, with confusion matrices."""
+    """Return the accuracy of the paper's KNN and of the discriminant under both splits, with confusion matrices."""
     scores = [TaskScores.score(task, run.quick) for task in TASKS]
     head = (
         "Task",
@@ -276,8 +285,8 @@ def fig20(run: Run) -> Item:
     ax = fig.subplots()
     bars = []
     for channel in CHANNELS:
-        by_pixel = [score_simulated(t, PAPER, channel, True, run.quick).pixels for t in tasks]
-        left_out = [score_simulated(t, PAPER, channel, False, run.quick).pixels for t in tasks]
+        by_pixel = [score_simulated(t, PAPER_MODEL, channel, True, run.quick).pixels for t in tasks]
+        left_out = [score_simulated(t, PAPER_MODEL, channel, False, run.quick).pixels for t in tasks]
         means = [float(np.average(x, weights=weight)) for x in (by_pixel, left_out)]
         rows.append((channel, f"{printed[channel]:.2f} %", *(percent(x) for x in (*means, *left_out))))
         bars.append((printed[channel], 100 * means[0], 100 * means[1]))
@@ -321,9 +330,9 @@ def fig20(run: Run) -> Item:
 def confusion_figure(materials: Sequence[Published], h: Score, best: Score) -> Figure:
     """Draw the confusion of the paper's KNN by H alone beside the discriminant's, by pixels and by patches."""
     panels: tuple[Panel, ...] = (
-        (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER}"),
-        (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT}"),
-        (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT}"),
+        (h, h.confusion, f"H alone: {percent(h.pixels)}\n{PAPER_MODEL}"),
+        (best, best.confusion, f"H, V and P, pixels alone: {percent(best.pixels)}\n{DISCRIMINANT_MODEL}"),
+        (best, best.patch_confusion, f"H, V and P, by patch: {percent(best.by_patch)}\n{DISCRIMINANT_MODEL}"),
     )
     n = len(materials)
     if n > 12:

@@ -272,7 +272,7 @@ def words(name: str) -> frozenset[str]:
                 number = word
             out.append(f"{float(number):g}")
         else:
-            if word in materials.METALS:
+            if word in materials.METAL_WORDS:
                 out += ["metal"]
             else:
                 out += str(_ALIASES.get(word, word)).split()

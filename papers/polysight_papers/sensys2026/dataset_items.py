@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 
 from polysight.materials import (
     CHANNELS,
-    DISCRIMINANT,
-    PAPER,
+    DISCRIMINANT_MODEL,
+    PAPER_MODEL,
     Library,
     Permittivity,
     Samples,
@@ -86,7 +86,7 @@ def _samples(library: Library) -> Samples:
 
 
 def pair_scans(first: Library, second: Library) -> tuple[Library, Library]:
-    """Scans of two angles in pairs, those with most materials in common first; a pair has one name in both.
+    """Return scans of two angles in pairs, those with most materials in common first; a pair has one name in both.
 
     No scan is in two pairs, so that a pair can be left out as a whole. Scans without a partner are left out.
     """
@@ -205,7 +205,7 @@ FIG18_NOTES = (
 
 
 def authors_fig18(judge: Judgements) -> Item:
-    """Accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
+    """Return the accuracy of the paper's KNN and of the discriminant, with confusion matrices. Raises DataError."""
     printed = published_values()["classification"]
     rows = []
     content = {}
@@ -215,9 +215,9 @@ def authors_fig18(judge: Judgements) -> Item:
         paper = published_percent(task) / 100
         published_h = None if two_angles else printed[name]["h_percent"] / 100
         several = select_repeated(samples)
-        knn_mixed, knn_apart = judge.score(source, task, PAPER)
-        discriminant_mixed, discriminant_apart = judge.score(source, task, DISCRIMINANT)
-        h_mixed, h_apart = judge.score(source, task, PAPER, "H")
+        knn_mixed, knn_apart = judge.score(source, task, PAPER_MODEL)
+        discriminant_mixed, discriminant_apart = judge.score(source, task, DISCRIMINANT_MODEL)
+        h_mixed, h_apart = judge.score(source, task, PAPER_MODEL, "H")
         scores = (knn_mixed, knn_apart, discriminant_mixed, discriminant_apart)
         if several is None:
             split = OPTIMISTIC
@@ -277,7 +277,7 @@ def authors_fig20(judge: Judgements) -> Item:
         tasks_of_source = [(t, x) for s, t, x in judged_tasks if s == source]
         means: dict[str, tuple[float, float | None]] = {}
         for channel in CHANNELS:
-            scores = [judge.score(source, t, PAPER, channel) for t, _ in tasks_of_source]
+            scores = [judge.score(source, t, PAPER_MODEL, channel) for t, _ in tasks_of_source]
             weight = [np.unique(x.names).size for _, x in tasks_of_source]
             mixed = float(np.average([by_pixel.pixels for by_pixel, _ in scores], weights=weight))
             scores_apart = [apart for _, apart in scores if apart is not None]
@@ -508,7 +508,7 @@ def authors_recipe(p: Complex, angle_deg: float, leakage: float = AXIAL_RATIO) -
 
 
 def _collect_pixels(data: AuthorsData, source: str, m: Published) -> tuple[Complex, float, int] | None:
-    """Ratios of a material's pixels, their angle (degrees), and how many scans; None if the source lacks it.
+    """Return ratios of a material's pixels, their angle (degrees), and how many scans; None if the source lacks it.
 
     At the paper's angle, or else at the smallest there is.
     """

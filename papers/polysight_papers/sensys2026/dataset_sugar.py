@@ -21,7 +21,7 @@ FIG21_NOTE = (
 
 
 def authors_fig21(data: AuthorsData) -> Item:
-    """Concentration of sugar by a line through the other concentrations. Raises DataError."""
+    """Return the concentration of sugar by a line through the other concentrations. Raises DataError."""
     printed = published_values()["sugar_median_error_percent"]
     tables = []
     content = {}

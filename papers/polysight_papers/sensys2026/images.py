@@ -295,7 +295,7 @@ FIG14_NOTE = (
 
 
 def fig14(run: Run) -> Item:
-    """Phase of H, V and P inside water, oil and metal."""
+    """Return the phase of H, V and P inside water, oil and metal."""
     view = view_scan("liquids", SETS["liquids"], run)
     drawn_materials = ("Water (with glass)", "Corn Oil (with glass)", "copper")
     fig = new_figure(11.5, 3.4)

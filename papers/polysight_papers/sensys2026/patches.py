@@ -22,9 +22,9 @@ import numpy.typing as npt
 import scipy
 
 from polysight.materials import (
-    DISCRIMINANT,
+    DISCRIMINANT_MODEL,
     MODELS,
-    PAPER,
+    PAPER_MODEL,
     Entry,
     Library,
     Model,
@@ -175,7 +175,7 @@ def draw(
 def h_accuracy(group: Group, errors: Errors, seeds: tuple[int, ...]) -> float:
     """Return the share of pixels that the paper's KNN names right from |H| alone, split by pixel, mean over draws."""
     drawn = (draw(group.materials, group.angle_deg, errors, seed).samples() for seed in seeds)
-    return float(np.mean([score(s, PAPER, "H", by_pixel=True).pixels for s in drawn]))
+    return float(np.mean([score(s, PAPER_MODEL, "H", by_pixel=True).pixels for s in drawn]))
 
 
 def count_draws(quick: bool) -> int:
@@ -252,7 +252,7 @@ def add_spread(group: str, angles_deg: tuple[float, ...], spread: tuple[float, f
     errors = replace(calibrated_errors(group, count_draws(quick)), spread=spread)
     taught = draw_at_angles(group, angles_deg, errors, _LIBRARY_SEED, LIBRARY_SCANS)
     test = draw_at_angles(group, angles_deg, errors, _TEST_SEED, test_scans)
-    model = MODELS[DISCRIMINANT]("H+V+P").fit(taught)
+    model = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(taught)
     named, right, sure = by_patch(model, test)
     calibration = calibration_error(sure[named], right[named])
     share = float((named & right).mean())
@@ -335,7 +335,7 @@ def count_named_strangers(taught: Samples, test: Samples, quick: bool) -> tuple[
     scans = np.unique(test.groups)[:most_scans]
     for name in np.unique(test.names):
         taught_others = taught.take(taught.names != name)
-        model = MODELS[DISCRIMINANT]("H+V+P").fit(taught_others)
+        model = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(taught_others)
         for scan in scans:
             scan_samples = test.take(test.groups == scan)
             classifications = model.by_scan(scan_samples.x, scan_samples.patches)
@@ -410,7 +410,7 @@ def spread_table(quick: bool) -> Table:
     )
     caption = (
         f"Patches of specimens that were never learnt, {LIBRARY_SCANS} other specimens of each material in the library,"
-        f" the noise of Fig. 18; {DISCRIMINANT}. The bound knows every material's distribution, the errors' sizes and"
-        " the scan's reference. Strangers are each material in turn, left out of the library."
+        f" the noise of Fig. 18; {DISCRIMINANT_MODEL}. The bound knows every material's distribution, the errors' sizes"
+        " and the scan's reference. Strangers are each material in turn, left out of the library."
     )
     return Table(caption, head, tuple(rows))

@@ -58,7 +58,7 @@ def _list_published(numbers: tuple[int, ...]) -> tuple[item.Published, ...]:
 
 
 def fig3(run: item.Run) -> item.Item:
-    """Reflectances |r_s|^2 and |r_p|^2 and their ratio over the incidence angle (no random errors)."""
+    """Return reflectances |r_s|^2 and |r_p|^2 and their ratio over the incidence angle (no random errors)."""
     del run
     materials = (*_list_published(COMMON), WATER)
     angle = np.arange(0.0, 90.0, 0.25)

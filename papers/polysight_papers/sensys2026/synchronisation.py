@@ -15,7 +15,7 @@ import scipy
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from polysight.capture import decode_row, row_words
+from polysight.capture import decode_row, view_row_words
 from polysight.imaging import ImageBuilder
 from polysight.report import INK, PALETTE, QUANTITIES, SyncReport
 from polysight.sync import (
@@ -100,7 +100,7 @@ def sync_scan(run: Run) -> SyncScan:
         for row in source.rows():
             for name, setup in setups.items():
                 data = source.read_row(name, row)
-                words, valid = row_words(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
+                words, valid = view_row_words(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
                 synced = synchronise_row(words, valid, setup)
                 reports[name].add(synced)
                 raw, _ = decode_row(data.payload, data.missing, data.frames_expected, chirp.samples, rx)
@@ -191,7 +191,7 @@ def fig12(run: Run) -> Item:
 
 
 def fig15(run: Run) -> Item:
-    """Standard deviation of frequency, phase and amplitude after each stage, and the Cramer-Rao bounds."""
+    """Return the standard deviation of frequency, phase and amplitude after each stage, and the Cramer-Rao bounds."""
     paper = published_values()
     published = {"frequency_hz": paper["frequency_std_hz"], "phase_rad": paper["phase_std_rad"]}
     summary: dict[str, Any] = {name: r.summary() for name, r in sync_scan(run).reports.items()}
@@ -261,7 +261,7 @@ def _tabulate_stages(summary: Mapping[str, Any], published: Mapping[str, float])
 
 
 def tones(chirps: npt.NDArray[np.complex64], chirp: Chirp) -> tuple[npt.NDArray, npt.NDArray]:
-    """IF (Hz) and amplitude of the strongest tone of each chirp, both [chirp], of chirps [rx, chirp, sample].
+    """Return IF (Hz) and amplitude of the strongest tone of each chirp, both [chirp], of chirps [rx, chirp, sample].
 
     Power is summed over RX.
     The peak of the zero-padded spectrum: with 4096 points, a peak between two of them loses less than 0.1 %.

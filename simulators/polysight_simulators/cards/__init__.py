@@ -6,6 +6,6 @@ network with every kind of trouble. `server` runs the cards of one process (`pyt
 Specification: docs/spec/simulated-rig.md.
 """
 
-from polysight_simulators.cards.adversary import KINDS, RADAR, Adversary, Arrival, Sent
+from polysight_simulators.cards.adversary import NETWORK_TROUBLES, RADAR_TROUBLES, Adversary, Arrival, SentRecord
 from polysight_simulators.cards.card import MAC, CardEndpoint, bind_udp
 from polysight_simulators.cards.dca1000 import SOURCE_PORT, Network

@@ -1,9 +1,10 @@
 """A capture card and a network with every kind of trouble, for records of a few packets to thousands.
 
-`KINDS` lists what a card or a network can do (docs/spec/simulated-rig.md marks what a real card was seen to do): the
-card is reset, ends a record early or starts one by itself; the network loses, duplicates, delays and reorders packets.
-Each packet's record stays known: `Arrival.record`. A record is what the card sends of one row of the scan; its frames
-are the radar's, each started by a pulse on SYNC_IN. Probabilities, counts and pauses in here are chosen.
+`NETWORK_TROUBLES` lists the faults of a card or a network (docs/spec/simulated-rig.md marks what a real card was seen
+to do): the card is reset, ends a record early or starts one by itself; the network loses, duplicates, delays and
+reorders packets. Each packet's record stays known: `Arrival.record`. A record is what the card sends of one row of the
+scan; its frames are the radar's, each started by a pulse on SYNC_IN. Probabilities, counts and pauses in here are
+chosen.
 """
 
 import random
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from polysight_simulators.cards.dca1000 import DATA_HEADER_BYTES, Packetiser
 
-KINDS = (
+NETWORK_TROUBLES = (
     # Packets are lost: anywhere, at the end or the beginning of a record, or all of them.
     "lose",
     "lose_tail",
@@ -28,7 +29,7 @@ KINDS = (
     # Every packet comes twice; the second path is slower.
     "two_paths",
     "reorder",
-    # A switch sends packets by turns over queues of different length.
+    # A switch distributes packets over queues of different length, one after another.
     "flows",
     # Packets are held until later ones have come, perhaps those of the next pulses.
     "held",
@@ -53,17 +54,17 @@ KINDS = (
     # The record of the second card comes, and this card's own is lost.
     "twin_alone",
 )
-RADAR = (
+RADAR_TROUBLES = (
     # SYNC_IN pulses are missed.
     "missed",
-    # Nobody sent these edges; the radar counts its frames and ignores as many pulses at the end.
+    # Edges that are not pulses start frames; the radar counts its frames and ignores as many pulses at the end.
     "spurious",
     # A spurious edge replaces a pulse that the radar missed.
     "near",
     # The radar does not count its frames.
     "endless",
 )
-"""What a radar can do, in :meth:`Adversary.take`: only the times of its frames show it."""
+"""Troubles of a radar, for :meth:`Adversary.take`: only the times of its frames show them."""
 # Time in which a radar sends a frame: the published chirp.
 _FRAME_NS = 128_000
 NEAREST_EDGE_NS = 350_000
@@ -82,7 +83,7 @@ class Arrival:
 
 
 @dataclass
-class Sent:
+class SentRecord:
     """One record, and the packets that arrived while the host received it."""
 
     number: int
@@ -93,7 +94,7 @@ class Sent:
     # Packets in the order of their arrival.
     arrivals: list[Arrival] = field(default_factory=list)
     # The card sent the complete record, with consecutive counters.
-    whole: bool = True
+    is_complete: bool = True
     troubles: tuple[str, ...] = ()
 
 
@@ -121,7 +122,8 @@ class Adversary:
         self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
         # Packets that arrive in a later record.
         self._late: list[Arrival] = []
-        # Of the record being made: its data, the numbers of the bytes not yet in a packet, and of each packet's last.
+        # Data of the record that is being made, numbers of its bytes that are not in a packet yet, and number of the
+        # last data byte in each packet.
         self._bytes = np.zeros(0, np.uint8)
         self._waiting = np.zeros(0, np.int64)
         self._made: list[int] = []
@@ -139,42 +141,42 @@ class Adversary:
         self.resets = 0
         self.forget_late()
 
-    def take(self, pulses_ns: NDArray[np.int64], troubles: tuple[str, ...] = ()) -> Sent:
+    def take(self, pulses_ns: NDArray[np.int64], troubles: tuple[str, ...] = ()) -> SentRecord:
         """Send the record of a row whose SYNC_IN pulses, int64 [pulse], start frames.
 
-        Troubles may also be of `RADAR`. The row's data (`Sent.data`) is what all pulses would have given; frames of
-        other edges hold other bytes. Each packet arrives when its last frame fills it.
+        Troubles may also be of `RADAR_TROUBLES`. The row's data (`SentRecord.data`) is what all pulses would have
+        given; frames of other edges hold other bytes. Each packet arrives when its last frame fills it.
         """
         chance = self._chance
-        draw = np.random.default_rng(chance.getrandbits(32))
-        row = draw.integers(1, 256, (pulses_ns.size, self._frame), np.uint8)
-        edges = [(int(t), row[k]) for k, t in enumerate(pulses_ns)]
+        byte_generator = np.random.default_rng(chance.getrandbits(32))
+        frames = byte_generator.integers(1, 256, (pulses_ns.size, self._frame), np.uint8)
+        edges = [(int(t), frames[k]) for k, t in enumerate(pulses_ns)]
         if "missed" in troubles:
             for _ in range(chance.randint(1, min(3, len(edges) - 1))):
                 edges.pop(chance.randrange(len(edges)))
         if "near" in troubles:
             t, _ = edges.pop(chance.randrange(len(edges)))
-            beside = t + chance.choice([-1, 1]) * chance.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
-            edges.append((beside, draw.integers(1, 256, self._frame, np.uint8)))
+            edge_near_pulse = t + chance.choice([-1, 1]) * chance.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
+            edges.append((edge_near_pulse, byte_generator.integers(1, 256, self._frame, np.uint8)))
         if "spurious" in troubles:
             for _ in range(chance.randint(1, 2)):
                 t = chance.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
                 # An edge during a frame or just after it starts none; one near a missed pulse counts as that pulse.
                 if np.abs(np.append(pulses_ns, [e for e, _ in edges]) - t).min() > 5 * _FRAME_NS:
-                    edges.append((t, draw.integers(1, 256, self._frame, np.uint8)))
+                    edges.append((t, byte_generator.integers(1, 256, self._frame, np.uint8)))
         edges.sort(key=lambda edge: edge[0])
         if "endless" not in troubles:
             edges = edges[: pulses_ns.size]
         times = [t for t, _ in edges]
         self._now_ns = int(pulses_ns[0]) - 50_000_000
         sent = self.record(len(edges), troubles, b"".join(f.tobytes() for _, f in edges), times)
-        sent.whole = sent.whole and len(edges) == pulses_ns.size
-        sent.data = row.tobytes()
+        sent.is_complete = sent.is_complete and len(edges) == pulses_ns.size
+        sent.data = frames.tobytes()
         return sent
 
     def record(
         self, frames: int, troubles: tuple[str, ...] = (), data: bytes = b"", edges_ns: list[int] | None = None
-    ) -> Sent:
+    ) -> SentRecord:
         """Send one record with these troubles; delayed packets arrive with later records. Without `data`, draw it.
 
         `edges_ns` are the times of its frames; without them, the packets follow each other.
@@ -182,12 +184,12 @@ class Adversary:
         chance = self._chance
         self._number += 1
         if not data:
-            draw = np.random.default_rng(chance.getrandbits(32))
-            data = draw.integers(1, 256, frames * self._frame, np.uint8).tobytes()
+            byte_generator = np.random.default_rng(chance.getrandbits(32))
+            data = byte_generator.integers(1, 256, frames * self._frame, np.uint8).tobytes()
         begin_ns = self._now_ns + 1_000_000
         if edges_ns is not None:
             begin_ns = edges_ns[0] - 1_000_000
-        sent = Sent(self._number, data, begin_ns, troubles=troubles)
+        sent = SentRecord(self._number, data, begin_ns, troubles=troubles)
         packets, last_bytes = self._make_packets(sent, data)
         made_ns = [begin_ns + (k + 1) * _GAP_NS for k in range(len(packets))]
         if edges_ns is not None:
@@ -196,16 +198,16 @@ class Adversary:
         made_ns = made_ns or [begin_ns]
         # Delayed packets of earlier records: those that come before the first of this record, and those among its own.
         packets_before = self.take_late(0.5)
-        in_between = self.take_late(0.7)
+        packets_between = self.take_late(0.7)
         arriving = self._transmit(packets, made_ns, sent)
         if "twin" in troubles or "twin_alone" in troubles:
-            sent.whole = False
+            sent.is_complete = False
             twin_data = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
             twin = [bytes(p) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
             arriving += [Arrival(made_ns[min(k, len(made_ns) - 1)], p, -1) for k, p in enumerate(twin)]
             arriving.sort(key=lambda a: a.t_ns)
         # Half of them come among the first three packets.
-        for late in in_between:
+        for late_packet in packets_between:
             latest_place = len(arriving)
             if chance.random() < 0.5:
                 latest_place = min(latest_place, 3)
@@ -213,13 +215,13 @@ class Adversary:
             t_ns = made_ns[0]
             if place:
                 t_ns = arriving[place - 1].t_ns
-            arriving.insert(place, Arrival(t_ns, late.packet, late.record))
-        before = [Arrival(self._now_ns + k * 1000, a.packet, a.record) for k, a in enumerate(packets_before)]
-        sent.arrivals = before + arriving
+            arriving.insert(place, Arrival(t_ns, late_packet.packet, late_packet.record))
+        arrivals_before = [Arrival(self._now_ns + k * 1000, a.packet, a.record) for k, a in enumerate(packets_before)]
+        sent.arrivals = arrivals_before + arriving
         self._now_ns = max([begin_ns, *(a.t_ns for a in arriving)]) + 10_000_000
         return sent
 
-    def _make_packets(self, sent: Sent, data: bytes) -> tuple[list[bytes], list[int]]:
+    def _make_packets(self, sent: SentRecord, data: bytes) -> tuple[list[bytes], list[int]]:
         """Return the packets of one record as the card sends them, and the number of the last data byte in each."""
         self._bytes = np.frombuffer(data, dtype=np.uint8)
         self._waiting = np.zeros(0, np.int64)
@@ -227,20 +229,20 @@ class Adversary:
         out = self._send_record(sent, np.arange(len(data)))
         return out, self._made
 
-    def _send_record(self, sent: Sent, data: NDArray[np.int64]) -> list[bytes]:
+    def _send_record(self, sent: SentRecord, data: NDArray[np.int64]) -> list[bytes]:
         """Send bytes of the data, by their numbers."""
         troubles = sent.troubles
         chance = self._chance
         frame = self._frame
         frames = len(data) // frame
         if "miss_frames" in troubles and frames > 1:
-            sent.whole = False
+            sent.is_complete = False
             for missed_frame in sorted(
                 chance.sample(range(frames), chance.randint(1, min(3, frames - 1))), reverse=True
             ):
                 data = np.delete(data, slice(missed_frame * frame, (missed_frame + 1) * frame))
         if "drop_inside" in troubles or "drop_frames" in troubles:
-            sent.whole = False
+            sent.is_complete = False
             if "drop_frames" in troubles:
                 dropped_bytes = frame * chance.randint(1, 3)
             else:
@@ -249,7 +251,7 @@ class Adversary:
             cut = chance.randrange(max(1, len(data) - dropped_bytes))
             data = np.delete(data, slice(cut, cut + dropped_bytes))
         if "two_drops" in troubles:
-            sent.whole = False
+            sent.is_complete = False
             dropped_bytes = frame * chance.randint(1, 2)
             first_part = 16 * chance.randint(1, dropped_bytes // 16 - 1)
             for size in (first_part, dropped_bytes - first_part):
@@ -259,13 +261,13 @@ class Adversary:
             self._reset()
         out: list[bytes] = []
         if "end_early" in troubles and frames > 2:
-            sent.whole = False
+            sent.is_complete = False
             cut = chance.randint(1, frames - 2) * frame
             lost_bytes = chance.randint(0, 1) * frame
             out += self._make_stream(data[:cut]) + self._end()
             data = data[cut + lost_bytes :]
         if "reset" in troubles or "reset_early" in troubles:
-            sent.whole = False
+            sent.is_complete = False
             cut = chance.randrange(len(data) + 1)
             if "reset_early" in troubles:
                 cut = min(cut, 3 * self._payload)
@@ -309,42 +311,46 @@ class Adversary:
         """Time at which the card sends a byte of the data: 0.1 ms (chosen) after it leaves the radar."""
         return edges_ns[byte // self._frame] + _FRAME_NS * (byte % self._frame) // self._frame + 100_000
 
-    def _transmit(self, packets: list[bytes], made_ns: list[int], sent: Sent) -> list[Arrival]:
+    def _transmit(self, packets: list[bytes], made_ns: list[int], sent: SentRecord) -> list[Arrival]:
         """Return the packets that arrive in time, in the order of arrival; keep the delayed ones.
 
         Each trouble delays a packet by at most 0.6 ms, and lets others overtake it; only "held" waits for later pulses.
         """
-        t = sent.troubles
+        troubles = sent.troubles
         chance = self._chance
         n = len(packets)
         lost_packets: set[int] = set()
-        if "lose_all" in t or "twin_alone" in t:
+        if "lose_all" in troubles or "twin_alone" in troubles:
             lost_packets = set(range(n))
-        if "lose" in t:
+        if "lose" in troubles:
             lost_packets |= {k for k in range(n) if chance.random() < chance.choice([0.02, 0.2])}
-        if "lose_head" in t:
+        if "lose_head" in troubles:
             lost_packets |= set(range(min(n, chance.randint(1, 4))))
-        if "lose_tail" in t:
+        if "lose_tail" in troubles:
             lost_packets |= set(range(max(0, n - chance.randint(1, 4)), n))
-        late: set[int] = set()
-        if "delay" in t and n:
-            late |= {chance.randrange(n) for _ in range(chance.randint(1, 3))}
-        if "backlog" in t:
-            late |= set(range(max(0, n - chance.randint(1, 4)), n))
-        self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late - lost_packets)]
+        late_packets: set[int] = set()
+        if "delay" in troubles and n:
+            late_packets |= {chance.randrange(n) for _ in range(chance.randint(1, 3))}
+        if "backlog" in troubles:
+            late_packets |= set(range(max(0, n - chance.randint(1, 4)), n))
+        self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late_packets - lost_packets)]
         # Arrival time, number in the record, and bytes of each packet.
-        coming = [(made_ns[k], k, self._damage(packets[k], t)) for k in range(n) if k not in lost_packets | late]
-        if "duplicate" in t and coming:
+        coming = [
+            (made_ns[k], k, self._damage(packets[k], troubles))
+            for k in range(n)
+            if k not in lost_packets | late_packets
+        ]
+        if "duplicate" in troubles and coming:
             coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
-        if "two_paths" in t:
+        if "two_paths" in troubles:
             coming += [(t_ns + chance.choice([10_000, 600_000]), k, p) for t_ns, k, p in coming]
             if chance.random() < 0.5 and n:
                 self._late.append(Arrival(0, packets[-1], sent.number))
-        if "reorder" in t:
+        if "reorder" in troubles:
             coming = [(t_ns + chance.randint(0, 120_000) * (chance.random() < 0.2), k, p) for t_ns, k, p in coming]
-        if "flows" in t:
+        if "flows" in troubles:
             coming = [(t_ns + 100_000 * (k % 3), k, p) for t_ns, k, p in coming]
-        if "held" in t:
+        if "held" in troubles:
             # Two of three packets wait for the fifth or the tenth after them.
             coming = [(made_ns[min(k + 5 * (k % 3), n - 1)] + k % 3, k, p) for _, k, p in coming]
         return [Arrival(t_ns, p, sent.number) for t_ns, _, p in sorted(coming, key=lambda c: c[0])]
@@ -355,7 +361,7 @@ class Adversary:
             return packet[: self._chance.randint(DATA_HEADER_BYTES, len(packet))]
         if "turn_header_bit" in troubles and self._chance.random() < 0.05:
             bit = self._chance.randrange(8 * DATA_HEADER_BYTES)
-            turned = bytearray(packet)
-            turned[bit // 8] ^= 1 << bit % 8
-            return bytes(turned)
+            damaged_packet = bytearray(packet)
+            damaged_packet[bit // 8] ^= 1 << bit % 8
+            return bytes(damaged_packet)
         return packet

@@ -249,18 +249,18 @@ class CardSender:
 
 def bind_udp(address: str, port: int) -> socket.socket:
     """Return a UDP socket bound to an address of this machine. Raises DeviceError."""
-    s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp_socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        s.bind((address, port))
+        udp_socket.bind((address, port))
     except OSError as e:
-        s.close()
+        udp_socket.close()
         raise DeviceError(
             f"simulated card: cannot bind {address}:{port}: {e.strerror}",
             "another simulated rig uses this address, or it is not an address of this machine (loopback is 127.x.y.z)",
             "start the rig with `python -m polysight_simulators.rig`, which chooses free loopback addresses",
             code=ErrorCode.BUSY,
         ) from None
-    return s
+    return udp_socket
 
 
 def _can_segment(s: socket.socket) -> bool:
@@ -499,7 +499,7 @@ class SimulatedCard:
         # Number of the chip, by which the host distinguishes boards.
         die = 1 + [b.name for b in rig.boards].index(board.name)
         if native:
-            self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die=die)
+            self.radar = RadarBoard(clock_s, dead_s=dead_s, fault_pulses=faults.radar_fault_pulses, die_number=die)
         else:
             self.radar = None
         self._sync = SyncInput(rig, self.radar)
@@ -517,7 +517,7 @@ class SimulatedCard:
         """Its DCA1000."""
         return self.endpoint.card
 
-    def pulses(self, rising_ns: list[int], track: StageTrack) -> None:
+    def process_pulses(self, rising_ns: list[int], track: StageTrack) -> None:
         """Process rising edges of SYNC_IN at these wire times."""
         pulses = [Pulse(self._pulses + i, t) for i, t in enumerate(rising_ns)]
         self._pulses += len(pulses)

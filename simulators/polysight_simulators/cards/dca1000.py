@@ -148,15 +148,15 @@ class Packetiser:
         fresh = np.ascontiguousarray(lvds).view(np.uint8).reshape(-1)
         stream = np.concatenate([self._rest, fresh])
         n = len(stream) // self.payload_bytes
-        used = n * self.payload_bytes
-        self._rest = stream[used:].copy()
-        return self._pack(stream[:used].reshape(n, self.payload_bytes))
+        used_bytes = n * self.payload_bytes
+        self._rest = stream[used_bytes:].copy()
+        return self._pack(stream[:used_bytes].reshape(n, self.payload_bytes))
 
     def flush(self) -> Bytes2D:
         """Return the short last packet, [1, 10 + rest]; [0, 10] if nothing is left."""
-        rest = self._rest
+        waiting_bytes = self._rest
         self._rest = np.empty(0, np.uint8)
-        return self._pack(rest.reshape(1 if len(rest) else 0, len(rest)))
+        return self._pack(waiting_bytes.reshape(1 if len(waiting_bytes) else 0, len(waiting_bytes)))
 
     def _pack(self, payload: Bytes2D) -> Bytes2D:
         """Put headers before payloads, uint8 [n, size], and advance the counters."""

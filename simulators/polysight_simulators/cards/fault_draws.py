@@ -99,9 +99,9 @@ class NetworkFaults:
 
     def drain(self) -> list[Rows]:
         """Return the packets held back, which arrive now: after the next packet, or at the end of a record."""
-        held = self._held
+        held_packets = self._held
         self._held = []
-        return held
+        return held_packets
 
 
 class PulseFaults:

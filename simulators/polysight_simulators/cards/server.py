@@ -60,13 +60,13 @@ class CardServer:
         self._trigger_ns = 0
         self._pulse_ns = 0
         self._selector = selectors.DefaultSelector()
-        # Of each card: the number of its binding (`CardEndpoint.bindings`), and its descriptor then.
+        # By card: the number of its binding (`CardEndpoint.bindings`), and the descriptor of its socket at that time.
         self._bound: dict[SimulatedCard, tuple[int, int]] = {}
         self._select_cards()
         self._selector.register(wires, selectors.EVENT_READ)
         for server in (*control, *chips):
             self._selector.register(server, selectors.EVENT_READ)
-        # Whether the wires are watched, whether their client may hold unread lines, and when they are next read.
+        # True while the wires are watched; true while their client may have unread lines; time of the next read.
         self._listening = True
         self._unread = False
         self._next_read_s = 0.0
@@ -109,11 +109,11 @@ class CardServer:
 
     def _select_cards(self) -> None:
         """Register the cards' sockets, which change at a power cycle."""
-        changed = [card for card in self._cards if self._bound.get(card, (0,))[0] != card.endpoint.bindings]
-        for card in changed:
+        changed_cards = [card for card in self._cards if self._bound.get(card, (0,))[0] != card.endpoint.bindings]
+        for card in changed_cards:
             if card in self._bound:
                 self._selector.unregister(self._bound[card][1])
-        for card in changed:
+        for card in changed_cards:
             descriptor = card.endpoint.fileno()
             self._selector.register(descriptor, selectors.EVENT_READ)
             self._bound[card] = (card.endpoint.bindings, descriptor)
@@ -134,7 +134,7 @@ class CardServer:
                 self._take_edge(message, rising)
         for card in self._cards:
             if rising[card.line]:
-                card.pulses(rising[card.line], self._track)
+                card.process_pulses(rising[card.line], self._track)
                 self._next_read_s = self._clock_s() + GATHER_S
         return any(rising.values())
 

@@ -15,8 +15,8 @@ from polysight_simulators.radars import RadarBoard
 # Shortest time between the end of a frame and the next SYNC_IN pulse (AWR2243, hardware trigger: TI mmWave Radar
 # Interface Control, page 93).
 RECOVERY_US = 150.0
-# The last so many motion lines, and triggers, are kept at least; they are cut to it at twice as many; chosen.
-_KEEP = 4096
+# Number of motion lines, and of triggers, that are kept at least; the oldest are removed at twice this number; chosen.
+_KEPT_LINES = 4096
 
 
 class Pulse(NamedTuple):
@@ -115,17 +115,17 @@ class StageTrack:
             self._line_times.clear()
         self._lines.append(motion)
         self._line_times.append(motion.t_ns)
-        if len(self._lines) > 2 * _KEEP:
-            del self._lines[:_KEEP]
-            del self._line_times[:_KEEP]
+        if len(self._lines) > 2 * _KEPT_LINES:
+            del self._lines[:_KEPT_LINES]
+            del self._line_times[:_KEPT_LINES]
 
     def trigger(self, t_ns: int) -> None:
         """Record a trigger of the stage."""
         if self._triggers and t_ns < self._triggers[-1]:
             self._triggers.clear()
         self._triggers.append(t_ns)
-        if len(self._triggers) > 2 * _KEEP:
-            del self._triggers[:_KEEP]
+        if len(self._triggers) > 2 * _KEPT_LINES:
+            del self._triggers[:_KEPT_LINES]
 
     @property
     def moving(self) -> bool:

@@ -5,6 +5,6 @@ connects it to a host: through its USB chip, at a TCP address, or by the line se
 MATLAB servers.
 """
 
-from polysight_simulators.radars.board import FUNCTIONAL, Fault, RadarBoard
+from polysight_simulators.radars.board import FUNCTIONAL_LEVELS, Fault, RadarBoard
 from polysight_simulators.radars.control import LineServer, RadarSocket, UsbChip
 from polysight_simulators.radars.cores import make_image

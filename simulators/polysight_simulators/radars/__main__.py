@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from polysight_simulators.process import command_line
-from polysight_simulators.radars.board import FUNCTIONAL, RadarBoard
+from polysight_simulators.radars.board import FUNCTIONAL_LEVELS, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
-# Where the traced board raised its interrupt, the simulated clock advances in these steps until the simulated board
+# If the traced board raised its interrupt, the simulated clock advances in these steps until the simulated board
 # raises its own, at most for this timeout. Chosen; the timeout is longer than the start of a board.
 _STEP_S = 1e-4
 _TIMEOUT_S = 15.0
@@ -53,7 +53,7 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
         time.s = max(time.s, record.get("t", 0.0))
         if record.get("line") == "NRST":
             # Set before the release of the reset, at which the board reads its mode from the sense-on-power pins.
-            board.sense(FUNCTIONAL)
+            board.set_sense_lines(FUNCTIONAL_LEVELS)
             board.reset(held=not record["level"])
         elif record.get("line") == "HOST_INTR" and record["level"]:
             until = time.s + _TIMEOUT_S
@@ -65,9 +65,9 @@ def replay(trace: Path, make: Callable[[Callable[[], float]], RadarBoard]) -> li
             for word in _list_words(record["out"]):
                 board.write_word(word)
         elif "in" in record:
-            sent = [board.read_word() for _ in _list_words(record["in"])]
-            if sent != _list_words(record["in"]):
-                sent_hex = b"".join(w.to_bytes(2, "little") for w in sent).hex()
+            sent_words = [board.read_word() for _ in _list_words(record["in"])]
+            if sent_words != _list_words(record["in"]):
+                sent_hex = b"".join(w.to_bytes(2, "little") for w in sent_words).hex()
                 differences.append(f"line {number}: the traced board sent {record['in']}, the simulated one {sent_hex}")
     return differences
 

@@ -16,19 +16,19 @@ from polysight_simulators.radars.cores import (
     ERASE_S,
     EVENT,
     FRAME_END,
+    HOST_READY,
     NACK,
-    READY,
     RESPONSE,
     RF_FAULT,
     TO_DEVICE,
     Cores,
-    frame,
-    ones_sum,
+    compute_ones_sum,
+    encode_message,
 )
 
 # Levels of the three sense-on-power lines for functional mode. The bits are in the order in which the USB chip's pins
 # drive them (`control.py`): only the highest is set.
-FUNCTIONAL = 4
+FUNCTIONAL_LEVELS = 4
 # Delays of an answer, and of its data after the interrupt. Chosen: real timing is not known.
 ANSWER_S = 1e-4
 DATA_S = 1e-3
@@ -61,7 +61,7 @@ class RadarBoard:
         Minimum time from a frame's pulse to the next; default: the frame period.
     fault_pulses
         Numbers, from 0, of the pulses at which the RF core faults; all pulses since the board was made are counted.
-    die
+    die_number
         Part of the die id, which identifies the board.
     supply_v
         Voltage of the RF supplies; LDO bypass at 1.3 V destroys the board.
@@ -89,7 +89,7 @@ class RadarBoard:
         flash: bytes = b"",
         dead_s: float | None = None,
         fault_pulses: tuple[int, ...] = (),
-        die: int = 1,
+        die_number: int = 1,
         supply_v: float = 1.3,
         erase_s: float = ERASE_S,
         fault_at: str = "power-up",
@@ -103,7 +103,7 @@ class RadarBoard:
         self.functional_jumpers = functional_jumpers
         self._answers_32_bit = answers_32_bit
         self.cores = Cores(
-            now, self._send_event, flash, die=die, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
+            now, self._send_event, flash, die_number=die_number, supply_v=supply_v, erase_s=erase_s, fault_at=fault_at,
             first_generation=first_generation,
         )  # fmt: skip
         self.plugged = True
@@ -153,7 +153,7 @@ class RadarBoard:
         self._pulse_s = float("-inf")
         # Commands that come before this time are ignored
         self._busy_until = -1.0
-        self.cores.forget()
+        self.cores.reset()
 
     def inject(self, *faults: Fault) -> None:
         """Set the faults of the next answers, one each; earlier ones are discarded."""
@@ -161,14 +161,14 @@ class RadarBoard:
 
     # --- lines: supply, reset, sense-on-power, host interrupt, SYNC_IN ------------------------------------------------
 
-    def power(self, on: bool) -> None:
+    def switch_power(self, on: bool) -> None:
         """Switch the board's supply, not that of its USB chip; the flash keeps its content."""
         self._forget()
         self.powered = on
         if on and not self._is_in_reset:
             self._boot()
 
-    def sense(self, mode: int) -> None:
+    def set_sense_lines(self, mode: int) -> None:
         """Set the sense-on-power lines, which are read at the release of the reset."""
         self._sense_lines = mode
 
@@ -182,7 +182,7 @@ class RadarBoard:
 
     def _boot(self) -> None:
         """Boot if supply, jumpers and sense lines allow it."""
-        if self._sense_lines == FUNCTIONAL and self.functional_jumpers and self.powered and not self.destroyed:
+        if self._sense_lines == FUNCTIONAL_LEVELS and self.functional_jumpers and self.powered and not self.destroyed:
             self.cores.boot()
 
     @property
@@ -243,10 +243,10 @@ class RadarBoard:
         self._check_plugged()
         self._deliver()
         self._in += word.to_bytes(2, "little")
-        while len(self._in) >= 4 and self._in[:4] not in (TO_DEVICE, READY):
+        while len(self._in) >= 4 and self._in[:4] not in (TO_DEVICE, HOST_READY):
             del self._in[:2]
-        # READY: the host asks for the message that the interrupt announced.
-        if self._in[:4] == READY and len(self._in) >= 16:
+        # HOST_READY: the host asks for the message that the interrupt announced.
+        if self._in[:4] == HOST_READY and len(self._in) >= 16:
             del self._in[:16]
             self._interrupt_raised = False
             if self._waiting:
@@ -254,7 +254,7 @@ class RadarBoard:
                 self._readable_from = self.now() + DATA_S
         elif self._in[:4] == TO_DEVICE and len(self._in) >= 16:
             length = int.from_bytes(self._in[6:8], "little")
-            if ones_sum(bytes(self._in[4:16])) != 0xFFFF:
+            if compute_ones_sum(bytes(self._in[4:16])) != 0xFFFF:
                 # There is no response: the host has a timeout.
                 self._in.clear()
             elif len(self._in) >= 4 + length:
@@ -295,9 +295,9 @@ class RadarBoard:
 
     def _send_event(self, number: int, data: bytes, delay_s: float) -> None:
         """Send an event after a delay; numbers from 0x4000 on are the main core's, others the RF core's."""
-        from_main_core = number >= 0x4000
+        is_from_main_core = number >= 0x4000
         # Wide: with a CRC of 32 bits.
-        if from_main_core:
+        if is_from_main_core:
             wide = self.cores.crc32_events
         else:
             wide = not self.cores.first_generation
@@ -305,8 +305,8 @@ class RadarBoard:
         # Directions (ICD table 2.2): 6 from the main core to the host, 2 from the RF core. A sub-block's number is that
         # of its message times 32, and its own.
         self._send(
-            frame(
-                direction=6 if from_main_core else 2,
+            encode_message(
+                direction=6 if is_from_main_core else 2,
                 kind=EVENT,
                 number=number // 32,
                 body=block,
@@ -332,10 +332,10 @@ class RadarBoard:
         sequence = flags >> 12
         wide = self._answers_32_bit
         if fault is Fault.NACK or zlib.crc32(raw[: length - 4]) != int.from_bytes(raw[length - 4 :], "little"):
-            self._send(
-                frame(direction=direction, kind=NACK, number=number, body=b"", count=0, sequence=sequence, wide=wide),
-                0.0,
+            refusal = encode_message(
+                direction=direction, kind=NACK, number=number, body=b"", count=0, sequence=sequence, wide=wide
             )
+            self._send(refusal, 0.0)
             return
         is_retry = flags & 3 == 3
         if is_retry and self._last_answer[0] == sequence and self._last_answer[1]:
@@ -374,7 +374,7 @@ class RadarBoard:
         if error and (self.cores.first_generation or fault is Fault.REFUSE_BARE):
             # An AWR1243 announces this sub-block, but does not send it.
             blocks = b""
-        answer = frame(
+        answer = encode_message(
             direction=direction,
             kind=RESPONSE,
             number=number,

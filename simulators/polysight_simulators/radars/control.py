@@ -26,9 +26,9 @@ from polysight_simulators.faults import Faults
 from polysight_simulators.radars.board import RadarBoard
 
 # Pins of channel A: clock, data to the board, chip select.
-_CLOCK = 1 << 0
-_OUT = 1 << 1
-_SELECT = 1 << 3
+_CLOCK_PIN = 1 << 0
+_OUT_PIN = 1 << 1
+_SELECT_PIN = 1 << 3
 # MPSSE commands (FTDI AN_108): set and read the pins, set the clock divisor, write and read bytes, and commands without
 # arguments, of which one selects the clock of 60 MHz.
 _SET_PINS = 0x80
@@ -37,7 +37,7 @@ _SET_DIVISOR = 0x86
 _WRITE_BYTES = 0x11
 _READ_BYTES = 0x20
 _FAST_CLOCK = 0x8A
-_BARE = (0x85, 0x87, _FAST_CLOCK, 0x8C, 0x8D, 0x97)
+_COMMANDS_WITHOUT_DATA = (0x85, 0x87, _FAST_CLOCK, 0x8C, 0x8D, 0x97)
 # Bit of the host interrupt in the pins of channel B.
 _INTERRUPT_BIT = 5
 _CHANNELS = "ABCD"
@@ -48,7 +48,7 @@ _PIN_S = 0.2e-6
 _CLOCKS_S = 0.2e-6
 # Channel, operation and size of a request.
 _HEAD = struct.Struct("<ccH")
-LINE = b"Retrigger"
+RETRIGGER_LINE = b"Retrigger"
 # With this option, closing a connection sends a reset.
 _NO_LINGER = struct.pack("ii", 1, 0)
 
@@ -83,23 +83,23 @@ class UsbChip:
             # Pins 2 to 4 are the sense-on-power pins: 0b100 is the functional mode, 4.
             sense_pins = data[-1] >> 2 & 0b111
             self._sense = 4 if sense_pins == 0b100 else 0
-            self._board.sense(self._sense)
+            self._board.set_sense_lines(self._sense)
         elif name == "C":
             # The board runs while pins 6 and 7, its reset lines, are both high.
             for pins in data:
                 self._board.reset(held=pins >> 6 & 0b11 != 0b11)
         else:
             # USB delays each request: a chip select that is high between two of them has been so for long enough.
-            if name == "A" and self._pins & _SELECT:
+            if name == "A" and self._pins & _SELECT_PIN:
                 self._high_s = float("inf")
             self._pending[name] += data
             commands: dict[str, Callable[[bytearray], int]] = {"A": self._transfer_spi, "B": self._set_gpio}
             while self._pending[name]:
-                used = commands[name](self._pending[name])
-                if used == 0:
+                used_bytes = commands[name](self._pending[name])
+                if used_bytes == 0:
                     # The command is incomplete: wait for the rest.
                     return
-                del self._pending[name][:used]
+                del self._pending[name][:used_bytes]
 
     def give(self, name: str, size: int) -> bytes:
         """Return up to `size` bytes of a channel for the host. Raises DeviceError if unplugged."""
@@ -115,7 +115,7 @@ class UsbChip:
     def _transfer_spi(self, data: bytearray) -> int:
         """Execute the first command of channel A; return its length in bytes, or 0 if it is incomplete."""
         code = data[0]
-        if code in _BARE:
+        if code in _COMMANDS_WITHOUT_DATA:
             self._fast = self._fast or code == _FAST_CLOCK
             return 1
         if code == _SET_DIVISOR:
@@ -134,8 +134,8 @@ class UsbChip:
         count = 1 + int.from_bytes(data[1:3], "little")
         if code == _WRITE_BYTES and len(data) < 3 + count:
             return 0
-        if count != 2 or self._pins & _SELECT:
-            self.errors.append(f"{count} bytes at once, chip select {'high' if self._pins & _SELECT else 'low'}")
+        if count != 2 or self._pins & _SELECT_PIN:
+            self.errors.append(f"{count} bytes together, chip select {'high' if self._pins & _SELECT_PIN else 'low'}")
         if self._latched:
             self.errors.append("two words under one chip select")
         elif self._low_s < 2 * _CLOCKS_S - 1e-9:
@@ -155,12 +155,12 @@ class UsbChip:
             return 0
         pins = data[1]
         direction = data[2]
-        if direction & (_CLOCK | _OUT | _SELECT) != _CLOCK | _OUT | _SELECT:
+        if direction & (_CLOCK_PIN | _OUT_PIN | _SELECT_PIN) != _CLOCK_PIN | _OUT_PIN | _SELECT_PIN:
             self.errors.append(f"clock, data or chip select is not driven (direction {direction:08b})")
-        if pins & _CLOCK:
+        if pins & _CLOCK_PIN:
             self.errors.append("the clock rests high: not SPI mode 0")
-        was_high = self._pins & _SELECT
-        if pins & _SELECT:
+        was_high = self._pins & _SELECT_PIN
+        if pins & _SELECT_PIN:
             self._latched = 0
             if was_high:
                 self._high_s += _PIN_S
@@ -179,7 +179,7 @@ class UsbChip:
     def _set_gpio(self, data: bytearray) -> int:
         """Execute the first command of channel B; return its length in bytes, or 0 if it is incomplete."""
         code = data[0]
-        if code in _BARE:
+        if code in _COMMANDS_WITHOUT_DATA:
             return 1
         if code == _SET_PINS:
             if len(data) < 3:
@@ -327,9 +327,9 @@ class LineServer(_Server):
 
     def _execute(self, client: socket.socket, data: bytes) -> bytes:
         """Rearm for each whole line, but as the faults say; return the bytes that are left."""
-        *lines, rest = data.split(b"\n")
+        *lines, unfinished_line = data.split(b"\n")
         for line in lines:
-            if line.strip() != LINE:
+            if line.strip() != RETRIGGER_LINE:
                 continue
             number = self.lines
             self.lines = self.lines + 1
@@ -338,4 +338,4 @@ class LineServer(_Server):
                 raise ConnectionResetError
             if number not in self._faults.retrigger_fails:
                 self._rearm()
-        return rest
+        return unfinished_line

@@ -15,9 +15,9 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-# First bytes of a message to the device, of the host's word that it is ready to read, and of a message from the device.
+# First bytes of a message to the device, of the host's signal that it is ready, and of a message from the device.
 TO_DEVICE = bytes.fromhex("34122143")
-READY = bytes.fromhex("78566587")
+HOST_READY = bytes.fromhex("78566587")
 FROM_DEVICE = bytes.fromhex("badccdab")
 # Kinds of messages.
 RESPONSE = 1
@@ -34,7 +34,7 @@ OLD_UP_WRITTEN = bytes.fromhex("10aa0500") + bytes(16)
 POWER_UP_TIME = 0x5AA10
 
 
-def ones_sum(head: bytes) -> int:
+def compute_ones_sum(head: bytes) -> int:
     """Compute the ones-complement sum of 16-bit words; 0xFFFF over a header with its checksum (ICD 2.3.2)."""
     total = sum(struct.unpack(f"<{len(head) // 2}H", head))
     while total > 0xFFFF:
@@ -42,7 +42,7 @@ def ones_sum(head: bytes) -> int:
     return total
 
 
-def frame(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
+def encode_message(direction: int, kind: int, number: int, body: bytes, count: int, sequence: int, wide: bool) -> bytes:
     """Encode a message with a CRC of 32 (`wide`) or 16 bits (ICD 2.3); the latter has its acknowledgement bits set.
 
     `direction`: code of sender and receiver, four bits; `kind`: such as RESPONSE; `number`: message id; `body`: `count`
@@ -55,7 +55,7 @@ def frame(direction: int, kind: int, number: int, body: bytes, count: int, seque
         flags = sequence << 12 | 1 << 10
         crc_bytes = 4
     head = struct.pack("<5H", direction | kind << 4 | number << 6, 12 + len(body) + crc_bytes, flags, 0, count)
-    head += struct.pack("<H", 0xFFFF - ones_sum(head))
+    head += struct.pack("<H", 0xFFFF - compute_ones_sum(head))
     crc = zlib.crc32(head + body).to_bytes(4, "little")
     if not wide:
         crc = binascii.crc_hqx(head + body, 0xFFFF).to_bytes(2, "little")
@@ -66,12 +66,12 @@ def frame(direction: int, kind: int, number: int, body: bytes, count: int, seque
 METAHEADER_NOT_FOUND = 1 << 6
 METAHEADER_CRC_FAILURE = 1 << 30
 MSSIMAGE_NOT_FOUND = 1 << 28
-# Versions: major, minor, build, debug, year, month, day. Where the two parts of an image begin.
+# Versions: major, minor, build, debug, year, month, day. Then the offsets of the two parts of an image.
 _ROM = bytes((2, 2, 1, 7, 20, 3, 17))
 _MAIN_PATCH = bytes((2, 2, 2, 0, 20, 7, 29))
 _RF_PATCH = bytes((2, 2, 4, 0, 22, 7, 6))
-_MAIN_AT = 0x80
-_RF_AT = 0x880
+_MAIN_OFFSET = 0x80
+_RF_OFFSET = 0x880
 
 
 def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
@@ -82,13 +82,13 @@ def make_image(size: int = 7940, *, rom: bytes = _ROM) -> bytes:
     filler = bytes(n * 7 % 251 for n in range(size - 4))
     image = bytearray(filler)
     head = struct.pack("<4s5I", b"MSTR", 2, 0x37, 0, 0, size - 4)
-    image[:_MAIN_AT] = head.ljust(0x5C, b"\0") + b"MEND".ljust(0x24, b"\0")
-    for offset, patch in ((_MAIN_AT, _MAIN_PATCH), (_RF_AT, _RF_PATCH)):
+    image[:_MAIN_OFFSET] = head.ljust(0x5C, b"\0") + b"MEND".ljust(0x24, b"\0")
+    for offset, patch in ((_MAIN_OFFSET, _MAIN_PATCH), (_RF_OFFSET, _RF_PATCH)):
         image[offset : offset + 0x60] = b"RPRC".ljust(0x38, b"\0") + rom.ljust(0x10, b"\0") + patch.ljust(0x18, b"\0")
     return bytes(image) + zlib.crc32(image).to_bytes(4, "little")
 
 
-def boot_errors(image: bytes) -> int:
+def find_boot_errors(image: bytes) -> int:
     """Return the status bits of a boot from this image (ICD table 7.3); 0 if it succeeds."""
     if image[:4] != b"MSTR":
         return METAHEADER_NOT_FOUND | MSSIMAGE_NOT_FOUND
@@ -103,7 +103,7 @@ def encode_patch_version(image: bytes, main: bool) -> bytes:
 
     `main`: of the main core's part of the image, otherwise of the RF core's.
     """
-    start = _MAIN_AT if main else _RF_AT
+    start = _MAIN_OFFSET if main else _RF_OFFSET
     offset = start + 0x48
     major, minor, build, debug, *date = image[offset : offset + 7]
     return bytes((major, minor, *date, build << 4 | debug))
@@ -161,9 +161,9 @@ RESTORE = 0x008B
 # Calibration data come in three parts.
 CHUNK_BYTES = 224
 CHUNKS = 3
-# Number of data bytes of each sub-block. Numbers without a name are settings that are only stored, and in
-# docs/spec/mmwavelink.md: 0x0080 channels, 0x0082 ADC output, 0x4041 data format, 0x40C0 frame of the interface.
-SIZES = {
+# Number of data bytes of each sub-block. Numbers without a name are those of settings that are only stored; the others
+# are explained in docs/spec/mmwavelink.md: 0x0080 channels, 0x0082 ADC output, 0x4041 data format, 0x40C0 frame size.
+DATA_BYTES = {
     0x0080: 8, 0x0082: 8, 0x0083: 4, 0x0085: 4, 0x0086: 12, 0x0089: 12, RESTORE: 228, 0x008D: 16, SAVE: 4, INIT_RF: 0,
     PROFILE: 44, CHIRP: 20, FRAME: 24, STREAM_SET: 20, STREAM: 4, READ_PROFILE: 4, READ_CHIRP: 4, READ_FRAME: 0,
     START_OR_STOP_FRAMES: 4,
@@ -189,7 +189,7 @@ class Cores:
         Clock in seconds, and a function that sends an event: number, data, delay in s.
     flash, ram
         Images in the serial flash and downloaded to RAM; empty: none.
-    die
+    die_number
         Part of the die id, which identifies the board; 0: the id is all zeros.
     supply_v
         Voltage of the RF supplies; LDO bypass above 1.1 V makes the board `destroyed`.
@@ -215,16 +215,16 @@ class Cores:
     event: Callable[[int, bytes, float], None]
     flash: bytes = b""
     ram: bytes = b""
-    die: int = 1
+    die_number: int = 1
     supply_v: float = 1.3
     erase_s: float = ERASE_S
     fault_at: str = "power-up"
     first_generation: bool = False
     hardware_bits: int = 0
     # Bits of the self-tests of the RF core that pass.
-    rf_tests: int = 0x07FFFFFF
+    passing_rf_tests: int = 0x07FFFFFF
     # Bits of the RF calibrations that pass.
-    passes: int = 0x1FFE
+    passing_calibrations: int = 0x1FFE
     main_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     rf_rom: tuple[int, int, int, int] = (2, 2, 1, 7)
     destroyed: bool = False
@@ -235,9 +235,9 @@ class Cores:
     armings: int = 0
 
     def __post_init__(self) -> None:
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Reset: clear RAM and settings, keep the flash."""
         self.ram = b""
         # The flash's image from which the main core booted; empty: from ROM alone.
@@ -264,7 +264,7 @@ class Cores:
     def boot(self) -> None:
         """Boot in functional mode: ROM, then the flash's image if it is complete (ICD 5.21.1); report it by events."""
         self.main_up = True
-        broken = boot_errors(self.flash)
+        broken = find_boot_errors(self.flash)
         self._booted = b"" if broken else self.flash
         if self.first_generation:
             self.event(UP_MAIN, OLD_UP_EMPTY if broken else OLD_UP_WRITTEN, BOOT_S)
@@ -281,9 +281,9 @@ class Cores:
         if number == DOWNLOAD:
             return self._download(data, remaining)
         # A first-generation board does not know the PLL bandwidths, 0x008D.
-        if number not in SIZES or (self.first_generation and number == 0x008D):
+        if number not in DATA_BYTES or (self.first_generation and number == 0x008D):
             return UNKNOWN_COMMAND, b"", 0.0
-        if len(data) != SIZES[number]:
+        if len(data) != DATA_BYTES[number]:
             return WRONG_LENGTH, b"", 0.0
         if not self.main_up or (number not in _WITHOUT_RF and not self.rf_up):
             return WRONG_STATE, b"", 0.0
@@ -316,21 +316,21 @@ class Cores:
             if self._choose_image() or not self.first_generation:
                 self.rf_up = True
                 # Self-tests, and the duration of the power-up; chosen.
-                self.event(UP_RF, struct.pack("<4I", self.rf_tests, 2000, 0, 0), RF_UP_S)
+                self.event(UP_RF, struct.pack("<4I", self.passing_rf_tests, 2000, 0, 0), RF_UP_S)
         elif number == INIT_RF:
             self.calibrated = True
-            self._report_calibration(self.passes)
+            self._report_calibration(self.passing_calibrations)
         elif number == SET_LDO_BYPASS and data[0] & 1 and self.supply_v > 1.1:
             self.destroyed = True
         elif number in (READ_RF_VERSION, READ_MAIN_VERSION):
             rom = self.main_rom if number == READ_MAIN_VERSION else self.rf_rom
             # Three bytes of the hardware (chosen), the ROM's version, and its date as in _ROM.
-            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._patch(main=number == READ_MAIN_VERSION)
+            return bytes((1, 2, 0, *rom, 20, 3, 17)) + self._find_patch_version(main=number == READ_MAIN_VERSION)
         elif number == READ_DIE:
-            if not self.die:
+            if not self.die_number:
                 return bytes(32)
-            # Any words: only that they differ from board to board counts.
-            return struct.pack("<8I", 0x5EED0000 + self.die, 0xD1E, 2243, self.die, 0, 0, 0, 0)
+            # The words are arbitrary, but differ from board to board.
+            return struct.pack("<8I", 0x5EED0000 + self.die_number, 0xD1E, 2243, self.die_number, 0, 0, 0, 0)
         elif number == READ_TEMPERATURES:
             # Device time in ms, then degrees Celsius of ten sensors; chosen.
             return struct.pack("<I10h", int(self.now() * 1e3) & 0xFFFFFFFF, 41, 41, 42, 42, 45, 46, 45, 40, 43, 0)
@@ -338,11 +338,11 @@ class Cores:
 
     def _choose_image(self) -> bytes:
         """Return the image that the cores run: the downloaded one, else the flash's; b"" without."""
-        if self.ram and not boot_errors(self.ram):
+        if self.ram and not find_boot_errors(self.ram):
             return self.ram
         return self._booted
 
-    def _patch(self, main: bool) -> bytes:
+    def _find_patch_version(self, main: bool) -> bytes:
         """Return the patch version of a core as in a version answer; zeros without a patch."""
         image = self._choose_image()
         if image:
@@ -355,7 +355,7 @@ class Cores:
 
     def _store_profile_or_chirps(self, number: int, data: bytes) -> int:
         """Store a profile (0..3), or chirps (0..511) of one (ICD tables 5.24, 5.26); return an error number."""
-        # Of chirps: the first, the last and their profile. Data of a profile begin with its number, too.
+        # The data of chirps begin with the first, the last and their profile; those of a profile with its number.
         first, last, profile = struct.unpack_from("<3H", data)
         if number == PROFILE:
             if first > 3:
@@ -376,14 +376,14 @@ class Cores:
 
     def _read_back(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Read back a setting in the form in which it was sent (ICD 5.6.1..5.6.6)."""
-        stored = {
+        stored_data = {
             READ_PROFILE: lambda: self.profiles.get(struct.unpack_from("<H", data)[0]),
             READ_CHIRP: lambda: self.chirps.get(struct.unpack_from("<H", data)[0]),
             READ_FRAME: lambda: self.settings.get(FRAME),
         }[number]()
-        if stored is None:
+        if stored_data is None:
             return INVALID_INPUT, b""
-        return 0, stored
+        return 0, stored_data
 
     def _save_or_restore_calibration(self, number: int, data: bytes) -> tuple[int, bytes]:
         """Save or restore 672 bytes of calibration in three parts (ICD 5.2.11, 5.3.2); return error number and answer.
@@ -396,10 +396,10 @@ class Cores:
         if number == SAVE:
             if not self.calibrated:
                 return WRONG_STATE, b""
-            # Status bits, eight bytes of nothing, temperature, and any bytes that differ from board to board; chosen.
-            head = struct.pack("<2I8xh", self.passes, self.passes, 41)
-            rest = range(CHUNKS * CHUNK_BYTES - len(head))
-            calibration_data = head + bytes((self.die * 31 + n) & 0xFF for n in rest)
+            # Status bits, eight unused bytes, temperature, and arbitrary bytes that differ from board to board; chosen.
+            head = struct.pack("<2I8xh", self.passing_calibrations, self.passing_calibrations, 41)
+            filler_range = range(CHUNKS * CHUNK_BYTES - len(head))
+            calibration_data = head + bytes((self.die_number * 31 + n) & 0xFF for n in filler_range)
             return 0, struct.pack("<2H", CHUNKS, part) + calibration_data[CHUNK_BYTES * part : CHUNK_BYTES * (part + 1)]
         self._restored[part] = data[4:]
         if len(self._restored) == CHUNKS:
@@ -408,15 +408,15 @@ class Cores:
             self._report_calibration(status if status == copy else 0)
         return 0, b""
 
-    def _start_or_stop(self, what: int) -> int:
+    def _start_or_stop(self, action: int) -> int:
         """Start (1) or stop frames (0; 4: immediately). Return 0, 21 (not started) or 23 (invalid command)."""
-        if what == 1:
+        if action == 1:
             return self._start()
-        if what not in (0, 4):
+        if action not in (0, 4):
             return 23
         if not self.armed:
             return 21
-        if what == 4 and self.now() < self.frame_ends:
+        if action == 4 and self.now() < self.frame_ends:
             # Type, code and line of the firmware; the values are chosen.
             self.event(RF_FAULT, struct.pack("<BBH", 3, 2, 815) + bytes(28), 0.0)
         self.armed = False
@@ -491,4 +491,4 @@ class Cores:
     def _boot_from_ram(self) -> None:
         """Take the download as the image in RAM, and report its boot."""
         self.ram = self._received
-        self.event(BOOTED, struct.pack("<IQQ", POWER_UP_TIME, boot_errors(self.ram), 0), BOOT_S)
+        self.event(BOOTED, struct.pack("<IQQ", POWER_UP_TIME, find_boot_errors(self.ram), 0), BOOT_S)

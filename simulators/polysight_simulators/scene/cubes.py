@@ -168,13 +168,13 @@ def _sample_field(
     `gains` [rx] multiply the samples; in rows towards -x the stage lags behind by `backlash_mm`.
     """
     if np.array_equal(field.nodes_hz, f):
-        to_frequencies = np.eye(len(f))
+        nodes_to_frequencies = np.eye(len(f))
     else:
         # The second matrix, the derivative, is not needed.
-        to_frequencies = node_matrix(field, f)[0]
+        nodes_to_frequencies = node_matrix(field, f)[0]
     phase_and_gain = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m_of_rx, f)) * gains[:, None]
     # Matrix from the field's own frequencies to those requested, with phase and gain: [rx, node, frequency].
-    expand = (to_frequencies * phase_and_gain[:, None]).astype(np.complex64)
+    expand = (nodes_to_frequencies * phase_and_gain[:, None]).astype(np.complex64)
     plan = plan_raster(rig.grid)
     travel = mean_burst_travel_mm(rig.burst, rig.stage)
     cube = np.empty((len(path_m_of_rx), plan.rows, plan.columns, len(f)), dtype=np.complex64)

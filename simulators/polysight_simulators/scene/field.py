@@ -49,7 +49,7 @@ from polysight_simulators.scene.spectral_grid import OVERSAMPLING, TAPS, Axis, o
 # Errors relative to an echo, chosen: smaller ones take more kernels, that is more transforms.
 # Of the Chebyshev series in the local angle.
 _ANGLE_TOLERANCE = 1e-4
-# Of the interpolation in dpath/dz; chosen.
+# Error of the interpolation in dpath/dz; chosen.
 _RELIEF_TOLERANCE = 2e-4
 # Range of heights that share a kernel. Chosen: a wider one takes fewer levels, each with more nodes of dpath/dz.
 _LEVEL_MM = 2.0
@@ -70,14 +70,14 @@ def _fit_angle_series(
     centre = (theta[0] + theta[1]) / 2
     half = max((theta[1] - theta[0]) / 2, 1e-9)
     # More orders than r(theta) needs anywhere.
-    many = 16
-    x = cheb_nodes(many)
+    node_count = 16
+    x = cheb_nodes(node_count)
     # From values at the nodes to coefficients, [order, node].
-    to_series = chebyshev.chebvander(x, many - 1).T * (2.0 / many)
-    to_series[0] /= 2.0
+    values_to_series = chebyshev.chebvander(x, node_count - 1).T * (2.0 / node_count)
+    values_to_series[0] /= 2.0
     rows = [[reflect(p, f, centre + half * x) for f in nodes_hz] for p in scene.plates]
     values = np.array(rows, dtype=np.complex128)
-    series = np.einsum("pfm,jm->pfj", values.reshape(len(scene.plates), len(nodes_hz), many), to_series)
+    series = np.einsum("pfm,jm->pfj", values.reshape(len(scene.plates), len(nodes_hz), node_count), values_to_series)
     # Largest sum of all coefficients from each order on.
     tail = np.cumsum(np.abs(series).max(axis=(0, 1), initial=0.0)[::-1])[::-1]
     orders = max(1, int(np.sum(tail > _ANGLE_TOLERANCE)))
@@ -153,11 +153,11 @@ class _Level:
         n = len(self.steepness)
         if n == 1:
             return None
-        at_nodes = chebyshev.chebvander(cheb_nodes(n), n - 1) * (2.0 / n)
-        at_nodes[:, 0] /= 2.0
+        values_at_nodes = chebyshev.chebvander(cheb_nodes(n), n - 1) * (2.0 / n)
+        values_at_nodes[:, 0] /= 2.0
         # Without a slope dpath/dz is the sum of both cosines, twice the obliquity.
         everywhere = chebyshev.chebvander((2 * oblique - self.middle) / self.half, n - 1)
-        return [everywhere @ row for row in at_nodes]
+        return [everywhere @ row for row in values_at_nodes]
 
     def lift_phase(self, lift_m: optics.Real, wave: float, m: int) -> optics.Complex | float:
         """Return the phase factors of heights relative to the level, with the mean change of dpath/dz."""
@@ -282,9 +282,9 @@ class _Plane:
             self._transform_plate(self.surfaces[i], table[n, :2], turn[n], wave * level.steepness[m])
             for n, i in enumerate(level.plates)
         ]
-        y = np.concatenate([of_plate for of_plate, _ in strips])
-        x = np.concatenate([of_plate for _, of_plate in strips])
-        strips_of_plate = [len(of_plate) for of_plate, _ in strips]
+        y = np.concatenate([plate_points for plate_points, _ in strips])
+        x = np.concatenate([plate_points for _, plate_points in strips])
+        strips_of_plate = [len(plate_points) for plate_points, _ in strips]
         orders = weights.shape[1]
         # A plate's echo is a sum over orders. Either each plate has a kernel, which holds the sum, or each order has
         # one, which plates share by their weights.
@@ -348,17 +348,19 @@ def compute(
     series = [_fit_angle_series(plane.scene, reflect, nodes_hz, (low, high)) for plane in planes]
     ax = planes[0].x
     ay = planes[0].y
-    by_channel = np.zeros((len(rx), len(nodes_hz), ay.outputs, ax.outputs), dtype=np.complex64)
-    for plane, of_plates in zip(planes, series, strict=True):
+    field_by_channel = np.zeros((len(rx), len(nodes_hz), ay.outputs, ax.outputs), dtype=np.complex64)
+    for plane, plate_series in zip(planes, series, strict=True):
         levels_of_plane = [level for level_plane, level in levels if level_plane is plane]
-        kernels = [_Kernels.prepare(plane, level, (low, high), of_plates.shape[2], centre) for level in levels_of_plane]
+        kernels = [
+            _Kernels.prepare(plane, level, (low, high), plate_series.shape[2], centre) for level in levels_of_plane
+        ]
         for q, f in enumerate(nodes_hz):
             total = np.zeros((len(rx), plane.y.points, plane.x.points), dtype=np.complex64)
-            for of_level in kernels:
-                of_level.add_spectra(total, plane, of_plates[:, q], f)
+            for level_kernels in kernels:
+                level_kernels.add_spectra(total, plane, plate_series[:, q], f)
             for r, spectrum in enumerate(total):
-                by_channel[r, q] += oversample(oversample(spectrum, plane.y, 0), plane.x, 1)
-    values = np.ascontiguousarray(by_channel.transpose(2, 3, 0, 1))
+                field_by_channel[r, q] += oversample(oversample(spectrum, plane.y, 0), plane.x, 1)
+    values = np.ascontiguousarray(field_by_channel.transpose(2, 3, 0, 1))
     steps = ax.step / OVERSAMPLING, ay.step / OVERSAMPLING
     if scene.shapes:
         ant = planes[0].ant
@@ -418,15 +420,16 @@ def _choose_nodes(
             ranges.append((path.min(), path.max()))
     shortest_m = float(min(low for low, _ in ranges))
     longest_m = float(max(high for _, high in ranges))
-    inside = 0.0
+    margin_m = 0.0
     # Echoes inside plates extend the response: two round trips are counted.
-    for p in scene.plates:
-        depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in p.stack)
-        inside = max(inside, 4 * depth)
+    for plate in scene.plates:
+        depth = sum((layer.thickness_mm or 0.0) / 1e3 * abs(np.sqrt(layer.epsilon)) for layer in plate.stack)
+        margin_m = max(margin_m, 4 * depth)
     # Shapes extend beyond their fronts' heights; some 0.15 m on either side hold their specular points.
-    depth_m = max((abs(p.height_mm) / 1e3 + 0.15 for p in scene.shapes), default=0.0)
-    # Both ends are extended alike, so that the spread is even about the centre: by `inside`, and by twice each depth.
-    spread = longest_m - shortest_m + 2 * inside + 4 * depth_m
+    depth_m = max((abs(plate.height_mm) / 1e3 + 0.15 for plate in scene.shapes), default=0.0)
+    # Both ends are extended equally, so that the spread is even about the centre: by `margin_m`, and by twice each
+    # depth.
+    spread = longest_m - shortest_m + 2 * margin_m + 4 * depth_m
     centre = (longest_m + shortest_m) / 2
     # Time-bandwidth product plus a few: interpolation error of the Chebyshev series below 1e-6.
     nodes = int(np.ceil((samples_hz[-1] - samples_hz[0]) * spread / SPEED_OF_LIGHT_M_S)) + 8
@@ -437,7 +440,7 @@ def _choose_nodes(
 
 @dataclass(frozen=True)
 class _Kernels:
-    """What the kernels of a level have in common at all frequencies.
+    """Properties of the kernels of a level that are equal at all frequencies.
 
     Attributes
     ----------
@@ -523,7 +526,7 @@ def _transform_back(kernel: NDArray[np.complex64]) -> NDArray[np.complex64]:
 
 
 # Version of the content of cached fields: it changes with the physics above, so that older files are not read.
-_PHYSICS = 3
+_CACHE_VERSION = 3
 
 # Shape of the Kaiser window of the interpolation; chosen for `TAPS` and `OVERSAMPLING`.
 _KAISER_BETA = 8.0
@@ -573,11 +576,11 @@ class ObjectField:
 
     def covers(self, x_m: optics.Real, y_m: optics.Real) -> NDArray[np.bool_]:
         """True for offsets inside the field's aperture, bool [n]."""
-        inside = np.ones(len(x_m), dtype=np.bool_)
+        is_covered = np.ones(len(x_m), dtype=np.bool_)
         for axis, u in enumerate((x_m, y_m)):
             low, high = self._reach(axis)
-            inside &= (u >= low) & (u <= high)
-        return inside
+            is_covered &= (u >= low) & (u <= high)
+        return is_covered
 
     def _reach(self, axis: int) -> tuple[float, float]:
         """Return the first and last offset with all taps inside the grid, metres; 0 = x, 1 = y."""
@@ -619,12 +622,12 @@ def node_matrix(field: ObjectField, frequencies_hz: optics.Real) -> tuple[optics
     high = frequencies_hz[-1]
     scale = 2.0 / (high - low)
     x = (frequencies_hz - low) * scale - 1.0
-    at_nodes = chebyshev.chebvander(cheb_nodes(q), q - 1) * (2.0 / q)
-    at_nodes[:, 0] /= 2.0
+    values_at_nodes = chebyshev.chebvander(cheb_nodes(q), q - 1) * (2.0 / q)
+    values_at_nodes[:, 0] /= 2.0
     derivative = chebyshev.chebder(np.eye(q), axis=0)
     values = chebyshev.chebvander(x, q - 1)
     slopes = chebyshev.chebvander(x, max(q - 2, 0)) @ derivative
-    return at_nodes @ values.T, at_nodes @ slopes.T * scale
+    return values_at_nodes @ values.T, values_at_nodes @ slopes.T * scale
 
 
 def build_field(
@@ -663,8 +666,8 @@ def build_field(
     key = to_builtins(
         [rig, scene.plates, scene.points, scene.shapes, scene.object_gain, d.leakage_h, d.leakage_v, d.backlash_mm]
     )
-    drawn = scene.seed if any(p.rough_mm for p in scene.plates) else None
-    text = json.dumps([_PHYSICS, key, board.name, list(samples_hz), list(rx), drawn], sort_keys=True)
+    drawn_seed = scene.seed if any(p.rough_mm for p in scene.plates) else None
+    text = json.dumps([_CACHE_VERSION, key, board.name, list(samples_hz), list(rx), drawn_seed], sort_keys=True)
     path = cache_dir / f"field-{hashlib.sha256(text.encode()).hexdigest()[:24]}.npz"
     if path.exists():
         try:

@@ -141,10 +141,10 @@ class OwnLayout:
         self._plan = plan
         self._scan_id = scan_id
         self._started_utc = started_utc
-        # Of the events: the last number, and the Pi's monotonic clock.
+        # Number of the last event, and the time of the Pi's monotonic clock.
         self._seq = 0
         self._now_ns = NS_PER_S
-        # Of the manifest: number of lines, and digest of the last one; rows that were written.
+        # Number of lines of the manifest, digest of its last line, and number of rows that were written.
         self._lines = 0
         self._digest = ""
         self._rows = 0
@@ -210,8 +210,8 @@ class OwnLayout:
     def _write_fact(self, fact: str, **content: Any) -> None:
         """Append a line to the manifest, with its number, the digest of the line before, and a CRC-32."""
         record = {"fact": fact, **content, "count": self._lines, "previous": self._digest}
-        plain = json.dumps(record, sort_keys=True, separators=(",", ":"))
-        record["crc"] = f"{crc32(plain.encode()):08x}"
+        line_text = json.dumps(record, sort_keys=True, separators=(",", ":"))
+        record["crc"] = f"{crc32(line_text.encode()):08x}"
         line = json.dumps(record, sort_keys=True, separators=(",", ":"))
         path = self.folder / "manifest.jsonl"
         with name_in_errors(path), path.open("a", encoding="utf-8") as f:
@@ -334,12 +334,12 @@ class AuthorsLayout:
         for name, payload in payloads.items():
             skipped = self._skipped.get((name, row.index), frozenset())
             points = [i for i in range(row.points) if i not in skipped]
-            sent = payload.reshape(row.points, -1, *payload.shape[1:])[points]
-            # What was not sent cannot be lost.
-            lost_ranges = [(a, min(b, sent.nbytes)) for a, b in gaps[name] if a < sent.nbytes]
+            sent_payload = payload.reshape(row.points, -1, *payload.shape[1:])[points]
+            # Bytes that were not sent cannot be lost.
+            lost_ranges = [(a, min(b, sent_payload.nbytes)) for a, b in gaps[name] if a < sent_payload.nbytes]
             folder = self.folder / name
             folder.mkdir(exist_ok=True)
-            raw = blank_gaps(sent, lost_ranges)
+            raw = blank_gaps(sent_payload, lost_ranges)
             if not self._zero_filling:
                 # The received pieces lie between the end of one lost range and the start of the next.
                 starts = [0, *(stop for _, stop in lost_ranges)]
@@ -357,18 +357,19 @@ class AuthorsLayout:
     def end(self) -> None:
         """Write nothing more."""
 
-    def _format_packet_log(self, size: int, lost: Gaps, points: list[int], step_s: float) -> str:
+    def _format_packet_log(self, size: int, lost_ranges: Gaps, points: list[int], step_s: float) -> str:
         """Return a line for each packet received: sequence number, payload bytes, Unix time.
 
-        `size`: bytes sent; `lost`: ranges of them; `points`: numbers of the points sent; `step_s`: time between points.
-        The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs that.
+        `size`: bytes sent; `lost_ranges`: ranges of them; `points`: numbers of the points sent; `step_s`: time between
+        points. The last, incomplete packet is late, for the card sends it after a timeout; the authors' decoder needs
+        that.
         """
         full_bytes = packet_payload_bytes(self._rig)
         frame_bytes = self._rig.frame_bytes
         pulses = self._rig.burst.pulses
         period_s = self._rig.burst.period_us * 1e-6
         lost_packets: set[int] = set()
-        for lost_start, lost_stop in lost:
+        for lost_start, lost_stop in lost_ranges:
             lost_packets.update(range(lost_start // full_bytes, math.ceil(lost_stop / full_bytes)))
         lines = []
         for packet, start in enumerate(range(0, size, full_bytes)):
@@ -454,12 +455,12 @@ def _describe_radars(rig: Instrument) -> dict[str, Any]:
     }
 
 
-def _find_turn_deg(board: Board, axis: str, which: int) -> float:
+def _find_turn_deg(board: Board, axis: str, turn_number: int) -> float:
     """Return one of a mount's rotations about an axis (0: the first, -1: the last), degrees; 0 without any."""
     turns_deg = [step.turn_deg for step in board.mount if step.about == axis and step.turn_deg is not None]
     if not turns_deg:
         return 0.0
-    return turns_deg[which]
+    return turns_deg[turn_number]
 
 
 def _find_last_shift(board: Board) -> float:
@@ -509,7 +510,7 @@ def write_cube(
         direct_m = antennas(rig, board).direct_m
         if keep_direct:
             cube += (direct_factor(board, scene) * direct_m[0] / direct_m).astype(np.complex64)[:, None, None, None]
-        # The cube is without the direct path of each RX; so much of that path is added again.
+        # The cube is without the direct path of each RX; this part of that path is added again.
         if from_transmitter:
             added_m = direct_m
         elif common_reference:

@@ -297,14 +297,14 @@ class SimulatedRig:
         out = np.empty((n, samples, 2 * rx), dtype=np.int16)
         scale = np.float32(_FULL_SCALE / d.adc_full_scale)
         for start in range(0, n, _BATCH):
-            part = signal[start : start + _BATCH]
-            parts = part.view(np.float32).reshape(*part.shape, 2).transpose(0, 2, 3, 1)
+            batch = signal[start : start + _BATCH]
+            parts = batch.view(np.float32).reshape(*batch.shape, 2).transpose(0, 2, 3, 1)
             counts = np.rint(parts * scale)
             extreme = np.abs(counts).max(initial=0.0)
             if extreme > _FULL_SCALE:
                 self.clipped[board_name] += int(np.sum(np.abs(counts) > _FULL_SCALE))
                 np.clip(counts, -_FULL_SCALE - 1, _FULL_SCALE, out=counts)
-            out[start : start + _BATCH] = counts.reshape(len(part), samples, 2 * rx)
+            out[start : start + _BATCH] = counts.reshape(len(batch), samples, 2 * rx)
         return out
 
     def signals(
@@ -345,8 +345,8 @@ class SimulatedRig:
         backlash_mm = d.backlash_mm if direction < 0 else 0.0
         if not d.burst_motion:
             return np.full(burst.chirps_a_position, direction * mean_burst_travel_mm(burst, stage) + backlash_mm)
-        after_s = FIRST_PULSE_DELAY_S + np.array(burst.chirp_times_s)
-        return direction * stage.speed_mm_s * after_s + backlash_mm
+        time_after_trigger_s = FIRST_PULSE_DELAY_S + np.array(burst.chirp_times_s)
+        return direction * stage.speed_mm_s * time_after_trigger_s + backlash_mm
 
     def _make_receiving_board(self, name: str) -> _ReceivingBoard:
         """Return the simulation of a receiving board, made at its first use."""
@@ -378,13 +378,13 @@ class SimulatedRig:
         else:
             turns = 0.0 * delay
         factor, shift = compute_chirp_factors(simulated.receiver, delay, 2 * np.pi * turns, d.hpf)
-        inside = simulated.field.covers(x_m, y_m)
-        self.outside[board.name] += int(np.sum(~inside))
+        is_covered = simulated.field.covers(x_m, y_m)
+        self.outside[board.name] += int(np.sum(~is_covered))
         # [chirp, rx, node]: the field at the frequencies at which it was computed.
         nodes = np.zeros((len(x_m), *simulated.direct.shape[1:2], simulated.expand.shape[1]), dtype=np.complex64)
-        if inside.any():
-            gains = echo_drift(self.rig, d, board, chirps[inside])[:, None] * simulated.receiver.gains
-            nodes[inside] = simulated.field.interpolate(x_m[inside], y_m[inside]) * gains[:, :, None]
+        if is_covered.any():
+            gains = echo_drift(self.rig, d, board, chirps[is_covered])[:, None] * simulated.receiver.gains
+            nodes[is_covered] = simulated.field.interpolate(x_m[is_covered], y_m[is_covered]) * gains[:, :, None]
         # One small product per chirp: BLAS runs larger ones in threads, which is slow while other processes run.
         # [chirp, 2, rx, sample]
         ideal = np.matmul(nodes[:, None], simulated.expand)

@@ -331,7 +331,7 @@ class Disturbances(_Table, frozen=True):
 
 
 # The value of each disturbance that switches it off; the start of the bend and the ripple's decay cannot be.
-OFF: dict[str, Any] = {
+SWITCHED_OFF: dict[str, Any] = {
     "sync_uncertainty_ns": 0.0,
     "sync_latency_ns": 0.0,
     "crystal_ppm": {},
@@ -394,7 +394,7 @@ class Scene(_Table, frozen=True):
         """Return the scene with some disturbances changed; `ideal=True` switches all off first."""
         base = msgspec.to_builtins(self.disturbances)
         if changes.pop("ideal", False):
-            base = dict(OFF, bend_us=base["bend_us"], ripple_us=base["ripple_us"])
+            base = dict(SWITCHED_OFF, bend_us=base["bend_us"], ripple_us=base["ripple_us"])
         table = decode(_apply_switches({**base, **changes}, "with_disturbances"), Disturbances, "with_disturbances")
         return msgspec.structs.replace(self, disturbances=table)
 
@@ -417,17 +417,17 @@ def _apply_switches(table: Any, source: str) -> Any:
         )
     result: dict[str, Any] = {}
     if ideal:
-        result = dict(OFF)
+        result = dict(SWITCHED_OFF)
     for key, value in values.items():
         if value == "off" or value is False:
-            if key not in OFF and key in Disturbances.__struct_fields__:
+            if key not in SWITCHED_OFF and key in Disturbances.__struct_fields__:
                 raise ConfigError(
                     f"{source}: disturbances.{key} cannot be switched off",
                     "it only shapes another disturbance",
                     f"switch off disturbances.{key.partition('_')[0]}_hz instead",
                     code=ErrorCode.VALUE_INVALID,
                 )
-            result[key] = OFF.get(key, value)
+            result[key] = SWITCHED_OFF.get(key, value)
         elif value == "on" or value is True:
             # Its default. An unknown key stays: the caller's `decode` refuses it.
             result.pop(key, None)
@@ -567,8 +567,8 @@ def slopes(plate: Plate) -> tuple[float, float]:
 
 def _find_plane_height_mm(scene: Scene, at_mm: Pair) -> float:
     """Return how far the shifted and tilted plane lies beyond the nominal one at a place."""
-    along = [math.tan(math.radians(a)) * x for a, x in zip(scene.plane_tilt_deg, at_mm, strict=True)]
-    return scene.plane_shift_mm + sum(along)
+    heights_mm = [math.tan(math.radians(a)) * x for a, x in zip(scene.plane_tilt_deg, at_mm, strict=True)]
+    return scene.plane_shift_mm + sum(heights_mm)
 
 
 def _move_with_plane(plate: Plate, scene: Scene) -> Plate:

@@ -17,12 +17,12 @@ from polysight_shared.tables import to_builtins
 from polysight_simulators.scene.scene_file import Scene
 
 # Group of entry points in which a package offers its function.
-GROUP = "polysight.shape_echoes"
+ENTRY_POINT_GROUP = "polysight.shape_echoes"
 
 
 def find_echoes(scene: Scene) -> Any:
     """Return the function that computes echoes of shapes. Raises ConfigError if no package offers it."""
-    offered = list(entry_points(group=GROUP))
+    offered = list(entry_points(group=ENTRY_POINT_GROUP))
     if not offered:
         raise ConfigError(
             f"scene {scene.name} has [[shapes]]",

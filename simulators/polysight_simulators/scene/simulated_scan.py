@@ -101,14 +101,14 @@ def find_lost_bytes(radar: SimulatedRig, board_name: str, row: Row) -> layouts.G
     """Return the byte ranges of a row in lost packets, sorted and merged."""
     loss = radar.scene.disturbances.packet_loss
     size = row.points * radar.rig.burst.pulses * radar.rig.frame_bytes
-    full = layouts.packet_payload_bytes(radar.rig)
+    full_packet_bytes = layouts.packet_payload_bytes(radar.rig)
     if loss == 0.0:
         return []
     rng = np.random.default_rng([stream_key(radar.seed, "loss", board_name), row.index])
     gaps: layouts.Gaps = []
-    for k in np.flatnonzero(rng.random(-(-size // full)) < loss):
-        start = int(k) * full
-        stop = min((int(k) + 1) * full, size)
+    for k in np.flatnonzero(rng.random(-(-size // full_packet_bytes)) < loss):
+        start = int(k) * full_packet_bytes
+        stop = min((int(k) + 1) * full_packet_bytes, size)
         if gaps and gaps[-1][1] == start:
             gaps[-1] = (gaps[-1][0], stop)
         else:

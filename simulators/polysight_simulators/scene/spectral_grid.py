@@ -52,8 +52,8 @@ class Axis:
     def fade(self) -> Real:
         """Fade-out of the kernel, [points]: 1 within the scene, smoothly 0 outside."""
         w = self.w
-        beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
-        return np.cos(np.pi / 2 * np.clip(beyond, 0.0, 1.0)) ** 4
+        distance_beyond = np.maximum(self.low_w - w, w - self.high_w) / FADE_M
+        return np.cos(np.pi / 2 * np.clip(distance_beyond, 0.0, 1.0)) ** 4
 
     @property
     def kappa(self) -> Real:

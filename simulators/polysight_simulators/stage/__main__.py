@@ -183,22 +183,32 @@ def serve(
 
 def parser() -> argparse.ArgumentParser:
     """Build the parser of the command line."""
-    p = command_line("polysight_simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
-    p.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
-    p.add_argument("--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires; without it no edges")
-    p.add_argument("--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make")
-    p.add_argument("--time-scale", type=float, default=1.0, metavar="X", help="motion runs X times the wall clock")
-    p.add_argument("--boot-ms", type=int, default=BOOT_MS, metavar="N", help="reset to banner, wall time")
-    p.add_argument("--python", action="store_true", help="the Python stand-in, even where a C++ compiler exists")
-    return p
+    argument_parser = command_line(
+        "polysight_simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE"
+    )
+    argument_parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
+    argument_parser.add_argument(
+        "--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires; without it no edges"
+    )
+    argument_parser.add_argument(
+        "--link", type=Path, required=True, metavar="PATH", help="name of the serial port to make"
+    )
+    argument_parser.add_argument(
+        "--time-scale", type=float, default=1.0, metavar="X", help="motion runs X times the wall clock"
+    )
+    argument_parser.add_argument("--boot-ms", type=int, default=BOOT_MS, metavar="N", help="reset to banner, wall time")
+    argument_parser.add_argument(
+        "--python", action="store_true", help="the Python stand-in, even where a C++ compiler exists"
+    )
+    return argument_parser
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run until SIGTERM or SIGINT."""
-    p = parser()
-    args = p.parse_args(argv)
+    argument_parser = parser()
+    args = argument_parser.parse_args(argv)
     if not args.time_scale > 0:
-        p.error("--time-scale must be positive")
+        argument_parser.error("--time-scale must be positive")
     return run_until_stopped(lambda stop: _run(args, stop))
 
 

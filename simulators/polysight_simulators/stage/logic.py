@@ -5,7 +5,16 @@ from enum import Enum
 
 from polysight_shared.faults import StageError
 from polysight_shared.stage_line import Immediate, Parameter
-from polysight_simulators.stage.motion import EMERGENCY, LOOKS, MAX_RATE, MIN_RATE, SWITCH_X, SWITCH_Y, Leg, StepEngine
+from polysight_simulators.stage.motion import (
+    DEBOUNCING_READINGS,
+    EMERGENCY,
+    MAX_RATE,
+    MIN_RATE,
+    SWITCH_X,
+    SWITCH_Y,
+    Leg,
+    StepEngine,
+)
 
 # Limits of arguments, and the sequence of homing, as in arduino_stage/board.h: lengths in steps.
 MAX_TRAVEL = 999_999
@@ -39,7 +48,7 @@ ARGUMENTS = {"HELLO": 0, "SET": 2, "ENABLE": 1, "HOME": 0, "MOVE": 3, "ROW": 5, 
 MOTION_VERBS = ("HOME", "MOVE", "ROW", "BUZZ")
 
 
-class Refused(Exception):  # noqa: N818 - the answer to a command, not a failure of this program
+class RefusedCommand(Exception):  # noqa: N818 - the answer to a command, not a failure of this program
     """A command is refused with this number."""
 
     def __init__(self, number: StageError) -> None:
@@ -58,18 +67,18 @@ class Event(Enum):
 def count_steps_to_zero() -> int:
     """Return the steps from the closing point of a switch to the zero of homing.
 
-    The creep sees the switch open after LOOKS readings (debouncing; one a step), takes the steps of its ramp to stop,
+    The creep sees the switch open after DEBOUNCING_READINGS readings (one a step), takes the steps of its ramp to stop,
     and pulls off. Homing has to begin at least the ramp of the search away from the switch.
     """
     engine = StepEngine()
     engine.set_accel(HOME_ACCEL)
-    return LOOKS + engine.ramp_steps(CREEP_RATE) + PULL_OFF
+    return DEBOUNCING_READINGS + engine.ramp_steps(CREEP_RATE) + PULL_OFF
 
 
 def _require(ok: bool, number: StageError) -> None:
     """Raise Refused with this number unless `ok`."""
     if not ok:
-        raise Refused(number)
+        raise RefusedCommand(number)
 
 
 class StageLogic:
@@ -103,7 +112,7 @@ class StageLogic:
         self.activity = "idle"
         self.alarm: StageError | None = None
         self.homed = False
-        # Of the last motion command, for its `done` line: whether a HOLD came during the row, and which command it was.
+        # For the `done` line of the last motion command: whether a HOLD came during the row, and which command it was.
         self.held = False
         self.row_command = False
         self.homing_command = False
@@ -260,10 +269,10 @@ class StageLogic:
         self._begin("travel")
         self._row_y = y
         if self._engine.y > y - backlash:
-            from_below = y - backlash
+            approach_y = y - backlash
         else:
-            from_below = y
-        self._start_straight_leg(x0 - run_up, from_below, self.parameters[Parameter.TRAVEL_SPEED])
+            approach_y = y
+        self._start_straight_leg(x0 - run_up, approach_y, self.parameters[Parameter.TRAVEL_SPEED])
 
     def _is_within(self, x: int, y: int) -> bool:
         return 0 <= x <= self.parameters[Parameter.TRAVEL_X] and 0 <= y <= self.parameters[Parameter.TRAVEL_Y]
@@ -285,7 +294,7 @@ class StageLogic:
 
     def immediate(self, byte: int) -> bool:
         """Obey HOLD, RESUME, STATUS or STOP, which count without a line; return False for any other byte."""
-        alone = self._quiet
+        is_alone = self._quiet
         confirmed = self._resume_begun
         self._quiet = False
         self._byte_seen = True
@@ -303,7 +312,7 @@ class StageLogic:
             self._stop = True
         else:
             return False
-        self.heard |= alone
+        self.heard |= is_alone
         return True
 
     def _listen(self, now_ms: int) -> None:

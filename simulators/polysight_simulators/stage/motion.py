@@ -2,7 +2,7 @@
 
 Names and numbers are those of the firmware on purpose: both make the same steps at the same ticks, which the tests
 compare; arduino_stage/motion.h explains the arithmetic. Here the steps at constant speed between two events are taken
-at once (:meth:`StepEngine.skip`), because Python is too slow to make each.
+together (:meth:`StepEngine.skip`), because Python is too slow to make each.
 """
 
 import math
@@ -22,7 +22,7 @@ SWITCH_Y = 2
 EMERGENCY = 4
 SWITCHES = SWITCH_X | SWITCH_Y
 # A switch counts as changed after this many successive readings that differ from the old state (debouncing).
-LOOKS = 5
+DEBOUNCING_READINGS = 5
 
 
 class Leg(NamedTuple):
@@ -83,7 +83,7 @@ class StepEngine:
         self.stable = 0
         self._looks = 0
         self.leg = Leg(0, 0, MIN_RATE)
-        # That of the firmware at its start; the host sets its own.
+        # The firmware starts with this acceleration; the host sets another one.
         self.set_accel(40_000)
 
     def set_accel(self, steps_s2: int) -> None:
@@ -158,12 +158,12 @@ class StepEngine:
         self.fault = None
 
     def look(self, inputs: int) -> None:
-        """Debounce the switches: `stable` follows after :data:`LOOKS` successive readings that differ from it."""
+        """Debounce the switches: `stable` changes after `DEBOUNCING_READINGS` successive differing readings."""
         if inputs == self.stable:
             self._looks = 0
         else:
             self._looks += 1
-        if self._looks >= LOOKS:
+        if self._looks >= DEBOUNCING_READINGS:
             self.stable = inputs
             self._looks = 0
 

@@ -11,14 +11,14 @@ from polysight_shared.errors import ProtocolError
 from polysight_shared.faults import StageError
 from polysight_shared.stage_line import MAX_LINE_BYTES, PROTOCOL_VERSION, Command, Parameter, Reply, crc16
 from polysight_shared.wires import WireEdge, WireMessage, WireMotion
-from polysight_simulators.stage.logic import MOTION_VERBS, Event, Refused, StageLogic
+from polysight_simulators.stage.logic import MOTION_VERBS, Event, RefusedCommand, StageLogic
 from polysight_simulators.stage.motion import NS_PER_TICK, SWITCH_X, SWITCH_Y, TICK_HZ, StepEngine
 
 FIRMWARE = "0.1.0"
 # Interval of motion messages while the speed changes: 10 ms; chosen.
 REPORT_TICKS = TICK_HZ // 100
 # Check field at the end of a line: `*` and the CRC-16 in four hexadecimal digits.
-_TAIL = re.compile(rb"\*([^*]{4})")
+_CHECK_FIELD = re.compile(rb"\*([^*]{4})")
 
 
 class Rig(NamedTuple):
@@ -96,11 +96,11 @@ class PythonStage:
     def reset(self, now_ms: int) -> None:
         """Reset the board. The motors keep their position."""
         self._now_ms = now_ms
-        moved = self._armed
+        had_moved = self._armed
         self._power_on()
         if self._fall is not None:
             self._send_edge(self.tick, 0)
-        if moved:
+        if had_moved:
             self._report_motion()
         self._send(Reply("banner", fields={"fw": FIRMWARE, "proto": str(PROTOCOL_VERSION)}).encode())
 
@@ -176,7 +176,7 @@ class PythonStage:
                 self._send(self._outcome)
             elif event is Event.ALARM:
                 alarm = Reply("alarm", number=int(self._logic.alarm or 0)).encode()
-                # Of several alarms the first one ended the motion.
+                # If there were several alarms, the first one ended the motion.
                 self._outcome = self._outcome or alarm
                 self._send(alarm)
             if self._logic.status_requested:
@@ -242,7 +242,7 @@ class PythonStage:
 
     def _take_line(self, line: bytes) -> None:
         """Check a line and execute it; a damaged one gets an error without a sequence number."""
-        tail = _TAIL.fullmatch(line[-5:])
+        tail = _CHECK_FIELD.fullmatch(line[-5:])
         if tail is None:
             return self._refuse(StageError.MALFORMED)
         if tail[1] != b"%04X" % crc16(line[:-5]):
@@ -279,7 +279,7 @@ class PythonStage:
         try:
             self._logic.execute(command.verb, command.args)
             answer = Reply("ok", command.sequence, fields=fields)
-        except Refused as e:
+        except RefusedCommand as e:
             answer = Reply("error", command.sequence, int(e.number))
             accepted = False
         self._fresh = hello and accepted

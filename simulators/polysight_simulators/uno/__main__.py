@@ -15,7 +15,7 @@ from polysight_shared.errors import PolysightError
 from polysight_shared.program import die_with_parent
 from polysight_simulators.process import command_line, run_program
 from polysight_simulators.stage import count_steps_to_zero
-from polysight_simulators.uno import ENABLING_COMMAND, emulator, firmware, missing
+from polysight_simulators.uno import ENABLING_COMMAND, compile_emulator, compile_firmware, list_missing_packages
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -49,13 +49,13 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace) -> None:
     """Compile emulator and firmware, and become the emulator. Raises PolysightError if a package is missing."""
-    if missing_packages := missing():
+    if missing_packages := list_missing_packages():
         problem = f"not installed: {' '.join(missing_packages)}"
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)
     rig = load_instrument(args.config)
     # Steps from the closing point of a limit switch to the stage's zero, on both axes.
     zero_steps = count_steps_to_zero()
-    program = str(emulator())
+    program = str(compile_emulator())
     command = [program, "--pty", str(args.link), "--speed", repr(args.time_scale), "--boot-ms", str(args.boot_ms)]
     command += [
         "--zero",
@@ -67,7 +67,7 @@ def _run(args: argparse.Namespace) -> None:
     command += ["--line", str(rig.pi.trigger_in)]
     if args.wires:
         command += ["--wires", str(args.wires)]
-    os.execv(program, [*command, str(firmware())])
+    os.execv(program, [*command, str(compile_firmware())])
 
 
 if __name__ == "__main__":

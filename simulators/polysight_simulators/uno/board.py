@@ -1,6 +1,7 @@
 """The emulated board in lockstep with a Python program: time advances only by command.
 
-Emulator and firmware are compiled on demand, once for the same sources; :func:`missing` lists missing packages.
+Emulator and firmware are compiled on demand, once for the same sources; :func:`list_missing_packages` lists missing
+packages.
 """
 
 import os
@@ -21,7 +22,7 @@ _SOURCES = sorted(p for p in Path(__file__).parent.iterdir() if p.suffix in (".c
 _CC = ("gcc", "-O2", "-Wall", "-Wextra")
 _LIBRARIES = ("-lsimavr", "-lelf", "-lutil", "-lm")
 # Cause and remedy in the message of a failed compilation.
-_ON_FAILURE = ("a package is missing, or the sources were changed", ENABLING_COMMAND)
+_COMPILATION_ERROR = ("a package is missing, or the sources were changed", ENABLING_COMMAND)
 # Clock of the UNO.
 HZ = 16_000_000
 
@@ -42,7 +43,7 @@ class PinEdge(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Worst cases in cycles: of interrupts since the last call of :meth:`EmulatedUno.cost`, of pulses since power-on.
+    """Worst cases in cycles: of interrupts since the last :meth:`EmulatedUno.read_cost`, of pulses since power-on.
 
     Before the first pulse, the latter are the largest number of 64 bits.
     """
@@ -63,7 +64,7 @@ class EmulatedUno:
     Parameters
     ----------
     program, image
-        From :func:`polysight_simulators.uno.emulator` and :func:`polysight_simulators.uno.firmware`.
+        From :func:`polysight_simulators.uno.compile_emulator` and :func:`polysight_simulators.uno.compile_firmware`.
     start
         Position at power-on: steps from the switches.
     watch
@@ -107,22 +108,22 @@ class EmulatedUno:
         if output is None:
             raise DeviceError("the UNO emulator has no output", "a bug", "report it")
         for line in output:
-            tag, *rest = line.split()
+            tag, *values = line.split()
             if tag == "E":
-                self.edges.append(PinEdge(*map(int, rest)))
+                self.edges.append(PinEdge(*map(int, values)))
             elif tag == "T":
-                self.received.append(int(rest[1], 16))
+                self.received.append(int(values[1], 16))
             elif tag == "R":
-                self.cycle, *motors, self.sent = map(int, rest)
+                self.cycle, *motors, self.sent = map(int, values)
                 self.motors = (motors[0], motors[1], motors[2])
                 return
             elif tag == "C":
-                self._counted[int(rest[0])] = int(rest[2])
+                self._counted[int(values[0])] = int(values[2])
             elif tag == "W":
-                pulse, setup, hold = map(int, rest)
+                pulse, setup, hold = map(int, values)
                 self._pulse_cycles = (pulse, setup, hold)
             else:
-                self.troubles.append(" ".join(rest[1:]))
+                self.troubles.append(" ".join(values[1:]))
         raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
 
     def _apply_action(self, line: str) -> None:
@@ -152,7 +153,7 @@ class EmulatedUno:
         """
         self._apply_action(f"settle {pty_bytes}")
 
-    def rest(self, limit_s: float = 600.0) -> None:
+    def run_until_rest(self, limit_s: float = 600.0) -> None:
         """Run until no motor has stepped for 50 ms and the serial line is idle, at most `limit_s` by its clock."""
         self._apply_action(f"rest {round(limit_s * HZ)}")
 
@@ -176,7 +177,7 @@ class EmulatedUno:
         """Store the edges of these pins from now on."""
         self._apply_action("watch " + ",".join(map(str, pins)))
 
-    def cost(self) -> Cost:
+    def read_cost(self) -> Cost:
         """Return the worst cases, and start again with those of interrupts."""
         self._counted = {}
         self._apply_action("cost")
@@ -190,7 +191,7 @@ class EmulatedUno:
         self._process.wait(10)
 
 
-def missing() -> list[str]:
+def list_missing_packages() -> list[str]:
     """Return the missing Debian packages that compiling firmware and emulator needs."""
     lacking = {
         "gcc": shutil.which("gcc") is None,
@@ -204,13 +205,13 @@ def missing() -> list[str]:
     return [package for package, lacks in lacking.items() if lacks]
 
 
-def emulator() -> Path:
+def compile_emulator() -> Path:
     """Compile the emulator; return its path. Raises DeviceError if it does not compile."""
     code = [str(p) for p in _SOURCES if p.suffix == ".c"]
-    return compile_once("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _ON_FAILURE)
+    return compile_once("unosim", _SOURCES, [*_CC, "-o", "{folder}/unosim", *code, *_LIBRARIES], _COMPILATION_ERROR)
 
 
-def firmware(compiler: Path | None = None) -> Path:
+def compile_firmware(compiler: Path | None = None) -> Path:
     """Compile the image that `make flash` puts on a board; return the .hex file.
 
     Parameters
@@ -233,4 +234,4 @@ def firmware(compiler: Path | None = None) -> Path:
     command = ["make", "-s", "-C", str(SKETCH_DIR), "firmware", "AVR_B={folder}"]
     if compiler:
         command += [f"AVR={compiler}/avr-"]
-    return compile_once("arduino_stage.hex", sources, command, _ON_FAILURE)
+    return compile_once("arduino_stage.hex", sources, command, _COMPILATION_ERROR)

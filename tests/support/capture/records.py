@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from polysight.capture.dca1000 import Counters, PacketLog
-from polysight.capture.placement import Past, Placed, place_record
-from polysight_simulators.cards import Sent
+from polysight.capture.placement import EarlierRecords, PlacedRecord, place_record
+from polysight_simulators.cards import SentRecord
 
 # Bytes of samples in a full packet.
 FULL = 1456
@@ -85,14 +85,14 @@ def make_log(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> 
 
 
 def place(
-    size: int, packets: list[bytes], start: Counters | Past, frame: int = 1, batch: int = 7
-) -> tuple[Placed, np.ndarray]:
+    size: int, packets: list[bytes], start: Counters | EarlierRecords, frame: int = 1, batch: int = 7
+) -> tuple[PlacedRecord, np.ndarray]:
     """Place a row that starts at these counters, or after the known earlier records."""
-    past = Past(start) if isinstance(start, Counters) else start
+    past = EarlierRecords(start) if isinstance(start, Counters) else start
     return place_record(make_log(size, packets, batch), frame, past)
 
 
-def next_start(placed: Placed) -> Counters | None:
+def next_start(placed: PlacedRecord) -> Counters | None:
     """Counters with which the card's next record starts; None if that is uncertain."""
     return placed.past.start
 
@@ -105,13 +105,13 @@ def make_mask(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
     return mask
 
 
-def is_original_or_masked(record: Record, placed: Placed, out: np.ndarray) -> bool:
+def is_original_or_masked(record: Record, placed: PlacedRecord, out: np.ndarray) -> bool:
     """True if every byte of the placed row is the record's or is masked: the law of placement."""
     is_kept = ~make_mask(out.size, placed.missing)
     return bool((out[is_kept] == np.frombuffer(record.data, dtype=np.uint8)[is_kept]).all())
 
 
-def log_packets(sent: Sent, expected: int, batch: int) -> PacketLog:
+def log_packets(sent: SentRecord, expected: int, batch: int) -> PacketLog:
     """The arrivals as a receiver logs them, some at a time, each with the time of its arrival."""
     log = PacketLog(expected)
     for k in range(0, len(sent.arrivals), batch):

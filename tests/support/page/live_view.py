@@ -7,14 +7,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from polysight.acquisition.control import ALIVE, CONTROL, ControlFolder, StopRequest
+from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, ControlFolder, StopRequest
 from polysight.catalogue import Scans
 from polysight.page.history import ScanHistory
 from polysight.page.watch import Watch
 from polysight.serve.front import Front
 from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
-from polysight.serve.server import Place, make_reader_app, make_server
+from polysight.serve.server import ServerAddress, make_reader_app, make_server
 from polysight.serve.site import Site, Watches
 from polysight.serve.stage import StageControl
 from polysight.store import EVENTS, MANIFEST, manifest, utc_now
@@ -69,8 +69,8 @@ class GrowingScan:
 
     def live(self) -> None:
         """Touch the scan's `alive` file."""
-        (self.path / CONTROL).mkdir(exist_ok=True)
-        (self.path / CONTROL / ALIVE).touch()
+        (self.path / CONTROL_FOLDER).mkdir(exist_ok=True)
+        (self.path / CONTROL_FOLDER / ALIVE_FILE).touch()
 
 
 @contextmanager
@@ -79,7 +79,7 @@ def open_control(folder: Path) -> Iterator[StopRequest]:
     stop = StopRequest()
     with ControlFolder(folder, stop) as control:
         control.open()
-        wait_for((folder / CONTROL / ALIVE).exists, "the first sign of life")
+        wait_for((folder / CONTROL_FOLDER / ALIVE_FILE).exists, "the first sign of life")
         yield stop
 
 
@@ -87,13 +87,13 @@ class Served:
     """A site on a free port, or at the given address; both processes' applications in one thread."""
 
     def __init__(
-        self, site: Site, access: Access, host: str = "127.0.0.1", port: int = 0, place: Place | None = None
+        self, site: Site, access: Access, host: str = "127.0.0.1", port: int = 0, place: ServerAddress | None = None
     ) -> None:
         self.site = site
         starts = site.starts and access.control
         stage = StageControl(site.config) if starts else None
         front = Front(site.scans, access, starts, make_reader_app(site), stage)
-        self._server = make_server(front, place or Place())
+        self._server = make_server(front, place or ServerAddress())
         site.is_ending = lambda: self._server.should_exit
         self._server.config.host = host
         self._server.config.port = port
@@ -128,7 +128,7 @@ def served_folder(
     token: str = "",
     access: Access | None = None,
     config: Path | None = None,
-    place: Place | None = None,
+    place: ServerAddress | None = None,
 ) -> Iterator[Served]:
     """A server of all scans under a folder for the block; with a rig file it starts programs."""
     access = access or Access(token, control=bool(token))

@@ -16,7 +16,7 @@ from polysight_pi.service import Service
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.raster import plan_raster
-from polysight_shared.sockets import requester, subscriber
+from polysight_shared.sockets import create_requester, create_subscriber
 from tests.support.processes import LIMIT_S, idle_s, wait_for
 
 POLL_MS = 100
@@ -74,8 +74,8 @@ class HostSide:
     ) -> None:
         self.limit_s = limit_s
         self.context: Any = zmq.Context()
-        self.commands = requester(self.context, command_address, key_dir)
-        self.subscriber = subscriber(self.context, event_address, key_dir)
+        self.commands = create_requester(self.context, command_address, key_dir)
+        self.subscriber = create_subscriber(self.context, event_address, key_dir)
         self.instrument = instrument
         self.events: list[Any] = []
         # Once an event comes, the subscription has arrived.
@@ -156,7 +156,7 @@ class HostSide:
 
     @property
     def journalled(self) -> list[Any]:
-        return self.list_events(*m.JOURNALLED)
+        return self.list_events(*m.JOURNALLED_EVENTS)
 
     def replay(self, scan_id: str = "scan", from_seq: int = 1, limit: int = 10000) -> list[Any]:
         return self.ask(m.Replay(scan_id=scan_id, from_seq=from_seq, limit=limit)).events

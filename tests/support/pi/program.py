@@ -58,7 +58,7 @@ class Process:
 def require_stand_in_chip() -> None:
     """Skip the module where the stand-in GPIO chip cannot be used."""
     pytest.importorskip("gpiod", reason="libgpiod bindings are not installed: pip install 'gpiod>=2.1'")
-    if lacking := gpio.missing():
+    if lacking := gpio.list_missing_packages():
         pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import msgspec
 
 from polysight_shared.config import Instrument, NativeRadar, Radar
-from polysight_simulators.radars import FUNCTIONAL, RadarBoard
+from polysight_simulators.radars import FUNCTIONAL_LEVELS, RadarBoard
 from tests.support.rigs import published_rig
 
 
@@ -44,7 +44,7 @@ class BoardWords:
         return self.board.interrupt
 
     def reset(self, held: bool) -> None:
-        self.board.sense(FUNCTIONAL)
+        self.board.set_sense_lines(FUNCTIONAL_LEVELS)
         self.board.reset(held)
 
     def close(self) -> None:
@@ -65,8 +65,8 @@ class Restarts(BoardWords):
             self.left -= 1
             self.later += self.left < 0
             if self.left == 0:
-                self.board.power(False)
-                self.board.power(True)
+                self.board.switch_power(False)
+                self.board.switch_power(True)
 
 
 def native_rig() -> Instrument:

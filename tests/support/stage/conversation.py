@@ -68,7 +68,7 @@ class Conversation:
         if words[-1] == "ms":
             self.stage.run_ms(float(words[0]))
         elif words[0] == "rest":
-            self.stage.rest()
+            self.stage.run_until_rest()
         elif words[0] == "press":
             self.stage.press(PRESSED[words[1]])
         elif words[0] == "slip":

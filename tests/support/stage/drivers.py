@@ -85,7 +85,7 @@ class Driver:
         self.wires.clear()
         reply = self.command(verb, *args)
         assert reply.kind == "ok", reply
-        self.rest()
+        self.run_until_rest()
         *_, last = self.replies()
         return last, list(self.wires)
 
@@ -153,7 +153,7 @@ class FirmwareDriver(Driver):
     def run(self, ticks: int) -> None:
         self._do(f"run {ticks}")
 
-    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+    def run_until_rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
         self._do(f"rest {limit_ticks}")
 
     def press(self, mask: int) -> None:
@@ -196,7 +196,7 @@ class PythonDriver(Driver):
     def run(self, ticks: int) -> None:
         self._run(ticks, until_rest=False)
 
-    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+    def run_until_rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
         self._run(limit_ticks, until_rest=True)
 
     def _run(self, ticks: int, until_rest: bool) -> None:
@@ -247,8 +247,8 @@ class UnoDriver(Driver):
         self.uno.run(ticks * HZ // TICK_HZ)
         self._collect()
 
-    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
-        self.uno.rest(limit_ticks / TICK_HZ)
+    def run_until_rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+        self.uno.run_until_rest(limit_ticks / TICK_HZ)
         self._collect()
 
     def press(self, mask: int) -> None:
@@ -323,7 +323,7 @@ class PortDriver(Driver):
     def run(self, ticks: int) -> None:
         self._listen(ticks / TICK_HZ / self._speed)
 
-    def rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
+    def run_until_rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
         """Request the status until the stage rests; these answers are not kept."""
         limit = idle_s() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
         while idle_s() < limit:
@@ -360,8 +360,8 @@ class Host(Driver):
     def rx(self, data: bytes) -> None:
         self.uno.feed(data)
 
-    def rest(self) -> None:
-        self.uno.rest()
+    def run_until_rest(self) -> None:
+        self.uno.run_until_rest()
 
     def replies(self) -> list[Reply]:
         self.uno.settle()

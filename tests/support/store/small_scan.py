@@ -18,11 +18,11 @@ from polysight.acquisition import scan as host_run
 from polysight.acquisition.progress import ScanProgress, ScanResult
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.capture.dca1000 import PacketLog
-from polysight.capture.placement import Evidence, Losses, PacketCounts, Past, place_record
+from polysight.capture.placement import EarlierRecords, Evidence, Losses, PacketCounts, place_record
 from polysight.capture.receiver import RowCapture
-from polysight.capture.row_files import PACKETS, Segment, write_index, write_packets
+from polysight.capture.row_files import PACKETS_SUFFIX, Segment, write_index, write_packets
 from polysight.store import manifest
-from polysight.store.scan_folder import MANIFEST, PART, ScanFolder
+from polysight.store.scan_folder import MANIFEST, PART_SUFFIX, ScanFolder
 from polysight_pi.journal import Journal, JournalFullError, NewEvent
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
@@ -172,7 +172,7 @@ class SmallRig:
         del points
         self._row = (row, take)
         for board in self._samples.instrument.recorded:
-            path = folder / "raw" / board.name / f"{row:04d}{PART}"
+            path = folder / "raw" / board.name / f"{row:04d}{PART_SUFFIX}"
             self._segments[board.name] = Segment(path, self._samples.instrument.row_bytes)
 
     def statuses(self) -> dict[str, Any]:
@@ -193,13 +193,13 @@ class SmallRig:
         row, take = self._row
         data = self._samples.of(name, row)
         log = PacketLog(len(data))
-        evidence = Evidence(len(data), self._samples.instrument.frame_bytes, past=Past.after_reset())
+        evidence = Evidence(len(data), self._samples.instrument.frame_bytes, past=EarlierRecords.after_reset())
         for k, packet in enumerate(encode_packets(data, 1, 0)):
             log.add(np.frombuffer(packet, dtype=np.uint8)[None, :], np.array([len(packet)]), k + 1)
         placed, out = place_record(log, evidence.frame_bytes)
         crc = segment.finish(out)
         index = write_index(segment.path.with_suffix(".idx"), placed.facts(), placed.arrivals)
-        packets = write_packets(segment.path.with_suffix(PACKETS), log, evidence, placed)
+        packets = write_packets(segment.path.with_suffix(PACKETS_SUFFIX), log, evidence, placed)
         return RowCapture(
             row=row, take=take, expected=len(data), bytes=len(data), missing=[], located=True, reason="",
             counts=PacketCounts(placed=1), losses=Losses(), strangers=0, stale=0, kernel_drops=0,

@@ -274,7 +274,7 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     monkeypatch.setattr(
         processing,
         "make_products",
-        lambda *given: commands.append(given) or SimpleNamespace(summary=str, exit_status=0),
+        lambda *given, **_: commands.append(given) or SimpleNamespace(summary=str, exit_status=0),
     )
     monkeypatch.setattr(processing, "publish_images", lambda *_: None)
     update = progress.ScanBar.update

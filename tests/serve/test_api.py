@@ -24,6 +24,7 @@ from tests.support.products import judged_products, name_check_plate
 
 from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, SignOfLife, read_start_ticks
 from polysight.products import SCAN, write_json
+from polysight.products.folder import replace_products
 from polysight.results import ScanFacts, to_plain
 from polysight.serve import commands as control, site
 from polysight.serve.guard import TOKEN_HEADER
@@ -265,12 +266,12 @@ def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(
     generations = itertools.count()
     ended = threading.Event()
 
-    def replace_products() -> None:
+    def process_again() -> None:
         while not ended.is_set():
             with replace_products(out, "s") as new:
                 judged_products(new, "none" if next(generations) % 2 else "good")
 
-    worker = threading.Thread(target=replace_products)
+    worker = threading.Thread(target=process_again)
     worker.start()
     levels: list[str] = []
     try:

@@ -259,7 +259,7 @@ def add_model_option(sub: argparse.ArgumentParser, none: bool = False) -> None:
 
 
 def add_config_option(sub: argparse.ArgumentParser, shipped: bool = False) -> None:
-    """Add `--config`; with `parse_shipped_path` the packaged rig file is used where the current folder has none."""
+    """Add `--config`; with `shipped` the packaged rig file is used where the current folder has none."""
     default = RIG_FILE
     text = "instrument.toml"
     if shipped:

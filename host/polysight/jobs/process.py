@@ -33,7 +33,6 @@ from polysight.process import (
     convert_boxes_to_patches,
     explain_unnamed,
     is_given_images,
-    lacks_positions,
     load_classifier,
     make_reference,
     map_rows,
@@ -157,8 +156,7 @@ def make_products(
             products = pipeline.finish(new, plates, progress)
             if pipeline.quality.boards_masked:
                 raise _no_pixel_error(pipeline)
-            # Positions without data bend the phase of flat plates, too.
-            if has_steep_patch(new) and not lacks_positions(pipeline.quality):
+            if has_steep_patch(new):
                 progress("surfaces")
                 add_surfaces(pipeline, new)
             return replace(products, folder=out)

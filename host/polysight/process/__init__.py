@@ -9,7 +9,7 @@ on the result; `save_images` and `save_materials` write the products. `polysight
 
 from polysight.process.given_images import analyse_given_images, is_given_images, make_reference, read_given_images
 from polysight.process.inputs import NO_INPUTS, Inputs, convert_boxes_to_patches, explain_unnamed, load_classifier
-from polysight.process.judge import judge, lacks_positions
+from polysight.process.judge import judge
 from polysight.process.quality import Quality
 from polysight.process.rows import KeptSamples, SampleUse, count_cores, map_boards, map_rows
 from polysight.process.save import (

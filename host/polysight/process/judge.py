@@ -53,7 +53,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     return recorded + missing + rules.judge_reconstruction(filled)
 
 
-def lacks_positions(quality: Quality) -> bool:
+def _lacks_positions(quality: Quality) -> bool:
     """Return true if more positions than a few of some board have no data, and were not reconstructed."""
     if quality.filled:
         return False
@@ -114,7 +114,7 @@ def judge(
     tilt_deg = (0.0, 0.0)
     if "metal_reference" in quality.notes:
         tilt_deg = quality.notes["metal_reference"].tilt_deg
-    reasons += scene_reasons(result, plane, classifier, tilt_deg, has_gaps=lacks_positions(quality))
+    reasons += scene_reasons(result, plane, classifier, tilt_deg, has_gaps=_lacks_positions(quality))
     if check.name:
         reasons += check_reasons(check_plate(check, result.rows()))
     return join_reasons(reasons)

@@ -32,7 +32,7 @@ test: $(VENV)/installed  ## install what is missing, then run every test
 LONG := tests/stage tests/store tests/capture/test_adversary.py tests/acquisition/test_adversarial_scans.py \
 	tests/acquisition/test_mangled_takes.py tests/acquisition/test_pulse_times.py tests/pi/test_hostile.py \
 	tests/pi/test_edges.py tests/pi/test_stops.py tests/calibration/test_metal.py tests/materials \
-	tests/process/test_metal_scans.py tests/surfaces/test_what_is_no_surface.py tests/e2e/test_killed_processes.py \
+	tests/process/test_metal_scans.py tests/surfaces/test_rejected_surfaces.py tests/e2e/test_killed_processes.py \
 	tests/e2e/test_random_commands.py tests/radar/test_random_faults.py tests/serve/test_generations.py \
 	tests/serve/test_states.py tests/simulators/test_scene_pairs.py $(shell grep -rl --include='*.py' '^@given' tests)
 test-long: $(VENV)/installed  ## tests at full length: random rows, records, messages, faults and kills by the ten thousand (hours)

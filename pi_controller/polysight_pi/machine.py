@@ -559,7 +559,8 @@ class Machine:
         self._loop.disarm()
 
     def _abort(self, reason: str) -> str | None:
-        # STOP first: `_decide` waits for the burst under way, and the call that sets its line may hang.
+        # STOP first: `_set_result` disarms the loop, which waits for the burst under way, and the call that sets the
+        # line of that burst may hang.
         next_state = self._stop()
         self._set_result("aborted", PiFault.ABORTED, reason)
         return next_state

@@ -81,7 +81,7 @@ def test_touch_in_a_shell_is_a_command(control):
     wait_for(lambda: stop.paused, "the pause")
 
 
-def test_alive_says_who_scans_and_what_was_asked_and_goes_at_the_end(tmp_path):
+def test_the_status_of_a_scan_names_its_host_and_requests_and_ends_with_it(tmp_path):
     assert read_life(tmp_path) is None
     stop = StopRequest()
     with ControlFolder(tmp_path, stop) as control:
@@ -131,7 +131,7 @@ def test_a_sign_of_life_is_written_once_an_interval(tmp_path, monkeypatch):
         assert len(written) == 1
 
 
-def test_a_killed_program_is_told_from_one_that_says_nothing(tmp_path):
+def test_a_killed_program_is_distinguished_from_a_silent_one(tmp_path):
     """Also if another process has its process number now."""
     (tmp_path / CONTROL_FOLDER).mkdir()
     lives = [

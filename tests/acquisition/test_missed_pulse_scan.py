@@ -78,7 +78,7 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(timed_rig, paylo
         assert load_facts(result.folder, "row_committed")[0]["boards"][name]["pulses_missed"] == len(pulses)
 
 
-def test_a_card_is_reset_behind_a_row_whose_frames_came_at_other_times(timed_rig, tmp_path):
+def test_a_card_is_reset_after_a_row_whose_frames_came_at_other_times(timed_rig, tmp_path):
     """A spurious edge and as many lost packets at the end leave the length right: the next start is one frame off."""
     timed_rig.cards["RH"].extra[0, 1] = 20
     result = run_scan(timed_rig.instrument, tmp_path / "s")

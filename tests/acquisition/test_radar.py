@@ -101,7 +101,7 @@ def test_refused_connection_is_an_error_with_a_remedy(server):
     assert "radar.servers" in e.value.remedy
 
 
-def test_server_gone_between_rows_is_named(server):
+def test_a_server_that_ends_between_rows_is_named(server):
     with LineServers({"RH": server.address}, 5.0) as radars:
         server.accept()
         server.close()
@@ -227,7 +227,7 @@ def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
     assert any("RF core fault 7" in reason for reason in fact["reasons"])
 
 
-def test_radar_that_faults_within_a_row_ends_it_at_once(rig, tmp_path):
+def test_radar_that_faults_within_a_row_ends_it_immediately(rig, tmp_path):
     rig.pi.hang_at = {0}
     radars = Native(RadarState.ARMED)
     calls = []

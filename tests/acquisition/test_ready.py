@@ -93,7 +93,7 @@ def test_disk_space_checked_is_that_of_the_rows(make_instrument, tmp_path, monke
         check_disk(tmp_path, rig, rows)
 
 
-def test_plan_and_doctor_tell_the_size_of_a_scan(make_instrument):
+def test_plan_and_doctor_show_the_size_of_a_scan(make_instrument):
     rig = make_instrument()
     assert forecast(rig).raw_bytes == rig.scan_bytes == rig.grid.rows * rig.recorded_row_bytes
     bench: Any = SimpleNamespace(rig=rig)

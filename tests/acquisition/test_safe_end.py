@@ -124,7 +124,7 @@ def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
     assert m.Home not in sent[sent.index(m.RunRow) : last_row], "none between rows"
 
 
-def test_pi_that_restarted_between_rows_ends_the_scan_at_once(rig, tmp_path):
+def test_pi_that_restarted_between_rows_ends_the_scan_immediately(rig, tmp_path):
     def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.run = None

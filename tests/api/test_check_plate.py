@@ -77,7 +77,7 @@ def products_copy(products, tmp_path):
 
 
 @pytest.mark.parametrize(("permittivity", "status"), [((3.78, 0.7), 0), ((9.0, 0.01), 1)])
-def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permittivity, status):
+def test_the_command_prints_and_draws_the_check(products_copy, tmp_path, capsys, permittivity, status):
     x_mm, y_mm = PET["centre_mm"]
     name_check_plate(products_copy, CheckPlate(name="PET", permittivity=permittivity, place_mm=(x_mm, y_mm)))
     chart = tmp_path / "chart.png"
@@ -102,7 +102,7 @@ def test_the_command_says_and_draws_it(products_copy, tmp_path, capsys, permitti
     assert np.ptp(bar) == pytest.approx(2 * WARNING_SIGMAS * check["measured_std"][0])
 
 
-def test_a_check_of_nothing_says_so():
+def test_a_check_without_scans_is_refused():
     with refused(ErrorCode.OTHER):
         polysight.check()
 

@@ -93,7 +93,7 @@ def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, others):
     assert skipped <= NOT_CHECKED
 
 
-def test_columns_that_are_no_angles_are_refused(library):
+def test_columns_that_are_not_angles_are_refused(library):
     X, y, _ = library.columns()
     with pytest.raises(ValueError, match="3 feature"):
         Classifier("discriminant").fit(X[:, :3], y)

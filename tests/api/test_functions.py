@@ -67,7 +67,7 @@ def test_an_array_with_labels_is_one_medium(which):
 
 
 @pytest.mark.parametrize("theta", [55.0, np.array([0.9, 55.0]), xarray.DataArray([55.0], dims="angle")])
-def test_degrees_are_no_radians(theta):
+def test_degrees_are_not_taken_as_radians(theta):
     for call in (lambda: fresnel(3.8 - 0.7j, theta), lambda: permittivity_from_ratio(2.0, theta_rad=theta)):
         with refused(ErrorCode.VALUE_INVALID, 55):
             call()
@@ -76,7 +76,7 @@ def test_degrees_are_no_radians(theta):
     assert np.isnan(fresnel(3.8 - 0.7j, np.nan)[0])
 
 
-def test_types_say_whether_labels_are_kept():
+def test_types_show_whether_labels_are_preserved():
     """`assert_type` is judged by pyright: tests/api is among the files of `make check`."""
     plain = np.array([2.0, 3.0])
     labelled = xarray.DataArray(plain, dims="kind")
@@ -129,7 +129,7 @@ def test_labelled_scans_make_a_library_that_names_them(products, tmp_path):
 
 
 @pytest.mark.parametrize("box", [[1, 2, 3], 7.0, "10,10,20,20", (20, 10, 10, 20)])
-def test_what_is_no_box_is_refused_by_name(products, tmp_path, box):
+def test_a_value_that_is_not_a_box_is_refused_by_name(products, tmp_path, box):
     place = shutil.copytree(products, tmp_path / "one")
     (place / "labels.json").unlink(missing_ok=True)
     with refused(ErrorCode.VALUE_INVALID, "oak"):
@@ -162,7 +162,7 @@ def test_an_unknown_change_of_a_plan_is_refused_with_those_that_are_known():
 
 
 @pytest.mark.parametrize("changes", [{"width_mm": "wide"}, {"columns": None}, {"pulses": [7]}])
-def test_a_change_of_a_plan_that_is_no_number_is_refused_by_name(changes):
+def test_a_changed_plan_value_that_is_not_a_number_is_refused_by_name(changes):
     with refused(ErrorCode.VALUE_INVALID, next(iter(changes)), "not a number"):
         polysight.plan(**changes)
 

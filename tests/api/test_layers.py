@@ -36,7 +36,7 @@ def test_the_unknown_layer_of_each_patch(done):
     assert same.equals(layers)
 
 
-def test_a_free_thickness_by_one_band_is_told_ambiguous(done):
+def test_a_free_thickness_from_one_band_is_reported_as_ambiguous(done):
     layers = layer_dataset(done, CHIRP, ["sheet,?,0.5-4"], None, 10.0)
     assert bool(layers["ambiguous"].values[1])
     assert " mm" in layers["notes"].values[1]

@@ -63,7 +63,7 @@ def test_known_leakage_and_angle_are_taken_out_of_every_pixel(scan, angle_error_
     np.testing.assert_allclose(eps["permittivity"].values, TRUE, rtol=1e-9)
 
 
-def test_products_that_do_not_say_what_was_removed_are_not_corrected_twice(scan):
+def test_products_without_a_record_of_corrections_are_not_corrected_twice(scan):
     leaking = leaking_scan(scan.rig)
     assert leaking.materials is not None
     known = LeakageError(h=pair(LEAKAGE_H), v=pair(LEAKAGE_V), std=(0.01, 0.01), source="scene")
@@ -161,6 +161,6 @@ def test_a_place_has_the_figures_of_map_and_patch(scan):
 
 
 @pytest.mark.parametrize("place", [(900.0, 0.0), (0.0, -900.0)])
-def test_a_place_outside_the_image_is_no_border_pixel(scan, place):
+def test_a_place_outside_the_image_is_not_a_border_pixel(scan, place):
     with refused(ErrorCode.VALUE_INVALID):
         scan.probe(*place)

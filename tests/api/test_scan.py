@@ -337,7 +337,7 @@ def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
             call()
 
 
-def test_a_scan_without_metal_says_what_can_be_had(tmp_path):
+def test_a_scan_without_metal_lists_the_available_results(tmp_path):
     scan = open_scan(simulate_plates(tmp_path / "scan"))
     assert scan.verdict is not None
     assert scan.verdict.level == "none"
@@ -359,7 +359,7 @@ def test_parameters_that_cannot_be_used_are_errors(folder, wrong):
         open_scan(folder, **wrong).materials()
 
 
-def test_a_rig_beside_a_scan_folders_own_is_said_to_be_ignored(folder):
+def test_a_given_rig_is_reported_as_ignored_if_the_scan_folder_has_one(folder):
     with pytest.warns(UserWarning, match="`rig` is ignored"):
         opened = open_scan(folder, rig=REPO / "instrument.toml")
     assert opened.rig == open_scan(folder).rig
@@ -374,7 +374,7 @@ def test_products_cannot_be_processed_again(products):
         open_scan(products).image(metal_referenced=False)
 
 
-def test_products_that_say_nothing_of_the_scan_still_open(products, tmp_path):
+def test_products_without_facts_of_the_scan_can_be_opened(products, tmp_path):
     bare = shutil.copytree(products, tmp_path / "bare")
     for name in ("scan.json", "quality.json", "patches.npz"):
         (bare / name).unlink()

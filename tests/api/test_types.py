@@ -51,7 +51,7 @@ def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
 @pytest.mark.parametrize(
     ("name", "function"), [pytest.param(*f, id=f[0]) for f in public_functions() if f[0] not in NOT_TYPED]
 )
-def test_every_parameter_and_result_has_a_type_that_says_something(name, function):
+def test_every_parameter_and_result_has_a_specific_type(name, function):
     signature = inspect.signature(function)
     types = {p.name: p.annotation for p in signature.parameters.values() if p.name not in ("self", "cls")}
     if not name.endswith(".__init__"):

@@ -79,7 +79,7 @@ def test_without_a_gpu_nothing_is_claimed(
     assert not (tmp_path / "gpu.json").exists()
 
 
-def test_another_library_is_measured_beside_numpy_and_the_exact_sum(
+def test_another_library_is_compared_with_numpy_and_the_exact_sum(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     strict = gpu.Library("array-api-strict", importlib.import_module("array_api_strict"), None, "no card")

@@ -26,7 +26,7 @@ def test_learnt_intervals_are_narrower_by_what_a_feature_tells():
     assert 0.19 < np.median(half_width) < 0.95
 
 
-def test_what_no_feature_tells_stays_in_the_intervals():
+def test_errors_that_no_feature_shows_stay_in_the_intervals():
     rng = np.random.default_rng(4)
     row = np.zeros(600, np.intp)
     deviation = rng.standard_normal(row.size)

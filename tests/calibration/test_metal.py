@@ -156,7 +156,7 @@ def test_a_scan_without_metal_is_refused(tmp_path, make_rig, make_scan):
     assert not (tmp_path / "c").exists()
 
 
-def test_a_plastic_sheet_is_no_metal_plate(tmp_path, make_rig, make_scan):
+def test_a_plastic_sheet_is_not_a_metal_plate(tmp_path, make_rig, make_scan):
     sheet = {k: v for k, v in PLATE.items() if k != "metal"} | {"name": "acrylic", "permittivity": [4.0, 0.4]}
     folder = make_scan(tmp_path / "sheet", make_rig(**SMALL), plates=[sheet])
     with refused(ErrorCode.NO_DATA, "no metal"):

@@ -74,7 +74,7 @@ def test_lost_reply_is_retried(scripted_card):
     assert [c for c, _ in card.seen] == [Code.ALIVE, Code.ALIVE]
 
 
-def test_a_reply_that_waits_when_the_program_goes_on_is_no_lost_one(scripted_card, monkeypatch):
+def test_a_reply_that_waits_while_the_program_is_stopped_is_not_lost(scripted_card, monkeypatch):
     """The program is delayed after its request, or the machine sleeps: it reads the reply after the timeout."""
     client, sent_to = scripted_card(lambda code, _: [reply(code)])
     requests = []
@@ -302,7 +302,7 @@ def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_
         client.record_start()
 
 
-def test_second_cards_are_told_of_every_board(rig, cards, monkeypatch):
+def test_a_second_card_of_any_board_is_reported(rig, cards, monkeypatch):
     names = [board.name for board in rig.boards]
     cards(*names, **dict.fromkeys(names, Faults(twin=True)))
     monkeypatch.setattr(card, "_TWIN_S", HANG_S)

@@ -52,7 +52,7 @@ def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str 
     return root
 
 
-def test_an_interface_that_does_not_tell_its_link_is_passed_over(tmp_path):
+def test_an_interface_without_a_link_status_is_skipped(tmp_path):
     root = kernel(tmp_path, carrier=None)
     assert find_silent_hop(CARD, root) is Hop.LINK
     (root / "sys/class/net/eth1/operstate").write_text("unknown\n")
@@ -147,7 +147,7 @@ try mute
 """
 
 
-def test_real_interfaces_tell_the_hops_apart():
+def test_each_hop_is_distinguished_on_real_interfaces():
     """A separate network of two virtual ethernet ports: unplug it, remove the card, silence it."""
     tools = [shutil.which(name) for name in ("unshare", "ip", "nsenter", "mount")]
     make = ["unshare", "-rnm", "sh", "-c", "mount -t sysfs s /sys && ip link add c0 type veth peer name c1"]

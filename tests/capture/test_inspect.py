@@ -50,7 +50,7 @@ def test_other_files_are_refused(tmp_path, content):
 
 @pytest.mark.parametrize("size", [5000, 1 << 16, 1 << 20])
 @pytest.mark.parametrize("layout", [Layout(), Layout(lanes=2), Layout(samples=64)])
-def test_random_bytes_are_no_recording(tmp_path, size, layout):
+def test_random_bytes_are_not_a_recording(tmp_path, size, layout):
     path = tmp_path / "x.bin"
     path.write_bytes(np.random.default_rng(size).bytes(size))
     with refused(ErrorCode.FILE_FOREIGN, str(path)):

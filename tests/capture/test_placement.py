@@ -108,7 +108,7 @@ class Oracle:
     cut=st.floats(0, 0.05),
     strange=st.floats(0, 0.05),
 )
-def test_every_disorder_at_once(
+def test_every_disorder_together(
     frame, packets, count, sequence, batch, chance: random.Random, loss, double, shuffle, lateness, cut, strange
 ):
     """Loss, duplicates, reordering, late and truncated packets, leftovers and nonsense, each up to 5 %."""
@@ -166,7 +166,9 @@ def test_every_disorder_at_once(
     skip=st.integers(0, 3),
     chance=st.randoms(use_true_random=True),
 )
-def test_counters_go_on_and_are_not_proportional(frames, frame, records, count, sequence, skip, chance: random.Random):
+def test_counters_continue_and_are_not_proportional(
+    frames, frame, records, count, sequence, skip, chance: random.Random
+):
     """Each record ends with a short packet: sequence and byte count drift apart, but every record is found."""
     start = EarlierRecords(Counters(count, sequence))
     for n in range(records):
@@ -347,7 +349,7 @@ def test_a_lost_start_is_known_again_after_a_reset(size):
 
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
-def test_of_a_card_that_counts_anew_in_every_record_every_second_take_is_kept(size):
+def test_every_second_take_of_a_card_that_restarts_its_counters_in_each_record_is_kept(size):
     card = Card(size)
     past = EarlierRecords.after_reset()
     accepted = []

@@ -46,7 +46,7 @@ def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
         card.sendto(packet, (board.host_address, board.data_port))
 
 
-def test_rows_are_bit_exact_and_counters_go_on(board, card, tmp_path):
+def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
     size = 300 * 4096
     first = noise(size, 1)
     second = noise(size, 2)
@@ -257,7 +257,7 @@ def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
     assert read_index(tmp_path / "a.idx")[0]["card_status"] == row.card_status
 
 
-def test_the_short_last_packet_is_reported_at_once(board, card, tmp_path):
+def test_the_short_last_packet_is_reported_immediately(board, card, tmp_path):
     """Frames were missed: the byte count is not reached, and the card's short last packet shows the end."""
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part", after_reset=True)

@@ -18,7 +18,7 @@ from polysight_shared.errors import DataError, ErrorCode
 CENTRE = tuple(PET["centre_mm"])
 
 
-def test_a_place_tells_its_own_pixel(processed):
+def test_a_place_shows_its_own_pixel(processed):
     pixels = Pixels(processed / "one" / "products")
     row, column = pixels.nearest(*CENTRE)
     answer = probe(processed / "one", *CENTRE)
@@ -63,7 +63,7 @@ def test_the_range_profile_has_its_peak_at_the_plate(processed):
             assert abs(answer.path_m[int(np.argmax(levels))]) < 0.03
 
 
-def test_metal_has_no_permittivity_and_says_why(processed):
+def test_metal_has_no_permittivity_and_the_reason_is_given(processed):
     answer = probe(processed / "one", *COPPER["centre_mm"])
     assert answer.permittivity is None
     assert "metal" in answer.why
@@ -76,7 +76,7 @@ def test_places_outside_the_image_are_refused(processed):
             probe(processed / "one", *place)
 
 
-def test_without_a_result_nothing_is_told_of_materials(tmp_path):
+def test_without_a_result_no_material_is_reported(tmp_path):
     judged_products(tmp_path, "none", careless=True)
     answer = probe(tmp_path, 0.0, 0.0)
     assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
@@ -200,7 +200,7 @@ def test_images_whose_arrays_do_not_belong_together_are_refused(tmp_path, change
             look()
 
 
-def test_a_pipe_in_the_image_s_place_keeps_nobody_waiting(tmp_path):
+def test_a_pipe_in_place_of_the_image_blocks_no_reader(tmp_path):
     folder = judged_products(tmp_path / "a", "good")
     (folder / "image.npz").unlink()
     os.mkfifo(folder / "image.npz")

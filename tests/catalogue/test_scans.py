@@ -58,7 +58,7 @@ def test_every_scan_is_listed_with_its_state(root):
     )
 
 
-def test_images_without_materials_are_no_result(root):
+def test_images_without_materials_are_not_a_result(root):
     """Such folders are left by a killed `process`, or made by `polysight image`."""
     (root / "done" / "products" / "materials.json").unlink()
     summary = Scans(root).summary("done")
@@ -130,7 +130,7 @@ def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
     assert Scans(root, index=index).summary("done").notes == "dog"
 
 
-def test_a_list_whose_time_is_over_goes_on_with_the_next(root):
+def test_a_list_cut_off_by_its_time_limit_continues_at_the_next_request(root):
     """The last name comes first, and entries that were read are kept; the index is written only for complete lists."""
     whole = Scans(root).list()
     last = max(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))

@@ -178,7 +178,7 @@ def test_other_words_are_left_as_they_are():
 
 
 @pytest.mark.parametrize("place", ["-60,0", "-.5,-1", "60,-1"])
-def test_a_place_in_the_left_half_is_no_option(place):
+def test_a_negative_coordinate_is_not_taken_as_an_option(place):
     words = build_parser().parse_args(join_negative_values(["probe", "scan", place]))
     assert words.place_mm == tuple(map(float, place.split(",")))
 

@@ -125,13 +125,13 @@ sys.exit(cli.main([]))
 """
 
 
-def test_an_early_interrupt_on_the_pi_is_no_traceback():
+def test_an_early_interrupt_on_the_pi_prints_no_traceback():
     """Its modules take a second to load on a Pi: they are loaded where Ctrl-C is handled."""
     process = subprocess.run([sys.executable, "-c", INTERRUPT_THE_PI], capture_output=True, text=True, check=False)
     assert (process.returncode, process.stderr) == (128 + signal.SIGINT, "")
 
 
-def test_characters_that_the_terminal_lacks_are_no_traceback(products):
+def test_characters_that_the_terminal_lacks_cause_no_traceback(products):
     (products.parent / "Käse").mkdir()
     products.rename(products.parent / "Käse" / "products")
     line = "PYTHONIOENCODING=ascii $P materials Käse/products > said"
@@ -157,7 +157,7 @@ sys.exit(main(["plan", "--help"]))
 
 
 @pytest.mark.parametrize("module", ["typing", "pathlib", "polysight_shared.program", "polysight.cli.options"])
-def test_an_interrupt_while_the_first_modules_load_is_no_traceback(module):
+def test_an_interrupt_while_the_first_modules_load_prints_no_traceback(module):
     command = [sys.executable, "-c", INTERRUPT_AN_IMPORT, module]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode in (128 + signal.SIGINT, -signal.SIGINT)

@@ -30,7 +30,7 @@ def test_every_page_is_found_from_the_index():
     assert not {p.name for p in pages - linked}
 
 
-def test_fault_numbers_and_exit_statuses_are_told():
+def test_fault_numbers_and_exit_statuses_are_documented():
     text = (ROOT / "docs/how-to/when-it-goes-wrong.md").read_text(encoding="utf-8")
     for fault in PiFault:
         e = EXPLANATIONS[fault]
@@ -40,7 +40,7 @@ def test_fault_numbers_and_exit_statuses_are_told():
     assert {kind.exit_status for kind in kinds} | {0, 130} == answer
 
 
-def test_every_request_to_a_scan_is_told():
+def test_every_request_to_a_scan_is_documented():
     page = (ROOT / "docs/how-to/live-view.md").read_text(encoding="utf-8")
     assert all(f"control/{command}" in page for command in ScanCommand)
     assert list(ScanCommand) == [*SCAN_COMMANDS]

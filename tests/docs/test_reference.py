@@ -52,7 +52,7 @@ def test_links_between_the_pages_lead_somewhere(reference):
     assert 'href="docs/README.html"' in (reference / "index.html").read_text(encoding="utf-8")
 
 
-def test_pictures_and_linked_files_lie_beside_their_pages(reference):
+def test_pictures_and_linked_files_are_in_the_folder_of_their_pages(reference):
     """The folder can be moved: it does not depend on files of the machine that made it."""
     for page in reference.rglob("*.html"):
         assert '="file:' not in page.read_text(encoding="utf-8"), page

@@ -148,7 +148,7 @@ def test_frames_that_are_missing_are_an_error_and_lost_packets_a_warning(row, ve
 
 
 @pytest.mark.parametrize("state", RadarState)
-def test_only_a_fault_of_the_radar_itself_is_an_error_beside_complete_frames(state):
+def test_with_complete_frames_only_a_fault_of_the_radar_itself_is_an_error(state):
     context = with_frames(simulate_frames("RH"))
     context.captured["RH"] = replace(context.captured["RH"], radar=BoardState(state, "hot"))
     finding = check_radar(context, RIG.by_name("RH"))

@@ -120,7 +120,7 @@ def test_a_scan_is_planned_started_and_shown(lab):
     assert "oak" in list_text
 
 
-def test_a_scan_pauses_goes_on_stops_and_is_resumed(lab):
+def test_a_scan_pauses_continues_stops_and_is_resumed(lab):
     folder = lab.start("second", rows=ROWS)
     lab.wait_rows(folder, 1)
     lab.click("pause")

@@ -118,7 +118,7 @@ def scan(recorded_scan, bench):
 
 
 @pytest.mark.parametrize("command", ["process", "validate", "resume"])
-def test_folder_that_is_no_scan(bench, command):
+def test_a_folder_that_is_not_a_scan_is_refused(bench, command):
     out = ["--out", "out"] if command == "process" else []
     (bench.folder / "empty").mkdir()
     (bench.folder / "other").mkdir()

@@ -100,7 +100,7 @@ def lacks_a_part(call: ast.Call) -> bool:
     return len(call.args) + len(keywords & {"why", "remedy"}) < 3 and not is_unpacked
 
 
-def test_every_error_says_what_why_and_what_to_do():
+def test_every_error_gives_its_cause_and_a_remedy():
     files = [file for file in list_tracked(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
     incomplete = {str(file.relative_to(ROOT)): read_facts(file).incomplete_errors for file in files}
     assert {name: lines for name, lines in incomplete.items() if lines} == {}
@@ -116,7 +116,7 @@ def rooms() -> list[Path]:
 
 
 @pytest.mark.parametrize("room", rooms(), ids=lambda p: p.name)
-def test_a_room_says_what_it_is(room):
+def test_the_front_of_each_room_describes_it(room):
     tree = ast.parse((room / "__init__.py").read_text(encoding="utf-8"))
     docstring = ast.get_docstring(tree) or ""
     assert 2 <= len(docstring.splitlines()) <= 14, (
@@ -146,7 +146,7 @@ def test_neighbours_import_only_from_a_rooms_front():
     assert past == []
 
 
-def test_no_module_is_taken_from_behind_a_front():
+def test_no_module_is_imported_past_the_front_of_its_room():
     """Not `from polysight.sync import tone` either, unless the front names it; nor relative imports."""
     past = []
     for file in (f for top in (HOST, PAPERS) for f in top.rglob("*.py")):

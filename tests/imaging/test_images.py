@@ -504,7 +504,7 @@ def test_plates_of_any_heights_are_on_a_plane_that_is_tilted_as_the_plates_are(m
     assert errors_deg["unseen"] > 0.6
 
 
-def test_own_tilts_of_too_few_plates_or_unlike_ones_say_little_of_the_planes_tilt():
+def test_tilts_of_few_or_differing_plates_determine_the_planes_tilt_poorly():
     alike = plane.TiltPrior.from_plates([(0.01, 0.0), (0.01, 0.0), (0.01, 0.0)])
     assert alike.mean[0] == pytest.approx(0.01, rel=0.1)
     # Their tilt along y is not known.

@@ -81,7 +81,7 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
     assert peak == pytest.approx(1, abs=0.03)
 
 
-def test_notices_of_images_are_told_if_there_are_any(make_rig):
+def test_notices_of_images_are_reported_if_there_are_any(make_rig):
     builder = ImageBuilder(make_rig(5, 5))
     notice = "the direct sum is slower"
     assert describe_imaging(builder, SimpleNamespace(notices=(notice,)))["notices"] == [notice]

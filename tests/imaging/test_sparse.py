@@ -62,7 +62,7 @@ def test_points_of_a_sparse_scan_are_reconstructed_without_aliases(board, name):
     assert reconstruction.residual[-1] < 0.25 < reconstruction.residual[0]
 
 
-def test_weak_reflectors_beside_a_strong_one_are_kept(board):
+def test_weak_reflectors_near_a_strong_one_are_kept(board):
     """Thin wood has 0.42 of the amplitude of metal in H and 0.035 in V."""
     amplitudes = np.array([1.0, 0.035j, -0.42])
     reconstruction = reconstruct(board(_select_kept("every second column"), amplitudes), iterations=25)
@@ -141,7 +141,7 @@ def test_steps_too_wide_for_the_image_are_divided(scan):
     assert ghosts[1] < 0.5 * ghosts[0]
 
 
-def test_an_aperture_that_needs_the_direct_sum_is_refused_at_once(scan):
+def test_an_aperture_that_needs_the_direct_sum_is_refused_immediately(scan):
     """Rows 6 mm apart and pixels of 5 mm: each of a hundred images would take seconds."""
     is_kept = np.ones((10, 60), bool)
     is_kept[4] = False

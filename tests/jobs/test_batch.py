@@ -239,7 +239,7 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
 
 
 @pytest.mark.usefixtures("worker")
-def test_a_wrong_folder_fails_and_the_status_says_so(tmp_path, capsys):
+def test_a_wrong_folder_fails_and_the_exit_status_shows_it(tmp_path, capsys):
     scans(tmp_path / "in", "a", "bad")
     command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
     assert main([*command, "--jobs", "1"]) == 1
@@ -251,7 +251,7 @@ def test_a_wrong_folder_fails_and_the_status_says_so(tmp_path, capsys):
     assert main([*command[:3], "--out", str(tmp_path / "file")]) == 2
 
 
-def test_without_dask_the_line_that_installs_it_is_told(tmp_path, monkeypatch, capsys):
+def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "dask", None)
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
     scans(tmp_path / "in", "a")

@@ -69,7 +69,7 @@ def test_boxes_are_drawn_moved_renamed_and_removed(products):
     assert boxes(products).specimen("oak") is None
 
 
-def test_a_patch_told_to_be_metal_is_called_so(products):
+def test_a_patch_declared_as_metal_is_named_metal(products):
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "2=oak"]) == 0
     assert (list(boxes(products).boxes), boxes(products).metal) == (["metal", "oak"], "metal")
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "1=x", "--rename", "2=oak"]) == 0
@@ -141,7 +141,7 @@ def test_without_a_terminal_patches_are_listed(products, capsys):
     assert not (products / "labels.json").exists()
 
 
-def test_labels_of_a_scan_folder_lie_beside_its_rows(tmp_path):
+def test_labels_of_a_scan_folder_are_saved_in_the_folder_of_its_rows(tmp_path):
     scan = tmp_path / "scan"
     judged_products(scan / "products", "good")
     (scan / "manifest.jsonl").write_text("")
@@ -162,7 +162,7 @@ def test_boxes_by_hand_outlive_products_of_the_same_scan_alone(products, scan_id
     assert (products / "labels.png").exists() == kept
 
 
-def test_the_classifiers_names_are_no_labels(products):
+def test_the_classifiers_names_are_not_labels(products):
     (products / "labels.json").write_text(json.dumps({"labels": {"metal": [0, 0, 3, 3]}}))
     assert find_labels(products) is None
 

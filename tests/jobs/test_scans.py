@@ -75,7 +75,7 @@ def test_a_running_scan_is_asked(root, capsys):
     assert "polysight resume" in capsys.readouterr().err
 
 
-def test_a_place_and_two_scans_are_told(root, capsys, tmp_path):
+def test_results_at_a_place_and_of_two_scans_are_printed(root, capsys, tmp_path):
     text = answer(capsys, "probe", root / "two", "0,0")
     assert "|H|" in text
     assert json.loads(answer(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True

@@ -102,7 +102,7 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
         assert abs(np.median(first_item.p) / np.median(second_item.p) - 1) < 0.02
 
 
-def test_labels_win_over_the_truth_and_drawn_specimens_are_told_apart(tmp_path):
+def test_labels_override_the_truth_and_drawn_specimens_are_distinguished(tmp_path):
     spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
     scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
     answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(load_training_scan(scan, RIG_FILE))]

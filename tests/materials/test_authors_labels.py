@@ -95,7 +95,7 @@ def test_the_orientation_does_not_depend_on_the_unit_of_the_images(tmp_path, fac
     assert not list(recwarn)
 
 
-def test_a_missing_image_is_told_in_words(tmp_path):
+def test_a_missing_image_is_reported_in_words(tmp_path):
     folder = write_scan(tmp_path)
     (folder / "sar_v.npy").unlink()
     with refused(ErrorCode.FILE_UNREADABLE, "sar_v.npy: not an image: No such file or directory"):

@@ -77,7 +77,7 @@ def test_older_names_of_numpy_are_read(tmp_path):
         content() | {"incident_angle": 10**400}, content() | {"incident_angle": []},
     ],
 )  # fmt: skip
-def test_a_pickle_of_something_else_is_no_material_file(tmp_path, thing):
+def test_a_pickle_of_something_else_is_not_a_material_file(tmp_path, thing):
     path = tmp_path / "PET_55.pkl"
     path.write_bytes(pickle.dumps(thing))
     with refused(ErrorCode.FILE_FOREIGN, path):

@@ -90,7 +90,7 @@ def test_two_scans_are_enough_to_learn_from():
     assert named[0].verdict.name == drawn.materials[1].name
 
 
-def test_another_model_can_be_asked_for_and_the_report_says_so(powders):
+def test_another_model_can_be_chosen_and_the_report_names_it(powders):
     knn = Classifier(powders, model="knn", angles_deg=[60.0])
     assert knn.model == PAPER_MODEL
     assert classifier_sentence(knn).startswith(PAPER_MODEL)
@@ -164,7 +164,7 @@ def test_two_scans_as_typed(folders, capsys):
     assert PAPER_MODEL in out
 
 
-def test_patches_exchanged_between_two_angles_are_told(folders, scans, capsys):
+def test_patches_exchanged_between_two_angles_are_reported(folders, scans, capsys):
     second_scan = scans[1]
     angle = "60"
     truths = {"wood": "ceramic", "ceramic": "wood"}

@@ -52,7 +52,7 @@ def test_angle_of_metal_is_45_degrees():
     assert polarisation_angle_rad(np.exp(1j)) == pytest.approx(np.pi / 4)
 
 
-def test_an_exact_line_is_recovered_and_tells_what_it_has_not_seen():
+def test_an_exact_line_is_recovered_and_concentrations_left_out_are_predicted():
     result = fit_concentration(library(), {"water": 0.0})
     assert result.line.slope == pytest.approx(-400.0, rel=1e-4)
     assert result.median_error < 1e-3
@@ -81,7 +81,7 @@ def test_prediction_intervals_cover_as_often_as_they_say():
     assert 0.84 < np.mean(inside) < 0.96
 
 
-def test_names_tell_concentrations_unless_they_are_given():
+def test_concentrations_are_read_from_names_unless_they_are_given():
     assert concentrations(["Cane Sugar (1.3%, w glass)", "salt 12 %", "oil", "water"], {"water": 0.0}) == {
         "Cane Sugar (1.3%, w glass)": 1.3,
         "salt 12 %": 12.0,

@@ -63,7 +63,7 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
     assert (moved_verdicts.pixel_names == test.names).mean() > alone
 
 
-def test_a_phase_of_180_degrees_is_no_edge():
+def test_a_phase_of_180_degrees_is_not_an_edge():
     assert score(draw_pixels(2), DISCRIMINANT_MODEL).patches == 1.0
 
 
@@ -142,7 +142,7 @@ def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
 
 
 @pytest.mark.parametrize("stray", [0, 5])
-def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
+def test_metal_with_a_stray_pixel_does_not_change_the_results_of_others(stray):
     """The reference has no error of its own, so its patch does not change the results of others."""
     model = ErrorDiscriminant().fit(with_metal(draw_pixels(8), 0))
     test = with_metal(draw_pixels(9, scans=1), stray)
@@ -153,7 +153,7 @@ def test_metal_with_a_stray_pixel_tells_nothing_of_the_reference(stray):
     assert beside.names[-1] == "metal"
 
 
-def test_two_angles_are_independent_and_tell_more():
+def test_two_angles_are_independent_and_separate_materials_better():
     first_angle = draw_pixels(0, pixel=0.1, patch=0.05)
     two = draw_pixels(1, pixel=0.1, patch=0.05)
     both_angles = first_angle.join(two)
@@ -185,7 +185,7 @@ def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
     assert beside.confusion[1:].sum(axis=1) == pytest.approx(1.0)
 
 
-def test_a_library_says_which_materials_could_not_be_judged():
+def test_a_library_lists_the_materials_that_could_not_be_judged():
     few = draw_pixels(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
     fit = fit_samples(add_lonely_material(few))
     assert (fit["materials"], fit["not_judged"]) == (4, ["lonely"])

@@ -136,7 +136,7 @@ def test_leakage_that_was_not_measured_is_within_the_error_bars_whatever_its_pha
         assert all(p.dominated_by == "leakage" for p in result.patches)
 
 
-def test_where_even_plates_tell_the_leakage_it_is_found():
+def test_leakage_is_found_from_evenly_lit_plates():
     leak = (0.05j, 0.05j)
     patches = world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
     result = invert(patches, RigPrior(1e-5, reference_std=5e-4, brightness_range=(0.002, 0.002)))
@@ -265,7 +265,7 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     assert abs(into_v.mean() - 0.055) < 0.015
 
 
-def test_images_with_the_other_sign_of_phase_are_told_from_those_with_ours():
+def test_images_with_the_other_sign_of_phase_are_distinguished_from_ours():
     rng = np.random.default_rng(3)
     prior = RigPrior(1e-3, leakage_std=0.01)
     measurements = world(rng, (0.01, -0.01j))

@@ -94,7 +94,7 @@ def test_names_of_any_script_are_kept_in_one_form(text, name):
 
 
 @pytest.mark.parametrize("mark", ["\u200b", "\u00ad", "\u2060", "\ufeff"])
-def test_marks_that_show_nothing_are_no_part_of_a_name(mark):
+def test_invisible_characters_are_not_part_of_a_name(mark):
     with refused(ErrorCode.VALUE_INVALID):
         materials.clean_name(f"rubber{mark}")
 
@@ -148,7 +148,7 @@ def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
 
 
 @pytest.mark.parametrize("other", [(0.0, -20.0, 20.0, 20.0), (-20.0, 5.0, 20.0, 20.0), (5.0, 5.0, 20.0, 20.0)])
-def test_boxes_beside_or_above_each_other_do_not_overlap(other):
+def test_boxes_next_to_or_above_each_other_do_not_overlap(other):
     copper = (-20.0, -20.0, 0.0, 0.0)
     assert set(check_boxes({"copper": copper, "oak": other}).boxes) == {"copper", "oak"}
     reaching = (min(other[0], -0.5), min(other[1], -0.5), *other[2:])

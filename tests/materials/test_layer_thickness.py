@@ -72,7 +72,7 @@ def test_infinite_permittivity_is_metal_behind_a_layer():
     np.testing.assert_allclose([r_s, r_p], -turned, rtol=1e-9)
 
 
-def test_an_error_that_all_bands_share_is_no_misfit_and_moves_little():
+def test_an_error_that_all_bands_share_is_not_a_misfit_and_moves_little():
     """Two deviations of the common error: the data still fit, within the error bars."""
     for stack, layers in (([SHEET], [Layer("sheet")]), ([SHEET, PLATE], [Layer("sheet"), PLATE])):
         fit = fit_layer(measure_bands(stack, offset=2 * COMMON * np.exp(0.7j)), layers, THETA, NEAR)
@@ -90,7 +90,7 @@ def test_differences_between_bands_are_known_better_than_each():
     assert shared.std_thickness_m < 0.7 * independent.std_thickness_m
 
 
-def test_two_thicknesses_that_fit_are_both_told_in_millimetres():
+def test_two_thicknesses_that_fit_are_both_reported_in_millimetres():
     """The ratio of one narrow band repeats with half a wave more in the sheet."""
     band = Spectrum(np.array([[76.3e9], [76.4e9]]), np.ones((2, 1)))
     q, h = predict([SHEET], band, THETA)
@@ -188,7 +188,7 @@ def test_products_without_patches_print_none_and_their_verdict(folder, capsys):
     assert "no patch" not in capsys.readouterr().err
 
 
-def test_products_that_do_not_say_what_bands_share_know_no_more_than_one(folder):
+def test_products_without_the_errors_that_bands_share_count_as_one_band(folder):
     row = ScanMaterials.read(folder / "materials.json").segments[0]
     new = bands_of_row(row, CHIRP, 4)
     bands = [structs.replace(band, covariance=None) for band in row.bands]

@@ -98,7 +98,7 @@ def test_error_bars_grow_faster_than_the_noise_where_the_posterior_is_bent():
     assert (large < 1.5 * small).all()
 
 
-def test_ambiguity_is_said():
+def test_ambiguity_is_reported():
     """The ratio of one narrow band repeats with every half wave in the sheet; the whole sweep distinguishes them."""
     eps = 7.0 - 0.1j
     sheet = [Layer("sheet", None, 2e-3)]
@@ -125,7 +125,7 @@ def test_a_layer_before_which_nothing_lies_is_not_called_hidden_for_a_large_erro
     assert replace(fit, std_real=2.0).warnings() == ["the data hardly depend on this layer: its error bar is large"]
 
 
-def test_as_many_unknowns_as_numbers_are_told_with_what_would_tell_more():
+def test_as_many_unknowns_as_numbers_are_reported_with_the_missing_measurements():
     rival = LayerFit(6.11 - 1.58j, 0.96e-3, 0.1, 0.1, 1e-5, 0.02, 0)
     fit = LayerFit(6.28 - 1.22j, 1.74e-3, 0.1, 0.1, 1e-5, 0.01, 0, rivals=(rival,))
     told = fit.warnings()
@@ -161,14 +161,14 @@ def test_fewer_data_than_unknowns_are_refused():
         fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, (0.5e-3, 2e-3))
 
 
-def test_a_solution_at_the_end_of_what_is_looked_for_says_so():
+def test_a_solution_at_the_end_of_the_search_range_is_reported():
     beyond = fit_layer(measure_bands([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
     assert any("at the limit" in words for words in beyond.warnings())
     lossless = fit_layer(measure_bands([Layer("clear", 4 - 0j)]), [Layer("clear")], THETA)
     assert not any("at the limit" in words for words in lossless.warnings())  # zero loss is a valid result
 
 
-def test_what_one_scan_in_a_thousand_would_miss_is_said_and_its_rivals_are_kept():
+def test_a_misfit_of_one_scan_in_a_thousand_is_reported_and_its_rivals_are_kept():
     # Probability 0.97e-3
     fit = LayerFit(
         permittivity=4 - 0.4j, thickness_m=3e-3, std_real=0.03, std_loss=0.03, std_thickness_m=0.0, chi2=24.4, freedom=7
@@ -193,7 +193,7 @@ def test_a_known_layer_that_no_passive_material_is(eps):
         check_stack([Layer("a", eps, 1e-3), Layer("b")])
 
 
-def test_a_range_of_thickness_that_nothing_can_tell_apart():
+def test_a_range_of_thickness_too_wide_to_distinguish_solutions_is_refused():
     check_range((0.5e-3, 20e-3))
     with refused(ErrorCode.VALUE_INVALID, "1000 mm"):
         check_range((0.5e-3, 1.0))

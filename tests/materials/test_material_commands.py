@@ -11,7 +11,7 @@ from polysight.materials import Entry, Library
 from polysight_shared.errors import ErrorCode
 
 
-def test_a_report_of_images_alone_says_what_is_missing(tmp_path):
+def test_a_report_of_images_alone_lists_the_missing_results(tmp_path):
     (tmp_path / "image.npz").touch()
     with refused(ErrorCode.FILE_MISSING, "report.html"):
         report(tmp_path)

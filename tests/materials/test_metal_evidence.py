@@ -96,7 +96,7 @@ def test_alone_nothing_is_shown():
     assert evidence.others == 0
 
 
-def test_a_patch_that_looks_the_same_is_no_witness():
+def test_a_patch_that_looks_the_same_is_not_evidence():
     """Water beside water looks like metal beside metal."""
     equal_patches = [PatchMeasurement(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
     evidence = metal_evidence(dict(enumerate(equal_patches)), RigPrior(3e-3), 1.0 + 0j, KINDS)

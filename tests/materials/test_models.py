@@ -106,7 +106,7 @@ def test_scans_are_left_out_if_joined_ones_share_no_material():
     assert np.isfinite([judged.pixels, judged.by_patch, judged.patches, judged.unknown]).all()
 
 
-def test_the_split_by_pixel_does_straddle_and_says_so():
+def test_a_split_by_pixel_divides_patches_and_is_reported_as_optimistic():
     data = samples(groups=5, pixels=7)
     assert all(set(data.patches[train]) & set(data.patches[test]) for train, test in splits(data, by_pixel=True))
     assert "optimistic" in score(data, DISCRIMINANT_MODEL, by_pixel=True).split
@@ -215,7 +215,7 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
     assert (our_names == sklearn_names).mean() > 0.99
 
 
-def test_weights_are_fitted_and_turn_from_a_channel_that_tells_nothing():
+def test_a_channel_without_information_gets_a_small_weight():
     data = samples(groups=5, pixels=10)
     noisy = data.x.copy()
     noisy[:, 0] += np.random.default_rng(3).standard_normal(len(noisy))

@@ -57,7 +57,7 @@ def test_a_name_of_the_literature_is_never_one_of_the_library(real, loss):
         clean_name(verdict.name if verdict.source != "library" else UNKNOWN)
 
 
-def test_what_only_the_literature_explains_is_said_as_like_it():
+def test_a_patch_that_only_the_literature_explains_is_named_as_like_it():
     verdict = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).verdict
     assert verdict.source == "literature"
     assert "sapphire" in verdict.literature
@@ -86,7 +86,7 @@ def test_a_second_angle_makes_a_true_name_surer():
     assert verdict.confidence > alone
 
 
-def test_what_is_no_half_space_but_a_thin_plate_is_a_possible_layer():
+def test_a_thin_plate_that_fits_no_half_space_is_a_possible_layer():
     t, _ = draw_sheets(ANGLES[0])
     far = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
     names = [name_ratios(complex(far)).verdict.name, name_ratios(-0.25 + 0.2j).verdict.name]
@@ -119,13 +119,13 @@ def layer_probability(plates: int, brightness_std: float) -> tuple[float, float]
     return float(thin), float(thick)
 
 
-def test_brightness_tells_thin_plates_from_half_spaces_of_the_same_ratio():
+def test_brightness_distinguishes_thin_plates_from_half_spaces_of_the_same_ratio():
     thin, thick = layer_probability(60, brightness_std=0.05)
     assert thin > 0.5
     assert thick < 0.05
 
 
-def test_where_plates_are_unevenly_bright_their_brightness_tells_little():
+def test_brightness_of_unevenly_lit_plates_is_weak_evidence():
     thin, thick = layer_probability(60, brightness_std=0.6)
     assert abs(thin - thick) < 0.2
 
@@ -150,7 +150,7 @@ def dispersion(change: np.ndarray, std: float = 0.01) -> PatchDispersion:
     return PatchDispersion(change, np.full(3, std), BAND_HZ)
 
 
-def test_a_change_over_the_sweep_tells_layers_from_half_spaces():
+def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
     """Changes of plates before half spaces, from multilayer's r_s and r_p at both ends of a band of a tenth."""
     rng = np.random.default_rng(7)
     centre_hz = np.mean(BAND_HZ)
@@ -171,7 +171,7 @@ def test_a_change_over_the_sweep_tells_layers_from_half_spaces():
     assert max(half_spaces) < 1
 
 
-def test_a_change_over_the_sweep_that_is_not_known_well_tells_nothing():
+def test_an_uncertain_change_over_the_sweep_is_not_evidence():
     for std in (30.0, 1e60):
         unknown = compute_layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
         assert np.median(unknown) == pytest.approx(1, abs=0.05)
@@ -215,7 +215,7 @@ def test_each_reason_of_a_name_has_a_subject():
 
 
 @pytest.mark.parametrize(("unknown", "rival"), [(0.5, "a material that the library lacks 50 %"), (0.001, "no other")])
-def test_a_likely_unknown_material_is_told_as_a_rival(unknown, rival):
+def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
     """Half of the probability without a name is another likely material."""
     named = name_ratios(complex(inverse_ratio(LIBRARY["acrylic"], ANGLES[0])))
     verdict = replace(named.verdict, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})

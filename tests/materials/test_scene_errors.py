@@ -174,13 +174,13 @@ def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_wa
     assert np.abs(along_y_alone.value).max() > 2 * np.abs(both_ways.value).max()
 
 
-def test_slopes_along_a_row_are_no_drift():
+def test_slopes_along_a_row_are_not_a_drift():
     change = estimate_common_change(make_scatter(lambda x, _y: (20 * x, 0j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.005
     assert change.drifts < 0.9
 
 
-def test_plates_at_the_border_say_nothing_of_a_drift():
+def test_plates_at_the_border_are_not_evidence_of_a_drift():
     steep = make_scatter(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
     change = estimate_common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
     assert np.abs(change.value[:6]).max() < 0.01
@@ -215,7 +215,7 @@ def test_a_plate_that_a_copy_of_another_disturbs_is_doubted_alone():
     assert error[1:].max() < 0.01
 
 
-def test_bent_plates_are_no_ripple():
+def test_bent_plates_are_not_a_ripple():
     """Their brightness changes along y, in which direction H and V see different places."""
     rng = np.random.default_rng(3)
     bent = make_scatter(lambda _x, _y: (0j, complex(rng.normal(0, 4))))
@@ -246,7 +246,7 @@ def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
 
 
 @pytest.mark.parametrize(("left_px", "lies_in_halo"), [(59, True), (61, False)])
-def test_a_plate_within_36_mm_of_the_metal_lies_in_its_halo_even_if_nothing_beside_it_shows_that(left_px, lies_in_halo):
+def test_a_plate_within_36_mm_of_the_metal_lies_in_its_halo_even_without_free_pixels_around_it(left_px, lies_in_halo):
     metal = np.zeros((SIDE, SIDE), bool)
     metal[50:73, 20:43] = True
     plate = np.zeros_like(metal)

@@ -62,7 +62,7 @@ def test_speckle_does_not_hide_the_plates(synthetic):
     assert extra <= 2
 
 
-def test_weak_plates_are_found_beside_strong_ones(synthetic):
+def test_weak_plates_are_found_near_strong_ones(synthetic):
     """From metal to foam, 16 dB below it and 8 dB above the noise."""
     right, plates, extra = count_right_plates(synthetic, range(4), materials=WEAK_AND_STRONG, noise=0.06)
     assert right >= plates - 1
@@ -168,7 +168,7 @@ def test_plates_that_nearly_touch_are_patches_of_their_own(gap_cells, same_mater
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_plates_that_fill_the_image_are_all_found_beside_metal(seed):
+def test_plates_that_fill_the_image_with_metal_are_all_found(seed):
     """Six plates of 46 mm, 20 mm apart, as a small aperture sees them; all but the metal are 12 to 24 dB below it."""
     rng = np.random.default_rng(seed)
     levels_db = rng.permutation([0.0, -12.0, -15.0, -18.0, -21.0, -24.0]).reshape(2, 3)

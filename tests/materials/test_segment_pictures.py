@@ -212,7 +212,7 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_plate_cut_off_from_a_larger_patch_is_told(seed):
+def test_a_plate_cut_off_from_a_larger_patch_is_reported(seed):
     """Six plates without gaps: four in a square, two in a row at its corner. The last one was once lost."""
     size = 23
     places = [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]
@@ -239,7 +239,7 @@ def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
     assert copies.level_db == pytest.approx(-16.0, abs=2.0)
 
 
-def test_weak_plates_one_pitch_away_are_no_copies_if_both_channels_show_them():
+def test_weak_plates_one_pitch_away_are_not_copies_if_both_channels_show_them():
     """Cups and sheets of a grid lie where a shift by one pitch would copy others, 16 dB weaker in H."""
     plates = raster([0.0, 0.0, 0.0, 0.0], [COPPER, 0.3, 0.25, 0.35], 8)
     h, v = draw(5, plates, amplitude=0.05, phase_deg=3.0)
@@ -269,7 +269,7 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
         assert not best.cut
 
 
-def test_a_dim_plate_that_is_no_patch_is_no_background_but_a_table_is():
+def test_a_dim_plate_outside_patches_is_not_background_but_a_table_is():
     """A dim plate is not a measure of the background of others; a table behind is as dim, but larger than any plate."""
     usable = np.ones((AXIS.size, AXIS.size), bool)
     patch_mask = np.zeros_like(usable)

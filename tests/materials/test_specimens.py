@@ -59,7 +59,7 @@ def test_the_spread_is_found():
     assert np.mean([f[:, 1].mean() for f in spreads]) == pytest.approx(0.2, rel=0.2)
 
 
-def test_a_material_with_one_patch_tells_nothing_of_the_errors_of_others():
+def test_a_material_with_one_patch_does_not_change_the_errors_of_others():
     """Its patch is its mean: a residual of zero does not count."""
     samples = draw_pixels((0.03, 0.2), 6)
     repeated = np.isin(samples.names, ["a", "b", "c"])
@@ -92,7 +92,7 @@ def test_the_order_of_patches_does_not_matter_to_the_spread():
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
-def test_probabilities_mean_what_they_say_of_specimens_never_seen():
+def test_probabilities_of_unseen_specimens_are_calibrated():
     close = {"a": 4.0 - 0.4j, "b": 4.2 - 0.45j, "c": 4.45 - 0.6j, "d": 4.7 - 0.7j}
     model = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(draw_pixels((0.03, 0.15), 40, 1, kinds=close))
     sure = []
@@ -159,7 +159,7 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
 
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
-def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
+def test_only_models_with_probabilities_report_that_no_other_material_is_near(model):
     samples = draw_pixels((0.01, 0.05), 12, 3)
     classifier = Classifier(entries(samples), model=model, angles_deg=[60.0])
     test = draw_pixels((0.0, 0.0), 1, 4)
@@ -172,7 +172,7 @@ def test_only_what_gives_probabilities_says_that_nothing_else_comes_near(model):
     assert any("no other material" in cause for cause in whys) == (model == "discriminant")
 
 
-def test_a_patch_that_no_material_looks_like_is_told_with_the_nearest():
+def test_a_patch_unlike_every_material_is_reported_with_the_nearest():
     """It is named for any distance, so that a person knows where to begin."""
     classifier = Classifier(entries(draw_pixels((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
     x = draw_pixels((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})

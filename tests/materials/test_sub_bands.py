@@ -47,7 +47,7 @@ def cut_left_half(mask):
     return mask & left_half
 
 
-def test_metal_that_a_sub_band_does_not_show_is_no_part_of_its_reference(scene, analysis):
+def test_metal_that_a_sub_band_does_not_show_is_not_part_of_its_reference(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~cut_left_half(analysis.metal.mask)
     full_rows = band_rows(analysis, [BAND], [channels(scene, everywhere)], (0, 0), 1.5)
@@ -105,7 +105,7 @@ def test_brightness_that_a_sub_band_changes_over_a_plate_is_an_error_of_that_ban
         assert uneven.own_std == pytest.approx(even.own_std, rel=0.2)
 
 
-def test_a_told_error_of_brightness_keeps_the_loss_of_a_sheet_within_its_error():
+def test_with_a_given_error_of_brightness_the_loss_of_a_sheet_is_within_its_error():
     sheet = Layer("sheet", 3.0 - 0.1j, 1.2e-3)
     told_std = 0.01
     rng = np.random.default_rng(1)

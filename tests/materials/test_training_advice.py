@@ -21,7 +21,7 @@ def advise(fit) -> str:
     return "\n".join(accuracy_lines(Library((), {"angles": {"60": fit}})))
 
 
-def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_specimens():
+def test_unnamed_pieces_make_an_underconfident_library_that_asks_for_specimens():
     """They differ by 12 %, which counts as an error of placement for all materials alike."""
     text = advise(fit_samples(draw_pixels((0.12, 0.6), 6, seed=1, labelled=False)))
     assert "underconfident" in text
@@ -37,7 +37,7 @@ def test_pieces_that_nobody_named_make_an_underconfident_library_that_asks_for_s
         ({}, "a scan may be disturbed, or a label wrong"),
     ],
 )
-def test_names_said_too_surely_are_told_with_the_likeliest_cause(fit_of_many_specimens, change, cause):
+def test_overconfident_names_are_reported_with_the_likeliest_cause(fit_of_many_specimens, change, cause):
     text = advise(fit_of_many_specimens | {"named": 200, "said": 0.97, "right": 0.8} | change)
     assert "overconfident: names are said with 97 % and 80 % are right" in text
     assert cause in text
@@ -49,7 +49,7 @@ def test_a_library_of_many_specimens_needs_none_and_is_neither_over_nor_undercon
     assert "needed" not in text
 
 
-def test_materials_that_no_number_of_specimens_separates_are_told():
+def test_materials_that_more_specimens_cannot_separate_are_reported():
     text = advise(fit_samples(draw_pixels((0.03, 0.2), 8, seed=3, kinds=CLOSE)))
     assert "acrylic and resin lie" in text
     assert "rubber" not in text.split("lie")[0].splitlines()[-1]

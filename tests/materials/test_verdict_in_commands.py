@@ -79,7 +79,7 @@ def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("level", LEVELS)
-def test_report_says_the_verdict_and_where_the_page_is(tmp_path, capsys, level):
+def test_report_prints_the_verdict_and_the_path_of_the_page(tmp_path, capsys, level):
     folder = judged_products(tmp_path, level)
     (folder / "report.html").write_text("<html>", encoding="utf-8")
     assert main(["report", str(folder)]) == (NoResult.exit_status if level == "none" else 0)

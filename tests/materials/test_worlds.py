@@ -87,7 +87,7 @@ def test_a_dielectric_declared_as_metal_is_found_out(eps):
 @pytest.mark.parametrize(
     "coat", [(3.2 - 0.1j, 0.15e-3), (2.7 - 0.02j, 1.8e-3)], ids=["paint", "a sheet of plastic on metal"]
 )
-def test_the_reference_is_bare_metal_though_coated_metal_beside_it_is_brighter(coat):
+def test_the_reference_is_bare_metal_though_coated_metal_is_brighter(coat):
     pair = simulate(world(*map(half_space, (2.6 - 0.02j, 4 - 0.4j, 5 - 1.1j)), Stack((coat,), METAL.below)))
     # As other plates, metal may be lit less than its neighbours.
     (left, bottom, right, top), *_ = (box for plate, box in pixel_boxes(pair) if plate.name == "copper")

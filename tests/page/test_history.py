@@ -65,7 +65,7 @@ def test_trigger_health_is_the_worst_of_all_bursts(finished):
     assert history.trigger.jitter_max_ns == max(c.jitter_ns for c in captures)
 
 
-def test_a_fault_told_twice_is_one(finished):
+def test_a_fault_reported_twice_is_shown_once(finished):
     history = answer(load_facts(finished))
     fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, problem="a trigger edge was lost")
     history.add_events([fault])
@@ -83,7 +83,7 @@ def test_time_left_is_what_rows_took(begun):
     assert estimate_time_left(history, parse_seconds(UTC.format(9, 0))) == (0, "measured")
 
 
-def test_a_pause_is_no_time_of_a_row(begun):
+def test_a_pause_does_not_count_as_time_of_a_row(begun):
     history, last = begun
     add_fact(history, {"fact": "scan_paused", "paused_utc": UTC.format(2, 0)})
     assert history.paused
@@ -127,7 +127,7 @@ def test_rejected_then_committed_leaves_a_warning(begun):
     assert len(history.notices) == 1
 
 
-def test_rejections_of_earlier_releases_are_told_without_a_cause(begun):
+def test_rejections_of_earlier_releases_are_shown_without_a_cause(begun):
     history, _ = begun
     add_fact(history, {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}})
     assert (history.marks[2], history.notices[-1].facts["detail"]) == ("rejected", "RV: no data")

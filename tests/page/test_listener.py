@@ -64,7 +64,7 @@ def test_where_the_stage_is_in_the_rig_frame(pi):
     assert (listener.state.x_mm, listener.state.y_mm) == (-3.0, 5.0)
 
 
-def test_a_row_as_it_runs_and_nobody_else_s(pi):
+def test_a_row_is_shown_while_it_runs_and_rows_of_other_scans_are_not(pi):
     tell, listener = pi
     tell(m.RowStarted(**OF, seq=2, row=plan_raster(RIG.grid).row(7), take=2), capture(0), capture(1, "another"))
     wait_for(lambda: listener.state.point, "a point")
@@ -98,7 +98,7 @@ def test_words_of_strangers_are_named_and_survived(pi):
     assert listener.state.receive_error is None
 
 
-def test_without_keys_the_view_is_deaf_and_says_so(tmp_path):
+def test_without_keys_the_view_receives_no_events_and_reports_it(tmp_path):
     elsewhere = {"event_address": "tcp://192.0.2.1:5602", "key_dir": str(tmp_path)}
     instrument = msgspec.structs.replace(RIG, pi=msgspec.structs.replace(RIG.pi, **elsewhere))
     listener = PiListener(instrument, "mine")

@@ -97,7 +97,7 @@ def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
         (replace(LIVELY, now_s=4e9), replace(RUNNING, row=-1), "No row has ended"),
     ],
 )
-def test_trouble_says_why_and_what_to_do(history, signs, heard, word):
+def test_a_problem_is_shown_with_its_cause_and_remedy(history, signs, heard, word):
     add_fact(history, ROW | {"row": 0, "committed_utc": "2026-01-01T00:00:00Z"})
     history._row_seconds = [20.0]
     s = status(history, signs, heard)
@@ -132,7 +132,7 @@ def test_a_row_taken_again_is_a_warning_for_a_while(history):
         assert status(history).level == level
 
 
-def test_an_rx_without_a_signal_is_told(history):
+def test_an_rx_without_a_signal_is_reported(history):
     s = status(history, shown=ShownResults(sync={"RH": {0: RowSync(0.02, 0.004, 0, dead_rx=(3,))}}))
     assert s.level == "warn"
     assert "RX3 of RH gives no signal" in s.headline + s.detail
@@ -146,7 +146,7 @@ def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, le
     assert bool(s.do) == (level == "warn")
 
 
-def test_requests_are_said_with_who_sent_them_until_they_come_to_pass(history):
+def test_requests_are_shown_with_their_sender_until_they_are_carried_out(history):
     s = status(history, make_signs("pause"))
     assert (s.headline, s.press) == ("Pausing after this row", ("continue", "stop", "abort"))
     assert "the page" in s.detail
@@ -156,7 +156,7 @@ def test_requests_are_said_with_who_sent_them_until_they_come_to_pass(history):
     assert status(history, make_signs("abort")).headline == "Stopping now"
 
 
-def test_an_abort_is_no_fault(history):
+def test_an_abort_is_not_a_fault(history):
     """There is no such notice in the row that it ends, at the Pi, or when the scan has ended."""
     aborted = REJECTED | {"faults": [{"kind": "on_request"}]}
     add_fact(history, aborted)
@@ -195,7 +195,7 @@ def test_there_is_no_result_before_materials(history):
     assert "killed" in status(history, killed).detail
 
 
-def test_a_start_that_failed_says_why_and_is_offered_again():
+def test_a_failed_start_is_shown_with_its_cause_and_offered_again():
     failure = Finding("error", "no Pi answers", "it is off", "switch it on")
     failed = Program("scan", False, 4, (), "2026-01-01T00:00:00", "")
     s = status(None, program=failed, failure=failure)
@@ -204,14 +204,14 @@ def test_a_start_that_failed_says_why_and_is_offered_again():
     assert status(None, program=replace_struct(failed, running=True)).key == "starting"
 
 
-def test_no_state_says_what_it_must_not():
+def test_no_state_shows_text_of_another_state():
     for state in STATES.values():
         words = " ".join((state.headline, state.detail, state.why, state.do))
         assert not [phrase for phrase in state.never if phrase in words], state.key
         assert bool(state.why or "{" in state.detail) or state.level not in ("bad", "warn"), state.key
 
 
-def test_ends_say_how(history):
+def test_each_end_of_a_scan_is_described(history):
     ended = {"fact": "scan_ended", "exit_status": "fail", "reason": "the Pi did not answer"}
     add_fact(history, ended | {"why": "it is off", "remedy": "switch it on"})
     s = status(history)
@@ -226,9 +226,9 @@ def test_ends_say_how(history):
     assert (s.level, s.do) == ("done", "")
 
 
-def test_no_scan_says_how_to_begin_one():
+def test_without_a_scan_the_page_explains_how_to_begin_one():
     assert f"polysight scan --out {FOLDER}" in status(None).do
 
 
-def test_a_folder_that_was_renamed_is_said_to_be_gone(history):
+def test_a_renamed_folder_is_reported_as_missing(history):
     assert status(history, gone=True).headline == "The scan's folder is gone"

@@ -50,7 +50,7 @@ def test_each_content_that_differs_is_a_new_version():
     assert third.publish(Motion(now_s=1)) is third
 
 
-def test_a_finished_folder_is_shown_as_it_is(finished, truth, watching):
+def test_a_finished_folder_is_shown_unchanged(finished, truth, watching):
     scan, pipeline, pictures = truth
     watch = watching(finished)
     watch.wait_for(shows(scan.plan.rows))
@@ -93,7 +93,7 @@ def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     watch.wait_for(lambda s: s["status"]["level"] == "done")
 
 
-def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
+def test_a_scan_that_becomes_silent_is_reported_as_ended(growing, watching):
     watch = watching(growing.path, lapse_s=2.0)
     growing.grow_until("row_committed")
 
@@ -111,7 +111,7 @@ def test_a_scan_that_falls_silent_is_said_to_be_gone(growing, watching):
     wait_for(is_alive, "that it lives again")
 
 
-def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, watching):
+def test_a_killed_program_is_reported_immediately_however_long_its_timeout_is(growing, watching):
     growing.grow_until("row_committed")
     program = subprocess.Popen(["sleep", "600"])
     life = SignOfLife(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
@@ -126,7 +126,7 @@ def test_a_killed_program_is_said_at_once_however_long_its_timeout_is(growing, w
     assert answer(watch)["status"]["press"] == ["resume", "repeat"]
 
 
-def test_an_unfinished_folder_without_a_program_is_said_to_be_at_once(growing, watching):
+def test_an_unfinished_folder_without_a_program_is_reported_immediately(growing, watching):
     growing.grow_until("row_committed")
     assert answer(watching(growing.path))["status"]["key"] in ("frozen", "killed")
 
@@ -262,7 +262,7 @@ def test_the_verdict_follows_the_products(tmp_path):
     assert tail.look("") is None
 
 
-def test_images_before_materials_and_earlier_products_are_no_result(tmp_path):
+def test_images_before_materials_and_earlier_products_are_not_a_result(tmp_path):
     judged_products(tmp_path / "products", "good")
     facts = ScanFacts.read(tmp_path / "products" / SCAN)
     write_json(tmp_path / "products" / SCAN, replace(facts, processed_utc="2026-01-01T00:00:00+00:00"))

@@ -133,7 +133,7 @@ def test_table_2_is_recovered_from_both_kinds_of_files(out):
         assert abs(complex(*row["as_is"].values()) - true) > abs(without_leakage - true)
 
 
-def test_the_figures_stand_beside_the_published_values(out):
+def test_the_figures_are_compared_with_the_published_values(out):
     solids = json.loads((out / "fig18.json").read_text())["solids, materials/"]
     assert solids["published_percent"] == 95.74
     assert solids["scores"][0]["split"] == "by pixel (optimistic)"
@@ -178,7 +178,7 @@ def test_the_page_says_that_the_files_were_simulated_and_what_was_left_out(out, 
     assert not read_authors(dataset, RIG_FILE).sources[MATERIALS].names.count("unobtainium")
 
 
-def test_what_a_name_means_can_be_said(dataset, tmp_path):
+def test_the_meaning_of_a_name_can_be_given(dataset, tmp_path):
     names = tmp_path / "names.json"
     names.write_text('{"unobtainium": 20}')
     data = read_authors(dataset, RIG_FILE, names=names)

@@ -108,7 +108,7 @@ def test_contrast_under_each_angle_is_that_of_eq_2():
 
 
 @pytest.mark.parametrize("key", ["fig3", "fig21", "table2"])
-def test_items_are_made_and_stand_beside_the_published_values(key, tmp_path):
+def test_items_are_made_and_compared_with_the_published_values(key, tmp_path):
     item = report.MAKERS[key](Run(quick=True))
     assert item.key == key
     assert item.tables

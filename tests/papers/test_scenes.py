@@ -55,7 +55,7 @@ def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
     assert amplitude[0] == pytest.approx(40 * np.sqrt((np.abs(gains) ** 2).sum()), rel=2e-3)
 
 
-def test_a_simulated_scan_is_there_and_gone_again():
+def test_a_simulated_scan_is_made_and_removed():
     grid = {"columns": 3, "rows": 1, "step_x_mm": 10.0, "step_y_mm": 6.0}
     with simulate_scan("small", [plate("copper", None, 0, 0)], RIG_FILE, seed=1, grid=grid) as (source, truth):
         assert source.simulated
@@ -112,7 +112,7 @@ def test_names_stand_in_the_middle_of_the_plates():
     assert {t.get_text() for t in axes.texts} == {"glass"}
 
 
-def test_the_smear_beside_a_tone_rises_with_the_power_of_its_noise():
+def test_the_smear_around_a_tone_rises_with_the_power_of_its_noise():
     chirp = published_rig().chirp
     noise = np.random.default_rng(1).standard_normal((1, 20, chirp.samples, 2)) @ [1, 1j]
     tone = np.exp(2j * np.pi * 0.2 * np.arange(chirp.samples))

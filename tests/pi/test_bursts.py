@@ -155,7 +155,7 @@ def test_a_failed_burst_is_reported_and_then_a_fault(number):
         assert x.next().number == number
 
 
-def test_edges_from_before_arming_or_while_disarmed_are_no_points():
+def test_edges_before_arming_or_while_disarmed_are_not_points():
     with Loop() as x:
         x.loop.disarm()
         x.edge(100, 1)

@@ -93,7 +93,7 @@ def test_commands_without_the_service(command, instrument, write_config, hub, st
     assert command("events", "--config", config, "--limit-s", 0.1)[0] == 5
 
 
-def test_commands_beside_the_service(command, instrument, write_config, start, hub):
+def test_commands_while_the_service_runs(command, instrument, write_config, start, hub):
     """Commands that need lines, stage or ports are refused because the service runs; the error has its address."""
     # Ports that stay the same from one program to the next
     rig = move_to_free_subnet(instrument)

@@ -117,7 +117,7 @@ def stranger(pi):
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
-def test_an_impossible_value_is_no_command(commands, field, wrong):
+def test_an_impossible_value_is_not_a_command(commands, field, wrong):
     """Invalid messages are refused; the fuzz test below shows that through the socket."""
     for command in commands:
         for value in wrong:

@@ -194,7 +194,7 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
     assert (opt / "venv/bin/python").is_file()
 
 
-def test_a_machine_that_is_no_pi_is_not_changed(install, bench, tmp_path):
+def test_a_machine_that_is_not_a_pi_is_not_changed(install, bench, tmp_path):
     if Path("/proc/device-tree/model").exists():
         pytest.skip("this machine has a device tree: it may be a Pi")
     del bench["ROOT"]

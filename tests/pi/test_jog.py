@@ -38,7 +38,7 @@ def client(rig):
     context.destroy(linger=0)
 
 
-def test_the_command_says_where_the_stage_rests_and_its_limits(rig, write_config, capsys):
+def test_the_command_prints_the_stage_position_and_its_limits(rig, write_config, capsys):
     config = str(write_config(rig))
     assert main(["jog", "x", "10", "--config", config]) == 0
     assert main(["jog", "x", "-2.5", "--speed-mm-s", "5", "--json", "--config", config]) == 0

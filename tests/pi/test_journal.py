@@ -71,7 +71,7 @@ def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, 
 
 @given(records=st.lists(st.binary(min_size=1, max_size=40), min_size=1, max_size=8), data=st.data())
 @settings(max_examples=60, deadline=None)
-def test_a_damaged_byte_loses_only_what_lies_behind_it(tmp_path_factory, records, data):
+def test_a_damaged_byte_loses_only_the_events_after_it(tmp_path_factory, records, data):
     path = tmp_path_factory.mktemp("j") / "a.journal"
     raw = bytearray(write_records(path, records))
     position = data.draw(st.integers(len(MAGIC), len(raw) - 1))
@@ -316,7 +316,7 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
     assert [type(e) for e in host.replay()] == [m.RunStarted, m.RunStopped] * 2
 
 
-def test_the_pis_client_prints_each_event_once_also_behind_a_lost_journal(pi, instrument):
+def test_the_pis_client_prints_each_event_once_even_after_a_lost_journal(pi, instrument):
     host = pi.host
     stop = m.EndRun(scan_id="scan", exit_status="success")
     for seq in (0, 5000):

@@ -113,7 +113,7 @@ def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, which):
     assert not client.poll(0)
 
 
-def test_a_revoked_client_is_out_at_once_and_the_others_stay(tmp_path, served_pi, make_client):
+def test_a_revoked_client_is_disconnected_immediately_and_the_others_stay(tmp_path, served_pi, make_client):
     """The client's next command is refused although it is connected, and it cannot connect again."""
     keys = tmp_path / "keys"
     public, secret = allow_client(keys, "laptop")
@@ -162,7 +162,7 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
         client.hello()
 
 
-def test_a_server_without_keys_is_not_said_to_refuse_this_hosts(tmp_path, context):
+def test_a_server_without_keys_is_not_reported_as_refusing_this_hosts(tmp_path, context):
     """Either end may notice first: if the server does, it only hangs up, and the client connects again."""
     make_keys(tmp_path)
     rig = published_rig()

@@ -88,7 +88,7 @@ def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(0, 1), (1, 0), (0, 20_000), (-4000, 0)])
-def test_a_row_that_ends_elsewhere_is_no_row(dx, dy):
+def test_a_row_that_ends_elsewhere_is_not_counted(dx, dy):
     """The Pi does not rely on the stage's report: the position is compared with the command."""
     bench = Bench().begin_and_home()
     bench.start()
@@ -122,7 +122,7 @@ def test_stop_does_not_wait_for_the_burst_under_way(event, monkeypatch):
 
 
 @pytest.mark.parametrize("extra_pulses", [1, -1])
-def test_a_row_whose_stage_counts_other_trigger_pulses_is_no_row(extra_pulses):
+def test_a_row_whose_stage_counts_other_trigger_pulses_is_not_counted(extra_pulses):
     bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
@@ -172,7 +172,7 @@ def test_a_host_that_falls_silent_ends_its_homing():
     assert bench.machine.state == "homing", "a person at the Pi homes without a host"
 
 
-def test_a_held_row_goes_on_once_it_rests():
+def test_a_held_row_continues_when_the_stage_rests():
     """Then the place of the hold is known, and with it the times of the edges around it."""
     bench = Bench().begin_and_home()
     bench.start()
@@ -237,7 +237,7 @@ def test_a_stage_at_rest_may_answer_late():
 
 
 @pytest.mark.parametrize("lasting", [True, False])
-def test_a_lost_trigger_line_stops_everything_at_once(lasting):
+def test_a_lost_trigger_line_stops_every_motion_immediately(lasting):
     """The loop notices within its look-up time; the machine acts in the same turn."""
     assert LOOK_UP_S <= SAFE_WITHIN_S / 2
     bench = Bench().begin_and_home()
@@ -323,7 +323,7 @@ def test_a_stage_that_does_not_stop_its_jog_is_lost():
     assert bench.list_events(m.Jogged)[-1].status == "aborted"
 
 
-def test_the_end_of_the_program_stops_a_jog_and_says_so():
+def test_the_end_of_the_program_stops_a_jog_and_reports_it():
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
     assert not bench.machine.terminate(), "no row is waited for"

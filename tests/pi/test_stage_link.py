@@ -84,7 +84,7 @@ def test_numbers_wrap(connect):
     assert link.request("SET", 1, 500).sequence == 0
 
 
-def test_answers_are_told_apart_from_what_comes_by_itself(dry_stage, connect):
+def test_answers_are_distinguished_from_spontaneous_lines(dry_stage, connect):
     link, news = connect()
     dry_stage.say_raw(b"\x00garbage\n" + b"x" * 500 + b"\n")
     dry_stage.say(Reply("alarm", number=12))
@@ -107,7 +107,7 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
         link.request("SET", 1, 500)
 
 
-def test_a_moving_stage_that_hears_but_is_not_heard_is_stopped(dry_stage, connect):
+def test_a_moving_stage_that_receives_but_cannot_send_is_stopped(dry_stage, connect):
     # With its own heartbeat it would continue for longer than the half second of docs/spec/wire.md.
     link, news = connect(heartbeat_s=0.2)
     dry_stage.deaf = True

@@ -102,7 +102,9 @@ def test_the_stage_is_homed_and_jogged_between_its_limits(browser: Browser, view
         assert browser.find_violations(axe) == []
 
 
-def test_a_pi_that_does_not_answer_is_said_and_can_be_asked_again(browser: Browser, instrument, write_config, tmp_path):
+def test_a_pi_that_does_not_answer_is_reported_and_can_be_asked_again(
+    browser: Browser, instrument, write_config, tmp_path
+):
     silent = msgspec.structs.replace(
         instrument.pi, command_address="tcp://127.0.0.1:9", event_address="tcp://127.0.0.1:9"
     )

@@ -216,7 +216,7 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_
     back.close()
 
 
-def test_a_service_that_hangs_is_started_anew(pi: InstalledPi):
+def test_a_service_that_hangs_is_started_again(pi: InstalledPi):
     """The executor notifies systemd's watchdog."""
     hung = service_pid(pi)
     begun = time.monotonic()
@@ -273,7 +273,7 @@ def test_update_and_roll_back(pi: InstalledPi):
     assert set(sums_before.splitlines()) <= set(sums_after.splitlines())
 
 
-def test_a_power_cut_in_a_row_loses_no_event_that_was_told(pi: InstalledPi, homed_host: HostSide):
+def test_a_power_cut_in_a_row_loses_no_event_that_was_sent(pi: InstalledPi, homed_host: HostSide):
     """After a power cut the Pi starts by itself, with its keys, ready to be homed."""
     homed_host.must_accept(homed_host.begin("cut"))
     homed_host.must_accept(m.RunRow(scan_id="cut", row_index=0, take=1))

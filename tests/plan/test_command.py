@@ -52,7 +52,7 @@ def test_text_and_json_have_the_same_plan(capsys):
         (["--columns", "200", "--rows", "400", "--step-y-mm", "1"], "h", 3600),
     ],
 )
-def test_a_duration_is_said_in_seconds_minutes_or_hours(capsys, options, unit, unit_s):
+def test_a_duration_is_printed_in_seconds_minutes_or_hours(capsys, options, unit, unit_s):
     assert main(["plan", *RIG, *options, "--json"]) == 0
     total_s = json.loads(capsys.readouterr().out)["time_s"]["total"]
     assert main(["plan", *RIG, *options]) == 0
@@ -62,7 +62,7 @@ def test_a_duration_is_said_in_seconds_minutes_or_hours(capsys, options, unit, u
 
 
 @pytest.mark.parametrize(("options", "aliases"), [(SMALL, False), (["--columns", "60", "--rows", "60"], True)])
-def test_aliases_of_tilted_surfaces_are_said_only_of_tilts_that_are_seen(capsys, options, aliases):
+def test_aliases_of_tilted_surfaces_are_reported_only_for_visible_tilts(capsys, options, aliases):
     plan = ["plan", *RIG, *options, *(("--step-y-mm", "8") if aliases else ())]
     assert main([*plan, "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
@@ -101,7 +101,7 @@ def test_a_plan_that_is_impossible_fails(options, status):
         ("--scene-mm", "1e300,170"),
     ],
 )
-def test_a_value_that_is_no_quantity_is_a_usage_error(option):
+def test_a_value_that_is_not_a_quantity_is_a_usage_error(option):
     with pytest.raises(SystemExit) as e:
         main(["plan", *RIG, *option])
     assert e.value.code == 2

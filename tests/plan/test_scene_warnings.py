@@ -31,7 +31,7 @@ def topics(tmp_path: Path, *plates: dict[str, Any], grid: dict[str, Any] = GRID)
     return [warning.where for warning in warn_of_scene(*read_scene(path, published_rig()))]
 
 
-def test_the_own_scene_is_good_as_it_is():
+def test_the_example_scene_needs_no_change():
     assert not list(warn_of_scene(*read_scene(OWN_SCENE, published_rig())))
 
 
@@ -61,7 +61,7 @@ def test_one_row_or_column_is_too_small_an_aperture(tmp_path, axis):
     assert set(topics(tmp_path, plate(-30), plate(30), grid=GRID | {axis: 1})) == {"aperture"}
 
 
-def test_plan_and_simulate_say_it(tmp_path, capsys):
+def test_plan_and_simulate_print_the_warning(tmp_path, capsys):
     path = tmp_path / "scene.toml"
     plates = [plate(-30, metal=True) | {"permittivity": None}, plate(30)]
     del plates[0]["permittivity"]
@@ -78,7 +78,7 @@ def test_plan_and_simulate_say_it(tmp_path, capsys):
     assert any(str(note.message).startswith("gap: ") for note in notes)
 
 
-def test_proposals_are_of_the_scene_and_say_it_too(tmp_path, capsys):
+def test_proposals_are_for_the_scene_and_repeat_its_warnings(tmp_path, capsys):
     """Apertures of the plan have the same grid; plates are checked in each."""
     path = tmp_path / "scene.toml"
     grid = {"columns": 41, "rows": 21, "step_x_mm": 4.0, "step_y_mm": 4.0}
@@ -105,7 +105,7 @@ def test_a_text_of_the_scene_stays_a_text_in_the_lines_of_the_rig_file():
         (12.0, [plate(0, side_mm=420.0)], set()),
     ],
 )
-def test_ghosts_by_wide_steps_are_told_before_a_simulation(tmp_path, step_mm, plates, expected):
+def test_ghosts_by_wide_steps_are_reported_before_a_simulation(tmp_path, step_mm, plates, expected):
     path = tmp_path / "scene.toml"
     grid = {"columns": 31, "rows": 31, "step_x_mm": step_mm, "step_y_mm": step_mm}
     path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": plates}))

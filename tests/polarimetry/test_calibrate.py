@@ -42,7 +42,7 @@ def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
     return h + n[0] + 1j * n[1], v + n[2] + 1j * n[3]
 
 
-def test_a_ratio_that_is_no_number_is_nan_and_warns_of_nothing(recwarn):
+def test_a_ratio_that_is_not_a_number_is_nan_and_warns_of_nothing(recwarn):
     h = np.array([1.0, 2.0, 1.0, np.nan, 1.0], np.complex64)
     v = np.array([2.0, 1e-45, 0.0, 1.0, np.inf], np.complex64)
     p = ratio(h, v)

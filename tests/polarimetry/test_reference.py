@@ -70,7 +70,7 @@ def test_weak_parts_and_the_rim_are_masked():
     assert reference.facts().share_of_plane == pytest.approx(reference.valid.mean(), abs=1e-3)
 
 
-def test_its_facts_tell_how_the_gains_vary_over_the_plane():
+def test_facts_of_a_reference_hold_the_variation_of_the_gains_over_the_plane():
     reference = plane_reference(make_images(*gains(np.random.default_rng(5), 0.02)))
     assert reference.facts().ratio_variation_db > 0.01
 
@@ -88,7 +88,7 @@ def test_images_without_a_metal_plate_are_refused():
 
 
 @pytest.mark.parametrize("permittivity", [2.1, 4.75 - 2.43j, 9 - 0.2j])
-def test_a_scene_with_other_plates_beside_the_metal_is_refused(permittivity):
+def test_a_scene_with_other_plates_than_the_metal_is_refused(permittivity):
     """Otherwise all but the metal would be masked without a word."""
     r = fresnel(permittivity, THETA)
     is_metal = (X < 0.07)[None, :]

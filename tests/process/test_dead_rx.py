@@ -78,7 +78,7 @@ def other_reasons(findings: Findings) -> set[str]:
 
 
 @pytest.mark.parametrize(("board", "rx"), [("RV", 3), ("RH", 1)])
-def test_noise_instead_of_an_rx_is_told_and_changes_nothing_else(source, process, board, rx):
+def test_noise_instead_of_an_rx_is_reported_and_changes_nothing_else(source, process, board, rx):
     _, healthy_images, healthy = process()
     pipeline, images, findings = process(kill(board, rx))
     assert findings.verdict.level == "care"

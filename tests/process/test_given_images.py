@@ -151,7 +151,7 @@ def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented
     assert scan.simulated is False
 
 
-def test_exchanged_images_are_told_and_give_no_permittivity(save_images, pair, rig):
+def test_exchanged_images_are_reported_and_give_no_permittivity(save_images, pair, rig):
     """Eq. 3 gives the same permittivity for P and 1 / P: only the passivity of half spaces distinguishes them."""
     exchanged = read_given_images(save_images(h=pair["v"], v=pair["h"]), rig)
     inputs = Inputs(labels=Labels(BOXES, metal="copper"))
@@ -217,7 +217,7 @@ def test_images_without_a_phase_between_the_channels_are_refused(save_images, pa
         analyse_file(path, rig)
 
 
-def test_files_that_are_no_archive_are_refused(tmp_path, rig):
+def test_files_that_are_not_an_archive_are_refused(tmp_path, rig):
     path = tmp_path / "other.npz"
     with refused(ErrorCode.FILE_MISSING, path):
         read_given_images(path, rig)

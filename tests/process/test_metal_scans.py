@@ -139,7 +139,7 @@ def slope_over_sweep(stack: list[dict], band_hz: tuple[float, float]) -> np.ndar
 
 
 @pytest.mark.parametrize("name", ["plate", "acrylic 1", "water"])
-def test_the_change_over_the_sweep_is_that_of_the_plate_beside_metal_scanned_apart(scan, reference, name):
+def test_the_change_over_the_sweep_is_that_of_the_plate_if_metal_was_scanned_separately(scan, reference, name):
     pipeline, images = form_scan_images(scan(name, hv_gain_db=-2.0), Settings())
     result = pipeline.find_materials(pipeline.place_plane(images), KnownScene(metal=reference))
     (patch,) = result.patches
@@ -221,7 +221,7 @@ SIX = [
 SIX_STACKS = {**STACKS, "acrylic 3": (["acrylic,?,3"], 4.00 - 0.40j), "pvc": (["pvc,?,1"], 4.15 - 0.81j)}
 
 
-def test_six_plates_beside_each_other_with_metal_among_them(rig, tmp_path, pytestconfig):
+def test_six_plates_next_to_each_other_with_metal_among_them(rig, tmp_path, pytestconfig):
     """The same law with edges, neighbours and the scene's own metal: 72 x 78 mm plates, the whole instrument."""
     if not pytestconfig.getoption("--long"):
         pytest.skip("half a minute: --long")

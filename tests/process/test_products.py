@@ -67,7 +67,7 @@ def test_an_image_appears_with_its_whole_quality(scan: Path, tmp_path: Path, mon
     assert first == [read_json(tmp_path / QUALITY)]
 
 
-def test_images_published_beside_a_scan_are_those_of_all_rows_at_once(scan: Path, tmp_path: Path) -> None:
+def test_images_published_during_a_scan_are_those_of_all_rows_together(scan: Path, tmp_path: Path) -> None:
     pipeline = make_pipeline(ScanFolder.load(scan), live=True)
     publish_images(pipeline, tmp_path)
     first = read_products(tmp_path)

@@ -40,7 +40,7 @@ def with_order(rig: Instrument, board: str, *order: int) -> Instrument:
     ("board", "order"),
     [("RV", (2, 1, 3, 4)), ("RV", (4, 3, 2, 1)), ("RV", (1, 3, 2, 4)), ("RH", (2, 1, 3, 4)), ("RH", (4, 3, 2, 1))],
 )
-def test_another_order_is_told_and_nothing_else(process_six_plates, board, order):
+def test_another_order_is_reported_and_nothing_else(process_six_plates, board, order):
     pipeline, _, findings = process_six_plates(reorder(board, *order))
     assert findings.verdict.level == "none"
     (told,) = findings.verdict.reasons
@@ -64,7 +64,7 @@ def test_with_the_order_in_the_rig_file_the_images_are_the_same(six_plates, proc
     assert len(distances(six_plates, findings)) == len(PLATES)
 
 
-def test_the_right_order_and_a_dead_rx_are_no_other_order(process_six_plates):
+def test_the_right_order_and_a_dead_rx_are_not_reported_as_another_order(process_six_plates):
     def kill(name: str, _: int, words: np.ndarray) -> None:
         if name == "RV":
             words[..., 2] = 0
@@ -75,7 +75,7 @@ def test_the_right_order_and_a_dead_rx_are_no_other_order(process_six_plates):
 
 
 @pytest.mark.parametrize(("board", "order"), [("RV", (2, 1, 3, 4)), ("RH", (4, 3, 2, 1))])
-def test_cubes_tell_it_too(process_six_plates, board, order):
+def test_another_order_in_cubes_is_reported(process_six_plates, board, order):
     cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
     # The phases before synchronisation: only such a cube has the order of its RX in the direct path.
     setups = {b.name: BoardSetup.from_rig(published_rig(), b) for b in cubes.instrument.receivers}
@@ -111,7 +111,7 @@ def test_an_order_that_is_none_is_refused(order):
 
 
 @pytest.mark.parametrize("board", [0, 1])
-def test_phases_of_a_place_tell_the_order_in_spite_of_the_channels(board):
+def test_phases_of_a_place_show_the_order_in_spite_of_the_channels(board):
     """Of geometry alone: every order of four RX is found, or one with the same image; none is found without a swap."""
     rig = published_rig()
     path = BoardSetup.from_rig(rig, rig.receivers[board]).path

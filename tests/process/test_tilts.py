@@ -121,7 +121,7 @@ def test_tilts_follow_a_transposed_image(tilted_images):
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 
-def test_noise_gives_no_tilt_and_steep_phases_are_told():
+def test_noise_gives_no_tilt_and_steep_phases_are_reported():
     rng = np.random.default_rng(1)
     flat = np.ones((2, 40, 40), np.complex64)
     lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))

@@ -153,7 +153,7 @@ def test_a_shifted_plane_is_found_and_reported(examine, shift_mm):
     ],
     ids=lambda heights: " ".join(f"{height:.0f}" for height in heights.values()),
 )
-def test_plates_of_other_heights_are_no_tilt_and_keep_their_permittivities(examine, heights_mm):
+def test_plates_of_other_heights_are_not_a_tilt_and_keep_their_permittivities(examine, heights_mm):
     # 12 mm nearer to the radars the angle of incidence is larger by 0.7 degrees.
     scene = world(disturbances={"leakage_measured": 0.003})
     plates = tuple(msgspec.structs.replace(p, height_mm=heights_mm.get(p.name, 0.0)) for p in scene.plates)
@@ -196,7 +196,7 @@ def test_a_weak_direct_path_is_reported(examine):
     assert "direct path" in reasons(findings)
 
 
-def test_an_empty_table_is_no_result(examine):
+def test_an_empty_table_is_not_a_result(examine):
     findings, _ = examine(world(()))
     assert findings.verdict.level == "none"
     assert silent(findings)

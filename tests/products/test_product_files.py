@@ -66,7 +66,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert path.read_bytes() == b"old"
 
 
-def test_exports_lie_beside_their_products_by_default(tmp_path):
+def test_exports_are_written_to_the_folder_of_their_products_by_default(tmp_path):
     assert create_export_folder(tmp_path / "products", None) == tmp_path / "products-export"
     assert create_export_folder(tmp_path / "products", tmp_path / "other") == tmp_path / "other"
     (tmp_path / "elsewhere").mkdir()

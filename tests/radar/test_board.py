@@ -162,7 +162,7 @@ def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, w
         (0x1234, b""),
     ],
 )
-def test_other_events_are_no_faults(radar, board, number, data):
+def test_other_events_are_not_faults(radar, board, number, data):
     radar.arm(FRAMES)
     board.send_event(number, data)
     assert radar.poll() is State.ARMED

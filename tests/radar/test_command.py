@@ -134,7 +134,7 @@ def test_firmware_goes_to_ram_and_to_the_flash_only_with_flash(rig_file, words, 
     assert words.closed
 
 
-def test_a_file_that_is_no_image_is_refused_without_opening_a_board(rig_file, opened_boards, capsys, tmp_path):
+def test_a_file_that_is_not_an_image_is_refused_without_opening_a_board(rig_file, opened_boards, capsys, tmp_path):
     image = tmp_path / "notes.txt"
     image.write_text("not firmware")
     for options in ((), ("--flash",)):
@@ -239,7 +239,7 @@ def test_a_replay_with_another_rig_file_reports_the_first_different_line(rig, ri
 @pytest.mark.parametrize(
     "text", ["", "hello\n", "{}\n", '{"trace": 2}\n', '{"trace": 1, "board": "RH"}\n{"out": "00"}\n']
 )
-def test_a_file_that_is_no_trace_is_refused(rig_file, capsys, tmp_path, text):
+def test_a_file_that_is_not_a_trace_is_refused(rig_file, capsys, tmp_path, text):
     (tmp_path / "a").write_text(text)
     assert run(rig_file(), "replay", str(tmp_path / "a")) == 2
     assert "--trace FILE" in capsys.readouterr().err

@@ -42,7 +42,7 @@ def with_crc(data: bytes) -> bytes:
         (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
     ],
 )
-def test_a_file_that_is_no_image_is_refused_with_the_reason(data, why):
+def test_a_file_that_is_not_an_image_is_refused_with_the_reason(data, why):
     with refused(ErrorCode.FILE_FOREIGN, "image.bin", why):
         check_image(data, "image.bin")
 
@@ -260,7 +260,7 @@ def test_a_power_failure_at_any_part_is_recoverable(clock, part):
 
 
 @pytest.mark.parametrize("part", range(1, 36))
-def test_a_restart_during_a_download_ends_it_at_once(clock, part):
+def test_a_restart_during_a_download_ends_it_immediately(clock, part):
     """The restarted ROM would take the next part as the first of another file."""
     board = Simulated(lambda: clock.time, flash=DATA, erase_s=0.1)
     words = Restarts(board, clock, part + 1)

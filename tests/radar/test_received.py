@@ -119,7 +119,7 @@ def test_the_fault_during_loading_is_a_register_read_back_error():
 
 
 @pytest.mark.parametrize("sequence", range(16))
-def test_a_refusal_without_a_body_ends_a_command_with_any_sequence_number_at_once(sequence):
+def test_a_refusal_without_a_body_ends_a_command_of_any_sequence_number_immediately(sequence):
     """The known answer has number 0; it is not known if such a device repeats the command's number."""
     line, sent_words = connect(AWR1243_ERROR)
     line.sequence = sequence
@@ -137,7 +137,7 @@ def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
 
 
 @pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
-def test_a_response_of_another_core_is_no_answer(direction, kind):
+def test_a_response_of_another_core_is_not_an_answer(direction, kind):
     line, _ = connect(
         *[encode_message(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)] * 3
     )
@@ -182,7 +182,7 @@ def test_an_answer_in_chunks_is_joined():
 
 
 @pytest.mark.parametrize("chunks", [[(1, 0x40E0)], [(2, 0x40E0), (0, 0x40E2)]], ids=["last", "middle"])
-def test_an_answer_with_a_missing_chunk_is_no_answer(chunks):
+def test_an_answer_with_a_missing_chunk_is_not_an_answer(chunks):
     line, _ = connect(*[chunk(*fields, bytes(16)) for fields in chunks])
     with refused(ErrorCode.NO_ANSWER):
         line.call(GET_MAIN_VERSION)

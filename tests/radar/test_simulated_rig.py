@@ -55,7 +55,7 @@ class PatientClock(SystemClock):
         return super().now() / 1000
 
 
-def test_a_board_unplugged_behind_its_socket_is_a_fault_with_its_address(rig, served_board):
+def test_a_board_unplugged_from_its_socket_server_is_a_fault_with_its_address(rig, served_board):
     radar_socket, board = served_board
     radar = RadarBoard("LS", open_board(radar_socket.address), PatientClock(), make_program(rig, rig.by_name("LS")))
     radar.configure()

@@ -152,7 +152,7 @@ def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(wo
     assert link.warnings == []
 
 
-def test_an_unplugged_link_is_an_error_at_once(link, board):
+def test_an_unplugged_link_is_an_error_immediately(link, board):
     board.plugged = False
     with refused(ErrorCode.NO_ANSWER, "unplugged"):
         link.call(LOW_POWER_OFF)

@@ -54,7 +54,7 @@ def test_the_table_is_that_of_the_materials(folder):
     assert (inside, dataset["label"].sel(x_mm=-100, y_mm=0, method="nearest")) == (4, 5)
 
 
-def test_the_attributes_say_where_it_comes_from(folder):
+def test_the_attributes_give_the_origin_of_the_data(folder):
     attributes = export_folder(folder).attrs
     assert attributes["scan_id"] == "s"
     assert attributes["simulated"] is True
@@ -111,7 +111,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(folder, mo
     assert not list(out.iterdir())
 
 
-def test_what_is_no_netcdf_file_is_refused(tmp_path):
+def test_a_file_that_is_not_netcdf_is_refused(tmp_path):
     (tmp_path / "text.nc").write_text("text")
     for name in ("text.nc", "absent.nc"):
         with pytest.raises(DataError) as caught:

@@ -58,7 +58,7 @@ def test_the_command_writes_what_is_asked_for(folder, capsys):
         ([], ["--netcdf"]),
     ],
 )
-def test_what_cannot_be_exported_is_said(tmp_path, capsys, arguments, words):
+def test_data_that_cannot_be_exported_is_reported(tmp_path, capsys, arguments, words):
     assert main(["export", str(tmp_path), *arguments]) != 0
     message = capsys.readouterr().err
     assert all(word in message for word in words)

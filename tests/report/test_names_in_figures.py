@@ -55,7 +55,7 @@ def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
             assert f"patch {number}: {figure_label(name, 'x').removeprefix('x: ')}" in html
 
 
-def test_the_page_says_which_name_a_label_stands_for():
+def test_the_page_lists_the_name_of_each_label():
     odd = "\U0010fffd木"
     html = render(context([odd, "PET"]), {})
     assert f"patch 1: ?? is {odd}" in html

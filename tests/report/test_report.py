@@ -173,7 +173,7 @@ def test_nothing_is_loaded_from_elsewhere(page):
     assert "url(" not in html
 
 
-def test_images_are_embedded_and_lie_beside_it(page):
+def test_images_are_embedded_and_saved_in_the_folder_of_the_page(page):
     out, html = page
     inline = [base64.b64decode(s.partition(",")[2]) for s in Page(html).sources]
     files = {p.name: p.read_bytes() for p in (out / "figures").iterdir()}
@@ -191,7 +191,7 @@ def test_images_are_embedded_and_lie_beside_it(page):
     assert sorted(p.name for p in out.iterdir()) == ["figures", "report.html"]
 
 
-def test_simulated_is_said_everywhere(page):
+def test_every_output_is_labelled_as_simulated(page):
     _, html = page
     words = Page(html).words
     assert words.startswith("SIMULATED: Scan of two")
@@ -206,7 +206,7 @@ def test_measured_data_is_not_called_simulated(scan, tmp_path):
     assert "simulated" not in Page(html).words.lower()
 
 
-def test_results_stand_beside_the_truth(page):
+def test_results_are_shown_with_the_truth(page):
     _, html = page
     words = Page(html).words
     assert "0 of 2 plates named right" in words  # the metal is a reference, not a result
@@ -267,7 +267,7 @@ def test_runs_and_their_mask_are_the_same(scan):
         assert (masks["RH"] == rows).all()
 
 
-def test_the_report_says_what_was_masked_the_gains_and_the_whole_rig_file(scan):
+def test_the_report_has_the_masked_data_the_gains_and_the_whole_rig_file(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
     gains = {"RH": [RxGain(0.0, 0.0), RxGain(1.25, -8.1)]}
     rig = rig_table() | {"name": "a <rig>"}
@@ -293,7 +293,7 @@ BOARD = {
 }
 
 
-def test_the_imaging_table_has_a_column_for_each_board_and_says_what_is_unknown():
+def test_the_imaging_table_has_a_column_for_each_board_and_marks_unknown_values():
     table = imaging_table({"RH": BOARD, "RV": {"masked_positions": 70000}, "notices": ["RV: imaging by direct sum"]})
     assert table["head"] == ["Board", "RH", "RV"]
     cells = {row["cells"][0]: row["cells"][1:] for row in table["rows"]}

@@ -93,7 +93,7 @@ def test_errors_carry_their_code(view, path, status, code):
     assert (answer_status, json.loads(body)["code"]) == (status, code)
 
 
-def test_a_folder_inside_a_scan_is_no_scan(view, scans):
+def test_a_folder_inside_a_scan_is_not_a_scan(view, scans):
     for path in ("scan", "result", "thumbnail", "map/h_amplitude"):
         assert ask(view, f"/api/{path}?scan=one/products")[0] == 404, path
     assert post(view, "/api/notes?scan=one/products", {"notes": "x"})[0] == 404
@@ -138,7 +138,7 @@ def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans, damage
     assert chart["unreadable"] == [damaged]
 
 
-def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
+def test_one_of_two_simultaneous_starts_is_refused(view, scans, monkeypatch):
     barrier = threading.Barrier(2, timeout=3.0)
     real = control._check_free
 
@@ -162,7 +162,7 @@ def test_of_two_starts_at_once_one_is_refused(view, scans, monkeypatch):
     assert sum((scans / name).exists() for name in ("first", "second")) == 1
 
 
-def test_open_live_views_keep_nobody_from_pausing_and_stopping(view, scans):
+def test_open_live_views_do_not_prevent_pausing_and_stopping(view, scans):
     """A request does not close the view of its own scan, nor those of as many others as may be open."""
     for k in range(site.MAX_WATCHES):
         (scans / f"view{k}" / "program").mkdir(parents=True)
@@ -317,7 +317,7 @@ def test_a_disk_that_takes_nothing_is_named(view, scans, monkeypatch, number, co
     assert not list((scans / "one").glob("*operator.json*"))
 
 
-def test_a_client_that_hangs_up_is_no_fault_of_the_server(view, capfd):
+def test_a_client_that_hangs_up_is_not_a_fault_of_the_server(view, capfd):
     head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", view.port)) as s:

@@ -63,7 +63,7 @@ def abort_once(server: Server, folder: Path) -> float:
     return took_s
 
 
-def test_an_abort_gets_through_whoever_else_asks(processed: Path, tmp_path: Path, request, record_property):
+def test_an_abort_is_accepted_whatever_other_clients_request(processed: Path, tmp_path: Path, request, record_property):
     attack = LONG if request.config.getoption("--long") else BRIEF
     for k in range(VIEWS + 1):
         shutil.copytree(processed / "one", tmp_path / "scans" / f"s{k}", ignore=shutil.ignore_patterns("figures"))

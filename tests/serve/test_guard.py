@@ -131,7 +131,7 @@ def test_large_bodies_are_refused_and_nothing_is_kept(scans):
         assert compute_digest(scans) == state_before
 
 
-def test_open_connections_and_unread_answers_lock_nobody_out(scans):
+def test_open_connections_and_unread_answers_lock_no_client_out(scans):
     """300 clients send half a head, and 100 ask for pages and read none; the operator keeps its connection."""
     pages = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
     with served_folder(scans, TOKEN) as view, ExitStack() as clients:
@@ -169,7 +169,7 @@ def test_of_too_many_connections_those_without_a_request_are_closed(scans, monke
         stream.close()
 
 
-def test_when_every_connection_has_a_request_the_next_one_is_told_that_the_server_is_busy(scans, monkeypatch):
+def test_when_every_connection_has_a_request_the_next_one_is_answered_as_busy(scans, monkeypatch):
     """No connection is closed whose request is there when it is accepted. Some that were closed may still count."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 4)
     monkeypatch.setattr(server, "ACCEPTED_AT_ONCE", 3)
@@ -325,7 +325,7 @@ def hostile(port: int) -> list[bytes]:
 
 
 @pytest.mark.slow
-def test_a_thousand_hostile_requests_change_nothing_and_lock_nobody_out(scans, tmp_path):
+def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans, tmp_path):
     with served_folder(scans, TOKEN) as view:
         state_before = compute_digest(tmp_path)
         requests = list(islice(cycle(hostile(view.port)), 1000))

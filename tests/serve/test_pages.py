@@ -267,7 +267,7 @@ def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):
     page.browser.wait("location.pathname == '/scan'", "the scan's page")
 
 
-def test_the_control_chart_says_what_is_missing_and_follows_new_products(page, scans):
+def test_the_control_chart_names_missing_data_and_follows_new_products(page, scans):
     elsewhere = CheckPlate(name="PET", permittivity=(3.78, 0.7), place_mm=(200.0, 0.0))
     name_check_plate(scans / "one" / "products", elsewhere)
     name_check_plate(scans / "two" / "products", CheckPlate())
@@ -423,7 +423,7 @@ def test_what_is_named_to_harm_is_shown_as_text(page, scans):
     page.check_whole()
 
 
-def test_notes_are_kept_beside_the_scan(page, scans):
+def test_notes_are_stored_in_the_folder_of_the_scan(page, scans):
     page.open("/scan?scan=one")
     page.browser.fill("#notes-text", "Eiche, zweites Brett")
     page.browser.fill("#tags", "oak, 木")
@@ -454,7 +454,7 @@ def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
         reloaded_page.browser.wait("document.querySelectorAll('#waiting li').length == 0", "that it is out")
 
 
-def test_a_wrong_number_is_said_in_the_words_of_the_page(page):
+def test_a_wrong_number_is_reported_with_the_labels_of_the_page(page):
     page.open("/new")
     page.browser.fill("#columns", "0")
     page.browser.wait("document.getElementById('plan-wrong')?.innerText.length > 0", "the refusal")
@@ -514,7 +514,7 @@ def test_the_page_follows_products_that_another_program_has_made(page, scans):
     page.browser.errors.clear()
 
 
-def test_a_list_that_takes_long_is_shown_as_it_is_read(browser, tmp_path, monkeypatch):
+def test_a_long_list_is_shown_while_it_is_read(browser, tmp_path, monkeypatch):
     """Each answer of this server has one scan more; the page asks again until it has all, and shows that meanwhile."""
     monkeypatch.setattr(reading, "LIST_S", 0.0)
     for k in range(6):
@@ -637,7 +637,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     page.check_whole()
 
 
-def test_two_hundred_scans_are_shown_at_once(browser, tmp_path, monkeypatch):
+def test_two_hundred_scans_are_shown_together(browser, tmp_path, monkeypatch):
     # A list that comes in parts shows other scans at its top with each, and their pictures.
     monkeypatch.setattr(reading, "LIST_S", math.inf)
     judged_products(tmp_path / "made", "care")

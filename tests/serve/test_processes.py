@@ -99,7 +99,7 @@ def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_starte
         wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list again")
 
 
-def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_say_nothing(scans, tmp_path):
+def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_are_silent(scans, tmp_path):
     """More silent connections than are kept; a request that came with them is answered when the pages continue."""
     with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
         assert ask(server, "/api/page")[2]["connection"] == "close"
@@ -223,7 +223,7 @@ def test_only_a_whole_command_with_the_right_token_is_answered_at_the_door(head,
     assert is_command(head, b"right") == answered_here
 
 
-def test_the_token_survives_a_restart_and_nobody_else_can_read_it(scans, tmp_path, monkeypatch):
+def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_path, monkeypatch):
     with serving(scans, tmp_path / "state") as server:
         token = server.token
         status, _, headers = ask(server, "/api/session", "POST", {}, **{TOKEN_HEADER: token})
@@ -284,7 +284,7 @@ def test_a_folder_of_something_else_than_a_scan_has_no_live_view(scans, folder):
 
 
 @pytest.mark.parametrize(("folder", "words"), [("ones", "did you mean 'one'"), ("tomorrow", "waits"), ("new", "waits")])
-def test_the_live_view_of_no_scan_yet_says_so(scans, capsys, monkeypatch, folder, words):
+def test_the_live_view_reports_that_no_scan_has_begun(scans, capsys, monkeypatch, folder, words):
     """The scan may begin later, or the folder is mistyped."""
     monkeypatch.setattr(server, "_run", lambda *_: 0)
     (scans / "new").mkdir()

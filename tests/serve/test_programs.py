@@ -83,7 +83,7 @@ def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
     "content",
     [b"", b"[]", b"{}", b'{"pid":1,"ticks":"x"}', b"\xff", b'{"pid":-1,"ticks":0,"words":[],"started_utc":""}'],
 )
-def test_a_made_up_number_is_no_program_that_runs(tmp_path, content):
+def test_an_invented_process_number_is_not_a_running_program(tmp_path, content):
     (tmp_path / PROGRAM_FOLDER).mkdir()
     (tmp_path / PROGRAM_FOLDER / "scan.json").write_bytes(content)
     program = find_program(tmp_path, "scan")
@@ -98,7 +98,7 @@ def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
     assert find_program(tmp_path, "scan").log == "red back\ufffd"
 
 
-def test_a_scan_may_begin_beside_its_program_and_its_notes(tmp_path):
+def test_a_scan_may_begin_in_a_folder_with_its_log_and_notes(tmp_path):
     (tmp_path / PROGRAM_FOLDER).mkdir()
     (tmp_path / "operator.json").write_text("{}")
     _check_new(tmp_path)
@@ -128,7 +128,7 @@ def refusing_pi(tmp_path: Path) -> Iterator[tuple[Path, Callable[[], None]]]:
     context.destroy(linger=0)
 
 
-def test_a_scan_starts_with_its_plan_and_a_pi_that_refuses_it_says_why(refusing_pi, tmp_path):
+def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refusing_pi, tmp_path):
     config, refuse = refusing_pi
     root = tmp_path / "scans"
     root.mkdir()
@@ -166,7 +166,7 @@ def test_a_scan_starts_with_its_plan_and_a_pi_that_refuses_it_says_why(refusing_
         end_program(folder, "scan")
 
 
-def test_what_a_page_leaves_beside_a_scan_is_no_fault_of_it(finished, tmp_path):
+def test_files_that_a_page_leaves_in_a_scan_folder_are_not_a_fault(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "one")
     state_before = validate(tmp_path / "one")
     (tmp_path / "one" / PROGRAM_FOLDER).mkdir()

@@ -80,7 +80,7 @@ def test_after_a_scan_that_did_not_finish_the_queue_waits_for_a_person(queue, ri
     wait_for(lambda: rig.started == ["first", "second"], "the second")
 
 
-def test_what_cannot_be_started_stays_and_says_why(queue, rig):
+def test_a_scan_that_cannot_be_started_stays_with_its_cause(queue, rig):
     rig.is_broken = True
     rig.is_busy = False
     wait_for(lambda: "no launcher" in queue.waiting().held, "the reason")

@@ -57,7 +57,7 @@ def test_only_a_post_with_the_token_asks(desk, watching):
         assert ask(view, "/api/control/destroy", "POST", **{TOKEN_HEADER: TOKEN})[0] == 400
 
 
-def test_a_view_is_read_only_unless_told_otherwise(desk, watching):
+def test_a_view_is_read_only_unless_control_is_allowed(desk, watching):
     folder, stop = desk
     watch = watching(folder)
     with served(watch) as view:
@@ -76,7 +76,7 @@ def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
     assert (TOKEN.encode(), TOKEN.encode()) in compared
 
 
-def test_nobody_to_ask_is_said(finished, watching):
+def test_a_command_to_a_finished_scan_is_refused_with_a_remedy(finished, watching):
     with served(watching(finished, control=True), TOKEN) as view:
         status, body, _ = ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})
     assert status == 409
@@ -97,7 +97,7 @@ def test_the_page_needs_nothing_from_elsewhere():
     assert 'src="' in (STATIC / "frame.html").read_text()
 
 
-def test_a_page_that_never_reads_holds_nobody_up(growing, watching):
+def test_a_page_that_never_reads_delays_no_other_client(growing, watching):
     watch = watching(growing.path, lapse_s=1e6)
     growing.live()
     with served(watch) as view:
@@ -203,7 +203,7 @@ def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_tex
     ],
     ids=str,
 )
-def test_whoever_other_machines_may_be_needs_the_token(place, is_private, control, tmp_path, monkeypatch):
+def test_clients_of_other_machines_need_the_token(place, is_private, control, tmp_path, monkeypatch):
     """Behind a reverse proxy all clients have this machine's address, also on a server without commands."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     with socket.create_server(("127.0.0.1", 0)) as listener:

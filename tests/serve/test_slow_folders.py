@@ -82,7 +82,7 @@ def test_other_scans_are_read_while_one_folder_hangs(dead, view):
     wait_until_answered(view, "/api/result?scan=dead")
 
 
-def test_notes_and_names_of_a_dead_folder_hold_nobody_up(dead, view):
+def test_notes_and_names_of_an_unreachable_folder_delay_no_client(dead, view):
     dead.stop(scans, "is_scan")
     assert ask(view, "/api/scan?scan=dead")[0] == 503
     assert post(view, "/api/notes?scan=dead", {"notes": "x"})[0] == 503
@@ -114,7 +114,7 @@ def test_a_dead_folder_stops_no_other_live_view(dead, view):
 
 
 @pytest.mark.parametrize("address", ["/api/program/doctor", "/api/probe?scan=dead&x=0&y=0"])
-def test_programs_and_libraries_of_a_drive_that_is_gone_hold_nobody_up(dead, view, monkeypatch, address):
+def test_programs_and_libraries_of_an_unreachable_drive_delay_no_client(dead, view, monkeypatch, address):
     def hang(*_: object) -> None:
         dead.back.wait()
 

@@ -77,7 +77,7 @@ def still(finished: Path, tmp_path: Path) -> Iterator[tuple[StillWatch, Served]]
 
 
 @pytest.mark.parametrize(("size", "scheme"), [(DESK, "light"), (PHONE, "dark")], ids=["desk", "phone"])
-def test_every_state_says_what_the_table_says(browser: Browser, still, size, scheme, request):
+def test_every_state_shows_the_text_of_the_table(browser: Browser, still, size, scheme, request):
     """axe-core finds no faults in any state."""
     axe = find_axe()
     watch, view = still
@@ -118,7 +118,7 @@ def test_every_state_says_what_the_table_says(browser: Browser, still, size, sch
         ("", "Try again"),
     ],
 )
-def test_advice_beside_try_again_ends_with_the_button(browser: Browser, still, advice, shown):
+def test_advice_next_to_try_again_ends_with_the_button(browser: Browser, still, advice, shown):
     """A scan that could not start cannot be resumed."""
     watch, view = still
     browser.visit(f"{view.address}/watch#token={TOKEN}", DESK)
@@ -128,7 +128,7 @@ def test_advice_beside_try_again_ends_with_the_button(browser: Browser, still, a
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_a_page_that_is_alone_says_so_and_how_to_abort(browser: Browser, still, monkeypatch, size, request):
+def test_a_page_without_a_server_reports_it_and_how_to_abort(browser: Browser, still, monkeypatch, size, request):
     _, view = still
     axe = find_axe()
     monkeypatch.setattr(serve_site, "ALIVE_INTERVAL_S", 1e9)

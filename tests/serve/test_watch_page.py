@@ -81,7 +81,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
         assert browser.errors == []
 
 
-def test_a_page_finds_back_to_a_view_that_was_started_anew(browser, finished, watching):
+def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished, watching):
     """At an address of its own: a free port of 127.0.0.1 may be used by another program by then."""
     rig = move_to_free_subnet(published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")

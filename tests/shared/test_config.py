@@ -20,7 +20,7 @@ def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):
     assert load_instrument(path) == rig
 
 
-def test_paths_are_beside_the_rig_file_and_no_path_stays_none(rig: Instrument, tmp_path: Path):
+def test_paths_are_relative_to_the_rig_file_and_no_path_stays_empty(rig: Instrument, tmp_path: Path):
     table = to_builtins(rig)
     table["pi"]["key_dir"] = ""
     table["radar"] |= {"firmware": "", "trace_dir": "traces"}
@@ -169,7 +169,7 @@ def test_a_missing_file_bad_toml_and_binary_data_are_refused(tmp_path: Path, con
         load_instrument(path)
 
 
-def test_a_file_in_another_encoding_is_told_so_with_its_line(tmp_path: Path):
+def test_a_file_in_another_encoding_is_reported_with_its_line(tmp_path: Path):
     path = tmp_path / "rig.toml"
     path.write_bytes("a = 1\n# M\xfcnchen\n".encode("latin-1"))
     with refused(ErrorCode.FILE_UNREADABLE, path, "line 2", "save it as UTF-8"):

@@ -45,7 +45,7 @@ def test_a_pipe_is_not_replaced_by_a_file(tmp_path):
     assert (tmp_path / "pipe").is_fifo()
 
 
-def test_errors_name_the_file_and_not_the_one_beside_it(tmp_path, monkeypatch):
+def test_errors_name_the_file_and_not_its_temporary_copy(tmp_path, monkeypatch):
     def fail(part: Path, path: Path) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted", str(part), None, str(path))
 

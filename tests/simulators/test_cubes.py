@@ -70,7 +70,7 @@ def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
         assert unlike > 3 * own_error, "the bound is too wide to detect leakage"
 
 
-def test_the_echo_of_v_drifts_by_what_the_scene_says_and_h_and_the_direct_path_do_not() -> None:
+def test_the_echo_of_v_drifts_as_in_the_scene_and_h_and_the_direct_path_do_not() -> None:
     drifting = SCENE.with_disturbances(hv_drift=[0.2, 30.0])
     echoes = {b: [synced_cube(RIG, s, b, noise=0.0, direct=False) for s in (drifting, SCENE)] for b in ("RH", "RV")}
     assert np.array_equal(echoes["RH"][0], echoes["RH"][1])

@@ -37,7 +37,7 @@ def test_requests_and_replies_byte_for_byte(request_hex: str, reply_hex: str) ->
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x5a\xa5\x09\x00", bytes(8), bytes.fromhex("a55a 0900 0000 eeaa")])
-def test_what_is_no_request_gets_no_answer(junk: bytes) -> None:
+def test_a_packet_that_is_not_a_request_gets_no_answer(junk: bytes) -> None:
     assert Card(HOME).command(junk, 0.0) == []
 
 

@@ -68,7 +68,7 @@ def test_a_recorded_scan_of_a_sphere_is_processed_to_its_samples(tmp_path):
         assert np.linalg.norm(row.samples / common - blocks) < 0.015 * np.linalg.norm(blocks)
 
 
-def test_a_scene_with_shapes_says_what_to_install(monkeypatch):
+def test_a_scene_with_shapes_names_the_missing_package(monkeypatch):
     monkeypatch.setattr("polysight_simulators.scene.shapes.entry_points", lambda **_: [])
     with pytest.raises(ConfigError, match="worlds"):
         reference_cube(RIG, scene(shapes=[BALL]))

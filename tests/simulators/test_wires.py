@@ -92,7 +92,7 @@ def test_a_client_gets_its_subscriptions_and_never_its_own_lines(serve: Serve, j
     assert cards.receive(0.05) is None
 
 
-def test_a_client_that_does_not_read_delays_nobody_and_loses_nothing(serve: Serve, join: Join) -> None:
+def test_a_client_that_does_not_read_delays_no_other_and_loses_nothing(serve: Serve, join: Join) -> None:
     path = serve()
     slow = join(path, (26,))
     fast = join(path, (26,))

@@ -91,7 +91,7 @@ def test_signals_end_it_cleanly(start: Start, number: signal.Signals):
     stage.end(number)
 
 
-def test_ends_when_the_wires_are_gone(start: Start, speed: float):
+def test_the_stage_ends_when_its_wires_are_closed(start: Start, speed: float):
     stage = start(speed)
     with closing(PortDriver(str(stage.link), speed)) as driver:
         driver.replies()

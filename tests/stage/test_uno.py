@@ -111,7 +111,7 @@ def test_backlash_comes_from_below_and_runs_up(host):
         assert len({b - a for a, b in itertools.pairwise(x_before)}) == 1  # so do those of x in the row's direction
 
 
-def test_a_short_hold_is_told_and_costs_no_step(host):
+def test_a_short_hold_is_reported_and_costs_no_step(host):
     """RESUME directly after HOLD: the row is reported as held even if the main program did not see the hold."""
     host.uno.edges.clear()
     host.must_obey("ROW", 3000, 100, 60, 0, 4000)

@@ -34,7 +34,7 @@ CHATTER = {
 
 
 @pytest.mark.parametrize("kind", CHATTER)
-def test_chatter_is_no_heartbeat(host, kind: str):
+def test_other_traffic_is_not_a_heartbeat(host, kind: str):
     """The stage stops within its heartbeat and ramp after the last STATUS byte, whatever else it receives."""
     rng = random.Random(kind)
     host.set(Parameter.HEARTBEAT, 500)
@@ -120,7 +120,7 @@ def test_a_program_that_works_is_never_reset(host):
 
 
 @pytest.mark.parametrize("mask", [1, 2, 4, 7])
-def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
+def test_a_glitch_is_not_a_switch(host, request: pytest.FixtureRequest, mask: int):
     """A switch that closes for up to 100 us at any moment of a row at 100 mm/s does not change the row."""
     rng = random.Random(mask)
     host.set(Parameter.ACCEL, 400_000)
@@ -145,7 +145,7 @@ def test_a_glitch_is_no_switch(host, request: pytest.FixtureRequest, mask: int):
 
 @pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
 @pytest.mark.parametrize(("mask", "number"), [(1, StageError.LIMIT_SWITCH), (4, StageError.EMERGENCY_STOP)])
-def test_a_real_switch_stops_at_once(host, rate: int, mask: int, number: int):
+def test_a_real_switch_stops_immediately(host, rate: int, mask: int, number: int):
     """A switch stays closed for 15 ms at least: the stage stops within six steps."""
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
@@ -200,7 +200,7 @@ def test_homing_overruns_the_switch_by_little(host, accel: int):
     assert host.motion("ROW", 6000, 200, 3, 500, 1000).integer("points") == 3
 
 
-def test_homing_tells_the_steps_that_were_lost(host):
+def test_homing_reports_the_lost_steps(host):
     host.motion("MOVE", 9000, 700, TOP_RATE)
     host.uno.slip(-7, 12)
     answer = host.motion("HOME")

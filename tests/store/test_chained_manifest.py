@@ -51,7 +51,7 @@ def test_repeated_lines_are_noticed(lines):
 
 
 @pytest.mark.parametrize("damage", [b"{}\n", b"\x00\xff\n", b""])
-def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, damage):
+def test_a_damaged_line_is_one_fault_and_the_chain_continues_after_it(tmp_path, damage):
     lines = chain_lines(tmp_path)
     remaining = [*lines[:3], damage, *lines[4:]]
     (tmp_path / MANIFEST).write_bytes(b"".join(remaining))
@@ -62,7 +62,7 @@ def test_a_damaged_line_is_one_fault_and_the_chain_goes_on_behind_it(tmp_path, d
     assert [f.facts["line"] for f in content.faults] == [4]
 
 
-def test_a_manifest_without_chain_reads_as_before_and_goes_on_with_one(tmp_path):
+def test_a_manifest_without_chain_reads_as_before_and_continues_with_one(tmp_path):
     path = tmp_path / MANIFEST
     path.write_bytes(b"".join(map(encode_line, SOME)))
     assert (load_facts(path), manifest.read(path).faults) == (SOME, [])
@@ -89,7 +89,7 @@ def remove_line(folder: Path, *numbers: int) -> None:
     (folder / MANIFEST).write_bytes(b"".join(line for n, line in enumerate(lines, 1) if n not in numbers))
 
 
-def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
+def test_a_missing_line_of_a_row_is_an_error_that_names_line_and_row(scan):
     assert validate(scan) == []
     remove_line(scan, 4)
     error_text = "\n".join(errors(scan))
@@ -100,7 +100,7 @@ def test_a_row_s_line_that_is_gone_is_an_error_that_names_line_and_row(scan):
     assert {f.facts["line"] for f in error_text.manifest_faults} == {4}
 
 
-def test_the_last_row_s_line_that_is_gone_is_missed_by_the_end(scan):
+def test_a_missing_line_of_the_last_row_is_detected_by_the_end(scan):
     lines = (scan / MANIFEST).read_bytes().splitlines()
     facts = [json.loads(line) for line in lines]
     plain = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
@@ -121,7 +121,7 @@ def test_a_row_taken_again_makes_the_gap_a_note(scan):
     assert "line 4" in "\n".join(map(to_text, validate(scan)))
 
 
-def test_a_row_withdrawn_after_the_end_is_no_fault_of_the_manifest(scan):
+def test_a_row_withdrawn_after_the_end_is_not_a_fault_of_the_manifest(scan):
     with ScanFolder.load(scan).writer() as writer:
         writer.append({"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["its file changed"]})
     assert ScanFolder.load(scan).manifest_faults == ()

@@ -187,7 +187,7 @@ def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):
 
 
 @pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])
-def test_the_other_boards_tell_which_end_is_missing(tmp_path, gone):
+def test_the_other_boards_show_which_end_is_missing(tmp_path, gone):
     folder, sent = record(tmp_path, {("RH", 2): gone})
     scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 2), sent["RH", 2])

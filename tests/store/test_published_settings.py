@@ -195,7 +195,7 @@ def test_a_value_that_no_scan_has_is_refused_by_the_files_own_key(write, base, k
     assert "step_x_mm" not in str(refusal.value)
 
 
-def test_a_whole_number_with_a_decimal_point_is_told_so(write, base):
+def test_a_whole_number_with_a_decimal_point_is_reported_as_such(write, base):
     folder = write(total_y=4.0)
     with refused(ErrorCode.TYPE_WRONG, "total_y = 4.0: must be a whole number, without a decimal point"):
         open_source(folder, base)

@@ -55,7 +55,7 @@ def test_flipped_bit_is_never_a_fact(some, data):
         assert content.facts == [parse_fact(fact) for fact in some]
 
 
-def test_after_every_truncation_the_lines_before_it_stand_and_the_chain_goes_on(tmp_path):
+def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_continues(tmp_path):
     some = [{"fact": "scan_paused"}, {"fact": "row_withdrawn", "row": 0}, {"fact": "scan_ended", "reason": "é"}]
     path = tmp_path / "manifest.jsonl"
     ends = [0]
@@ -147,7 +147,7 @@ def test_validate_names_each_damage(whole_scan, kind):
     assert any(place in f.where and description in f.what for f in errors), to_json(errors)
 
 
-def test_events_behind_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed_scan, tmp_path):
+def test_events_after_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed_scan, tmp_path):
     """Such events were not synced, and the Pi's journal has them; committed data may not be damaged."""
     scan = undisturbed_scan.copy(tmp_path / "scan")
     log = scan.path / "events.msgpack"
@@ -249,7 +249,7 @@ def test_other_folders_are_refused(whole_scan, tmp_path):
 
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 400))
-def test_truncated_events_go_on_after_the_last_whole_one(tmp_path_factory, cut):
+def test_truncated_events_continue_after_the_last_whole_one(tmp_path_factory, cut):
     path = tmp_path_factory.mktemp("e") / "events.msgpack"
     writer = EventWriter(path)
     some = [Fault(scan_id="s", seq=k, t_mono_ns=k, number=1, problem="x" * k) for k in range(1, 5)]

@@ -55,7 +55,7 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypa
     ]
 
 
-def test_row_whose_file_is_gone_is_taken_again(undisturbed_scan, monkeypatch):
+def test_a_row_without_its_file_is_taken_again(undisturbed_scan, monkeypatch):
     scan = ScanFolder.load(undisturbed_scan.path)
     missing_file = undisturbed_scan.path / next(iter(scan.committed_rows()[1].boards.values())).file
     path_open = Path.open

@@ -46,7 +46,7 @@ FIRST = (
     "tests/e2e/test_killed_processes.py",
     "tests/doctor/test_live_rig.py",
     "tests/api",
-    "tests/surfaces/test_what_is_no_surface.py",
+    "tests/surfaces/test_rejected_surfaces.py",
     "tests/process/test_laws.py",
     "tests/process/test_samples.py",
     "tests/process/test_given_images.py",

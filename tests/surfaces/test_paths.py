@@ -80,7 +80,7 @@ def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
     assert np.abs(echoes.amplitude) == pytest.approx(0.5, rel=1e-2)
 
 
-def test_a_weak_echo_is_found_beside_a_strong_one():
+def test_a_weak_echo_is_found_near_a_strong_one():
     strong = with_mirror(empty_scan(), 0.65, 1.0)
     both_echoes = with_echo(strong, FRONT_M, 0.1, 0.16)
     echoes = find_echoes(both_echoes, (1.4, 2.1))

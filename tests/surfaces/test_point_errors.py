@@ -181,7 +181,7 @@ def test_a_wide_object_averages_over_what_a_reference_leaves_and_a_flat_one_does
 @pytest.mark.parametrize(
     ("wave", "least", "most"), [(0.0, 0.0, 0.0012), (0.006, 0.0028, 0.005)], ids=["noise", "gains"]
 )
-def test_noise_of_the_points_of_a_reference_is_no_property_of_its_gains(wave, least, most):
+def test_noise_of_the_points_of_a_reference_does_not_enter_its_gains(wave, least, most):
     """The polynomials average over noise; gains that they do not follow are the same for every object."""
     x, y = np.meshgrid(np.arange(16) * 0.028, np.arange(14) * 0.028)
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)

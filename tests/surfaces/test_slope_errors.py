@@ -66,7 +66,7 @@ def test_ripple_is_estimated_though_overlapping_windows_share_it(bend):
 
 
 @pytest.mark.parametrize("bend", [PLANE, BENT], ids=["plane", "bent"])
-def test_noise_that_windows_know_of_is_no_ripple(bend):
+def test_noise_that_windows_account_for_is_not_a_ripple(bend):
     rng = np.random.default_rng(7)
     noise = np.stack([draw_noise(rng, 0), draw_noise(rng, 1)])
     wider = estimate_slope_std(make_echoes(bend, noise, SLOPE_STD)) / SLOPE_STD
@@ -83,7 +83,7 @@ def test_ripple_of_a_straight_edge_is_estimated_though_the_curvature_takes_it(pe
     assert 0.6 < estimated[0] / SLOPE_STD[0] < 1.3
 
 
-def test_a_curvature_that_changes_is_no_ripple():
+def test_a_curvature_that_changes_is_not_a_ripple():
     """The path over a cone, whose curvature falls from 2 to 1 / m within the scan."""
     steps = np.arange(SIDE) * STRIDE_M
     x, y = np.meshgrid(steps, steps)

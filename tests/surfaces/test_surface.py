@@ -162,7 +162,7 @@ def test_files_hold_what_was_found(glass_ball, tmp_path):
 @pytest.mark.parametrize(
     "content", [None, b"", b"not an archive", {"points_m": np.zeros((1, 3))}, {"segments": "[{}]"}]
 )
-def test_a_file_that_is_no_surface_is_refused_by_name(content: Any, tmp_path):
+def test_a_file_that_is_not_a_surface_is_refused_by_name(content: Any, tmp_path):
     path = tmp_path / SURFACE
     if isinstance(content, bytes):
         path.write_bytes(content)

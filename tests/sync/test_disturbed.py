@@ -97,7 +97,7 @@ def test_no_chirp_of_an_undisturbed_burst_is_left_out(align, receive_bursts, cou
 
 
 @pytest.mark.parametrize("travel_mm", [0.5, 1.0])
-def test_motion_in_a_burst_is_no_disturbance(align, receive_bursts, counts, travel_mm):
+def test_motion_in_a_burst_is_not_a_disturbance(align, receive_bursts, counts, travel_mm):
     """The echo of a plate aside turns by its change of path, up to 1.6 times the travel."""
     moved = np.linspace(-0.5, 0.5, CHIRPS)[:, None, None] * 1.6 * travel_mm / 3.85
     direct = receive_bursts(60.0, seed=3, echo=0.0)

@@ -98,7 +98,7 @@ def test_what_is_not_known_is_not_held_against_a_result():
     assert level(rules.judge_levels({"H": None})) == "good"
 
 
-def test_every_reason_says_what_why_and_what_to_do():
+def test_every_reason_has_its_cause_and_a_remedy():
     reasons = [
         *rules.judge_recording(Coverage(9, 5, 900, 400, ("x",)), 0.3),
         *rules.judge_direct_path("RH", -20.0, None, 1.0),
@@ -227,7 +227,7 @@ def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reaso
     assert never not in text, text
 
 
-def test_paint_is_no_cause_where_a_dielectric_reference_explains_the_others_better():
+def test_paint_is_not_the_cause_where_a_dielectric_reference_explains_the_others_better():
     """The other patch that fits metal least is known only if the evidence, paint included, speaks against metal."""
     (doubt,) = rules.judge_metal("patch 5", False, False, True, False, False, culprit=2, painted=1.0, paint_mm=0.1)
     (paint,) = rules.judge_metal("patch 5", False, False, True, False, False, painted=1.0, paint_mm=0.1)
@@ -236,7 +236,7 @@ def test_paint_is_no_cause_where_a_dielectric_reference_explains_the_others_bett
 
 
 @pytest.mark.parametrize("labels", [[4], [4, 7]])
-def test_smears_are_told_with_their_own_cause_and_advice(labels):
+def test_smears_are_reported_with_their_own_cause_and_advice(labels):
     assert rules.judge_smears({}) == []
     (told,) = rules.judge_smears(dict.fromkeys(labels, SMEAR))
     assert all(str(label) in told.what for label in labels)
@@ -244,7 +244,7 @@ def test_smears_are_told_with_their_own_cause_and_advice(labels):
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_paint_is_said_of_a_given_reference_and_of_one_that_was_found(given):
+def test_paint_is_reported_on_a_given_reference_and_on_one_that_was_found(given):
     (paint,) = rules.judge_metal("patch 5", True, True, given, False, False, painted=0.9, paint_mm=0.1)
     assert "(patch 5) may be painted: probability 0.90, 0.10 mm" in paint.what
     assert rules.judge_metal("patch 5", True, True, given, False, False, painted=0.1, paint_mm=0.1) == []
@@ -403,11 +403,11 @@ def test_a_reconstruction_is_advised_where_it_would_help(masked, is_filled, advi
 
 
 @pytest.mark.parametrize(("std_deg", "told"), [(0.0, True), (0.29, True), (0.31, False)])
-def test_a_tilt_of_the_plane_is_told_beyond_its_standard_deviation(std_deg, told):
+def test_a_tilt_of_the_plane_beyond_its_standard_deviation_is_reported(std_deg, told):
     assert bool(rules.judge_plane(True, 0.0, (0.1, -0.8), 0.1, (0.0, std_deg))) is told
 
 
-def test_fringes_are_ascribed_to_what_lies_behind_where_that_disturbs_the_plates():
+def test_fringes_are_ascribed_to_the_background_where_it_disturbs_the_plates():
     """A table behind the plates was called a second path, before the reason that names it (found from outside)."""
     (fringes,) = rules.judge_fringes(0.9, behind=0.15)
     (behind,) = rules.judge_background(0.15)

@@ -52,7 +52,7 @@ def test_a_plate_stands_where_it_was_put(metal_images):
     assert metal_images.y_m[rows[[0, -1]]] == pytest.approx([y0, y1], abs=0.005)
 
 
-def test_a_dielectric_beside_metal_has_the_ratio_of_fresnel(metal_images):
+def test_a_dielectric_relative_to_metal_has_the_ratio_of_fresnel(metal_images):
     plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
     images = simulate(World((plate,)))
     measured = ratio(images, plate) / ratio(metal_images, metal_images.world.plates[0])

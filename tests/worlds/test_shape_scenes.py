@@ -61,7 +61,7 @@ def test_each_disturbance_changes_the_samples_and_repeats(change):
     assert all(np.array_equal(disturbed[channel], second_scan[channel]) for channel in quiet)
 
 
-def test_the_back_of_a_body_is_no_surface_that_is_seen():
+def test_the_back_of_a_body_is_not_a_surface_that_is_seen():
     """A table that touches it has another normal."""
     scene = worlds.draw_shapes(5, "barrel")
     middle_m = np.array(scene.shapes[0].place_m)

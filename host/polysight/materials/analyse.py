@@ -651,7 +651,10 @@ def _select_patches(images: Images, known_scene: KnownScene) -> Segmentation:
 
 
 def _list_references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
-    """Return the given metal reference, or else the brightest patch and others like it; `no_metal` without patches."""
+    """Return the given metal reference, or else those that :func:`find_metals` finds.
+
+    Without patches it is that of :func:`make_missing_reference`.
+    """
     if isinstance(known_scene.metal, PlaneReference):
         return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
     if isinstance(known_scene.metal, int):

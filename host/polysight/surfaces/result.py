@@ -65,7 +65,7 @@ LEAST_REAL = 1.25
 MOST_REAL = 39.0
 # Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
 # Beyond what the rig's errors explain 46 drawn solids have at most 0.020 and 0.0034; walls that pass as a medium which
-# is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_what_is_no_surface.py).
+# is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_rejected_surfaces.py).
 MAX_LEVEL_MISS = 0.05
 MAX_BAND_RISE = 0.01
 NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"

@@ -162,7 +162,10 @@ def unknowns(quick: bool) -> Table:
 
 @dataclass(frozen=True)
 class TaskScores:
-    """Scores of a task of Fig. 18: the paper's KNN and the discriminant, scans left out, and by pixel (`_pixel`)."""
+    """Scores of a task of Fig. 18: the paper's KNN and the discriminant.
+
+    Fields that end in `_pixel` are of the split by pixel, the others of the split by scan.
+    """
 
     task: str
     knn: Score

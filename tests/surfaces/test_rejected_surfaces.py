@@ -43,7 +43,7 @@ CENTRE_M = (-0.01, 0.104, 0.5)
 MEDIUM = 4.2 - 0.4j
 
 
-def test_the_sharp_edges_of_a_tilted_plate_are_no_surface(see, gains, optics):
+def test_the_sharp_edges_of_a_tilted_plate_are_not_a_surface(see, gains, optics):
     """The plate is seen from two thirds of the grid, and only its edges from the rest."""
     board = plate("board", Stack(below=MEDIUM), CENTRE_M, (0.1, 0.1), tilt_deg=(2.0, -2.0))
     surface = analyse_surface(see([board]), optics, gains, uncertainty=EXACT)
@@ -80,7 +80,7 @@ def test_an_edge_has_no_level_of_its_own(metal, gains, optics):
     assert not find_reflecting(edge, amplitude * fall, number, learnt).any()
 
 
-def test_what_reflects_less_than_any_medium_is_no_surface(metal, gains, optics):
+def test_a_reflection_weaker_than_of_any_medium_is_not_a_surface(metal, gains, optics):
     voltages = find_voltages(metal, optics)
     amplitude = np.abs(metal.h.amplitude)
     number = np.zeros(len(metal), int)
@@ -111,7 +111,7 @@ def check_a_thin_wall(see, gains, optics, wall_mm):
     assert np.mean(away_m < 1.96 * surface.position_std_m) >= 0.9
 
 
-def test_a_small_body_says_whether_one_medium_explains_it(metal, gains, optics):
+def test_it_is_reported_whether_one_medium_explains_a_small_body(metal, gains, optics):
     """Below 40 mm no segment has a permittivity; the points of a wall are still displaced, and its reason says so."""
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
@@ -184,7 +184,7 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
         assert error < 0.02
 
 
-def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(metal, gains, optics):
+def test_points_behind_a_body_may_be_echoes_from_inside(metal, gains, optics):
     def add_echo(path_m, shift_m=0.0):
         """Points of the front, and an echo of each later by `path_m`, seen from `shift_m` farther away in x."""
         later = replace(metal.h, path_m=metal.h.path_m + path_m, at_m=metal.h.at_m + np.array([shift_m, 0.0, 0.0]))
@@ -210,7 +210,7 @@ def test_what_the_windows_of_a_body_see_behind_it_may_be_an_echo_from_inside(met
     assert unknown_m[-1] == pytest.approx(0.166 / np.sqrt(3), rel=0.05)
 
 
-def test_points_near_the_border_of_a_segment_are_told_but_not_where_the_scan_ends():
+def test_points_near_the_border_of_a_segment_are_reported_but_not_at_the_end_of_the_scan():
     """A segment that fills the scan in y, and ends within it in x."""
     x, y = np.meshgrid(np.arange(0.1, 0.3, 0.008), np.arange(0.0, 0.2, 0.008))
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)
@@ -273,7 +273,7 @@ def test_ripples_of_edges_do_not_make_a_plate_a_wall(rippled_plane, metal, gains
 
 
 @pytest.mark.parametrize(("least", "most"), [(0.1, 0.25), (0.25, 0.4), (0.4, 0.55), (0.55, 0.9)])
-def test_points_of_a_wall_say_how_far_they_may_lie_off(least, most):
+def test_points_of_a_wall_have_the_error_of_their_position(least, most):
     """Drawn walls: the path by the matched filter over the band, by the sum of both faces' echoes at 53 degrees.
 
     Among them are thick walls, whose faces one window just does not resolve.
@@ -343,7 +343,7 @@ def test_a_place_is_doubted_for_a_wall_and_for_an_echo_behind_another_surface(
     assert (judged.radius_std_mm > 1) is (judged_as != "surface")
 
 
-def test_a_radius_says_where_curvatures_and_normals_disagree(metal, optics):
+def test_a_radius_is_reported_where_curvatures_and_normals_disagree(metal, optics):
     """A wall's two faces bend paths otherwise than they turn normals: one gave 75 mm for 42 mm without a warning."""
     shape = find_shape(metal.h, optics)
     sound = describe_segment(0, shape)
@@ -386,7 +386,7 @@ def see_sphere(optics, radius_m: float = 0.125) -> SeenEchoes:
 
 
 @pytest.mark.parametrize("medium", [2.1 - 0.002j, 4.2 - 0.4j, 8.0 - 1.0j])
-def test_a_sphere_that_is_not_of_metal_is_no_reference(medium, optics):
+def test_a_sphere_that_is_not_of_metal_is_not_a_reference(medium, optics):
     voltages = find_voltages(see_sphere(optics), optics)
 
     def learn(eps):

@@ -12,6 +12,15 @@ connect) and creates the other parts, each with a thread of its own:
 scheduling, systemd notifications and the memory limit.
 """
 
+import shlex
+from collections.abc import Sequence
+
 # Path at which install.sh installs the program.
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
-AS_THE_SERVICE = f"as the service's user: `sudo -u polysight {PROGRAM} ...`"
+# Rig file that install.sh installs.
+RIG_FILE = "/etc/polysight/instrument.toml"
+
+
+def advise_as_service(words: Sequence[str]) -> str:
+    """Return the advice to run `polysight-pi` with these words as the user of the service."""
+    return f"as the service's user: `sudo -u polysight {PROGRAM} {shlex.join(words)}`"

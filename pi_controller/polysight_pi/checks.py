@@ -9,8 +9,9 @@ from typing import Any
 
 import zmq
 
-from polysight_pi import AS_THE_SERVICE, system
+from polysight_pi import RIG_FILE, advise_as_service, system
 from polysight_pi.journal import Journal
+from polysight_pi.keys import read_allowed
 from polysight_pi.lines import (
     GpiodLines,
     SpiDevice,
@@ -24,10 +25,17 @@ from polysight_pi.lines import (
 from polysight_pi.stage import BenchStage
 from polysight_pi.trigger import MIN_DURATION_SHARE, BurstSpec, make_spi_burst
 from polysight_shared.config import Instrument, Pi
-from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, convert_os_error
+from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, convert_os_error, quote
 from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
-from polysight_shared.sockets import create_publisher, create_replier, is_loopback, make_server_context
+from polysight_shared.sockets import (
+    PI_KEYS,
+    advise_keys,
+    create_publisher,
+    create_replier,
+    is_loopback,
+    make_server_context,
+)
 
 # Free space that the journals need: a scan of 70,000 positions journals about 20 MB.
 JOURNAL_BYTES = 100 << 20
@@ -66,7 +74,9 @@ def run_check(name: str, check: Callable[..., str | Finding], *args: object) -> 
     except PolysightError as e:
         return Finding.of_error(e, where=name)
     except OSError as e:
-        return Finding("error", convert_os_error(e).what, do=AS_THE_SERVICE, where=name)
+        return Finding(
+            "error", convert_os_error(e).what, do=advise_as_service(["check", "--config", RIG_FILE]), where=name
+        )
     if isinstance(result, Finding):
         return result
     return Finding("ok", result, where=name)
@@ -131,17 +141,21 @@ def _check_journal(path: Path, needed_bytes: int) -> str:
 
 
 def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
-    """Check that the Pi's secret key is there, for its user alone, unless all addresses are loopback."""
+    """Check that the Pi's secret key is there, for its user alone, and lets a client in, unless all are loopback."""
     if all(is_loopback(a) for a in addresses):
         return "not needed: both addresses are loopback"
-    secret = folder / "pi.key_secret"
+    secret = folder / PI_KEYS[0]
     if not secret.is_file():
-        raise DeviceError(f"{secret} is missing", "keys were not made yet", "polysight-pi keys")
+        raise DeviceError(f"{secret} is missing", "keys were not made yet", advise_keys(folder))
     if secret.stat().st_mode & 0o077:
         summary = f"{secret} can be read by others than its owner"
-        remedy = f"chmod 600 {secret}; new ones with `polysight-pi keys --replace`"
+        remedy = f"chmod 600 {quote(secret)}; new ones with `polysight-pi keys --dir {quote(folder)} --replace`"
         return Finding("warning", summary, do=remedy, where="keys")
-    return f"{secret}"
+    clients = sorted(read_allowed(folder).values())
+    if not clients:
+        remedy = f"allow one: `polysight-pi keys --dir {quote(folder)} --client NAME`"
+        return Finding("warning", f"{folder} allows no client", do=remedy, where="keys")
+    return f"{secret}; allowed: {', '.join(clients)}"
 
 
 def _check_address(make_socket: Callable[..., zmq.Socket[bytes]], address: str, key_dir: Path) -> str:

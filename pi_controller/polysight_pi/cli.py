@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import json
 import math
 import signal
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from polysight_pi import AS_THE_SERVICE
+from polysight_pi import RIG_FILE, advise_as_service
 from polysight_shared import __version__
 from polysight_shared.program import (
     close_standard_output,
@@ -21,12 +23,19 @@ from polysight_shared.program import (
 
 if TYPE_CHECKING:
     from polysight_shared.config import Instrument
+    from polysight_shared.errors import DeviceError
 
 # Commands import their modules when they are called: `--help` needs no package of others, and Ctrl-C ends in no
 # traceback. A function with `args` and `instrument` is a command of COMMANDS; it returns the exit status.
 
 # Pause between two bursts of `pulse` (chosen).
 PAUSE_NS = 10_000_000
+# Largest number of bursts or events, and of an event: what a message to the service can carry.
+MAX_COUNT = 2**31 - 1
+# Largest distance and speed of `jog` (chosen: further than any stage goes), and longest timeout.
+MAX_DISTANCE_MM = 10_000.0
+MAX_SPEED_MM_S = 10_000.0
+MAX_TIMEOUT_S = 1e6
 
 
 def _write(text: str) -> None:
@@ -157,7 +166,7 @@ def _show_events(args: argparse.Namespace, instrument: Instrument) -> int:
     """Print the events of a scan's journal, or live ones, one JSON object a line."""
     from polysight_pi.client import follow_events, replay_events
 
-    if args.scan_id:
+    if args.scan_id is not None:
         events = replay_events(instrument, args.scan_id, args.from_seq)
     else:
         events = follow_events(instrument, args.limit_s)
@@ -180,8 +189,11 @@ def _make_keys(args: argparse.Namespace) -> int:
             _write(str(path))
         _write(f"copy them to that client as host.key and host.key_secret, with {folder / 'pi.key'}")
     if args.revoke or args.client or args.list:
-        for key, name in read_allowed(folder).items():
+        allowed = read_allowed(folder)
+        for key, name in allowed.items():
             _write(f"allowed: {key} {name}")
+        if not allowed:
+            _write("no client is allowed")
         return 0
     for path in make_keys(folder, args.replace):
         _write(str(path))
@@ -196,18 +208,30 @@ def _take_over(args: argparse.Namespace, instrument: Instrument) -> int:
     return 0
 
 
-def _parse_positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be at least 1")
+def _parse_count(text: str) -> int:
+    """Parse a whole number from 1 to MAX_COUNT. Raises ArgumentTypeError."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = 0
+    if not 1 <= value <= MAX_COUNT:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number from 1 to {MAX_COUNT}")
     return value
 
 
-def _parse_speed(text: str) -> float:
-    value = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError("must be above 0")
-    return value
+def _number_within(low: float, high: float) -> Callable[[str], float]:
+    """Return a function that parses a number of this range and raises ArgumentTypeError for another."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} must be a number from {low:g} to {high:g}")
+        return value
+
+    return parse
 
 
 def _make_option(*names: str, **how: Any) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -220,8 +244,15 @@ def _load_rig(args: argparse.Namespace) -> Instrument:
     import msgspec
 
     from polysight_shared.config import load_instrument
+    from polysight_shared.errors import ConfigError, ErrorCode
 
-    rig = load_instrument(args.config)
+    try:
+        rig = load_instrument(args.config)
+    except ConfigError as e:
+        # What a person types first on the Pi, in another folder than the rig file's.
+        if e.code == ErrorCode.FILE_MISSING and Path(RIG_FILE).exists():
+            e.remedy = f"give the rig file of this Pi: `--config {RIG_FILE}`"
+        raise
     overrides = {key: value for key, value in vars(args).items() if value is not None}
     pi_values = {key: overrides[key] for key in ("journal_dir", "command_address", "event_address") if key in overrides}
     stage_values = {"port": overrides["stage_port"]} if "stage_port" in overrides else {}
@@ -237,8 +268,10 @@ JOURNAL_OPTION = _make_option(
 )
 JSON_OPTION = _make_option("--json", action="store_true", help="print JSON, for programs")
 # Settings of options that are a number of things or a distance.
-COUNT_SETTINGS = {"type": _parse_positive, "metavar": "N"}
-DISTANCE_SETTINGS = {"type": float, "default": 0.0, "metavar": "MM"}
+COUNT_SETTINGS = {"type": _parse_count, "metavar": "N"}
+DISTANCE_SETTINGS = {"type": _number_within(-MAX_DISTANCE_MM, MAX_DISTANCE_MM), "default": 0.0, "metavar": "MM"}
+SPEED_SETTINGS = {"type": _number_within(0.001, MAX_SPEED_MM_S), "metavar": "MM_S"}
+TIMEOUT_SETTINGS = {"type": _number_within(0.001, MAX_TIMEOUT_S), "default": 10.0, "metavar": "S"}
 # Name, action, help, example (the words after the name) and options of each command.
 COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str, Any]], ...]], ...] = (
     ("run", _run, "serve the host until SIGTERM or SIGINT", "--config instrument.toml", (
@@ -259,7 +292,7 @@ COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str,
     ("jog", _jog, "move the stage by a distance (home it first)", "--dx 10 --dy -5", (
         STAGE_PORT, JSON_OPTION, _make_option("--dx", **DISTANCE_SETTINGS, help="along x, millimetres (0)"),
         _make_option("--dy", **DISTANCE_SETTINGS, help="along y, millimetres (0)"),
-        _make_option("--speed", type=_parse_speed, metavar="MM_S", help="mm/s (default: stage.travel_speed_mm_s)"),
+        _make_option("--speed", **SPEED_SETTINGS, help="mm/s (default: stage.travel_speed_mm_s)"),
     )),
     ("home", _home, "home the stage, through the service if it runs", "--config instrument.toml", (
         STAGE_PORT, JSON_OPTION,
@@ -268,7 +301,7 @@ COMMANDS: tuple[tuple[str, Any, str, str, tuple[tuple[tuple[str, ...], dict[str,
         _make_option("--scan-id", metavar="ID", help="print the journal of this scan instead of live events"),
         _make_option("--from-seq", **COUNT_SETTINGS, default=1, help="first event from the journal (%(default)s)"),
         _make_option("--count", **COUNT_SETTINGS, help="stop after this number of events"),
-        _make_option("--limit-s", type=float, default=10.0, metavar="S", help="timeout without an event (%(default)s)"),
+        _make_option("--limit-s", **TIMEOUT_SETTINGS, help="timeout without an event (%(default)s)"),
     )),
     ("keys", _make_keys, "make CURVE keys for addresses that are not loopback", "--dir /etc/polysight/keys", (
         _make_option("--dir", type=Path, metavar="DIR", help="folder of the keys; replaces pi.key_dir"),
@@ -311,15 +344,27 @@ def _make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _convert_os_error(e: OSError, words: Sequence[str]) -> DeviceError:
+    """Return the error of ours for an error of the operating system in the command with these words."""
+    from polysight_shared.errors import convert_os_error
+
+    if e.errno in (errno.EACCES, errno.EPERM):
+        return convert_os_error(e, "it belongs to another user", advise_as_service(words))
+    if e.errno in (errno.ENOSPC, errno.EDQUOT):
+        return convert_os_error(e, "the disk is full", "free space on it (df -h)")
+    return convert_os_error(e)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the command of `argv` (default: the program's arguments) and return the exit status.
 
     An error of ours or of the operating system is one message on stderr, without a traceback.
     """
     open_standard_streams()
+    words = expand_home(sys.argv[1:] if argv is None else argv)
     try:
         with interrupts_between_imports():
-            args = _make_parser().parse_args(expand_home(sys.argv[1:] if argv is None else argv))
+            args = _make_parser().parse_args(words)
             if args.action is _make_keys:
                 return args.action(args)
             return args.action(args, _load_rig(args))
@@ -330,11 +375,10 @@ def main(argv: list[str] | None = None) -> int:
         close_standard_output()
         return 0
     except Exception as e:
-        from polysight_shared.errors import PolysightError, convert_os_error
+        from polysight_shared.errors import PolysightError
 
         if isinstance(e, OSError):
-            cause = "a path is wrong, the disk is full, or it belongs to another user"
-            error = convert_os_error(e, cause, remedy=AS_THE_SERVICE)
+            error = _convert_os_error(e, words)
         elif isinstance(e, PolysightError):
             error = e
         else:

@@ -15,12 +15,11 @@ from typing import Any
 import msgspec
 import zmq
 
-from polysight_pi import AS_THE_SERVICE
 from polysight_pi.service import TAKE_OVER_KEY
 from polysight_pi.stage import MOTION_TIMEOUT_S
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
-from polysight_shared.errors import DeviceError, ErrorCode, convert_os_error
+from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.sockets import Socket, create_requester, create_subscriber
 
 # A program that does not accept a connection in this time counts as not running (chosen).
@@ -121,19 +120,29 @@ def home_by_service(instrument: Instrument) -> m.StatusReply | None:
 def take_over(instrument: Instrument, action: str) -> str:
     """Hold, resume, abort or end the active run of any client; return the state after it.
 
-    Raises DeviceError if the service refuses or does not answer, or if the take-over key cannot be read.
+    Raises DeviceError if the service refuses, does not answer or never ran here, or if there is no run to end; OSError
+    if the take-over key cannot be read.
     """
     # The service takes this key in place of the secret of the run's owner.
+    key_file = Path(instrument.pi.journal_dir) / TAKE_OVER_KEY
     try:
-        owner = (Path(instrument.pi.journal_dir) / TAKE_OVER_KEY).read_text(encoding="ascii").strip()
-    except OSError as e:
-        raise convert_os_error(
-            e, "polysight-pi run is not running here, or you are not its user", AS_THE_SERVICE
+        owner = key_file.read_text(encoding="ascii").strip()
+    except FileNotFoundError:
+        raise DeviceError(
+            f"{key_file}: no such file",
+            "`polysight-pi run` has not run on this Pi, or its journals are in another folder",
+            "start it: `sudo systemctl restart polysight-pi`; or name the folder of its journals with --journal",
+            code=ErrorCode.FILE_MISSING,
         ) from None
     reason = "a person at the Pi took over the run"
     with _open_service(instrument) as ask:
         if action == "end":
             scan_id = ask(m.Status()).scan_id
+            if not scan_id:
+                remedy = "there is nothing to end"
+                raise DeviceError(
+                    "no run is active", "it has ended, or none was begun", remedy, code=ErrorCode.REFUSED_BY_PEER
+                )
             return ask(m.EndRun(scan_id=scan_id, exit_status="abort", reason=reason, owner=owner)).state
         if action == "abort":
             return ask(m.Abort(reason=reason, owner=owner)).state
@@ -160,17 +169,22 @@ def replay_events(instrument: Instrument, scan_id: str, from_seq: int) -> Iterat
 
     Raises DeviceError without an answer or a journal.
     """
+    missing = DeviceError(
+        f"the Pi has no journal of scan {scan_id!r}",
+        "the scan has another name, or another Pi ran it",
+        f"list the journals in {instrument.pi.journal_dir}",
+        code=ErrorCode.FILE_MISSING,
+    )
+    try:
+        msgspec.convert(scan_id, m.ScanId)
+    except msgspec.ValidationError:
+        # No scan can have this name.
+        raise missing from None
     with _open_service(instrument) as ask:
         while True:
             reply = ask(m.Replay(scan_id=scan_id, from_seq=from_seq))
             if reply.last_seq == 0:
-                summary = f"the Pi has no journal of scan {scan_id!r}"
-                raise DeviceError(
-                    summary,
-                    "the scan has another name, or another Pi ran it",
-                    f"list the journals in {instrument.pi.journal_dir}",
-                    code=ErrorCode.FILE_MISSING,
-                )
+                raise missing
             if not reply.events:
                 return
             yield from map(msgspec.to_builtins, reply.events)

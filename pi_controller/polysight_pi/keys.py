@@ -12,8 +12,8 @@ from pathlib import Path
 import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
-from polysight_shared.errors import ConfigError, ErrorCode
-from polysight_shared.sockets import HOST_KEYS
+from polysight_shared.errors import ConfigError, ErrorCode, quote
+from polysight_shared.sockets import HOST_KEYS, PI_KEYS, advise_keys
 
 # Names of the two pairs of keys that `make_keys` makes.
 KEY_PAIRS = ("pi", "host")
@@ -34,13 +34,13 @@ class AllowedKeys:
         self._names: dict[str, str] = {}
         # Time and size of the file when it was last read.
         self._stamp = (-1, -1)
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ConfigError):
             self._names = read_allowed(folder)
 
     def client_name(self, key: bytes) -> str:
         """Return the name of the client with this public key (32 bytes), or "" if it is not allowed."""
         # Keep the last list if the file is missing or unreadable.
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ConfigError):
             stat = (self._folder / ALLOWED_FILE).stat()
             stamp = (stat.st_mtime_ns, stat.st_size)
             if self._stamp != stamp:
@@ -52,9 +52,20 @@ class AllowedKeys:
 
 
 def read_allowed(folder: Path) -> dict[str, str]:
-    """Return the names of the clients that may connect, by public key (Z85 text)."""
+    """Return the names of the clients that may connect, by public key (Z85 text).
+
+    Raises ConfigError if the list is not text, OSError if it cannot be read.
+    """
     try:
         lines = (folder / ALLOWED_FILE).read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        path = folder / ALLOWED_FILE
+        raise ConfigError(
+            f"{path} is not a list of clients",
+            "the file is damaged; no client can connect",
+            f"remove it, so that the host alone is allowed: `rm {quote(path)}`; then add the other clients again",
+            code=ErrorCode.FILE_DAMAGED,
+        ) from None
     except FileNotFoundError:
         with suppress(OSError, ValueError):
             return {_derive_public(folder, "host"): "host"}
@@ -89,8 +100,11 @@ def make_keys(folder: Path, replace: bool = False) -> list[Path]:
 def allow_client(folder: Path, name: str) -> list[Path]:
     """Make keys for one more client and allow it. Return its files; the secret one is for that client only.
 
-    Raises ConfigError if the name is taken or not valid.
+    Raises ConfigError if the name is taken or not valid, or before the keys of the Pi are made.
     """
+    if not (folder / PI_KEYS[0]).exists():
+        summary = f"{folder} has no keys of the Pi"
+        raise ConfigError(summary, "they were not made yet", advise_keys(folder), code=ErrorCode.FILE_MISSING)
     if (
         not name.replace("-", "").replace("_", "").isalnum()
         or name in KEY_PAIRS
@@ -112,7 +126,7 @@ def revoke_client(folder: Path, name: str) -> None:
     names = read_allowed(folder)
     remaining = {key: client for key, client in names.items() if client != name}
     if remaining == names:
-        remedy = f"allowed: {', '.join(names.values())}"
+        remedy = f"allowed: {', '.join(names.values()) or 'no client'}"
         raise ConfigError(f"no client {name!r} is allowed", "a typing error", remedy, code=ErrorCode.KEY_UNKNOWN)
     _write_allowed(folder, remaining)
 
@@ -124,7 +138,12 @@ def _derive_public(folder: Path, name: str) -> str:
 
 def _create_pair(folder: Path, name: str) -> list[Path]:
     """Create a pair of key files, public and secret; the secret one is readable by the owner only."""
-    public, secret = map(Path, create_certificates(folder, name))
+    try:
+        public, secret = map(Path, create_certificates(folder, name))
+    except OSError as e:
+        # pyzmq writes the files without naming them in an error of the disk.
+        e.filename = e.filename or str(folder / f"{name}.key")
+        raise
     secret.chmod(0o600)
     return [public, secret]
 

@@ -131,10 +131,13 @@ def find_chip(name: str, devices: Path = Path("/dev")) -> str:
         if label == name:
             return str(path)
         chips.append(f"{path} is {label!r}")
+    remedy = "set pi.gpio_chip in instrument.toml to one of these labels or to a path"
+    if not chips:
+        remedy = "run this on the Pi; with a simulated rig (docs/spec/simulated-rig.md) give the socket of its --wires"
     raise DeviceError(
         f"no GPIO chip has the label {name!r}: found {', '.join(chips) or 'none'}",
         "another Pi model, no GPIO on this machine, or no permission (group gpio)",
-        "set pi.gpio_chip in instrument.toml to one of these labels or to a path",
+        remedy,
         code=ErrorCode.FILE_MISSING,
     )
 

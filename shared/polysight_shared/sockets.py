@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import ipaddress
+import re
 from pathlib import Path
 from typing import Any
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, quote
 from polysight_shared.messages import MAX_COMMAND_BYTES
 
 Socket = zmq.Socket[bytes]
@@ -29,6 +30,8 @@ HANDSHAKE_TIMEOUT_MS = 5000
 # Bit masks of ZMQ_AFFINITY: which of a context's I/O threads reads and writes the connections of a socket.
 COMMAND_IO_THREAD = 0b01
 EVENT_IO_THREAD = 0b10
+# Highest number of a TCP port.
+MAX_PORT = 65535
 _CHANGE_REMEDY = "change the address in instrument.toml"
 _NO_ADDRESS_CAUSE = ("the address does not exist on this machine", _CHANGE_REMEDY)
 _NO_RIGHTS_CAUSE = ("this user may not use it", f"{_CHANGE_REMEDY}: ports below 1024 need rights")
@@ -46,9 +49,11 @@ def host_name(address: str) -> str:
     """Return the host of `tcp://host:port` (port `*`: any free one). Raises ConfigError for another form."""
     scheme, _, host_and_port = address.partition("://")
     host, _, port = host_and_port.rpartition(":")
-    if scheme != "tcp" or not host or not (port == "*" or port.isdigit()):
+    # libzmq takes a larger number without the bits above the 16th: another port.
+    port_is_valid = port == "*" or (re.fullmatch("[0-9]{1,5}", port) and int(port) <= MAX_PORT)
+    if scheme != "tcp" or not host or not port_is_valid:
         raise ConfigError(
-            f"address {address!r} is not of the form tcp://host:port",
+            f"address {address!r} is not of the form tcp://host:port, with a port of at most {MAX_PORT}",
             "a typing error",
             "correct it in instrument.toml",
             code=ErrorCode.VALUE_INVALID,
@@ -67,6 +72,14 @@ def is_loopback(address: str) -> bool:
         return False
 
 
+def advise_keys(key_dir: Path) -> str:
+    """Return the advice to make the Pi's keys in this folder, in the place of damaged ones."""
+    command = f"polysight-pi keys --dir {quote(key_dir)}"
+    if not (key_dir / PI_KEYS[0]).exists():
+        return f"make them: `{command}`"
+    return f"make new ones: `{command} --replace`, then copy {' and '.join(HOST_KEYS)} to the host"
+
+
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
 
@@ -77,7 +90,7 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
         return
     if server:
         files = PI_KEYS
-        remedy = "make keys with `polysight-pi keys`, or use a loopback address"
+        remedy = f"{advise_keys(key_dir)}, or use a loopback address"
     else:
         files = HOST_KEYS
         remedy = f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}"
@@ -94,10 +107,11 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
             socket.curve_server = True
         else:
             socket.curve_serverkey = load_certificate(key_dir / HOST_KEYS[0])[0]
-    except (OSError, ValueError) as e:
+    # zmq.ZMQError: a key of the wrong length.
+    except (OSError, ValueError, zmq.ZMQError) as e:
         raise ConfigError(
             f"{address} is not loopback, and no CURVE keys are usable: {e}",
-            f"{key_dir} lacks {' or '.join(files)}, or they belong to another user",
+            f"{key_dir} lacks {' or '.join(files)}, they are damaged, or they belong to another user",
             remedy,
             code=ErrorCode.FILE_MISSING,
         ) from None

@@ -1,17 +1,23 @@
 """`polysight-pi`: starting, ending, dying; commands with and without a running service; errors and exit status."""
 
+import errno
 import json
 import os
+import shlex
 
 import pytest
 from tests.support.pi.fakes import FakeLines
 from tests.support.pi.program import Process
-from tests.support.rigs import at_stage_port
+from tests.support.refusals import refused
+from tests.support.rigs import at_stage_port, published_rig
 
+from polysight_pi import PROGRAM
 from polysight_pi.cli import main
 from polysight_pi.trigger import BurstRecord
 from polysight_shared import messages as m
+from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
+from polysight_shared.sockets import create_replier, make_server_context
 from polysight_simulators.loopback import move_to_free_subnet
 
 
@@ -110,11 +116,96 @@ def test_commands_while_the_service_runs(command, instrument, write_config, star
     assert (status, "'none'" in err) == (5, True)
 
 
-@pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
-def test_an_impossible_speed_is_a_usage_error(config, speed):
-    with pytest.raises(SystemExit) as e:
-        main(["jog", "--config", str(config), "--dx", "1", f"--speed={speed}"])
-    assert e.value.code == 2
+IMPOSSIBLE_NUMBERS = [
+    ("jog", "--speed", ["0", "-1", "nan", "inf", "1e9", "fast"]),
+    ("jog", "--dx", ["nan", "-inf", "1e300", "far"]),
+    ("events", "--limit-s", ["nan", "-1", "1e300", "long"]),
+    ("events", "--from-seq", ["0", "9" * 24, "first"]),
+    ("pulse", "--count", ["0", "1.5", "many"]),
+]
+
+
+@pytest.mark.parametrize(("command", "option", "values"), IMPOSSIBLE_NUMBERS)
+def test_an_impossible_number_is_a_usage_error_that_names_it(config, capsys, command, option, values):
+    for value in values:
+        with pytest.raises(SystemExit) as e:
+            main([command, "--config", str(config), f"{option}={value}"])
+        err = capsys.readouterr().err
+        assert (e.value.code, repr(value) in err, "_parse" in err) == (2, True, False)
+
+
+def test_a_name_that_no_scan_can_have_and_an_end_without_a_run(command, instrument, write_config, start, hub):
+    rig = move_to_free_subnet(instrument)
+    start(rig, "--wires", hub)
+    config = write_config(rig)
+    for name in ("../x", "", "a\nb"):
+        status, _, err = command("events", "--config", config, "--scan-id", name)
+        assert (status, "no journal of scan" in err, "releases" in err) == (5, True, False)
+    status, _, err = command("take-over", "end", "--config", config)
+    assert (status, "no run is active" in err) == (5, True)
+
+
+def test_take_over_where_no_service_ever_ran_says_so(command, config):
+    status, _, err = command("take-over", "abort", "--config", config)
+    assert (status, "has not run" in err, "systemctl" in err) == (5, True, True)
+
+
+def test_advice_for_another_users_file_is_the_whole_command(command, config, monkeypatch):
+    """A test as root may read every file, so the refusal is simulated."""
+
+    def refuse(*_args, **_kwargs):
+        raise PermissionError(errno.EACCES, "Permission denied", "take-over-key")
+
+    monkeypatch.setattr("pathlib.Path.read_text", refuse)
+    monkeypatch.setattr("polysight_shared.config.load_instrument", lambda _: published_rig())
+    status, _, err = command("take-over", "abort", "--config", config)
+    assert status == 5
+    assert f"sudo -u polysight {PROGRAM} take-over abort --config {config}`" in err
+
+
+def test_a_missing_rig_file_leads_to_that_of_the_pi(command, tmp_path, monkeypatch):
+    installed = tmp_path / "installed.toml"
+    installed.touch()
+    monkeypatch.setattr("polysight_pi.cli.RIG_FILE", str(installed))
+    status, _, err = command("check", "--config", tmp_path / "none.toml")
+    assert (status, f"--config {installed}`" in err) == (2, True)
+
+
+def test_keys_are_advised_as_a_command_that_works(command, tmp_path):
+    """Every `do:` is pasted: keys before the first client, new keys for damaged ones, a damaged list removed."""
+    folder = tmp_path / "the keys"
+
+    def paste(err):
+        (line,) = [line for line in err.splitlines() if line.strip().startswith("do:")]
+        return shlex.split(line.split("`")[1])
+
+    status, _, err = command("keys", "--dir", folder, "--client", "laptop")
+    assert (status, folder.exists()) == (2, False)
+    assert command(*paste(err)[1:])[0] == 0
+    assert command("keys", "--dir", folder, "--client", "laptop")[0] == 0
+
+    (folder / "allowed_clients").write_bytes(b"\xff\xfe\x00")
+    for option in (["--list"], ["--client", "b"], ["--revoke", "laptop"]):
+        status, _, err = command("keys", "--dir", folder, *option)
+        assert (status, "allowed_clients" in err) == (2, True)
+    assert paste(err) == ["rm", str(folder / "allowed_clients")]
+
+    (folder / "allowed_clients").write_text("")
+    assert command("keys", "--dir", folder, "--list")[1] == "no client is allowed\n"
+
+    (folder / "pi.key_secret").write_text("public-key = 'short'\nsecret-key = 'short'\n")
+    with make_server_context() as context, refused(ErrorCode.FILE_MISSING, "CURVE") as error:
+        create_replier(context, "tcp://0.0.0.0:*", folder).close()
+    assert command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == 0
+
+
+def test_keys_on_a_full_disk_say_so(command, tmp_path, monkeypatch):
+    def fill(*_args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("polysight_pi.keys.create_certificates", fill)
+    status, _, err = command("keys", "--dir", tmp_path / "keys")
+    assert (status, "the disk is full" in err, str(tmp_path) in err, "sudo" in err) == (5, True, True, False)
 
 
 def test_pulse_reports_faults(command, config, monkeypatch):

@@ -7,8 +7,8 @@ from unittest.mock import Mock
 import pytest
 import zmq
 
-from polysight_shared.errors import DeviceError, ErrorCode
-from polysight_shared.sockets import create_replier
+from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
+from polysight_shared.sockets import create_replier, host_name
 
 
 @pytest.mark.parametrize(
@@ -35,3 +35,15 @@ def test_an_address_that_cannot_be_bound_is_refused_with_its_cause(
     assert cause in caught.value.why
     assert remedy in caught.value.remedy
     socket.close.assert_called_once_with()
+
+
+@pytest.mark.parametrize("port", ["65536", "99999", "²", "9" * 5000, "-1", ""])
+def test_a_port_that_does_not_exist_is_refused(port: str) -> None:
+    """libzmq would bind port 34463 for 99999."""
+    with pytest.raises(ConfigError) as caught:
+        host_name(f"tcp://127.0.0.1:{port}")
+    assert caught.value.code == ErrorCode.VALUE_INVALID
+
+
+def test_the_highest_port_is_accepted() -> None:
+    assert host_name("tcp://127.0.0.1:65535") == "127.0.0.1"

@@ -50,7 +50,8 @@ def test_spreads_are_those_of_the_errors():
 
 
 def test_the_papers_figures_are_the_bound_of_one_tone_at_7_2_db():
-    f, phase, _ = make_report(row(7.2), rx=1).bounds()["aligned"]
+    # Four times that of the average of 16 chirps.
+    f, phase, _ = 4 * np.array(make_report(row(7.2), rx=1).bounds()["averaged"])
     assert f == pytest.approx(PUBLISHED_STD["frequency_hz"], rel=0.01)
     assert phase == pytest.approx(PUBLISHED_STD["phase_rad"], rel=0.02)
 
@@ -58,8 +59,22 @@ def test_the_papers_figures_are_the_bound_of_one_tone_at_7_2_db():
 def test_four_receivers_and_16_chirps_are_worth_64_times_the_power():
     bounds = make_report(row(7.2)).bounds()
     alone = make_report(row(7.2), rx=1).bounds()["aligned"]
-    assert bounds["averaged"] == pytest.approx(np.array(alone) / 8)
+    burst_alone = make_report(row(7.2), rx=1).bounds()["averaged"]
+    assert bounds["averaged"] == pytest.approx(np.array(burst_alone) / 2)
+    assert np.array(alone) == pytest.approx(4 * np.sqrt(15 / 16) * np.array(burst_alone))
     assert bounds["aligned"] == pytest.approx(np.array(alone) / 2)
+
+
+@pytest.mark.parametrize("chirps", [2, 3, 16])
+def test_the_bound_of_an_aligned_chirp_is_that_of_its_deviation_from_the_burst(chirps):
+    """The mean of a burst is taken out of its chirps' errors: with two chirps half of the variance is left."""
+    noisy = row(7.2)
+    noisy.chirps[:] = chirps
+    report = make_report(noisy)
+    one_chirp = np.sqrt(chirps) * np.array(report.bounds()["averaged"])
+    errors = np.random.default_rng(0).standard_normal((3, 20_000, chirps)) * one_chirp[:, None, None]
+    errors -= errors.mean(axis=2, keepdims=True)
+    assert errors.std(axis=(1, 2)) == pytest.approx(np.array(report.bounds()["aligned"]), rel=0.02)
 
 
 @pytest.mark.parametrize("simulated", [True, False])

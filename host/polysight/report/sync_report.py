@@ -92,7 +92,8 @@ class SyncReport:
         """Return Cramer-Rao bounds (Hz, rad, relative amplitude) of one tone as strong as the direct path, by stage.
 
         Rife and Boorstyn 1974: var(w) = 6 / (snr N (N^2 - 1)), var(phase at the centre) = 1 / (2 snr N), and the same
-        for relative amplitude; N samples on every RX. A chirp with an echo close to the direct path may lie below.
+        for relative amplitude; N samples on every RX. The bound of an aligned chirp is that of its deviation from its
+        burst. A chirp with an echo close to the direct path may lie below.
         """
         if not self.chirps or not self._snr:
             return {}
@@ -104,7 +105,8 @@ class SyncReport:
             f = np.sqrt(6 / (snr * n * (n**2 - 1))) / (2 * np.pi) * self._rate
             return float(f), float(phase), float(phase)
 
-        single_chirp = compute_bound_of_tone(self.snr * self._rx)
+        # The mean of the burst is taken out of the errors of its chirps: 1 - 1 / chirps of their variance is left.
+        single_chirp = compute_bound_of_tone(self.snr * self._rx / (1 - 1 / chirps))
         mean = compute_bound_of_tone(self.snr * self._rx * chirps)
         # The residual of this stage is a difference of two signals with equal noise.
         f, phase, amplitude = (float(np.sqrt(2)) * bound for bound in mean)

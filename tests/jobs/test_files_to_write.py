@@ -6,6 +6,7 @@ import pytest
 
 from polysight.cli.main import main
 from polysight.jobs import recordings, scans, train
+from polysight.store import MANIFEST
 
 
 class WorkedError(Exception):
@@ -89,3 +90,13 @@ def test_a_file_that_can_be_written_lets_the_work_begin(tmp_path, command, name)
     with pytest.raises(WorkedError):
         main([*COMMANDS[command], str(tmp_path / name)])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "file.png", "folder.png"]
+
+
+@pytest.mark.parametrize("command", ["surface", "focus", "sync-report"])
+def test_results_are_not_written_among_recorded_rows(tmp_path, capsys, command):
+    scan = tmp_path / "scan"
+    scan.mkdir()
+    (scan / MANIFEST).touch()
+    assert main([command, str(scan), "--out", str(scan)]) == 2
+    assert "recorded rows" in capsys.readouterr().err
+    assert [path.name for path in scan.iterdir()] == [MANIFEST]

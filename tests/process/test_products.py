@@ -1,6 +1,7 @@
 """`polysight process` and `image`: images are written first and stay; old products stay until new ones are complete."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -101,14 +102,24 @@ def test_a_scan_waits_at_its_end_for_a_program_that_is_writing_its_products(
     scan = make_scan(tmp_path / "scan", make_scene(COPPER, PET, columns=10, rows=11))
     out = scan / "products"
     running = LiveProcessing(scan, Settings(model="none"))
+    waited_s = []
+
+    def wait(pause_s: float) -> None:
+        waited_s.append(pause_s)
+        if sum(waited_s) > 130:
+            other.close()
+
     with ExitStack() as other:
         other.enter_context(lock_products(out))
         for row in range(11):
             running.add_row(row)
         assert not out.exists()
-        monkeypatch.setattr(folder.time, "sleep", lambda _: other.close())
+        monkeypatch.setattr(folder.time, "sleep", wait)
         running.finish()
-    assert f"waiting: another program is writing products in {out}" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert err.count(f"waiting: another program is writing products in {out}\n") == 1
+    # Once a minute it says what it still waits for.
+    assert re.findall(r"still waiting: .* in (.*) \((\d) min\); Ctrl-C", err) == [(str(out), "1"), (str(out), "2")]
     assert read_products(out).quality.coverage.rows_recorded == 11
 
 

@@ -101,7 +101,16 @@ def test_a_folder_inside_a_scan_is_not_a_scan(view, scans):
     assert sorted(p.name for p in (scans / "one").iterdir()) == ["products", "program"]
 
 
-@pytest.mark.parametrize("page", ["/scan", "/watch", "/scan?scan="])
+@pytest.mark.parametrize("path", ["/surfaces", "/label", "/scan/one", "/../x"])
+def test_a_mistyped_address_is_a_page_in_a_browser_and_json_for_a_program(view, path):
+    status, body, headers = ask(view, path, Accept="text/html,application/xhtml+xml,*/*;q=0.8")
+    assert (status, headers["content-type"]) == (404, "text/html; charset=utf-8")
+    assert b'<a href="/">' in body
+    status, body, _ = ask(view, path)
+    assert (status, json.loads(body)["code"]) == (404, ErrorCode.OTHER)
+
+
+@pytest.mark.parametrize("page", ["/scan", "/watch", "/surface", "/scan?scan="])
 def test_pages_of_a_scan_without_a_name_lead_to_the_list(view, page):
     status, _, headers = ask(view, page)
     assert (status, headers["location"]) == (307, "/")

@@ -40,13 +40,20 @@ from polysight.process import (
     save_images,
     save_materials,
 )
-from polysight.products import IMAGE, REPORT, check_products_folder, raw_dropped, replace_products, write_json
+from polysight.products import (
+    IMAGE,
+    REPORT,
+    check_products_folder,
+    check_results_folder,
+    raw_dropped,
+    replace_products,
+    write_json,
+)
 from polysight.results import format_one_line, rules
 from polysight.settings import DEFAULT, Settings, path_text
 from polysight.store import MANIFEST, ScanFolder, Source, dropped_rows, manifest, open_source, raw_source, require_raw
 from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, join_advice, quote
-from polysight_shared.files import require_writable_folder
 
 _log = logging.getLogger(__name__)
 
@@ -445,7 +452,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
     """
     from polysight.report import focus_figure
 
-    require_writable_folder(out.absolute())
+    check_results_folder(out)
     source = open_source(data, config, dropped=True)
     out.mkdir(parents=True, exist_ok=True)
     # The range gate has to keep the echoes of every plane searched: of the sweep, and of plates up to `PLANE_REACH_M`.
@@ -515,7 +522,7 @@ def sync_report(data: Path, out: Path, config: Path | None) -> int:
     from polysight.report import SyncReport, write_sync_report
     from polysight.sync import BoardSetup, synchronise_row
 
-    require_writable_folder(out.absolute())
+    check_results_folder(out)
     source = raw_source(open_source(data, config), data)
     calibration = load_scan_calibration(source)
     rig = calibration.rig(source.instrument)

@@ -13,6 +13,7 @@ from polysight.jobs.output import load_rig_file, print_json, print_lines, say
 from polysight.jobs.process import process_rows
 from polysight.materials import WEAK_V_DB
 from polysight.pipeline import Pipeline
+from polysight.products import check_results_folder
 from polysight.settings import Settings
 from polysight.store import open_source
 from polysight.surfaces import (
@@ -79,7 +80,7 @@ def surface(
     Several scans are of one object on a turntable, which had turned by `turned_deg` about a vertical axis at `axis_mm`:
     x from the middle of the grid, z from the object plane (None: 0, 0).
     """
-    require_writable_folder(out.absolute())
+    check_results_folder(out)
     check_turns(len(scans), turned_deg)
     surfaces = [make_surface(scan, config, reference) for scan in scans]
     joined = surfaces[0]

@@ -22,6 +22,7 @@ from polysight.products.exports import (
 from polysight.products.folder import (
     LABELS_PICTURE as LABELS_PICTURE,
     check_products_folder as check_products_folder,
+    check_results_folder as check_results_folder,
     find_labels as find_labels,
     find_scan_folder as find_scan_folder,
     label_folder as label_folder,

@@ -33,7 +33,7 @@ from polysight.products.processed import (
 )
 from polysight.store import is_source, lock_file
 from polysight.surfaces import POINTS, SURFACE
-from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, quote
 from polysight_shared.files import require_writable_folder, sync_folder, write_atomically
 
 # Picture of the boxes, and the products of surfaces.
@@ -128,12 +128,27 @@ def check_products_folder(out: Path, scan_id: str) -> None:
         )
 
 
+def check_results_folder(out: Path) -> None:
+    """Raise ConfigError if results other than products must not be written into this folder; call it before the work.
+
+    That is the case for the folder of recorded rows, and for one that cannot be written.
+    """
+    require_writable_folder(out.absolute())
+    if is_source(out):
+        raise ConfigError(
+            f"{out} holds the recorded rows of a scan",
+            "results are not written among them",
+            f"give a folder of their own: --out {quote(out / 'results')}",
+            code=ErrorCode.FILE_EXISTS,
+        )
+
+
 @contextmanager
 def replace_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Path]:
     """Yield a new folder for products; it replaces `out` if the block ends without an error.
 
     After an error `out` is unchanged. Hidden files of other programs, and boxes drawn by hand for this scan, are kept.
-    With `wait` it waits while another program writes products there, and says so on stderr.
+    With `wait` it waits while another program writes products there, and says so on stderr, once a minute.
 
     Raises
     ------
@@ -192,7 +207,7 @@ def _lock(out: Path, new: Path, wait: bool = False) -> FolderLock:
 
     Raises ConfigError.
     """
-    is_told = False
+    waited_s = 0.0
     while True:
         try:
             new.parent.mkdir(parents=True, exist_ok=True)
@@ -207,12 +222,15 @@ def _lock(out: Path, new: Path, wait: bool = False) -> FolderLock:
                 ) from None
         except OSError as e:
             raise _no_folder_error(out, e) from None
-        if not is_told:
+        if waited_s % 60 == 0:
+            message = f"waiting: another program is writing products in {out}"
+            if waited_s > 0:
+                message = f"still {message} ({waited_s / 60:.0f} min); Ctrl-C ends the wait, no recorded row is lost"
             # If the terminal was closed, it still waits.
             with suppress(OSError):
-                sys.stderr.write(f"waiting: another program is writing products in {out}\n")
-            is_told = True
+                sys.stderr.write(f"{message}\n")
         time.sleep(_TRY_AGAIN_S)
+        waited_s += _TRY_AGAIN_S
 
 
 def _no_folder_error(out: Path, e: OSError) -> ConfigError:

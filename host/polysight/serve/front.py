@@ -147,7 +147,7 @@ def page_routes(front: Front) -> list[Route]:
         if path == "/" and only is not None:
             # A browser keeps the fragment, and the token in it.
             return RedirectResponse("/watch")
-        if path in ("/scan", "/watch") and only is None and not request.query_params.get("scan"):
+        if path in ("/scan", "/surface", "/watch") and only is None and not request.query_params.get("scan"):
             return RedirectResponse("/")
         return pages[path]
 

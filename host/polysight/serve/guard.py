@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request, cookie_parser
-from starlette.responses import JSONResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError, convert_os_error
@@ -283,9 +283,32 @@ async def tell_error(request: Request, e: Exception) -> Response:
     return refuse(status, error.code, error.what, error.why, error.remedy)
 
 
+# The page for a mistyped address. No script: it has nothing to ask.
+NO_PAGE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>No such page · polysight</title>
+<link rel="icon" href="/icon.svg">
+<link rel="stylesheet" href="/base.css">
+</head>
+<body>
+<main id="main">
+<h1>There is no such page</h1>
+<p>The address is wrong. Begin at <a href="/">the list of scans</a>.</p>
+</main>
+</body>
+</html>
+"""
+
+
 async def tell_no_page(request: Request, e: Exception) -> Response:
-    """Answer for an address that does not exist."""
-    del request, e
+    """Answer for an address that does not exist: with a page to a browser, as JSON to a program."""
+    del e
+    if not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", ""):
+        return HTMLResponse(NO_PAGE, 404)
     return refuse(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
 
 

@@ -4,11 +4,16 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# Rules have OUT in quotes, as it may have spaces; a shell expands no ~ there.
+override OUT := $(patsubst ~/%,$(HOME)/%,$(OUT))
+ifneq ($(words $(VENV)),1)
+$(error VENV is a path without spaces, not '$(VENV)')
+endif
 JOBS ?= $(shell expr 2 + $$(getconf _NPROCESSORS_ONLN))  # tests wait a good part of their time; each worker collects for 4 CPU s
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not for each of a hundred programs
 
-.PHONY: help demo test test-long test-uml test-pi mutants quick check bench firmware flash pi-install library reproduce wheels docs clean
+.PHONY: help demo test test-long test-uml test-pi mutants quick check bench firmware flash pi-install host-is-named library reproduce wheels docs clean
 
 help:  ## this list
 	@awk -F':.*## ' '/^[a-z-]+:.*## /{printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -17,12 +22,12 @@ PROJECTS := shared pi_controller simulators host papers worlds
 KERNELS := $(wildcard host/polysight/sync/*.c host/polysight/sync/*.h) host/polysight/sync/build.py host/setup.py
 
 $(VENV)/installed: pyproject.toml $(PROJECTS:%=%/pyproject.toml) $(KERNELS)
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
-	@./tests/install-python.sh $(PYTHON) $(VENV)
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11"; exit 2; }
+	@./tests/install-python.sh "$(PYTHON)" $(VENV)
 	@touch $@
 
 demo: $(VENV)/installed  ## the whole rig, simulated: scan nine plates on a table, end with a report (OUT=out)
-	$(BIN)/polysight demo --out $(OUT)/demo
+	$(BIN)/polysight demo --out "$(OUT)/demo"
 
 test: $(VENV)/installed  ## install what is missing, then run every test
 	@./tests/install-tools.sh
@@ -48,6 +53,7 @@ test-pi: $(VENV)/installed  ## a Raspberry Pi 3B in a box: Debian's kernel on QE
 	$(BIN)/python -m pytest tests/pi_box --pi-box -rP
 
 CHANGED = $(shell git diff --name-only --diff-filter=d HEAD -- host papers pi_controller shared simulators worlds 2>/dev/null | grep '\.py$$')
+UNCHANGED = $(shell git rev-parse HEAD >/dev/null 2>&1 && echo nothing differs from the last commit || echo without git none are checked, make check does)
 LAWS := tests/house/test_rooms.py tests/shared tests/polarimetry tests/sync/test_tone.py tests/imaging/test_direct.py
 
 mutants: $(VENV)/installed  ## change the code at 100 random places: do the tests notice? (hours; COUNT=100 SEED=1)
@@ -58,7 +64,7 @@ mutants: $(VENV)/installed  ## change the code at 100 random places: do the test
 quick: $(VENV)/installed  ## under a minute: lint, types of what differs from the last commit, the fastest laws
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(if $(CHANGED),$(BIN)/pyright $(CHANGED),@echo "types: nothing differs from the last commit")
+	$(if $(CHANGED),$(BIN)/pyright $(CHANGED),@echo "types: $(UNCHANGED)")
 	$(BIN)/lint-imports >/dev/null || $(BIN)/lint-imports
 	$(BIN)/python -m pytest -q -n $(JOBS) $(LAWS)
 
@@ -71,23 +77,23 @@ check: $(VENV)/installed  ## lint, format, types, import contracts
 bench: $(VENV)/installed  ## speed as ratios, measured side by side in one run
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --group bench
-	$(BIN)/python -m benchmarks --out $(OUT)/bench
+	$(BIN)/python -m benchmarks --out "$(OUT)/bench"
 
 reproduce: $(VENV)/installed  ## the paper's tables and figures from simulation, beside the published values
-	$(BIN)/polysight reproduce --out $(OUT)/reproduce
+	$(BIN)/polysight reproduce --out "$(OUT)/reproduce"
 
 library: $(VENV)/installed  ## make the simulated reference library of the classifier again
 	$(BIN)/polysight train --simulate examples/library --times 2 --out host/polysight/materials/simulated-library.npz
 
 wheels: $(VENV)/installed  ## wheels for users, x86-64 and ARM64, any Python, for machines without a compiler (OUT=out)
 	rm -rf $(PROJECTS:%=%/build)  # modules that were renamed since would come along
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels $(patsubst %,./%,$(filter-out host,$(PROJECTS)))
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir "$(OUT)/wheels" $(patsubst %,./%,$(filter-out host,$(PROJECTS)))
 	for platform in manylinux_2_17_x86_64 manylinux_2_17_aarch64; do \
-	  POLYSIGHT_WHEEL=$$platform $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/wheels ./host || exit 1; done
-	@ls $(OUT)/wheels
+	  POLYSIGHT_WHEEL=$$platform $(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir "$(OUT)/wheels" ./host || exit 1; done
+	@ls "$(OUT)/wheels"
 
 docs: $(VENV)/installed  ## make the API reference (OUT=out), check all links, run every command that README and docs show
-	$(BIN)/python -m docs.reference --out $(OUT)/docs
+	$(BIN)/python -m docs.reference --out "$(OUT)/docs"
 	$(BIN)/python -m docs.check --run
 
 firmware: $(VENV)/installed  ## build the sketch for an UNO with avr-gcc
@@ -96,16 +102,19 @@ firmware: $(VENV)/installed  ## build the sketch for an UNO with avr-gcc
 flash: firmware  ## flash it: make flash PORT=/dev/ttyACM0
 	$(MAKE) -C arduino_stage flash PORT=$(PORT)
 
-ON_PI := .cache/polysight-install
-pi-install: $(VENV)/installed  ## install or update the Pi half on a Pi: make pi-install HOST=pi@polysight
+host-is-named:
 	@test -n "$(HOST)" || { echo "make pi-install HOST=user@address"; exit 2; }
-	rm -rf $(OUT)/pi && mkdir -p $(OUT)/pi/sources
-	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C $(OUT)/pi/sources
-	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir $(OUT)/pi/copied $(OUT)/pi/sources/shared $(OUT)/pi/sources/pi_controller
-	cp pi_controller/install.sh pi_controller/requirements.txt pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml $(OUT)/pi/copied/
-	tar -c -C $(OUT)/pi/copied . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
+
+ON_PI := .cache/polysight-install
+pi-install: host-is-named $(VENV)/installed  ## install or update the Pi half on a Pi: make pi-install HOST=pi@polysight
+	rm -rf "$(OUT)/pi" && mkdir -p "$(OUT)/pi/sources"
+	tar -c --exclude=__pycache__ --exclude='*.egg-info' --exclude=build shared pi_controller | tar -x -C "$(OUT)/pi/sources"
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir "$(OUT)/pi/copied" "$(OUT)/pi/sources/shared" "$(OUT)/pi/sources/pi_controller"
+	cp pi_controller/install.sh pi_controller/requirements.txt pi_controller/polysight-pi.service pi_controller/60-polysight.rules instrument.toml "$(OUT)/pi/copied/"
+	tar -c -C "$(OUT)/pi/copied" . | ssh $(HOST) 'rm -rf $(ON_PI) && mkdir -p $(ON_PI) && tar -x -C $(ON_PI)'
 	ssh -t $(HOST) sudo $(ON_PI)/install.sh
 
 clean:  ## remove what was built; products (OUT=out) stay
-	rm -rf $(VENV) arduino_stage/build
-	@test ! -e $(OUT) || echo "$(OUT)/ stays: products are in it, perhaps the only ones of a scan; remove it yourself"
+	rm -rf arduino_stage/build
+	@test ! -e $(VENV)/pyvenv.cfg || rm -rf $(VENV)  # an environment, and no folder of yours
+	@test ! -e "$(OUT)" || echo "$(OUT)/ stays: products are in it, perhaps the only ones of a scan; remove it yourself"

@@ -13,7 +13,7 @@ PROJECTS = ("shared", "pi_controller", "simulators", "host", "papers", "worlds")
 
 @pytest.fixture
 def make(tmp_path: Path):
-    """Runs `make` in a folder with a space in its name, without git and with an environment; gives status and output."""
+    """Runs `make` in a folder with a space in its name, with an environment; gives status and output."""
     folder = tmp_path / "my copy"
     folder.mkdir()
     shutil.copy(REPO / "Makefile", folder)

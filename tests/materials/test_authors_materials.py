@@ -55,6 +55,15 @@ def test_a_thickness_may_be_a_text(tmp_path, answer, mm):
     assert read_material(path).thickness_mm == mm
 
 
+def test_texts_of_a_file_are_lines_without_control_characters(tmp_path):
+    """They are printed, and ESC would control the terminal."""
+    path = tmp_path / "PET_55.pkl"
+    names = {"name": "PET\x1b[31m\n3 mm\n", "collection_name": "scan\t1\x00", "ref_name": "\u202ecopper"}
+    path.write_bytes(pickle.dumps(content(4) | names))
+    entry = read_material(path)
+    assert (entry.name, entry.scan, entry.reference) == ("PET?[31m 3 mm", "scan 1?", "?copper")
+
+
 @pytest.mark.parametrize("angle", [float("nan"), float("inf"), 0, -55, 90, 550])
 def test_an_angle_that_is_none_is_refused(tmp_path, angle):
     path = tmp_path / "PET_55.pkl"

@@ -55,9 +55,29 @@ def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_
         assert "(simulated)" in caption
     assert "could not be made" in page
     assert "no such image" in page
-    assert "Not asked for in this run: fig21" in page
+    assert "Not made in this run: fig21" in page
     missing = page.split("not reproduced yet:")[1].split("</p>")[0]
     assert all(key in missing for key in report.TITLES if key not in makers)
+
+
+def test_a_run_that_is_interrupted_has_a_page_and_a_second_one_names_what_is_not_on_its_page(
+    tmp_path, monkeypatch, capsys
+):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "MAKERS", {"fig3": lambda _: item(), "fig20": interrupt})
+    assert main(["reproduce", "--out", str(tmp_path)]) == 130
+    page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")
+    assert 'id="fig3"' in page
+    assert "Not made in this run: fig20" in page
+
+    monkeypatch.setattr(report, "MAKERS", {"fig21": lambda _: item("fig21")})
+    capsys.readouterr()
+    assert main(["reproduce", "--out", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "1 item (simulated)" in out
+    assert "not on this page: fig3 of an earlier run" in out
 
 
 def test_the_files_hold_the_numbers(tmp_path):

@@ -354,3 +354,11 @@ def test_images_of_a_simulated_scan_stay_simulated(tmp_path, rig, pair, beside):
     assert read_given_images(tmp_path / name, rig).simulated
     write_image(tmp_path / "measured.npz", images)
     assert not read_given_images(tmp_path / "measured.npz", rig).simulated
+
+
+def test_train_on_published_images_says_to_process_them_first(labels_folder, tmp_path, capsys):
+    """`polysight label` refuses the folder itself."""
+    assert main(["train", str(labels_folder), "--out", str(tmp_path / "own.npz")]) == 3
+    err = capsys.readouterr().err
+    assert f"do: polysight process {labels_folder} --out out/{labels_folder.name}" in err
+    assert f"polysight label {labels_folder}" not in err

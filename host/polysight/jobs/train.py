@@ -37,7 +37,7 @@ from polysight.materials import (
     specimen_seed,
 )
 from polysight.polarimetry import incidence_choice
-from polysight.process import Inputs
+from polysight.process import Inputs, is_given_images
 from polysight.products import (
     IMAGE,
     LABELS,
@@ -50,7 +50,7 @@ from polysight.products import (
 )
 from polysight.settings import Settings
 from polysight.store import TRUTH, open_source, versions
-from polysight_shared.errors import ConfigError, DataError, ScanError, make_missing_path_error, quote
+from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError, make_missing_path_error, quote
 
 EDGE_MM = 9.0
 """Rim of a known plate that is not used for training: about the resolution in x."""
@@ -98,6 +98,15 @@ def check_labelled(data: Path) -> None:
     if not data.is_dir():
         raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
     saved_labels = find_labels(data)
+    if is_given_images(data):
+        out = quote(f"out/{data.resolve().name}")
+        raise DataError(
+            f"{data}: images of another program, not a scan",
+            "a library is made from recorded scans and from products",
+            f"polysight process {quote(data)} --out {out}; polysight label {out}; then train on {out}."
+            " The whole published data: polysight train --authors DIR",
+            code=ErrorCode.FILE_FOREIGN,
+        )
     if saved_labels is None:
         if (scan / TRUTH).exists():
             return

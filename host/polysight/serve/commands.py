@@ -122,6 +122,7 @@ class ProcessRequest(Body, frozen=True):
     labels: bool = False
     metal: Box | None = None
     bands: Annotated[int, msgspec.Meta(ge=1, le=MAX_BANDS)] | None = None
+    sparse: bool = False
 
 
 class LayersRequest(Body, frozen=True):
@@ -425,6 +426,8 @@ def _process(site: Site, scan: RequestedScan, body: ProcessRequest) -> None:
         words += ["--labels", labels[0]]
     if body.bands is not None:
         words += ["--bands", str(body.bands)]
+    if body.sparse:
+        words.append("--sparse")
     site.programs.start(folder, "process", words)
 
 

@@ -143,12 +143,15 @@ def make_items(
 ) -> int:
     """Make items (default: all of `makers`), write their files and the page; return the exit status.
 
-    An item that fails is listed on the page and on stderr; the others are made. `on_item` is called with each item.
+    The page is written after each item, so that an interrupted run has one, too. An item that fails is listed on the
+    page and on stderr; the others are made. `on_item` is called with each item.
     """
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     failed: dict[str, str] = {}
     chosen = list(dict.fromkeys(keys) or makers)
+    earlier_keys = [key for key in TITLES if key not in chosen and (out / f"{key}.json").exists()]
+    page = out / "reproduce.html"
     # `steps` prints the item that is being made, and its duration.
     for key in steps(chosen, [f"making {TITLES[key]}" for key in chosen]):
         try:
@@ -157,12 +160,16 @@ def make_items(
         except PolysightError as e:
             failed[key] = str(e)
             sys.stderr.write(f"\n{key}: {e}\n")
-            continue
-        items.append(item)
-        if on_item is not None:
-            on_item(item)
-    page = write_page(out=out, items=items, pictures=pictures, failed=failed, quick=quick, origin=origin, makers=makers)
-    sys.stdout.write(f"{page}: {len(items)} items ({origin.word}) beside the published values\n")
+        else:
+            items.append(item)
+            if on_item is not None:
+                on_item(item)
+        write_page(page, items=items, pictures=pictures, failed=failed, quick=quick, origin=origin, makers=makers)
+    noun = "item" if len(items) == 1 else "items"
+    sys.stdout.write(f"{page}: {len(items)} {noun} ({origin.word}) beside the published values\n")
+    if earlier_keys:
+        keys_text = ", ".join(earlier_keys)
+        sys.stdout.write(f"not on this page: {keys_text} of an earlier run, whose files stay in {out}\n")
     if failed:
         return 1
     return 0
@@ -199,15 +206,15 @@ def _format_csv(table: Table, origin: Origin) -> str:
 
 
 def write_page(
-    out: Path,
+    path: Path,
     items: Sequence[Item],
     pictures: dict[str, bytes],
     failed: dict[str, str],
     quick: bool,
     origin: Origin,
     makers: Container[str],
-) -> Path:
-    """Write `reproduce.html` with the items and a list of missing ones; return its path.
+) -> None:
+    """Write the page `reproduce.html` with the items and a list of missing ones.
 
     `makers` holds the keys of possible items.
     """
@@ -218,7 +225,8 @@ def write_page(
         trim_blocks=True,
     )
     made_keys = {i.key for i in items}
-    # On the page `left_out` are items that nobody asked for, `missing` those that cannot be made from these makers.
+    # On the page `left_out` are items that were not asked for, or not made yet, `missing` those that cannot be made from
+    # these makers.
     page = environment.get_template("reproduce.html").render(
         items=sorted(items, key=lambda i: list(TITLES).index(i.key)),
         images={name: base64.b64encode(data).decode("ascii") for name, data in pictures.items()},
@@ -228,6 +236,4 @@ def write_page(
         quick=quick,
         origin=origin,
     )
-    path = out / "reproduce.html"
     write_atomically(path, page.encode("utf-8"))
-    return path

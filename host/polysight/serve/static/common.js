@@ -9,7 +9,7 @@ const ON_PAGE = [
   [/\(--metal(-box)? [A-Z0-9,]+\)/g, "(Process again, metal reference)"],
   [/\(polysight label; process --labels[^)]*\)/g, "(Label, then Process again with the boxes)"],
   [/`polysight process --bands (\d+)`/g, "Process again with $1 sub-bands"],
-  [/`polysight process SCAN --sparse --out DIR`/g, "processing in a terminal, with the option for sparse scans,"],
+  [/`polysight process SCAN --sparse --out DIR`/g, "Process again, which can fill in positions that were not recorded,"],
   [/`?polysight permittivity --layer( NAME,\?,\?)?`?/g, "Fit layers"],
   [/polysight label (SCAN )?--specimen NAME=WHICH/g, "Label, piece"],
   [/polysight label \/.*; then train again/g, "label it on its page, then train again"],

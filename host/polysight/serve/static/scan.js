@@ -241,7 +241,8 @@ for (const id of ["process", "layers"]) {
 by("process").addEventListener("submit", (event) => {
   event.preventDefault();
   by("process-open").click();
-  run("process", { library: by("library").value, labels: by("use-labels").checked, metal, bands: +by("bands").value || null });
+  run("process", { library: by("library").value, labels: by("use-labels").checked, metal, bands: +by("bands").value || null,
+    sparse: by("sparse").checked });
 });
 by("layers").addEventListener("submit", (event) => {
   event.preventDefault();

@@ -378,6 +378,15 @@ def clean_name(text: str, kind: str = "name") -> str:
     return name
 
 
+def clean_line(value: object) -> str:
+    """Return a text of a foreign file as one line: its words with a space between them, `?` for unprintable characters.
+
+    Control characters must not reach the terminal.
+    """
+    line = " ".join(str(value).split())
+    return "".join(character if character.isprintable() else "?" for character in line)
+
+
 def box_name(text: str) -> str:
     """Clean the name of a box: material or material#specimen. Raises DataError as :func:`clean_name`."""
     material, mark, specimen = text.partition(SPECIMEN_SEPARATOR)

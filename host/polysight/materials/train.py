@@ -36,7 +36,7 @@ import numpy as np
 import numpy.typing as npt
 
 from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, fit_weights
-from polysight.materials.labels import METAL_WORDS, find_label_file, is_metal, read_labels
+from polysight.materials.labels import METAL_WORDS, clean_line, find_label_file, is_metal, read_labels
 from polysight.materials.library import Entry, Library, Real, Samples, majority
 from polysight.materials.result import MaterialsResult
 from polysight.materials.segment import Box
@@ -289,15 +289,6 @@ def read_pickle(path: Path) -> Any:
         ) from None  # fmt: skip
 
 
-def _read_line(value: Any) -> str:
-    """Return a text of a file as one line: its words with a space between them, `?` for characters that do not print.
-
-    Control characters of a foreign file must not reach the terminal.
-    """
-    line = " ".join(str(value).split())
-    return "".join(character if character.isprintable() else "?" for character in line)
-
-
 def read_material(path: Path) -> Entry:
     """Read a material file as a library entry, divided by its reference.
 
@@ -311,10 +302,10 @@ def read_material(path: Path) -> Entry:
     try:
         p, h, v = (_read_pixels(x, file_bytes) for x in raw["values"])
         ref_p, ref_h, ref_v = (_read_pixels(x, file_bytes) for x in raw["ref_values"])
-        name = _read_line(raw["name"])
+        name = clean_line(raw["name"])
         angle = float(raw["incident_angle"])
-        scan = _read_line(raw["collection_name"])
-        reference = _read_line(raw["ref_name"])
+        scan = clean_line(raw["collection_name"])
+        reference = clean_line(raw["ref_name"])
         thickness = _parse_thickness(raw.get("thickness"))
         if not 0 < angle < 90:
             raise ValueError(f"incident_angle {angle:g}: expected degrees, above 0 and below 90")

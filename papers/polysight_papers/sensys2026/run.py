@@ -225,8 +225,8 @@ def write_page(
         trim_blocks=True,
     )
     made_keys = {i.key for i in items}
-    # On the page `left_out` are items that were not asked for, or not made yet, `missing` those that cannot be made from
-    # these makers.
+    # On the page `left_out` are items that were not asked for, or not made yet; `missing` are those that these makers
+    # cannot make.
     page = environment.get_template("reproduce.html").render(
         items=sorted(items, key=lambda i: list(TITLES).index(i.key)),
         images={name: base64.b64encode(data).decode("ascii") for name, data in pictures.items()},

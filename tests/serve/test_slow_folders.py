@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -135,6 +136,20 @@ def test_the_size_of_a_dead_folder_is_not_waited_for(dead, root, monkeypatch):
     sizes = site.Sizes()
     assert sizes.read_size(root / "dead") is None
     wait_for(lambda: sizes.read_size(root / "alive") is not None, "the size of another folder")
+
+
+def test_the_size_of_a_growing_folder_is_counted_again_sooner(root, monkeypatch):
+    """A running scan is 10 s after its start not as small as at its start."""
+    now_s = 100.0
+    monkeypatch.setattr(site, "time", SimpleNamespace(monotonic=lambda: now_s))
+    sizes = site.Sizes()
+    folder = root / "alive"
+    wait_for(lambda: sizes.read_size(folder) is not None, "the first count")
+    before = sizes.read_size(folder)
+    (folder / "more").write_bytes(bytes(1000))
+    now_s += 10.0
+    assert sizes.read_size(folder) == before
+    wait_for(lambda: sizes.read_size(folder, site.GROWING_SIZE_AGE_S) == before + 1000, "the second count")
 
 
 def test_only_threads_that_may_hang_ask_a_folder_of_the_list_for_its_time(root, monkeypatch):

@@ -270,7 +270,7 @@ def bands_of_row(
     parts = [row] if count == 1 else list(row.bands or ())
     if len(parts) != count:
         raise DataError(
-            f"segment {row.label} has {len(parts) or 'no'} sub-bands, not {count}",
+            f"segment {row.label} has {len(parts) or 'no'} sub-bands, {count} are needed",
             "sub-bands are imaged from the recorded rows",
             f"process the scan again with --bands {count}",
             code=ErrorCode.MISMATCH,

@@ -104,7 +104,7 @@ async def _send_scans(site: Site, request: Request) -> Response:
     stamp = request.query_params.get("since", "")
 
     def list_scans() -> ScanList:
-        scans = [ListedScan(**asdict(s), bytes=site.size(s.name)) for s in site.scans.list(LIST_S)]
+        scans = [ListedScan(**asdict(s), bytes=site.size(s.name, s.state)) for s in site.scans.list(LIST_S)]
         free_bytes = None
         if root.is_dir():
             free_bytes = shutil.disk_usage(root).free
@@ -125,9 +125,15 @@ async def _send_scan(site: Site, request: Request) -> Response:
     name = site.name(request)
 
     def read_details(folder: Path) -> ScanDetails:
-        facts = asdict(site.scans.summary(name)) | asdict(catalogue.read_notes(folder))
+        summary = site.scans.summary(name)
+        facts = asdict(summary) | asdict(catalogue.read_notes(folder))
         folder_text = str(folder.absolute())
-        return ScanDetails(**facts, bytes=site.size(name), folder=folder_text, programs=catalogue.find_programs(folder))
+        return ScanDetails(
+            **facts,
+            bytes=site.size(name, summary.state),
+            folder=folder_text,
+            programs=catalogue.find_programs(folder),
+        )
 
     return make_json_answer(await site.read_scan(request, read_details))
 

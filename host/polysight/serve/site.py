@@ -51,6 +51,8 @@ READERS = 4
 READERS_OF_ONE_FOLDER = 2
 # A size that is asked for is counted again if its count is older (chosen).
 SIZE_AGE_S = 20.0
+# The same for a scan that is running, whose folder grows; chosen, as often as the list is looked at.
+GROWING_SIZE_AGE_S = 4.0
 STREAM_INTERVAL_S = 0.1
 # A page that receives nothing for some of these (chosen) reconnects.
 ALIVE_INTERVAL_S = 2.0
@@ -140,9 +142,10 @@ class Site:
         """Run a command in a thread that no read can have taken."""
         return await anyio.to_thread.run_sync(work)
 
-    def size(self, name: str) -> int | None:
-        """Return the bytes of a scan on the disk; None while they are being counted."""
-        return self._sizes.read_size(self.scans.root / name)
+    def size(self, name: str, state: str) -> int | None:
+        """Return the bytes of a scan in this state on the disk; None while they are being counted."""
+        max_age_s = GROWING_SIZE_AGE_S if state == "running" else SIZE_AGE_S
+        return self._sizes.read_size(self.scans.root / name, max_age_s)
 
     @property
     def logs(self) -> Path:
@@ -284,11 +287,11 @@ class Sizes:
         self._counting_since: dict[Path, float] = {}
         self._lock = threading.Lock()
 
-    def read_size(self, folder: Path) -> int | None:
-        """Return the size in bytes at the last count, None before the first; an old one (`SIZE_AGE_S`) is renewed."""
+    def read_size(self, folder: Path, max_age_s: float = SIZE_AGE_S) -> int | None:
+        """Return the size in bytes at the last count, None before the first; one older than `max_age_s` is renewed."""
         size, counted_at = self._counted.get(folder, (None, float("-inf")))
         now = time.monotonic()
-        if now - counted_at > SIZE_AGE_S:
+        if now - counted_at > max_age_s:
             with self._lock:
                 if folder not in self._counting_since:
                     self._waiting[folder] = None

@@ -5,8 +5,9 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
-from polysight_shared.errors import PolysightError, convert_os_error
+from polysight_shared.errors import ConfigError, ErrorCode, PolysightError, convert_os_error
 from polysight_shared.program import die_with_parent
 
 
@@ -35,6 +36,17 @@ def announce_ready(text: str = "") -> None:
     """Print `ready <text>`, for which the parent process waits."""
     sys.stdout.write(f"ready {text}".rstrip() + "\n")
     sys.stdout.flush()
+
+
+def check_link(link: Path) -> None:
+    """Raise ConfigError if a port cannot get this name: the link to it would replace a file, or a real port."""
+    if link.exists() and not link.is_symlink():
+        raise ConfigError(
+            f"--link {link}: is there already",
+            "the link to the simulated port would replace it",
+            "give another name",
+            code=ErrorCode.FILE_EXISTS,
+        )
 
 
 def run_program(run: Callable[[], object]) -> int:

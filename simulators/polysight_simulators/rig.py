@@ -10,6 +10,7 @@ clock of the simulated signals: wall time times the time scale.
 """
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -330,7 +331,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
     scene = None
     if scene_path is not None:
         scene = load_scene(scene_path)
-    if options.time_scale <= 0:
+    if not 0 < options.time_scale < math.inf:
         raise ConfigError(f"--time-scale {options.time_scale:g}", "it must be positive", "give a number above 0")
     if scene is None and not options.pattern:
         raise ConfigError("neither --scene nor --pattern", "the radars need a signal", "give one of them")

@@ -1,13 +1,20 @@
 """Seeds and addresses that a simulated rig cannot use are refused or replaced before a process starts."""
 
+import threading
+
 import msgspec
 import pytest
+from tests.support.paths import RIG_FILE
+from tests.support.refusals import refused
 from tests.support.rigs import published_rig
 
 from polysight_shared.config import NativeRadar
+from polysight_shared.errors import ErrorCode
 from polysight_simulators import __main__ as simulate, rig as simulated_rig
 from polysight_simulators.cards import __main__ as cards
 from polysight_simulators.loopback import move_to_subnet
+from polysight_simulators.stage import __main__ as stage
+from polysight_simulators.uno import __main__ as uno
 
 
 @pytest.mark.parametrize(
@@ -24,6 +31,23 @@ def test_a_seed_is_a_whole_number_from_zero(main, arguments, seed, capsys):
         main([*arguments, "--seed", seed])
     assert caught.value.code == 2
     assert f"--seed: {seed} is not a whole number" in capsys.readouterr().err
+
+
+def test_the_link_to_a_port_replaces_no_file(tmp_path):
+    file = tmp_path / "notes.txt"
+    file.write_text("mine")
+    arguments = stage.parser().parse_args(["--config", str(RIG_FILE), "--link", str(file)])
+    for run in (lambda: stage._run(arguments, threading.Event()), lambda: uno._run(arguments)):
+        with refused(ErrorCode.FILE_EXISTS, file):
+            run()
+    assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
+def test_a_time_scale_that_is_none_is_refused_before_a_process_starts(tmp_path, capsys, speed):
+    arguments = ["--config", str(RIG_FILE), "--pattern", "--dir", str(tmp_path / "rig"), f"--time-scale={speed}"]
+    assert simulated_rig.main(arguments) == 2
+    assert f"--time-scale {speed}" in capsys.readouterr().err
 
 
 def move_native(boards):

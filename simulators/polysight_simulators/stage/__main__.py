@@ -22,7 +22,7 @@ from polysight_shared.errors import DeviceError
 from polysight_shared.units import NS_PER_MS
 from polysight_shared.wires import WireClient
 from polysight_simulators.builds import build_sketch, sketch_compiler
-from polysight_simulators.process import announce_ready, command_line, run_until_stopped
+from polysight_simulators.process import announce_ready, check_link, command_line, run_until_stopped
 from polysight_simulators.stage.motion import TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
 
@@ -215,6 +215,7 @@ def main(argv: list[str] | None = None) -> int:
 def _run(args: argparse.Namespace, stop: Signal) -> None:
     """Become the compiled sketch if it can be built; otherwise serve the Python stand-in. Raises PolysightError."""
     rig = load_instrument(args.config)
+    check_link(args.link)
     gxx = None
     if not args.python:
         gxx = sketch_compiler()

@@ -13,7 +13,7 @@ from pathlib import Path
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import PolysightError
 from polysight_shared.program import die_with_parent
-from polysight_simulators.process import command_line, run_program
+from polysight_simulators.process import check_link, command_line, run_program
 from polysight_simulators.stage import count_steps_to_zero
 from polysight_simulators.uno import ENABLING_COMMAND, compile_emulator, compile_firmware, list_missing_packages
 
@@ -49,6 +49,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: argparse.Namespace) -> None:
     """Compile emulator and firmware, and become the emulator. Raises PolysightError if a package is missing."""
+    check_link(args.link)
     if missing_packages := list_missing_packages():
         problem = f"not installed: {' '.join(missing_packages)}"
         raise PolysightError(problem, "the emulated board is compiled on this machine", ENABLING_COMMAND)

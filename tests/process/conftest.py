@@ -10,6 +10,7 @@ from tests.support.paths import EXAMPLES
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import published_rig, rig_with
 from tests.support.scenes import COPPER, PET, make_scene
+from tests.support.suite import make_once
 
 from polysight.imaging import Images
 from polysight.materials import TruthPlate, read_truth
@@ -34,8 +35,9 @@ Make = Callable[..., Imaged]
 @pytest.fixture(scope="session")
 def six_plates(tmp_path_factory: pytest.TempPathFactory) -> ScanFolder:
     """Raw data of the scene of `mangled_scans`."""
-    folder = tmp_path_factory.mktemp("six-plates") / "scan"
-    return ScanFolder.load(simulate(published_rig(), decode_scene(mangled_scans.SCENE, "test"), folder))
+    scene = decode_scene(mangled_scans.SCENE, "test")
+    folder = make_once(tmp_path_factory, "six-plates", lambda folder: simulate(published_rig(), scene, folder / "scan"))
+    return ScanFolder.load(folder / "scan")
 
 
 @pytest.fixture(scope="session")

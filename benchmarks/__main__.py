@@ -48,7 +48,10 @@ def main(argv: list[str]) -> int:
     else:
         options_by_name = {args.name: args}
     if args.out is not None:
-        args.out.mkdir(parents=True, exist_ok=True)
+        try:
+            args.out.mkdir(parents=True, exist_ok=True)
+        except OSError as e:
+            parser.error(f"--out {args.out}: {e.strerror}")
     for name, options in options_by_name.items():
         # Benchmarks without the option `json` have no such attribute; a file that was given stays.
         if args.out is not None and getattr(options, "json", "") is None:

@@ -75,6 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("pages", nargs="*", type=Path, metavar="PAGE", help="default: README and all of docs")
     parser.add_argument("--run", action="store_true", help="run the commands too, in a scratch copy")
     args = parser.parse_args(argv)
+    for path in args.pages:
+        if not path.is_file():
+            parser.error(f"{path} is not a page")
     pages = [read_page(path.resolve()) for path in args.pages or all_pages()]
     faults = [fault for page in pages for fault in page_faults(page)]
     runs: dict[Path, PageRun] = {}

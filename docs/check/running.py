@@ -20,7 +20,9 @@ LIMIT_S = 900.0
 RIG_SCENE = "examples/nine-materials.toml"
 RIG_TIME_SCALE = 40
 # Not copied: large files, and those made by the programs.
-_LEFT_OUT = shutil.ignore_patterns(".git", ".venv", "out", "build", "__pycache__", ".*_cache", "*.egg-info", "scans")
+_LEFT_OUT = shutil.ignore_patterns(
+    *(".git", ".venv", Path(sys.prefix).name, "out", "build", "__pycache__", ".*_cache", "*.egg-info", "scans")
+)
 
 
 @dataclass(frozen=True)
@@ -33,10 +35,10 @@ class PageRun:
 
 
 def scratch_copy(folder: Path, root: Path = ROOT) -> Path:
-    """A copy of the working tree with the same .venv; nothing that a page does reaches the tree itself."""
+    """A copy of the working tree with this environment as its .venv; nothing that a page does reaches the tree."""
     copy = folder / "polysight"
     shutil.copytree(root, copy, ignore=_LEFT_OUT)
-    (copy / ".venv").symlink_to(root / ".venv")
+    (copy / ".venv").symlink_to(sys.prefix)
     for file in copy.rglob("pyproject.toml"):
         # Older than .venv/installed: `make` shall not install the copy.
         os.utime(file, (0, 0))

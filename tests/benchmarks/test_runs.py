@@ -88,3 +88,15 @@ def test_another_library_is_compared_with_numpy_and_the_exact_sum(
     figures = json.loads((tmp_path / "gpu.json").read_text())["array-api-strict"]
     assert set(figures["seconds"]) >= {"image", "cube on disk to image", "exact sum"}
     assert max(figures["differences"].values()) < 1e-4
+
+
+def test_a_file_in_the_place_of_the_folder_is_a_usage_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in THREADS:
+        monkeypatch.setenv(variable, "1")
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as ended:
+        main(["--out", str(tmp_path / "file"), "widths"])
+    assert ended.value.code == 2
+    assert str(tmp_path / "file") in capsys.readouterr().err

@@ -6,6 +6,7 @@ import sys
 import time
 
 import pytest
+from docs.check.__main__ import main
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, read_page
 from docs.check.running import run_page
@@ -148,3 +149,10 @@ def test_a_block_that_a_line_left_of_it_ends_is_found(tmp_path):
     faults = page_faults(page(tmp_path, "# Page\n\n1. a\n\n   ```toml\n   x = 1\ny = 2\n   ```\n\n## Next\n"))
     assert len(faults) == 1
     assert ":10: a heading in a code block" in faults[0]
+
+
+def test_a_page_that_does_not_exist_is_a_usage_error(tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([str(tmp_path / "nope.md")])
+    assert ended.value.code == 2
+    assert "nope.md is not a page" in capsys.readouterr().err

@@ -72,3 +72,17 @@ def test_an_installation_on_no_pi_is_refused_before_the_tools_are_installed(make
 def test_without_git_no_file_is_said_to_be_unchanged(make):
     output = make("-n", "quick", "GIT_DIR=none")[1]
     assert "without git none are checked" in output
+
+
+@pytest.mark.parametrize("target", ["quick", "check"])
+def test_an_environment_of_another_name_is_used_and_not_checked(make, target):
+    (make.folder / ".venv").rename(make.folder / "env")
+    output = make("-n", target, "VENV=env", "CHANGED=a.py")[1]
+    for line in output.splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:1] == ["env/bin/ruff"]:
+            assert 'extend-exclude = ["build", "env"]' in words
+        if "env/bin/pyright" in words:
+            assert words[words.index("--pythonpath") + 1] == "env/bin/python"
+    assert output.count("env/bin/ruff") == 2
+    assert "env/bin/pyright" in output

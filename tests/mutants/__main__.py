@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     judged: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="polysight-mutants-") as folder:
         copy = Path(folder, "repository")
-        ignored = shutil.ignore_patterns(".venv", ".git", "out", "__pycache__")
+        ignored = shutil.ignore_patterns(".venv", Path(sys.prefix).name, ".git", "out", "__pycache__")
         shutil.copytree(REPO, copy, symlinks=True, ignore=ignored)
         sys.stdout.write(f"which tests come to the places of {len(mutants)} mutants?\n")
         sys.stdout.flush()

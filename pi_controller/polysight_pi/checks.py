@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import zmq
+from zmq.auth import load_certificate
 
 from polysight_pi import RIG_FILE, advise_as_service, system
 from polysight_pi.journal import Journal
@@ -31,6 +32,7 @@ from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight_shared.sockets import (
     PI_KEYS,
     advise_keys,
+    advise_owner,
     create_publisher,
     create_replier,
     is_loopback,
@@ -151,6 +153,12 @@ def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
         summary = f"{secret} can be read by others than its owner"
         remedy = f"chmod 600 {quote(secret)}; new ones with `polysight-pi keys --dir {quote(folder)} --replace`"
         return Finding("warning", summary, do=remedy, where="keys")
+    try:
+        load_certificate(secret)
+    except PermissionError:
+        raise DeviceError(f"{secret} cannot be read", "it belongs to another user", advise_owner(folder)) from None
+    except ValueError as e:
+        raise DeviceError(f"{secret}: {e}", "the file is damaged", advise_keys(folder)) from None
     clients = sorted(read_allowed(folder).values())
     if not clients:
         remedy = f"allow one: `polysight-pi keys --dir {quote(folder)} --client NAME`"

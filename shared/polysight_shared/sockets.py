@@ -80,6 +80,11 @@ def advise_keys(key_dir: Path) -> str:
     return f"make new ones: `{command} --replace`, then copy {' and '.join(HOST_KEYS)} to the host"
 
 
+def advise_owner(key_dir: Path) -> str:
+    """Return the advice to give the keys in this folder, made by root, to the user of the Pi's service."""
+    return f"give them to the service's user: `sudo chown -R polysight: {quote(key_dir)}`"
+
+
 def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     """Enable CURVE on a socket whose address is not loopback. Raises ConfigError without usable keys.
 
@@ -109,6 +114,8 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
             socket.curve_serverkey = load_certificate(key_dir / HOST_KEYS[0])[0]
     # zmq.ZMQError: a key of the wrong length.
     except (OSError, ValueError, zmq.ZMQError) as e:
+        if server and isinstance(e, PermissionError):
+            remedy = advise_owner(key_dir)
         raise ConfigError(
             f"{address} is not loopback, and no CURVE keys are usable: {e}",
             f"{key_dir} lacks {' or '.join(files)}, they are damaged, or they belong to another user",

@@ -1,5 +1,6 @@
 """GPIO and SPI lines without a chip, and `polysight-pi check`: each fault is found, named, and has a remedy."""
 
+import errno
 import json
 import shutil
 import socket
@@ -146,6 +147,31 @@ def test_keys(tmp_path):
     (folder / "pi.key_secret").chmod(0o644)
     finding = run_check("keys", checks._check_keys, folder, addresses)
     assert (finding.level, "chmod 600" in finding.do) == ("warning", True)
+    (folder / "pi.key_secret").chmod(0o600)
+    (folder / "allowed_clients").write_text("")
+    finding = run_check("keys", checks._check_keys, folder, addresses)
+    assert (finding.level, "--client" in finding.do) == ("warning", True)
+    (folder / "pi.key_secret").write_text("garbage")
+    finding = run_check("keys", checks._check_keys, folder, addresses)
+    assert (finding.level, f"keys --dir {folder} --replace" in finding.do) == ("error", True)
+
+
+def test_keys_that_root_made_are_given_to_the_services_user(tmp_path, monkeypatch):
+    """A test as root may read every file, so the refusal is simulated."""
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    folder = tmp_path / "keys"
+    make_keys(folder)
+    monkeypatch.setattr(checks, "load_certificate", refuse)
+    monkeypatch.setattr("zmq.auth.load_certificate", refuse)
+    address = "tcp://0.0.0.0:*"
+    for finding in (
+        run_check("keys", checks._check_keys, folder, (address,)),
+        run_check("command address", checks._check_address, create_replier, address, folder),
+    ):
+        assert (finding.level, f"`sudo chown -R polysight: {folder}`" in finding.do) == ("error", True)
 
 
 def test_addresses_and_bursts(tmp_path, gpio_rig):

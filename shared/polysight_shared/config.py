@@ -33,6 +33,8 @@ MIN_PIXEL_MM = 0.05
 MAX_PIXEL_MM = 100.0
 # The range gate's matrices grow as the square of an image's size: one of 400 m took all memory of a PC.
 MAX_IMAGE_MM = 4_000.0
+# Seconds, up to a day: the system's calls take no number of milliseconds above 2^31.
+Timeout = Annotated[float, msgspec.Meta(gt=0, le=86_400.0)]
 PixelSize = Annotated[float, msgspec.Meta(ge=MIN_PIXEL_MM, le=MAX_PIXEL_MM)]
 # Silence after which a card sends a packet that is not full (docs/spec/dca1000.md, observed).
 CARD_TAIL_S = 2.0
@@ -374,9 +376,9 @@ class Limits(Section, frozen=True):
     # Further attempts at a row with faults.
     row_retakes: Annotated[int, msgspec.Meta(ge=0)] = 2
     # Longest wait for a reply of the Pi, a card or a board's control server.
-    command_timeout_s: Positive = 5.0
+    command_timeout_s: Timeout = 5.0
     # Silence of a card after which its record of a row counts as ended.
-    end_of_record_s: Positive = 3.0
+    end_of_record_s: Timeout = 3.0
     # Space that stays free on the disk of the scans.
     free_disk_bytes: Annotated[int, msgspec.Meta(ge=0)] = 1 << 30
     # Maximum number of rows that wait for processing while another is recorded.

@@ -26,7 +26,7 @@ pytest.register_assert_rewrite("tests.support")
 
 from tests.support import preloaded  # noqa: E402
 from tests.support.page.chromium import Browser, find_chromium  # noqa: E402
-from tests.support.rigs import published_rig  # noqa: E402
+from tests.support.rigs import load_published_rig  # noqa: E402
 from tests.support.suite import ByFile, Costs, sort_longest_first  # noqa: E402
 
 # A shell that starts the tests in the background ignores Ctrl-C, and so would every program of the tests.
@@ -103,7 +103,7 @@ def _composed_figures(request: pytest.FixtureRequest) -> Iterator[None]:
 @pytest.fixture(scope="session")
 def rig() -> Instrument:
     """The published rig. Folders whose tests need another one have a fixture of the same name."""
-    return published_rig()
+    return load_published_rig()
 
 
 @pytest.fixture(scope="session")

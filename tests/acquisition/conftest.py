@@ -4,7 +4,7 @@ import pytest
 import tomli_w
 import zmq
 from tests.support.acquisition.fake_cards import make_payload
-from tests.support.acquisition.fake_rig import FakeRig, small_instrument
+from tests.support.acquisition.fake_rig import FakeRig, make_small_instrument
 from tests.support.page.fixtures import finished, samples
 
 from polysight.acquisition import capture_rig, scan
@@ -18,7 +18,7 @@ __all__ = ["finished", "samples"]
 @pytest.fixture
 def rig(monkeypatch):
     """A started `FakeRig`. A command times out only if its Pi loses the reply or a card is silent."""
-    fake = FakeRig(small_instrument())
+    fake = FakeRig(make_small_instrument())
 
     class Pi(PiClient):
         def __init__(self, *settings):
@@ -80,4 +80,4 @@ def payload():
 
 @pytest.fixture
 def make_instrument():
-    return small_instrument
+    return make_small_instrument

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.acquisition.fake_cards import FakeCard, make_payload
-from tests.support.acquisition.fake_rig import FakeRig, small_instrument
-from tests.support.store.plain_scan import errors
+from tests.support.acquisition.fake_rig import FakeRig, make_small_instrument
+from tests.support.store.plain_scan import list_errors
 
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.store import ScanFolder, place_again
@@ -68,7 +68,7 @@ GRIDS = [(3, 3), (91, 1), (7, 4)]
 
 def adversarial_rig(number: int) -> FakeRig:
     points, pulses = GRIDS[number % len(GRIDS)]
-    rig = FakeRig(small_instrument(columns=points, pulses=pulses, row_retakes=4))
+    rig = FakeRig(make_small_instrument(columns=points, pulses=pulses, row_retakes=4))
     for board in rig.instrument.recorded:
         chance = random.Random(f"{number} {board.name}")
         rig.cards[board.name] = AdversarialCard(board, rig.instrument.row_bytes, rig.instrument.frame_bytes, chance)
@@ -79,7 +79,7 @@ def adversarial_rig(number: int) -> FakeRig:
 def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
     """Check that every committed byte is right or masked, and that a row with a mask is listed as incomplete."""
     scan = ScanFolder.load(folder)
-    assert errors(folder) == []
+    assert list_errors(folder) == []
     for row, committed in scan.committed_rows().items():
         for name, board in committed.boards.items():
             data = scan.read_row(name, row)

@@ -182,7 +182,7 @@ def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
             send_command(tmp_path / "not" / "there", ScanCommand.PAUSE)
 
 
-def facts(path: Path) -> list[str]:
+def load_fact_contents(path: Path) -> list[str]:
     return [f["fact"] for f in load_facts(path)]
 
 
@@ -203,7 +203,7 @@ def call_when_paused(folder: Path, act: Callable[[], None]) -> None:
     """Call `act` in a thread once the manifest says that the scan is paused."""
 
     def wait() -> None:
-        wait_for(lambda: "scan_paused" in facts(folder), "the pause in the manifest")
+        wait_for(lambda: "scan_paused" in load_fact_contents(folder), "the pause in the manifest")
         act()
 
     threading.Thread(target=wait).start()
@@ -217,7 +217,7 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
         call_when_paused(tmp_path / "scan", lambda: setattr(stop, "paused", False))
 
     scan = scan_with(samples, tmp_path, stop, pause)
-    answer = [f for f in facts(scan.path) if f != "radars"]
+    answer = [f for f in load_fact_contents(scan.path) if f != "radars"]
     assert answer[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
     assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
@@ -234,6 +234,6 @@ def test_a_paused_scan_can_be_stopped(samples, tmp_path):
         call_when_paused(tmp_path / "scan", stop.request)
 
     scan = scan_with(samples, tmp_path, stop, pause)
-    assert facts(scan.path)[-1] == "scan_ended"
+    assert load_fact_contents(scan.path)[-1] == "scan_ended"
     assert list(ScanFolder.load(scan.path).committed_rows()) == [0]
     assert scan.run().exit_status == "success"

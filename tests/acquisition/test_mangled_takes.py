@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from tests.support.acquisition.arrival_model import MS, PAYLOAD, pulse_times
+from tests.support.acquisition.arrival_model import MS, PAYLOAD, draw_pulse_times
 from tests.support.capture.records import log_packets, make_mask
 
 from polysight.acquisition.pulse_times import PlacedFrames, find_frames_to_move, move_frames, place_frames
@@ -68,7 +68,7 @@ def keep(sent: SentRecord, past: EarlierRecords, pulses: np.ndarray, frame: int)
     )
 
 
-def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
+def draw_takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
     """One to three takes of a rig, each with up to three faults."""
     chance = random.Random(seed)
     points, count, frame = GRIDS[seed % len(GRIDS)]
@@ -76,7 +76,7 @@ def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
     past = EarlierRecords.after_reset()
     for number in range(chance.randint(1, 3)):
         troubles = tuple(chance.sample(TROUBLES, chance.randint(1, 3)))
-        pulses = pulse_times(points, count) + number * 10**11
+        pulses = draw_pulse_times(points, count) + number * 10**11
         sent = card.take(pulses.reshape(-1), troubles)
         judged_take = keep(sent, past, pulses, frame)
         past = judged_take.placed.past
@@ -86,7 +86,7 @@ def takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
         yield troubles, judged_take, sent
 
 
-def wrong_bytes(kept: Kept, sent: SentRecord) -> int:
+def count_wrong_bytes(kept: Kept, sent: SentRecord) -> int:
     truth = np.frombuffer(sent.data, dtype=np.uint8)
     return int((kept.out[~kept.masked] != truth[~kept.masked]).sum())
 
@@ -99,8 +99,8 @@ def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
     right = masked = 0
     first = int(os.environ.get("MANGLED_FIRST", "0"))
     for seed in range(first, first + (5_000 if request.config.getoption("--long") else 125)):
-        for troubles, take, sent in takes(seed):
-            wrong = wrong_bytes(take, sent)
+        for troubles, take, sent in draw_takes(seed):
+            wrong = count_wrong_bytes(take, sent)
             assert wrong == 0, (seed, troubles, wrong, take.whole, take.placed.reason)
             if take.placed.located and take.frames and not take.frames.contradicted and "held" not in troubles:
                 is_right = take.placed_out == np.frombuffer(sent.data, dtype=np.uint8)
@@ -115,7 +115,7 @@ def test_a_perfect_take_after_trouble_is_committed(grid):
     chance = random.Random(grid)
     card = Adversary(chance, frame)
     past = EarlierRecords.after_reset()
-    pulses = pulse_times(points, count)
+    pulses = draw_pulse_times(points, count)
     refused = 0
     for number in range(40):
         start_ns = pulses + number * 10**11
@@ -145,7 +145,7 @@ CASES = {
 def test_rows_that_were_once_kept_with_wrong_bytes(case, points, count, frame):
     for seed in range(3):
         card = Adversary(random.Random(f"{case} {seed}"), frame)
-        pulses = pulse_times(points, count)
+        pulses = draw_pulse_times(points, count)
         sent = card.take(pulses.reshape(-1), CASES[case])
         judged_take = keep(sent, EarlierRecords.after_reset(), pulses, frame)
-        assert wrong_bytes(judged_take, sent) == 0
+        assert count_wrong_bytes(judged_take, sent) == 0

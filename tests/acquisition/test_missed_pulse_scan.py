@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.support.acquisition.fake_rig import PI_AHEAD_NS, FakeRig
 from tests.support.store.facts import load_facts
-from tests.support.store.plain_scan import errors
+from tests.support.store.plain_scan import list_errors
 
 from polysight.acquisition import pulse_times
 from polysight.acquisition.pulse_times import ReceivedCapture
@@ -72,7 +72,7 @@ def test_row_that_is_kept_has_each_frame_at_its_pulse_or_masked(timed_rig, paylo
             timed_rig.cards[name].missed[0, take] = pulses
     result = run_scan(timed_rig.instrument, tmp_path / "s", keep_incomplete=True)
     assert (result.exit_status, result.incomplete_rows) == ("success", [0])
-    assert errors(result.folder.path) == []
+    assert list_errors(result.folder.path) == []
     for name, pulses in missed.items():
         assert check_unmasked(result, payload, name)[sorted(pulses)].all()
         assert load_facts(result.folder, "row_committed")[0]["boards"][name]["pulses_missed"] == len(pulses)

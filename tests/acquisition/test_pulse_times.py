@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, Load, pulse_times, receive
+from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, Load, draw_pulse_times, receive
 from tests.support.capture.records import make_mask
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.acquisition.pulse_times import PlacedFrames, describe, find_frames, place_frames, rewrite_row
 from polysight.capture.receiver import RowCapture
@@ -29,7 +29,7 @@ def place(pulses, answer, arrivals, frame: int = FRAME) -> PlacedFrames:
 
 def place_missed(missed: list[int], seed: int, load: Load = QUIET, drift: float = 0.0, lost=frozenset()):
     """Place a row whose radar missed these pulses; check that no frame is at a wrong one."""
-    pulses = pulse_times(BURSTS)
+    pulses = draw_pulse_times(BURSTS)
     truth = np.delete(np.arange(ALL), missed)
     arrivals, answer = receive(
         edges_ns=pulses.reshape(-1)[truth],
@@ -74,7 +74,7 @@ def test_frames_are_kept_up_to_where_frames_and_packets_last_began_together(miss
 
 @pytest.mark.parametrize("bursts", [1, 2])
 def test_a_whole_row_of_too_few_bursts_is_not_contradicted(bursts):
-    pulses = pulse_times(bursts)
+    pulses = draw_pulse_times(bursts)
     arrivals, answer = receive(pulses.reshape(-1), pulses, FRAME, np.random.default_rng(1))
     placed = place(pulses, answer, arrivals)
     assert (placed.is_timed, placed.contradicted) == (False, False)
@@ -82,7 +82,7 @@ def test_a_whole_row_of_too_few_bursts_is_not_contradicted(bursts):
 
 
 def test_undetermined_frames_are_masked_each_for_its_own_reason():
-    pulses = pulse_times(BURSTS)
+    pulses = draw_pulse_times(BURSTS)
     rng = np.random.default_rng(1)
     arrivals, answer = receive(np.delete(pulses.reshape(-1), 9), pulses, FRAME, rng)
     asleep = arrivals.copy()
@@ -90,7 +90,7 @@ def test_undetermined_frames_are_masked_each_for_its_own_reason():
     results = [
         place(pulses * 40, answer, arrivals),  # simulated time
         place(pulses, answer, arrivals, frame=1024),  # several frames in a packet
-        place(pulse_times(BURSTS, between_ms=25), answer, arrivals),  # no pause between bursts
+        place(draw_pulse_times(BURSTS, between_ms=25), answer, arrivals),  # no pause between bursts
         place(pulses, answer + (np.arange(BURSTS) > 0) * 100 * MS, arrivals),  # late events
         place(pulses[:1], answer[:1], arrivals[:20]),  # a single burst
         place(pulses[:6], answer[:6], arrivals),  # more frames than pulses
@@ -100,7 +100,7 @@ def test_undetermined_frames_are_masked_each_for_its_own_reason():
     assert len({r.reason for r in results}) >= len(results) - 1
     assert not any(r.is_timed for r in results)
     assert "simulated time, 40 times as fast" in results[0].reason
-    no_events = find_frames(Path("0000.part"), Row(0, 0.0, 0.0, 2.0, 3), [], published_rig())
+    no_events = find_frames(Path("0000.part"), Row(0, 0.0, 0.0, 2.0, 3), [], load_published_rig())
     assert (no_events.is_timed, no_events.reason) == (False, "capture events of the row are missing")
     everything_at_once = place(pulses, answer, asleep)
     assert everything_at_once.contradicted
@@ -149,7 +149,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
 @settings(max_examples=60, derandomize=True)
 @given(st.sampled_from(LOADS), st.integers(0, 2**32), st.sampled_from(DRIFTS), st.sampled_from([1456, 4096]))
 def test_a_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift, frame):
-    pulses = pulse_times(BURSTS)
+    pulses = draw_pulse_times(BURSTS)
     arrivals, answer = receive(pulses.reshape(-1), pulses, frame, np.random.default_rng(seed), load, drift=drift)
     result = place(pulses, answer, arrivals, frame)
     assert not result.contradicted

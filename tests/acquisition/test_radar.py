@@ -150,7 +150,7 @@ def test_half_open_connection_is_noticed():
 # --- radars in the rig file ---
 
 
-def with_radar(instrument: Instrument, **radar) -> dict:
+def change_radar_settings(instrument: Instrument, **radar) -> dict:
     """The settings of a rig whose table [radar] has these values."""
     return {**to_builtins(instrument), "radar": radar}
 
@@ -167,7 +167,7 @@ def with_radar(instrument: Instrument, **radar) -> dict:
 )
 def test_wrong_radar_tables_are_refused(make_instrument, radar, rule):
     with refused(ErrorCode.VALUE_INVALID, rule):
-        decode(with_radar(make_instrument(), **radar), Instrument, "test")
+        decode(change_radar_settings(make_instrument(), **radar), Instrument, "test")
 
 
 def test_backend_is_that_of_the_rig_file(make_instrument):
@@ -203,7 +203,7 @@ class Native(RadarControl):
         self.closed = True
 
 
-def rejection_reasons(scan: ScanFolder) -> list[str]:
+def list_rejection_reasons(scan: ScanFolder) -> list[str]:
     return [reason for fact in load_facts(scan, "row_rejected") for reason in fact["reasons"]]
 
 
@@ -243,7 +243,7 @@ def test_radar_that_faults_within_a_row_ends_it_immediately(rig, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars, progress=progress)
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert "aborting" in calls
-    assert any("RF core fault 7" in r for r in rejection_reasons(result.folder))
+    assert any("RF core fault 7" in r for r in list_rejection_reasons(result.folder))
 
 
 def test_radar_that_missed_a_pulse_has_its_row_taken_again(rig, tmp_path):
@@ -282,5 +282,5 @@ def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_
         run_scan(msgspec.structs.replace(rig.instrument, radar=radar), tmp_path / "s")
     lines = [server.accept().recv(1000) for _ in rig.instrument.boards]
     assert lines == [RETRIGGER_LINE * 3] * 3
-    rejected = rejection_reasons(ScanFolder.load(tmp_path / "s"))
+    rejected = list_rejection_reasons(ScanFolder.load(tmp_path / "s"))
     assert any("may not have obeyed" in r for r in rejected)

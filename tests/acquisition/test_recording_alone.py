@@ -23,7 +23,7 @@ open(sys.argv[1], "w").write(json.dumps([status, loaded]))
 """
 
 
-def modules_after(*words: object, note: Path) -> list[str]:
+def list_modules_after(*words: object, note: Path) -> list[str]:
     """Run a command of `polysight` in a new process; return those of our modules that it loaded."""
     command = [sys.executable, "-c", PROGRAM, str(note), *map(str, words)]
     process = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False)
@@ -35,9 +35,9 @@ def modules_after(*words: object, note: Path) -> list[str]:
 @pytest.mark.parametrize("resumed", [False, True])
 def test_a_recorded_scan_loads_nothing_of_the_processing(config, tmp_path, resumed):
     out = tmp_path / "scan"
-    loaded = modules_after("scan", "--config", config, "--out", out, "--no-process", note=tmp_path / "note")
+    loaded = list_modules_after("scan", "--config", config, "--out", out, "--no-process", note=tmp_path / "note")
     if resumed:
-        loaded = modules_after("resume", out, "--no-process", note=tmp_path / "note")
+        loaded = list_modules_after("resume", out, "--no-process", note=tmp_path / "note")
     rooms = {name.split(".")[1] for name in loaded if name.startswith("polysight.")}
     assert "acquisition" in rooms
     assert rooms & NOT_LOADED == set()

@@ -4,7 +4,7 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from tests.support.rigs import rig_with
+from tests.support.rigs import make_rig_with
 
 from polysight.acquisition.row import _SilenceCheck
 
@@ -21,7 +21,7 @@ def find_silent(rig, received: dict[str, int], bursts: int, age_s: float) -> lis
 
 @pytest.mark.parametrize("pulses", [1, 2, 16])
 def test_a_board_is_silent_when_it_sent_nothing_of_two_packets(pulses):
-    rig = rig_with(burst={"pulses": pulses})
+    rig = make_rig_with(burst={"pulses": pulses})
     two_packets_bytes = 2 * rig.card.packet_bytes
     burst_bytes = pulses * rig.frame_bytes
     enough = next(count for count in range(1, 100) if count * burst_bytes >= two_packets_bytes)

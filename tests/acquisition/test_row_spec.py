@@ -17,19 +17,21 @@ from polysight_shared.errors import ErrorCode
 SPEC = (REPO / "docs/spec/row.md").read_text(encoding="utf-8")
 
 
-def table(heading: str) -> list[list[str]]:
+def read_table(heading: str) -> list[list[str]]:
     """Cells of the first table under a heading, without its head."""
     section = SPEC.split(f"## {heading}\n")[1].split("\n## ")[0]
     rows = [line.strip("|").split("|") for line in section.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in row] for row in rows[2:]]
 
 
-def words(cell: str) -> list[str]:
+def find_code_words(cell: str) -> list[str]:
     return re.findall(r"`([^`]+)`", cell)
 
 
 def test_states_and_transitions():
-    described = {words(state)[0]: set(words(then)) for state, _, then in table("States of a take")}
+    described = {
+        find_code_words(state)[0]: set(find_code_words(then)) for state, _, then in read_table("States of a take")
+    }
     assert described == {str(state): {str(s) for s in then} for state, then in TRANSITIONS.items()}
     assert set(described) == {str(s) for s in RowState}
 
@@ -52,16 +54,16 @@ def test_messages_exist():
     documented = {
         "Pi": vars(messages), "receivers": vars(receiver_words), "cards": Code.__members__, "radars": vars(RadarControl)
     }  # fmt: skip
-    for state, party, said in table("Messages"):
-        assert words(state)[0] in set(RowState)
-        assert words(said)
-        for word in words(said):
+    for state, party, said in read_table("Messages"):
+        assert find_code_words(state)[0] in set(RowState)
+        assert find_code_words(said)
+        for word in find_code_words(said):
             assert word in documented[party.split()[0]], (party, word)
 
 
 def test_radar_backends_and_states_are_described():
     controls = Radar.__annotations__["control"]
-    assert [words(row[0])[0] for row in table("Radars")] == re.findall(r"\w+", controls)[1:]
+    assert [find_code_words(row[0])[0] for row in read_table("Radars")] == re.findall(r"\w+", controls)[1:]
     assert all(f"`{state.name}`" in SPEC for state in RadarState)
 
 

@@ -15,7 +15,7 @@ from tests.support.acquisition.fake_rig import FakeRig
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
 from tests.support.store.facts import load_facts
-from tests.support.store.plain_scan import errors
+from tests.support.store.plain_scan import list_errors
 
 from polysight.acquisition import capture_rig
 from polysight.acquisition.capture_rig import CaptureRig
@@ -31,7 +31,7 @@ from polysight_shared.errors import ErrorCode, ScanError
 from polysight_shared.messages import Capture, RunStarted, RunStopped
 
 
-def digests(scan: ScanFolder) -> dict[str, str]:
+def compute_digests(scan: ScanFolder) -> dict[str, str]:
     return {
         b.file: hashlib.sha256((scan.path / b.file).read_bytes()).hexdigest()
         for r in scan.committed_rows().values()
@@ -66,7 +66,7 @@ def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
 def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
     rig.pi.lose_events = 7
     assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
-    assert errors(tmp_path / "s") == []
+    assert list_errors(tmp_path / "s") == []
     ended = load_facts(tmp_path / "s", "scan_ended")[0]
     assert ended["events_refetched"] >= 7
 
@@ -94,7 +94,7 @@ def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, droppe
     rejected = load_facts(scan, "row_rejected")
     assert [(r["row"], r["take"]) for r in rejected] == [(1, 1)]
     assert "RV" in rejected[0]["reasons"][0]
-    assert errors(tmp_path / "s") == []
+    assert list_errors(tmp_path / "s") == []
 
 
 def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
@@ -109,7 +109,7 @@ def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
     result = resume_scan(tmp_path / "s")
     assert result.exit_status == "success"
     assert ScanFolder.load(tmp_path / "s").committed_rows()[1].take == 4
-    assert errors(tmp_path / "s") == []
+    assert list_errors(tmp_path / "s") == []
 
 
 def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
@@ -124,7 +124,7 @@ def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
     assert data.mask is not None
     assert np.array_equal(data.payload[~data.mask], want[~data.mask])
     assert not data.payload[data.mask].any()
-    assert errors(tmp_path / "s") == []
+    assert list_errors(tmp_path / "s") == []
 
 
 def test_keep_incomplete_masks_a_slipped_row_as_a_whole(rig, tmp_path):
@@ -146,7 +146,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "abort"
     assert list(result.folder.committed_rows()) == [0, 1]
-    state_before = digests(result.folder)
+    state_before = compute_digests(result.folder)
     (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
     with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
         f.write(b'{"fact": "row_comm')
@@ -154,10 +154,10 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     result = resume_scan(tmp_path / "s", on_row=rows.append)
     assert result.exit_status == "success"
     assert rows == [0, 1, 2, 3]
-    state_after = digests(result.folder)
+    state_after = compute_digests(result.folder)
     assert {k: state_after[k] for k in state_before} == state_before
     assert result.folder.read_row("RV", 3).payload.tobytes() == payload("RV", 3, rig.instrument.row_bytes)
-    assert errors(tmp_path / "s") == []
+    assert list_errors(tmp_path / "s") == []
     assert set(find_last_takes(result.folder)) == {0, 1, 2, 3}
 
 
@@ -176,12 +176,12 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_p
     rig.pi.wanted_end = True
     wait_for(lambda: rig.pi.hanging is None, "the end of row 2")
     scan = ScanFolder.load(tmp_path / "s")
-    state_before = digests(scan)
+    state_before = compute_digests(scan)
     assert list(scan.rows()) == [0, 1]
-    assert errors(tmp_path / "s") == []
+    assert list_errors(tmp_path / "s") == []
     result = resume_scan(tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
-    assert {k: v for k, v in digests(result.folder).items() if k in state_before} == state_before
+    assert {k: v for k, v in compute_digests(result.folder).items() if k in state_before} == state_before
     assert [r.take for r in result.folder.committed_rows().values()] == [1, 1, 2, 1]
     assert result.folder.read_row("RH", 2).payload.tobytes() == payload("RH", 2, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
@@ -242,10 +242,10 @@ def test_frames_below_a_packet_end_the_scan_before_it_begins(rig, tmp_path):
 
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
-    state_before = digests(ScanFolder.load(tmp_path / "s"))
+    state_before = compute_digests(ScanFolder.load(tmp_path / "s"))
     with refused(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
-    assert digests(ScanFolder.load(tmp_path / "s")) == state_before
+    assert compute_digests(ScanFolder.load(tmp_path / "s")) == state_before
 
 
 TAIL_S = 0.6  # time from the last data to the short last packet; a real card takes 2 s

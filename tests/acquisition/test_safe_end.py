@@ -29,7 +29,7 @@ from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, Scan
 from polysight_shared.faults import explain
 
 
-def commands(pi) -> list[type]:
+def list_motion_commands(pi) -> list[type]:
     return [type(c) for c in pi.commands if not isinstance(c, m.Status | m.Replay | m.Alive)]
 
 
@@ -74,7 +74,7 @@ def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
 
     def note(p) -> None:
         if p.phase not in ("connect", "warning"):
-            first.append(m.BeginRun in commands(rig.pi))
+            first.append(m.BeginRun in list_motion_commands(rig.pi))
 
     run_scan(rig.instrument, tmp_path / "s", progress=note)
     assert not first[0]
@@ -95,8 +95,8 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     assert rig.pi.latched in e.value.what
     assert e.value.remedy.startswith(explain(fault).remedy)
     assert f"1 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
-    assert commands(rig.pi).count(m.Home) == 1, "the one at the start"
-    assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
+    assert list_motion_commands(rig.pi).count(m.Home) == 1, "the one at the start"
+    assert list_motion_commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
     ended = load_facts(tmp_path / "s", "scan_ended")[0]
     assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
 
@@ -112,13 +112,13 @@ def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp
         with refused(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
             run_scan(rig.instrument, tmp_path / "s")
         assert "polysight-pi home" in e.value.remedy
-    assert commands(rig.pi).count(m.Home) == homes, "at the start, and after the last row"
+    assert list_motion_commands(rig.pi).count(m.Home) == homes, "at the start, and after the last row"
 
 
 def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
     rig.pi.fail_rows[1, 1] = 108
     assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
-    sent = commands(rig.pi)
+    sent = list_motion_commands(rig.pi)
     assert sent.index(m.Home) < sent.index(m.RunRow), "the one at the start"
     last_row = len(sent) - 1 - sent[::-1].index(m.RunRow)
     assert m.Home not in sent[sent.index(m.RunRow) : last_row], "none between rows"
@@ -134,9 +134,9 @@ def test_pi_that_restarted_between_rows_ends_the_scan_immediately(rig, tmp_path)
     with refused(ErrorCode.STAGE_NOT_READY) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert "2 of 4 rows are safe" in e.value.remedy
-    assert commands(rig.pi).count(m.Home) == 1
+    assert list_motion_commands(rig.pi).count(m.Home) == 1
     assert resume_scan(tmp_path / "s").exit_status == "success"
-    assert commands(rig.pi).count(m.Home) == 3, "somebody asked for it, and after the last row"
+    assert list_motion_commands(rig.pi).count(m.Home) == 3, "somebody asked for it, and after the last row"
 
 
 def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
@@ -146,7 +146,7 @@ def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
 
     with refused(ErrorCode.STAGE_NOT_READY, "another"):
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
-    assert m.Abort not in commands(rig.pi)
+    assert m.Abort not in list_motion_commands(rig.pi)
 
 
 @pytest.mark.parametrize("state", ["idle", "homed"])
@@ -159,7 +159,7 @@ def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state)
     with refused(ErrorCode.STAGE_NOT_READY, repr(state)) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert "polysight-pi home" in e.value.remedy
-    assert commands(rig.pi).count(m.Home) == 1
+    assert list_motion_commands(rig.pi).count(m.Home) == 1
 
 
 def test_homing_that_another_program_started_is_waited_for():
@@ -196,7 +196,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, rece
     with refused(ErrorCode.NO_ANSWER, board) as e:
         run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None, progress=progress)
     assert "1 of 4 rows are safe" in e.value.remedy
-    assert commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
+    assert list_motion_commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
     assert rig.pi.hanging is None
     scan = ScanFolder.load(tmp_path / "s")
     assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"

@@ -24,16 +24,16 @@ def lose_a_packet_on_the_way(rig) -> None:
     rig.cards["RV"].drop[0, 1] = {3}
 
 
-def no_data(rig) -> None:
+def send_no_data(rig) -> None:
     rig.cards["RV"].short[0, 1] = rig.instrument.row_bytes
 
 
-def frames_missing(rig) -> None:
+def drop_frame(rig) -> None:
     rig.cards["RV"].short[0, 1] = rig.instrument.frame_bytes
 
 
 def hold_row(rig) -> None:
-    frames_missing(rig)
+    drop_frame(rig)
     rig.pi.notes[0, 1] = HELD
 
 
@@ -43,7 +43,7 @@ def make_unlocated(rig) -> None:
     rig.cards["RV"].short[0, 1] = 5 * rig.instrument.frame_bytes // 2
 
 
-def pi_fault(rig) -> None:
+def lose_edge(rig) -> None:
     rig.pi.fail_rows[0, 1] = int(PiFault.EDGE_LOST)
 
 
@@ -65,11 +65,11 @@ def test_only_a_row_that_is_done_has_all_its_pulses_and_a_remark(status, all_sen
     ("spoil", "fault"),
     [
         (lose_a_packet_on_the_way, {"kind": "lost_on_the_way", "board": "RV"}),
-        (no_data, {"kind": "no_data", "board": "RV"}),
-        (frames_missing, {"kind": "frames_missing", "board": "RV"}),
+        (send_no_data, {"kind": "no_data", "board": "RV"}),
+        (drop_frame, {"kind": "frames_missing", "board": "RV"}),
         (hold_row, {"kind": "held", "board": "RV"}),
         (make_unlocated, {"kind": "unlocated", "board": "RV"}),
-        (pi_fault, {"kind": "pi_fault", "number": 103}),
+        (lose_edge, {"kind": "pi_fault", "number": 103}),
     ],
     ids=lambda x: x.__name__ if callable(x) else "",
 )

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from rich.console import Console
 from tests.support.page.live_view import add_fact, begin_history
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition import scan as running
@@ -43,7 +43,7 @@ def test_one_long_row_does_not_change_the_typical_row_time():
 
 
 def test_the_time_limit_of_a_row_is_a_minute_and_four_times_its_travel():
-    rig = published_rig()
+    rig = load_published_rig()
     stage = msgspec.structs.replace(rig.stage, travel_speed_mm_s=50.0, speed_mm_s=5.0)
     travel_s = (stage.travel_x_mm + stage.travel_y_mm) / 50
     row = Row(index=0, y_mm=0.0, x_start_mm=40.0, step_mm=-2.0, points=50)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, make_scene
 
 from polysight.acquisition import StopRequest, resume_scan, run_scan
@@ -39,5 +39,5 @@ def test_a_scan_is_recorded_resumed_and_validated(rig, home, tmp_path, form):
 @pytest.mark.parametrize("form", FORMS)
 def test_a_scan_is_processed(home, tmp_path, form):
     scene = decode_scene(make_scene(COPPER, columns=4, rows=4), "t")
-    simulate(published_rig(), scene, home / "a scan")
+    simulate(load_published_rig(), scene, home / "a scan")
     assert main(["image", form.format(tmp=tmp_path), "--out", str(tmp_path / "made")]) == 0

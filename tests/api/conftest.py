@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from tests.support.products import skip_rendering
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 
 from polysight.cli.main import main
@@ -24,10 +24,10 @@ def simulate_plates(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
     columns, rows, step_mm = (31, 27, (10.0, 6.0)) if plates else (15, 17, (14.0, 8.0))
     image = {"columns": 90, "rows": 60, "pixel_mm": 2.0}
     scene = make_scene(*plates, columns=columns, rows=rows, step_mm=step_mm, image=image)
-    return simulate(published_rig(), decode_scene(scene, "test"), folder, **more)
+    return simulate(load_published_rig(), decode_scene(scene, "test"), folder, **more)
 
 
-def command(*words: object) -> None:
+def run_command(*words: object) -> None:
     """Run a command of the host, which must succeed; its report is not rendered."""
     with redirect_stdout(StringIO()), skip_rendering():
         assert main([str(word) for word in words]) == 0
@@ -43,5 +43,5 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Products of `polysight process` for a copy of that scan folder; the samples are kept."""
     products_folder = tmp_path_factory.mktemp("processed")
-    command("process", shutil.copytree(folder, products_folder / "scan"), "--out", products_folder / "products")
+    run_command("process", shutil.copytree(folder, products_folder / "scan"), "--out", products_folder / "products")
     return products_folder / "products"

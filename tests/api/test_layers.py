@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.api.layers import layer_dataset
 from polysight.materials.layers import Layer, Spectrum, predict
 from polysight.products import ProcessedScan, write_json
 
-CHIRP = published_rig().chirp
+CHIRP = load_published_rig().chirp
 SHEET = Layer("sheet", 3.4 - 0.1j, 1.7e-3)
 
 

@@ -27,7 +27,7 @@ def scan(products):
     return open_scan(products)
 
 
-def leaking_scan(rig: Instrument, angle_error_rad: float = 0.0) -> ProcessedScan:
+def make_leaking_scan(rig: Instrument, angle_error_rad: float = 0.0) -> ProcessedScan:
     """Pixels of known permittivities with a leakage that the error budget knows, of which half was removed."""
     theta_rad = specular_incidence_rad(rig) + angle_error_rad
     r_s, r_p = fresnel(TRUE, theta_rad)
@@ -39,8 +39,8 @@ def leaking_scan(rig: Instrument, angle_error_rad: float = 0.0) -> ProcessedScan
         p_sigma=np.full(h.shape, 1e-3, np.float32),
     )  # fmt: skip
     leakage = LeakageError(
-        h=pair(LEAKAGE_H), v=pair(LEAKAGE_V), std=(0.01, 0.01), source="prior and scene",
-        removed_h=pair(LEAKAGE_H / 2), removed_v=pair(LEAKAGE_V / 2),
+        h=split_complex(LEAKAGE_H), v=split_complex(LEAKAGE_V), std=(0.01, 0.01), source="prior and scene",
+        removed_h=split_complex(LEAKAGE_H / 2), removed_v=split_complex(LEAKAGE_V / 2),
     )  # fmt: skip
     incidence = IncidenceError(deg=float(np.degrees(theta_rad)), std_deg=0.0)
     return ProcessedScan.from_results(
@@ -53,20 +53,20 @@ def leaking_scan(rig: Instrument, angle_error_rad: float = 0.0) -> ProcessedScan
     )
 
 
-def pair(value: complex) -> tuple[float, float]:
+def split_complex(value: complex) -> tuple[float, float]:
     return value.real, value.imag
 
 
 @pytest.mark.parametrize("angle_error_rad", [0.0, 3e-3])
 def test_known_leakage_and_angle_are_taken_out_of_every_pixel(scan, angle_error_rad):
-    eps = permittivity_dataset(leaking_scan(scan.rig, angle_error_rad))
+    eps = permittivity_dataset(make_leaking_scan(scan.rig, angle_error_rad))
     np.testing.assert_allclose(eps["permittivity"].values, TRUE, rtol=1e-9)
 
 
 def test_products_without_a_record_of_corrections_are_not_corrected_twice(scan):
-    leaking = leaking_scan(scan.rig)
+    leaking = make_leaking_scan(scan.rig)
     assert leaking.materials is not None
-    known = LeakageError(h=pair(LEAKAGE_H), v=pair(LEAKAGE_V), std=(0.01, 0.01), source="scene")
+    known = LeakageError(h=split_complex(LEAKAGE_H), v=split_complex(LEAKAGE_V), std=(0.01, 0.01), source="scene")
     earlier = ScanMaterials(segments=[], error_budget=ErrorBudget(leakage=known))
     vars(leaking)["materials"] = earlier
     expected = permittivity_from_ratio(leaking.p, specular_incidence_rad(scan.rig))
@@ -74,7 +74,7 @@ def test_products_without_a_record_of_corrections_are_not_corrected_twice(scan):
 
 
 def test_products_without_an_error_budget_have_a_map(scan):
-    leaking = leaking_scan(scan.rig)
+    leaking = make_leaking_scan(scan.rig)
     vars(leaking)["materials"] = ScanMaterials(segments=[])
     expected = permittivity_from_ratio(leaking.p, specular_incidence_rad(scan.rig))
     np.testing.assert_allclose(permittivity_dataset(leaking)["permittivity"].values, expected, rtol=1e-12)
@@ -120,15 +120,15 @@ def test_the_mask_holds_no_value_that_a_half_space_cannot_have(scan):
 
 def test_the_errors_of_the_map_are_those_of_its_ratio(scan):
     """Beside patches and without an error of the angle: a ratio off by `p_sigma` moves the value by its error."""
-    leaking = leaking_scan(scan.rig)
+    leaking = make_leaking_scan(scan.rig)
     eps = permittivity_dataset(leaking)
-    vars(leaking)["images"] = moved_images(leaking.images)
+    vars(leaking)["images"] = move_images(leaking.images)
     change = np.abs(permittivity_dataset(leaking)["permittivity"].values - eps["permittivity"].values) * 1e3
     for part in ("real", "loss"):
         np.testing.assert_allclose(eps[f"permittivity_{part}_standard_error"].values, change, rtol=0.15)
 
 
-def moved_images(images: Images) -> Images:
+def move_images(images: Images) -> Images:
     """Images whose P is off by a thousandth of `p_sigma`."""
     assert images.p is not None
     assert images.p_sigma is not None
@@ -136,7 +136,7 @@ def moved_images(images: Images) -> Images:
 
 
 def test_where_the_scan_lights_nothing_neither_value_nor_error_is_known(scan):
-    leaking = leaking_scan(scan.rig)
+    leaking = make_leaking_scan(scan.rig)
     dark = np.zeros(TRUE.shape, bool)
     dark[0, 1] = True
     vars(leaking)["images"] = replace(leaking.images, valid=~dark)

@@ -4,7 +4,7 @@ import subprocess
 import sys
 import textwrap
 
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight_simulators.scene import decode_scene, simulate
@@ -63,7 +63,7 @@ def test_every_public_name_is_imported_without_posix():
 
 def test_a_scan_is_processed_read_and_exported_without_posix(tmp_path):
     scene = decode_scene(make_scene(COPPER, PET, columns=15, rows=17), "test")
-    scan = simulate(published_rig(), scene, tmp_path / "scan")
+    scan = simulate(load_published_rig(), scene, tmp_path / "scan")
     program = """
     from polysight.cli.main import main
     scan, out = sys.argv[1:]

@@ -20,7 +20,7 @@ from polysight.store import MANIFEST, ScanFolder, manifest
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError, ErrorCode, PolysightError
 
-from .conftest import COPPER, PET, REPO, command, simulate_plates
+from .conftest import COPPER, PET, REPO, run_command, simulate_plates
 
 DATASETS = ("image", "patches", "permittivity", "materials")
 
@@ -30,7 +30,7 @@ def scan(folder):
     return open_scan(folder)
 
 
-def without_rows(folder: Path, out: Path, *rows: int) -> Path:
+def copy_without_rows(folder: Path, out: Path, *rows: int) -> Path:
     """A copy of a scan folder in which these rows were never committed."""
     shutil.copytree(folder, out)
     kept_facts = [f for f in load_facts(out) if f["fact"] != "row_committed" or f["row"] not in rows]
@@ -131,7 +131,7 @@ def test_each_pixel_can_have_its_own_incidence(folder):
 # --- the same as the commands -----------------------------------------------------------------------------------------
 
 
-def same_image(image: xarray.Dataset, file: Path) -> None:
+def assert_same_image(image: xarray.Dataset, file: Path) -> None:
     saved = read_image(file)
     for name in ("h", "v", "p"):
         np.testing.assert_allclose(image[name].values, getattr(saved, name), rtol=1e-6, atol=1e-6)
@@ -141,8 +141,8 @@ def same_image(image: xarray.Dataset, file: Path) -> None:
 
 
 def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
-    command("image", shutil.copytree(folder, tmp_path / "scan"), "--out", tmp_path / "out")
-    same_image(scan.image(metal_referenced=False), tmp_path / "out" / "image.npz")
+    run_command("image", shutil.copytree(folder, tmp_path / "scan"), "--out", tmp_path / "out")
+    assert_same_image(scan.image(metal_referenced=False), tmp_path / "out" / "image.npz")
     saved = open_scan(tmp_path / "out")
     xarray.testing.assert_allclose(saved.image(metal_referenced=False), scan.image(metal_referenced=False))
     for call in (saved.image, saved.patches, saved.plot):
@@ -173,7 +173,7 @@ def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folde
     shutil.rmtree(scan / "raw")
     shutil.rmtree(scan / "samples", ignore_errors=True)
     assert "saved products" in repr(open_scan(scan))
-    same_image(open_scan(scan).image(), saved / "image.npz")
+    assert_same_image(open_scan(scan).image(), saved / "image.npz")
     for opened in (open_scan(scan, fresh=True), open_scan(scan, model="none")):
         assert "recorded rows" in repr(opened)
         with pytest.raises(DataError):
@@ -181,7 +181,7 @@ def test_saved_products_of_a_scan_folder_are_used_while_they_hold_its_rows(folde
 
 
 def test_products_of_other_rows_are_not_used(folder, products, tmp_path):
-    scan = without_rows(folder, tmp_path / "scan", 26)
+    scan = copy_without_rows(folder, tmp_path / "scan", 26)
     shutil.copytree(products, scan / "products")
     opened = open_scan(scan)
     assert "recorded rows" in repr(opened)
@@ -196,8 +196,8 @@ def test_the_published_layout_opens(tmp_path, monkeypatch, by_columns):
     assert "SIMULATED" in repr(opened)
     assert opened.rows.missing == ()
     assert opened.rows.planned == (31 if by_columns else 27)
-    command("process", data, "--out", tmp_path / "out")  # with the instrument.toml of the data's folder
-    same_image(opened.image(), tmp_path / "out" / "image.npz")
+    run_command("process", data, "--out", tmp_path / "out")  # with the instrument.toml of the data's folder
+    assert_same_image(opened.image(), tmp_path / "out" / "image.npz")
     assert open_scan(tmp_path / "out").rows == opened.rows
     shutil.copytree(tmp_path / "out", data / "products")
     assert "recorded rows" not in repr(open_scan(data))
@@ -227,7 +227,7 @@ def test_the_published_layout_has_surfaces_with_the_rig_that_it_was_opened_with(
 
 
 def test_missing_rows_are_named(folder, tmp_path):
-    scan = open_scan(without_rows(folder, tmp_path / "scan", 3, 7, 8))
+    scan = open_scan(copy_without_rows(folder, tmp_path / "scan", 3, 7, 8))
     assert scan.rows.planned == 27
     assert list(scan.rows.indices) == list(range(27))
     assert scan.rows.missing == (3, 7, 8)
@@ -266,7 +266,7 @@ def test_results_are_the_callers_to_change(scan):
     xarray.testing.assert_identical(scan.image(), image_before)
 
 
-def state(folder: Path) -> dict[str, tuple[int, int]]:
+def read_file_states(folder: Path) -> dict[str, tuple[int, int]]:
     return {str(p): (p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.rglob("*"))}
 
 
@@ -274,20 +274,20 @@ def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch
     scan = shutil.copytree(folder, tmp_path / "scan")
     saved = shutil.copytree(products, tmp_path / "products")
     monkeypatch.chdir(tmp_path)
-    state_before = state(tmp_path)
+    state_before = read_file_states(tmp_path)
     for path in (scan, saved):
         opened = open_scan(path)
         repr(opened)
         for name in DATASETS:
             getattr(opened, name)()
         opened.plot()
-    assert state(tmp_path) == state_before
+    assert read_file_states(tmp_path) == state_before
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
-def same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
+def assert_same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
     variables = sorted(map(str, expected.data_vars))
     xarray.testing.assert_equal(found[variables], expected[variables])
     for name, variable in expected.variables.items():
@@ -300,7 +300,7 @@ def test_netcdf_keeps_every_value(products, tmp_path):
     scan = open_scan(products)
     scan.to_netcdf(tmp_path / "image.nc")
     dataset = read_netcdf(tmp_path / "image.nc")
-    same_dataset(dataset, scan.image().assign(scan.patches().data_vars))
+    assert_same_dataset(dataset, scan.image().assign(scan.patches().data_vars))
     assert dataset.attrs.items() >= {**scan.image().attrs, **scan.patches().attrs}.items()
     assert scan.rig.name in dataset.attrs["instrument"]
 
@@ -330,7 +330,7 @@ def test_other_folders_are_refused(tmp_path):
 
 
 def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
-    scan = open_scan(without_rows(folder, tmp_path / "scan", *range(27)))
+    scan = open_scan(copy_without_rows(folder, tmp_path / "scan", *range(27)))
     assert scan.rows.committed == ()
     for call in (scan.image, scan.patches, scan.plot, lambda: scan.image(metal_referenced=False)):
         with refused(ErrorCode.NO_DATA):

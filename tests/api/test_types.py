@@ -37,7 +37,7 @@ def list_functions(cls: type) -> Iterator[tuple[str, Callable[..., Any]]]:
                 yield f"{cls.__name__}.{name}", member
 
 
-def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
+def list_public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
     """Functions and methods behind the names of `polysight`, each overload by itself."""
     for name in polysight.__all__:
         value = getattr(polysight, name)
@@ -49,7 +49,7 @@ def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
 
 
 @pytest.mark.parametrize(
-    ("name", "function"), [pytest.param(*f, id=f[0]) for f in public_functions() if f[0] not in NOT_TYPED]
+    ("name", "function"), [pytest.param(*f, id=f[0]) for f in list_public_functions() if f[0] not in NOT_TYPED]
 )
 def test_every_parameter_and_result_has_a_specific_type(name, function):
     signature = inspect.signature(function)

@@ -70,7 +70,7 @@ def truth(world: tuple[Instrument, Scene], cube: NDArray[np.complex64]) -> NDArr
     return np.asarray(image).reshape(grid.shape)
 
 
-def correlation(a: NDArray[np.complexfloating], b: NDArray[np.complexfloating]) -> float:
+def correlate(a: NDArray[np.complexfloating], b: NDArray[np.complexfloating]) -> float:
     return float(abs(np.vdot(a, b)) / np.linalg.norm(a) / np.linalg.norm(b))
 
 
@@ -79,7 +79,7 @@ def test_imager_makes_the_matched_filters_image(
 ) -> None:
     rig, _ = world
     grid = image_grid(rig)
-    correlations = [correlation(form_image(cube, rig, rig.by_name("RH"), grid, n), truth) for n in SETTINGS]
+    correlations = [correlate(form_image(cube, rig, rig.by_name("RH"), grid, n), truth) for n in SETTINGS]
     assert correlations[0] > 0.98
     assert correlations == sorted(correlations), "finer range bins must not make it worse"
 
@@ -117,4 +117,4 @@ def test_synchroniser_makes_a_disturbed_scan_like_the_ideal_one(
         x, y = row_offsets_mm(radar, row)
         payload = radar.chirps("RH", x, y, row.index * len(x)).view(np.uint8).ravel()
         synced[:, row.index, [row.column(i) for i in range(row.points)]] = method.row(payload, row.points)
-    assert correlation(form_image(synced, rig, board, image_grid(rig)), truth) > 0.9
+    assert correlate(form_image(synced, rig, board, image_grid(rig)), truth) > 0.9

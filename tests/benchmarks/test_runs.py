@@ -10,7 +10,7 @@ from benchmarks import accuracy, demo, gpu, image, measure, sync, waits, whole
 from benchmarks.__main__ import main
 from benchmarks.data import RepeatedRows
 from benchmarks.measure import THREADS
-from tests.support.rigs import rig_with
+from tests.support.rigs import make_rig_with
 
 MODULES = {"sync": sync, "image": image, "whole": whole, "waits": waits, "demo": demo, "accuracy": accuracy}
 
@@ -54,7 +54,7 @@ def test_the_capture_trial_counts_as_lost_only_what_the_kernel_dropped(
 
 
 def test_a_repeated_row_counts_every_chirp_of_a_frame(tmp_path: Path) -> None:
-    rig = rig_with(burst={"pulses": 2, "chirps": 3, "chirp_us": 60.0}, grid={"columns": 5})
+    rig = make_rig_with(burst={"pulses": 2, "chirps": 3, "chirp_us": 60.0}, grid={"columns": 5})
     (tmp_path / "row").write_bytes(bytes(rig.frame_bytes))
     row = RepeatedRows(rig, {"RH": [tmp_path / "row"]}).read_row("RH", 0)
     assert row.frames_expected == 5 * 2 * 3

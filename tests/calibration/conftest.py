@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.support.rigs import Change, rig_with
+from tests.support.rigs import Change, make_rig_with
 from tests.support.store.facts import load_facts
 
 from polysight.store import MANIFEST, manifest
@@ -16,10 +16,10 @@ from polysight_simulators.scene import decode_scene, simulate
 
 @pytest.fixture(scope="session")
 def make_rig() -> Callable[..., Instrument]:
-    """`make_rig(change, **tables)`: the published rig with bursts of four pulses, changed as by `rig_with`."""
+    """`make_rig(change, **tables)`: the published rig with bursts of four pulses, changed as by `make_rig_with`."""
 
     def make(change: Change | None = None, **tables: dict[str, Any]) -> Instrument:
-        return rig_with(change, **{**tables, "burst": {"pulses": 4, **tables.get("burst", {})}})
+        return make_rig_with(change, **{**tables, "burst": {"pulses": 4, **tables.get("burst", {})}})
 
     return make
 

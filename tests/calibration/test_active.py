@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 import tomli_w
-from tests.support.calibration import SOURCES, filter_file, metal_reference
+from tests.support.calibration import SOURCES, filter_file, make_metal_reference
 from tests.support.refusals import refused
 from tests.support.store.facts import load_facts
 
@@ -102,7 +102,7 @@ def test_without_files_nothing_changes(make_rig):
 
 def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, hpf):
     dispersion = (0.1 - 0.2j, 0.05j)
-    metal = write_metal(replace(metal_reference(make_rig()), dispersion=dispersion), SOURCES, hpf.parent)
+    metal = write_metal(replace(make_metal_reference(make_rig()), dispersion=dispersion), SOURCES, hpf.parent)
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
     assert sorted(load_facts(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
     assert not [f for f in validate(scan.path) if f.level == "error"]
@@ -118,7 +118,7 @@ def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, 
 
 
 def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_naming, hpf):
-    metal = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "b")
+    metal = write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "b")
     hpf = hpf.rename(hpf.with_name("latest.toml"))
     metal = metal.rename(metal.with_name("latest.toml"))
     calibration = load_scan_calibration(create(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
@@ -126,7 +126,7 @@ def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_
 
 
 def test_metal_of_other_pixels_is_refused_before_the_scan(tmp_path, make_rig, rig_naming):
-    metal = write_metal(metal_reference(make_rig(image={"pixel_mm": 2.5})), SOURCES, tmp_path / "c")
+    metal = write_metal(make_metal_reference(make_rig(image={"pixel_mm": 2.5})), SOURCES, tmp_path / "c")
     with refused(ErrorCode.MISMATCH):
         create(tmp_path / "s", rig_naming(metal=metal))
 
@@ -156,7 +156,7 @@ def test_a_missing_file_is_refused_before_the_scan_is_created(tmp_path, rig_nami
 
 
 def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
-    reference = metal_reference(make_rig())
+    reference = make_metal_reference(make_rig())
     path = write_metal(reference, SOURCES, tmp_path)
     reloaded = load_calibration({"metal": path}).reference()
     for name in ("h", "v", "valid", "x_m", "y_m"):
@@ -167,8 +167,8 @@ def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
 
 
 def test_images_of_another_metal_reference_are_refused(tmp_path, make_rig):
-    path = write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "one")
-    other_reference = write_metal(metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
+    path = write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "one")
+    other_reference = write_metal(make_metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
     path.with_suffix(".npz").write_bytes(other_reference.with_suffix(".npz").read_bytes())
     with refused(ErrorCode.FILE_DAMAGED, path.with_suffix(".npz")):
         load_calibration({"metal": path}).reference()

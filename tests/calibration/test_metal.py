@@ -5,7 +5,7 @@ import shutil
 import msgspec
 import numpy as np
 import pytest
-from tests.support.calibration import SOURCES, filter_file, metal_reference
+from tests.support.calibration import SOURCES, filter_file, make_metal_reference
 from tests.support.refusals import refused
 
 from polysight.calibration.files import load_calibration, load_checked_calibration, write_calibration, write_metal
@@ -19,7 +19,7 @@ from polysight.store import ScanFolder
 from polysight_shared.errors import ErrorCode
 
 
-def board(name, **more):
+def set_board_values(name, **more):
     def change(table):
         (board,) = (b for b in table["boards"] if b["name"] == name)
         board.update(more)
@@ -37,11 +37,11 @@ def mount(name, first=(), last=()):
     return change
 
 
-def antennas(table):
+def move_antennas(table):
     table["antennas"]["rx_mm"] = [[x, y, 0.05] for x, y, _ in table["antennas"]["rx_mm"]]
 
 
-def tables(**more):
+def set_table_values(**more):
     return lambda table: [table[name].update(values) for name, values in more.items()]
 
 
@@ -49,21 +49,21 @@ MATTERS = {
     "V moved": (mount("RV", last=[{"shift_mm": [0.0, 0.05, 0.0]}]), ["RV"]),
     "H turned about the line of its antennas": (mount("RH", first=[{"turn_deg": 1.0, "about": "x"}]), ["RH"]),
     "transmitter moved": (mount("LS", last=[{"shift_mm": [0.0, 0.0, 0.1]}]), ["LS"]),
-    "another transmit antenna": (board("LS", tx_antenna=0), ["LS"]),
-    "antennas": (antennas, ["RV"]),
-    "object plane": (tables(geometry={"object_distance_mm": 499.4}), ["499.40 mm", "499.00"]),
-    "start frequency of the chirp": (tables(chirp={"start_hz": 76.02e9}), [192, 76.2917]),
-    "slope": (tables(chirp={"slope_hz_per_s": 38.8e12}), ["linear samples"]),
-    "linear samples": (tables(chirp={"linear_samples": [0, 180]}), [180]),
-    "window": (tables(image={"apodisation": "none"}), ["none", "kaiser"]),
-    "filters": (tables(chirp={"hpf1_khz": 235.0}), ["RH", "235 and 350 kHz", "175 and 350"]),
+    "another transmit antenna": (set_board_values("LS", tx_antenna=0), ["LS"]),
+    "antennas": (move_antennas, ["RV"]),
+    "object plane": (set_table_values(geometry={"object_distance_mm": 499.4}), ["499.40 mm", "499.00"]),
+    "start frequency of the chirp": (set_table_values(chirp={"start_hz": 76.02e9}), [192, 76.2917]),
+    "slope": (set_table_values(chirp={"slope_hz_per_s": 38.8e12}), ["linear samples"]),
+    "linear samples": (set_table_values(chirp={"linear_samples": [0, 180]}), [180]),
+    "window": (set_table_values(image={"apodisation": "none"}), ["none", "kaiser"]),
+    "filters": (set_table_values(chirp={"hpf1_khz": 235.0}), ["RH", "235 and 350 kHz", "175 and 350"]),
 }
 CANCELS = {
-    "raster": tables(grid={"columns": 20, "rows": 10, "step_x_mm": 4.0}),
-    "burst": tables(burst={"pulses": 2}),
-    "leakage and speckle filter": tables(polarimetry={"leakage_h": [0.1, 0.02], "smooth_px": 3.0}),
-    "start frequency of one receiver": board("RV", start_offset_hz=3e5),
-    "stage": tables(stage={"speed_mm_s": 10.0}),
+    "raster": set_table_values(grid={"columns": 20, "rows": 10, "step_x_mm": 4.0}),
+    "burst": set_table_values(burst={"pulses": 2}),
+    "leakage and speckle filter": set_table_values(polarimetry={"leakage_h": [0.1, 0.02], "smooth_px": 3.0}),
+    "start frequency of one receiver": set_board_values("RV", start_offset_hz=3e5),
+    "stage": set_table_values(stage={"speed_mm_s": 10.0}),
     "the same mount in other steps": mount("RV", last=[{"turn_deg": a, "about": "y"} for a in (30.0, -30.0)]),
 }
 
@@ -71,7 +71,7 @@ CANCELS = {
 @pytest.fixture
 def metal(make_rig, tmp_path):
     """A metal reference of the rig before it is changed."""
-    return write_metal(metal_reference(make_rig()), SOURCES, tmp_path / "c")
+    return write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "c")
 
 
 @pytest.mark.parametrize(("change", "values"), MATTERS.values(), ids=MATTERS)
@@ -182,15 +182,15 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
 
 
 def test_processing_refuses_the_calibration_of_another_rig(full_metal, taken_with):
-    assert metal_plane(Pipeline(taken_with(full_metal))) is not None
+    assert load_metal_plane(Pipeline(taken_with(full_metal))) is not None
     moved = Pipeline(taken_with(full_metal, MATTERS["V moved"][0]))
     with refused(ErrorCode.MISMATCH, "RV"):
-        metal_plane(moved)
+        load_metal_plane(moved)
     # Metal in the scene has the scene's rig
-    assert metal_plane(moved, in_scene=True) is None
+    assert load_metal_plane(moved, in_scene=True) is None
 
 
-def metal_plane(pipeline, bands=1, in_scene=False):
+def load_metal_plane(pipeline, bands=1, in_scene=False):
     return pipeline.calibration.metal_plane(pipeline.rig, None, in_scene, bands)
 
 
@@ -203,10 +203,10 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
             np.testing.assert_array_equal(getattr(read, name), getattr(actual, name))
         assert (read.spread, read.how) == (actual.spread, actual.how)
     pipeline = Pipeline(taken_with(banded_metal))
-    assert len(metal_plane(pipeline, BANDS).bands) == BANDS
-    assert metal_plane(pipeline) is not None
+    assert len(load_metal_plane(pipeline, BANDS).bands) == BANDS
+    assert load_metal_plane(pipeline) is not None
     with refused(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
-        metal_plane(pipeline, 3)
+        load_metal_plane(pipeline, 3)
 
 
 def test_missing_sub_bands_are_refused_before_rows_are_read(full_metal, taken_with, tmp_path):
@@ -219,7 +219,7 @@ def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded_metal, tak
     pipeline = Pipeline(taken_with(banded_metal), Settings(bands=BANDS))
     for row in pipeline.source.rows():
         pipeline.add_row(row)
-    reference = metal_plane(pipeline, BANDS)
+    reference = load_metal_plane(pipeline, BANDS)
     (metal_row,) = pipeline.find_materials(pipeline.form_images(), KnownScene(metal=reference)).rows()
     assert len(metal_row.bands) == BANDS
     for ratio in (metal_row.ratio, *(band.ratio for band in metal_row.bands)):

@@ -24,7 +24,7 @@ LAID_MM = (4.0, -3.0)
 TURN_DEG = 0.5
 
 
-def laid(points):
+def measure_positions(points):
     """Measured positions of a target's points."""
     c = np.cos(np.radians(TURN_DEG))
     s = np.sin(np.radians(TURN_DEG))
@@ -47,7 +47,7 @@ def case(tmp_path_factory, make_rig, make_scan):
     }
     believed = make_rig(**tables)
     true = make_rig(shift_boards, **tables)
-    points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in laid(POINTS)]
+    points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in measure_positions(POINTS)]
     folder = make_scan(tmp_path_factory.mktemp("places") / "scan", true, believed, points=points, seed=5)
     target = folder.parent / "target.toml"
     target.write_text(tomli_w.dumps({"name": "five balls", "points": [{"position_mm": list(p)} for p in POINTS]}))

@@ -18,7 +18,7 @@ from polysight_shared.tables import to_builtins
 TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {"columns": 20, "rows": 20}}
 
 
-def offset(value_hz):
+def set_offset(value_hz):
     def change(table):
         for board in table["boards"]:
             if board["role"] != "transmit":
@@ -30,7 +30,7 @@ def offset(value_hz):
 @pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
 def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_middle(make_rig, if_mode):
     """Law: true IF + change of offset = middle, if the rig file's expectation is within half a sample rate of it."""
-    rig = make_rig(offset(123e3), chirp={"if_mode": if_mode})
+    rig = make_rig(set_offset(123e3), chirp={"if_mode": if_mode})
     board = rig.receivers[0]
     rate = rig.chirp.sample_rate_hz
     middle = 0.45 * rate if if_mode == "complex1x" else 0.0
@@ -55,7 +55,7 @@ def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_
 
 
 def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
-    rig = make_rig(offset(50e3))
+    rig = make_rig(set_offset(50e3))
     board = rig.receivers[1]
     better = msgspec.structs.replace(board, start_offset_hz=predict_by_geometry(rig, board))
     # Steps of 54 Hz
@@ -66,7 +66,7 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
     """The boards were programmed 260 kHz away from what the rig file says, and their crystals differ."""
     wrong = {"if_offset_hz": 260e3, "crystal_ppm": {"receive_h": 0.8, "receive_v": -1.1}}
 
-    def advice(rig, name):
+    def make_advice(rig, name):
         folder = make_scan(tmp_path / name, rig, seed=4, disturbances=wrong)
         assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / name / "c")]) == 0
         boards = read_calibration(next((tmp_path / name / "c").iterdir()), StartFile, "start_frequency").boards
@@ -74,14 +74,14 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
         assert all(f"start_offset_hz = {b.start_offset_hz:.0f}" in output for b in boards.values())
         return {n: to_builtins(b) for n, b in boards.items()}
 
-    first = advice(make_rig(offset(300e3), **TABLES), "first")
+    first = make_advice(make_rig(set_offset(300e3), **TABLES), "first")
 
     def set_advice(table):
         for board in table["boards"]:
             if board["name"] in first:
                 board["start_offset_hz"] = first[board["name"]]["start_offset_hz"]
 
-    second = advice(make_rig(set_advice, **TABLES), "second")
+    second = make_advice(make_rig(set_advice, **TABLES), "second")
     for name, board in second.items():
         assert abs(first[name]["start_offset_hz"] - 300e3) > 100e3
         error = np.hypot(board["direct_if_standard_error_hz"], first[name]["direct_if_standard_error_hz"])
@@ -90,7 +90,7 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
 
 
 def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, make_scan, tmp_path):
-    rig = make_rig(offset(790e3), **TABLES)
+    rig = make_rig(set_offset(790e3), **TABLES)
     folder = make_scan(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
     with refused(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
         fit_start(open_raw(folder), "RH")

@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 from tests.support.capture.cards import Cards, ScriptedCard
 from tests.support.processes import HANG_S
-from tests.support.rigs import rig_with
+from tests.support.rigs import make_rig_with
 
 from polysight.capture.card import CardClient
 from polysight.capture.dca1000 import Code, Reply
@@ -19,17 +19,17 @@ from polysight_simulators.faults import Faults
 from polysight_simulators.loopback import move_to_free_subnet
 
 
-def small_rig() -> Instrument:
+def make_small_rig() -> Instrument:
     """Return a rig on a free subnet whose rows fit into the receive buffer, with a timeout that no test reaches."""
     grid = {"columns": 12, "rows": 2}
     card = {"receive_buffer_bytes": 1 << 20}
-    return move_to_free_subnet(rig_with(grid=grid, limits={"command_timeout_s": HANG_S}, card=card))
+    return move_to_free_subnet(make_rig_with(grid=grid, limits={"command_timeout_s": HANG_S}, card=card))
 
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Instrument:
     """A small rig; its file is `tmp_path / "instrument.toml"`."""
-    small = small_rig()
+    small = make_small_rig()
     (tmp_path / "instrument.toml").write_text(tomli_w.dumps(to_builtins(small)))
     return small
 

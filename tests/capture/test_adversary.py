@@ -34,7 +34,7 @@ GRIDS = [
 MAX_REFUSED = 1
 
 
-def wrong_bytes(sent: SentRecord, placed: PlacedRecord, out: np.ndarray) -> int:
+def count_wrong_bytes(sent: SentRecord, placed: PlacedRecord, out: np.ndarray) -> int:
     """Bytes that are not masked and are not those of the row."""
     mask = make_mask(out.size, placed.missing)
     assert not placed.located or not out[mask].any()
@@ -76,7 +76,7 @@ class Rows(RuleBasedStateMachine):
         sent = self.card.record(self.frames, troubles)
         log = log_packets(sent, self.size, batch)
         placed, out = place_record(log, self.frame, self.past, sent.not_before_ns if pulses_known else 0)
-        assert wrong_bytes(sent, placed, out) == 0, (troubles, placed.reason)
+        assert count_wrong_bytes(sent, placed, out) == 0, (troubles, placed.reason)
         c = placed.counts
         named = c.placed + c.duplicates + c.conflicting + c.leftover + c.restarted + c.outside + c.disagreeing
         assert named + c.malformed == len(sent.arrivals)

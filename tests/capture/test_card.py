@@ -216,7 +216,7 @@ def read_settings(client: CardClient) -> EepromSettings:
     return EepromSettings.of_board(client.board, "12:34:56:78:90:13")
 
 
-def card_that(status: int = 0, answer: int = 0):
+def make_answers(status: int = 0, answer: int = 0):
     """Answers of a card that reports `status` and replies `answer` when it is to write its EEPROM."""
 
     def answers(code: int, _: int) -> list[bytes]:
@@ -228,7 +228,7 @@ def card_that(status: int = 0, answer: int = 0):
 
 
 def test_written_once_confirmed(scripted_card):
-    client, card = scripted_card(card_that())
+    client, card = scripted_card(make_answers())
     settings = read_settings(client)
     program_eeprom(client, settings, settings.confirmation)
     assert card.seen == [(Code.ALIVE, b""), (Code.CONFIGURE_EEPROM, settings.encode())]
@@ -236,7 +236,7 @@ def test_written_once_confirmed(scripted_card):
 
 @pytest.mark.parametrize("confirmed", ["", "yes", "192.168.33.180"])
 def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
-    client, card = scripted_card(card_that())
+    client, card = scripted_card(make_answers())
     with refused(ErrorCode.VALUE_INVALID, client.board.card_address):
         program_eeprom(client, read_settings(client), confirmed)
     assert card.seen == []
@@ -251,7 +251,7 @@ def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
     ],
 )
 def test_a_card_that_could_not_write_it(scripted_card, status, answer, unanswered, code):
-    client, card = scripted_card(card_that(status, answer), unanswered=unanswered)
+    client, card = scripted_card(make_answers(status, answer), unanswered=unanswered)
     settings = read_settings(client)
     with refused(code):
         program_eeprom(client, settings, settings.confirmation)

@@ -28,7 +28,7 @@ def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended
     return run
 
 
-def verdicts(process: Ended) -> dict[str, dict[str, dict[str, str]]]:
+def read_verdicts(process: Ended) -> dict[str, dict[str, dict[str, str]]]:
     """Hops by board and name."""
     return {s["name"]: {hop["hop"]: hop for hop in s["hops"]} for s in json.loads(process.out)}
 
@@ -41,7 +41,7 @@ def test_every_hop_of_every_card(cards, card):
     assert [(s["name"], s["ok"], s["fpga_version"], s["silent_hop"]) for s in surveys] == [
         (name, True, "2.8", "") for name in ("LS", "RH", "RV")
     ]
-    for name, hops in verdicts(process).items():
+    for name, hops in read_verdicts(process).items():
         for hop in ("host", "route", "link", "card"):
             assert hops[hop]["verdict"] == "ok"
         received = "not checked" if name == "LS" else "ok"
@@ -163,6 +163,6 @@ def test_listening_ends_with_a_row_and_without_loss_wherever_the_last_record_end
     # Twice the time after which a test counts as hung.
     process = card("--listen", "3600", "--json")
     for name in ("RH", "RV"):
-        radar = verdicts(process)[name]["radar"]
+        radar = read_verdicts(process)[name]["radar"]
         assert radar["verdict"] == "ok", radar
         assert f"{rig.row_bytes} bytes" in radar["found"]

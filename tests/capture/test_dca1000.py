@@ -39,13 +39,13 @@ def test_out_of_range_is_refused():
         d.decode_packet_header(bytes(10))
 
 
-def cube(frames: int, samples: int, rx: int, seed: int = 0) -> np.ndarray:
+def draw_cube(frames: int, samples: int, rx: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     parts = rng.integers(-32768, 32768, (2, rx, frames, samples))
     return (parts[0] + 1j * parts[1]).astype(np.complex64)
 
 
-def four_lane(x: np.ndarray) -> bytes:
+def encode_four_lane(x: np.ndarray) -> bytes:
     """I0 I1 I2 I3 Q0 Q1 Q2 Q3 a sample, written out sample by sample."""
     rx, frames, samples = x.shape
     words = []
@@ -55,7 +55,7 @@ def four_lane(x: np.ndarray) -> bytes:
     return np.array(words, dtype="<i2").tobytes()
 
 
-def two_lane(x: np.ndarray) -> bytes:
+def encode_two_lane(x: np.ndarray) -> bytes:
     """A whole chirp of RX1, then RX2: I0 I1 Q0 Q1 I2 I3 Q2 Q3."""
     rx, frames, samples = x.shape
     words = []
@@ -70,8 +70,8 @@ def two_lane(x: np.ndarray) -> bytes:
 
 @given(st.integers(1, 4), st.integers(1, 9), st.sampled_from([1, 2, 4]))
 def test_four_lane_round_trip(frames, samples, rx):
-    x = cube(frames, samples, rx)
-    decoded, valid = decode_row(four_lane(x), (), frames, samples, rx)
+    x = draw_cube(frames, samples, rx)
+    decoded, valid = decode_row(encode_four_lane(x), (), frames, samples, rx)
     assert decoded.dtype == np.complex64
     assert valid.all()
     assert np.array_equal(decoded, x)
@@ -79,26 +79,26 @@ def test_four_lane_round_trip(frames, samples, rx):
 
 @given(st.integers(1, 4), st.integers(1, 5), st.sampled_from([1, 2, 4]))
 def test_two_lane_round_trip(chirps, pairs, rx):
-    x = cube(chirps, 2 * pairs, rx)
-    assert np.array_equal(decode_two_lane(two_lane(x), chirps, 2 * pairs, rx), x)
+    x = draw_cube(chirps, 2 * pairs, rx)
+    assert np.array_equal(decode_two_lane(encode_two_lane(x), chirps, 2 * pairs, rx), x)
 
 
 def test_swapped_order_exchanges_i_and_q():
-    x = cube(2, 4, 4)
+    x = draw_cube(2, 4, 4)
     swapped = x.imag + 1j * x.real
-    assert np.array_equal(decode_row(four_lane(x), (), 2, 4, 4, swap_iq=True)[0], swapped)
-    assert np.array_equal(decode_two_lane(two_lane(x), 2, 4, 4, swap_iq=True), swapped)
+    assert np.array_equal(decode_row(encode_four_lane(x), (), 2, 4, 4, swap_iq=True)[0], swapped)
+    assert np.array_equal(decode_two_lane(encode_two_lane(x), 2, 4, 4, swap_iq=True), swapped)
 
 
 @given(st.lists(st.tuples(st.integers(0, 639), st.integers(1, 100)), max_size=4))
 def test_frames_with_a_missing_byte_are_invalid_and_zero(cuts):
-    x = cube(5, 8, 4)
+    x = draw_cube(5, 8, 4)
     size = 5 * 8 * 16
     mask = np.zeros(size, dtype=bool)
     for a, n in cuts:
         mask[a : a + n] = True
     ranges = [(a, min(a + n, size)) for a, n in cuts]
-    decoded, valid = decode_row(four_lane(x), ranges, 5, 8)
+    decoded, valid = decode_row(encode_four_lane(x), ranges, 5, 8)
     assert np.array_equal(valid, ~mask.reshape(5, -1).any(axis=1))
     assert not decoded[:, ~valid].any()
     assert np.array_equal(decoded[:, valid], x[:, valid])

@@ -38,7 +38,7 @@ LOCAL = "eth1 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\n"
 GATEWAY = "eth0 00000000 0102A8C0 0003 0 0 100 00000000 0 0 0\n"
 
 
-def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str | None = "0x2") -> Path:
+def write_kernel_files(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str | None = "0x2") -> Path:
     """Files of a machine's /proc and /sys."""
     (root / "proc/net").mkdir(parents=True)
     (root / "proc/net/route").write_text(ROUTES + routes)
@@ -53,7 +53,7 @@ def kernel(root: Path, routes: str = LOCAL, carrier: str | None = "1", arp: str 
 
 
 def test_an_interface_without_a_link_status_is_skipped(tmp_path):
-    root = kernel(tmp_path, carrier=None)
+    root = write_kernel_files(tmp_path, carrier=None)
     assert find_silent_hop(CARD, root) is Hop.LINK
     (root / "sys/class/net/eth1/operstate").write_text("unknown\n")
     assert find_silent_hop(CARD, root) is Hop.CARD
@@ -73,7 +73,7 @@ def test_an_interface_without_a_link_status_is_skipped(tmp_path):
     ],
 )
 def test_every_hop_reads_differently(tmp_path, given, hop, says):
-    root = kernel(tmp_path, **given)
+    root = write_kernel_files(tmp_path, **given)
     assert find_silent_hop(CARD, root) is hop
     error = explain_silent_card(BOARD, "it did not answer", root)
     assert (error.what, says in error.why) == ("it did not answer", True)
@@ -84,10 +84,10 @@ def test_unknown_hops_are_not_guessed(tmp_path):
     assert find_silent_hop(CARD, tmp_path) is Hop.UNKNOWN
     assert route_interface(CARD, tmp_path) is None
     assert neighbour_mac(CARD, tmp_path) is None
-    assert find_silent_hop("127.0.0.5", kernel(tmp_path, routes="")) is Hop.UNKNOWN
+    assert find_silent_hop("127.0.0.5", write_kernel_files(tmp_path, routes="")) is Hop.UNKNOWN
 
 
-def row(**given) -> RowCapture:
+def make_row(**given) -> RowCapture:
     fields = dict.fromkeys((f.name for f in msgspec.structs.fields(RowCapture)), 0)
     fields |= {"counts": PacketCounts(), "losses": Losses()}
     return RowCapture(**(fields | {"missing": [(0, 9)], "located": False, "reason": "no packet came"} | given))
@@ -97,10 +97,10 @@ def row(**given) -> RowCapture:
     ("got", "says"),
     [
         (None, "the radar is not streaming"),
-        (row(), "the radar is not streaming"),
-        (row(strangers=7), "7 packets"),
-        (row(card_status=int(Status.NO_LVDS_DATA)), "the radar sends nothing over LVDS"),
-        (row(card_status=int(Status.NO_HEADER)), "without a header"),
+        (make_row(), "the radar is not streaming"),
+        (make_row(strangers=7), "7 packets"),
+        (make_row(card_status=int(Status.NO_LVDS_DATA)), "the radar sends nothing over LVDS"),
+        (make_row(card_status=int(Status.NO_HEADER)), "without a header"),
     ],
 )
 def test_a_radar_that_does_not_stream(got, says):

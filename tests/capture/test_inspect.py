@@ -10,12 +10,12 @@ import dpkt
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from tests.support.capture.recordings import CARD, OTHER, row, write_pcap
+from tests.support.capture.recordings import CARD, OTHER, draw_row, write_pcap
 from tests.support.capture.records import encode_packets
 from tests.support.paths import REAL_CAPTURES, RIG_FILE
 from tests.support.processes import Bench
 from tests.support.refusals import refused
-from tests.support.scenes import small_scene
+from tests.support.scenes import write_small_scene
 
 from polysight.capture import recognise_format
 from polysight.capture.dca1000 import Status
@@ -33,7 +33,7 @@ needs_real = pytest.mark.skipif(
                                     for samples in (128, 256)])  # fmt: skip
 def test_a_recording_in_its_layout_has_a_peak_and_no_remarks(tmp_path, layout):
     path = tmp_path / "x.bin"
-    row(layout.lanes, layout.q_first, samples=layout.samples).tofile(path)
+    draw_row(layout.lanes, layout.q_first, samples=layout.samples).tofile(path)
     r = inspect_bin(path, layout)
     assert (r.layout, r.chirps, r.remarks) == (layout, 32, [])
     assert r.peak_bin < layout.samples // 2
@@ -63,7 +63,7 @@ def test_zeros_have_their_own_exit_status(tmp_path, capsys):
     assert "every sample is zero" in capsys.readouterr().out
 
 
-def alter_file(words: np.ndarray, fault: str) -> np.ndarray:
+def write_faulty_file(words: np.ndarray, fault: str) -> np.ndarray:
     """A recording with a fault of the radar, the card or the program that wrote it."""
     if fault == "constant offset of":
         return words + np.int16(4000)
@@ -73,14 +73,16 @@ def alter_file(words: np.ndarray, fault: str) -> np.ndarray:
         return np.clip(words * (0.9 * 32767 / words.std()), -32768, 32767).astype("<i2")
     if fault == "no clear peak":
         return np.random.default_rng(1).normal(scale=20, size=words.size).astype("<i2")
-    return {"I and Q": row(4, True), "on RX1:": row(4, False, dead=0), "on RX4:": row(4, False, dead=3)}[fault]
+    return {"I and Q": draw_row(4, True), "on RX1:": draw_row(4, False, dead=0), "on RX4:": draw_row(4, False, dead=3)}[
+        fault
+    ]
 
 
 @pytest.mark.parametrize(
     "fault", ["constant offset of", "5 bytes after", "full scale", "I and Q", "on RX1:", "on RX4:", "no clear peak"]
 )
 def test_a_fault_is_the_only_remark(tmp_path, fault):
-    alter_file(row(4, False), fault).tofile(tmp_path / "x.bin")
+    write_faulty_file(draw_row(4, False), fault).tofile(tmp_path / "x.bin")
     r = inspect_bin(tmp_path / "x.bin")
     assert [fault in remark for remark in r.remarks] == [True]
     assert (r.clipped > 0) is (fault == "full scale")
@@ -88,7 +90,7 @@ def test_a_fault_is_the_only_remark(tmp_path, fault):
 
 @pytest.mark.parametrize("dead", [0, 3])
 def test_the_legend_of_the_range_profile_says_which_antenna_has_no_signal(tmp_path, monkeypatch, dead):
-    row(4, False, dead=dead).tofile(tmp_path / "x.bin")
+    draw_row(4, False, dead=dead).tofile(tmp_path / "x.bin")
     legends = []
     monkeypatch.setattr(
         Figure, "savefig", lambda f, *_, **__: legends.append([t.get_text() for t in f.axes[0].get_legend().texts])
@@ -99,7 +101,7 @@ def test_the_legend_of_the_range_profile_says_which_antenna_has_no_signal(tmp_pa
 
 def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
     """A program that writes packets as they come leaves ten bytes of counters before every 1456 of payload."""
-    data = row(4, False).tobytes()
+    data = draw_row(4, False).tobytes()
     path = tmp_path / "x.bin"
     path.write_bytes(b"".join(encode_packets(data, 9, 70_000)))
     r = inspect_bin(path)
@@ -112,7 +114,7 @@ def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
 def test_of_a_huge_file_only_the_beginning_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr("polysight.capture.inspect.MAX_BYTES", 1 << 20)
     path = tmp_path / "x.bin"
-    row(4, False).tofile(path)
+    draw_row(4, False).tofile(path)
     with path.open("r+b") as f:
         f.truncate(1 << 34)
     report = inspect_bin(path)
@@ -155,7 +157,7 @@ def test_pcapng_gives_the_same_datagrams(tmp_path):
 
 
 def test_lost_packets_of_a_pcap_are_masked_and_reported(tmp_path):
-    packets = encode_packets(row(4, False).tobytes(), 2**32 - 3, 2**48 - 30_000)
+    packets = encode_packets(draw_row(4, False).tobytes(), 2**32 - 3, 2**48 - 30_000)
     write_pcap(tmp_path / "x.pcap", [*packets[:5], *packets[6:], packets[4]])
     r = inspect_pcap(tmp_path / "x.pcap")
     assert r.card is not None
@@ -230,8 +232,8 @@ def polysight(tmp_path):
 
 
 def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
-    row(4, False).tofile(tmp_path / "rig.bin")
-    row(2, True, samples=128).tofile(tmp_path / "other.bin")
+    draw_row(4, False).tofile(tmp_path / "rig.bin")
+    draw_row(2, True, samples=128).tofile(tmp_path / "other.bin")
     process = polysight("rig.bin", "--config", RIG_FILE, "--plot", "rig.png")
     assert (process.status, "note" in process.out) == (0, False), process
     assert (tmp_path / "rig.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
@@ -242,7 +244,7 @@ def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):
 
 
 def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
-    each_packet_twice = [packet for packet in encode_packets(row(4, False).tobytes(), 1, 0) for _ in range(2)]
+    each_packet_twice = [packet for packet in encode_packets(draw_row(4, False).tobytes(), 1, 0) for _ in range(2)]
     # Known by its first bytes, not by its name
     write_pcap(tmp_path / "both", each_packet_twice, cards=(CARD, OTHER))
     process = polysight("both")
@@ -257,7 +259,7 @@ def test_the_command_reads_packets_of_one_of_several_cards(polysight, tmp_path):
 
 
 def test_a_row_of_a_scan_is_read_with_the_scans_rig_file(polysight, tmp_path):
-    (tmp_path / "scene.toml").write_text(small_scene(8, 2, metal=False))
+    (tmp_path / "scene.toml").write_text(write_small_scene(8, 2, metal=False))
     simulate = [sys.executable, "-m", "polysight_simulators", "simulate", tmp_path / "scene.toml", "--config", RIG_FILE]
     subprocess.run([*simulate, "--out", tmp_path / "scan"], check=True, capture_output=True)
     process = polysight("scan/raw/RV/0001.bin")

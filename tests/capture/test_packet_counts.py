@@ -13,7 +13,7 @@ STARTS = [(145_600_000, 100_001), (50_000_000, 5), (2**47, 2**32 - 7)]
 OWN_NAMES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "disagreeing", "malformed")
 
 
-def others_than(counts: PacketCounts, *names: str) -> dict[str, int]:
+def list_other_anomalies(counts: PacketCounts, *names: str) -> dict[str, int]:
     """Anomalies that were counted and are not among these."""
     return {name: n for name in OWN_NAMES if name not in names and (n := getattr(counts, name))}
 
@@ -35,13 +35,13 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
     past = EarlierRecords(Counters(*start))
     for _ in range(rows):
         placed, _ = place(size, card.record().packets, past, frame, batch)
-        assert not others_than(placed.counts)
+        assert not list_other_anomalies(placed.counts)
         past = placed.past
     record = card.record(resets=(restart_packet,))
     placed, out = place(size, record.packets, past, frame, batch)
     assert is_original_or_masked(record, placed, out)
     assert (placed.counts.placed, placed.counts.restarted) == (restart_packet, many - restart_packet), placed.reason
-    assert not others_than(placed.counts, "restarted")
+    assert not list_other_anomalies(placed.counts, "restarted")
     assert not placed.located
 
 
@@ -69,7 +69,7 @@ def test_frames_of_a_row_with_conflicts_are_not_moved():
     assert twice.holes == [(9 * FULL, 10 * FULL)]
 
 
-def spoilt(packets: list[bytes], kind: str, k: int) -> list[bytes]:
+def spoil_packet(packets: list[bytes], kind: str, k: int) -> list[bytes]:
     """A perfect row's packets with one anomaly at packet k."""
     head = packets[k][:10]
     payload = packets[k][10:]
@@ -102,10 +102,10 @@ def test_one_anomaly_is_counted_once_and_by_its_name(grid, kind, where, batch):
     past = place(size, card.record().packets, start, frame, batch)[0].past
     record = card.record()
     k = int(where * (len(record.packets) - 1))
-    placed, out = place(size, spoilt(record.packets, kind, k), past, frame, batch)
+    placed, out = place(size, spoil_packet(record.packets, kind, k), past, frame, batch)
     assert is_original_or_masked(record, placed, out)
     assert getattr(placed.counts, kind) == 1
-    assert not others_than(placed.counts, kind)
+    assert not list_other_anomalies(placed.counts, kind)
     assert placed.counts.placed == len(record.packets)
 
 
@@ -124,4 +124,4 @@ def test_late_packets_of_the_record_before_are_left_over(grid, lost_packets, bat
     placed, _ = place(size, mixed, past, frame, batch)
     assert placed.complete
     assert placed.counts.leftover == lost_packets
-    assert not others_than(placed.counts, "leftover")
+    assert not list_other_anomalies(placed.counts, "leftover")

@@ -13,10 +13,10 @@ from tests.support.capture.records import (
     Record,
     encode_packet,
     encode_packets,
+    find_next_start,
     is_original_or_masked,
     make_log,
     make_mask,
-    next_start,
     place,
 )
 
@@ -65,7 +65,7 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
         assert not out[mask].any()
     else:
         assert mask.all()
-    if placed.located and (start := next_start(placed)) is not None:
+    if placed.located and (start := find_next_start(placed)) is not None:
         assert start.byte_count == (count + len(record.data)) % COUNT
         assert start.sequence == (sequence + len(record.packets)) % SEQUENCE
 
@@ -283,7 +283,7 @@ def test_more_than_expected_is_not_a_row():
 def test_nothing_and_nonsense():
     placed, out = place(5000, [], Counters(0, 1))
     assert placed.missing == [(0, 5000)]
-    assert next_start(placed) is None
+    assert find_next_start(placed) is None
     placed, out = place(5000, [b"", b"short", b"0123456789"], Counters(0, 1))
     assert placed.counts.malformed == 3
     assert not out.any()
@@ -305,7 +305,7 @@ def test_last_packet_of_the_previous_record_is_not_the_first_of_this_one(rest, c
     assert (placed.located, placed.missing) == (True, [])
     assert out.tobytes() == record.data
     assert (placed.counts.leftover, placed.counts.placed) == (1, len(record.packets))
-    assert next_start(placed) == Counters((count + rest + out.size) % COUNT, (sequence + 1 + 21) % SEQUENCE)
+    assert find_next_start(placed) == Counters((count + rest + out.size) % COUNT, (sequence + 1 + 21) % SEQUENCE)
 
 
 def test_truncated_first_packet_is_not_the_last_of_the_record_before():

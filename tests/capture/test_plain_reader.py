@@ -11,7 +11,7 @@ import msgpack
 import numpy as np
 from tests.support.capture.records import encode_packets
 from tests.support.processes import wait_for
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, make_scene
 
 from polysight.capture.dca1000 import decode_packet_header
@@ -111,7 +111,7 @@ def test_manifest(tmp_path):
 
 def test_whole_scan(tmp_path):
     """All files of a simulated scan folder, read as docs/spec describes."""
-    folder = simulate(published_rig(), decode_scene(make_scene(COPPER, columns=3, rows=2), "t"), tmp_path / "scan")
+    folder = simulate(load_published_rig(), decode_scene(make_scene(COPPER, columns=3, rows=2), "t"), tmp_path / "scan")
     facts = [json.loads(line) for line in (folder / "manifest.jsonl").read_text("ascii").splitlines()]
     for fact in facts:
         take_crc(fact)

@@ -35,7 +35,7 @@ def card(board):
         yield s
 
 
-def noise(size: int, seed: int) -> bytes:
+def draw_noise(size: int, seed: int) -> bytes:
     return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
 
 
@@ -48,9 +48,9 @@ def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
 
 def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
     size = 300 * 4096
-    first = noise(size, 1)
-    second = noise(size, 2)
-    third = noise(size, 3)
+    first = draw_noise(size, 1)
+    second = draw_noise(size, 2)
+    third = draw_noise(size, 3)
     count = 0
     sequence = 1
     n = -(-size // FULL)
@@ -89,7 +89,7 @@ def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
 
 @pytest.mark.parametrize("source_port", [1024, 4098, 0])
 def test_data_counts_from_any_source_port(board, tmp_path, source_port):
-    data = noise(20_000, 4)
+    data = draw_noise(20_000, 4)
     with (
         ReceiverProcess(board, 1 << 20) as receiver,
         closing(bind_udp(board.card_address, source_port, "card")) as card,
@@ -103,13 +103,13 @@ def test_data_counts_from_any_source_port(board, tmp_path, source_port):
 
 
 def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
-    data = noise(20_000, 4)
+    data = draw_noise(20_000, 4)
     stranger_address = (board.host_address, 0)
     with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*stranger_address, "stranger")) as stranger:
-        send(card, board, encode_packets(noise(5000, 5), 1, 0))
-        wait_for(lambda: _waiting(board) > 0, "packets")
+        send(card, board, encode_packets(draw_noise(5000, 5), 1, 0))
+        wait_for(lambda: _count_waiting_bytes(board) > 0, "packets")
         assert receiver.begin_row(0, 1, len(data), 1, tmp_path / "a.part", after_reset=True) == 4
-        stranger.sendto(encode_packets(noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
+        stranger.sendto(encode_packets(draw_noise(5000, 6), 1, 0)[0], (board.host_address, board.data_port))
         send(card, board, encode_packets(data, 1, 0))
         wait_for(lambda: receiver.poll().complete, "packets")
         row = receiver.end_row()
@@ -128,7 +128,7 @@ def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch
     for name in ("take_core", "take_priority"):
         monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
     monkeypatch.setattr(receiver_process, "_MAX_BATCHES", 1)
-    data = noise(40 * FULL, 7)
+    data = draw_noise(40 * FULL, 7)
     receiver = receiver_process.Receiver(Connection(os.open(os.devnull, os.O_RDWR)))
     answer = receiver._answer
     answer(Open(board.name, board.host_address, board.data_port, board.card_address, 212_992))
@@ -146,7 +146,7 @@ def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch
     assert (row.complete, row.strangers, row.kernel_drops) == (True, 270, 0)
 
 
-def _waiting(board: Board) -> int:
+def _count_waiting_bytes(board: Board) -> int:
     """Number of bytes that wait in the kernel for the data port."""
     for line in Path("/proc/net/udp").read_text().splitlines()[1:]:
         words = line.split()
@@ -227,7 +227,7 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         for receiver in (swamped, quiet):
             receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part", after_reset=True)
         os.kill(swamped.pid, signal.SIGSTOP)
-        some = encode_packets(noise(2000 * FULL, 3), 1, 0)
+        some = encode_packets(draw_noise(2000 * FULL, 3), 1, 0)
         for packet in some:
             card.sendto(packet, (board.host_address, board.data_port))
         for packet in some[:20]:
@@ -244,7 +244,7 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
 
 
 def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
-    data = noise(20_000, 4)
+    data = draw_noise(20_000, 4)
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, len(data), 1000, tmp_path / "a.part", after_reset=True)
         send(card, board, encode_packets(data, 1, 0))
@@ -261,7 +261,7 @@ def test_the_short_last_packet_is_reported_immediately(board, card, tmp_path):
     """Frames were missed: the byte count is not reached, and the card's short last packet shows the end."""
     with ReceiverProcess(board, 1 << 20) as receiver:
         receiver.begin_row(0, 1, 40_960, 4096, tmp_path / "a.part", after_reset=True)
-        send(card, board, encode_packets(noise(36_864, 4), 1, 0))
+        send(card, board, encode_packets(draw_noise(36_864, 4), 1, 0))
         wait_for(lambda: receiver.poll().ended, "packets")
         assert not receiver.poll().complete
         row = receiver.end_row()

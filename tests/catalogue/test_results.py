@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
 from tests.support.scenes import COPPER, PET
 
@@ -77,7 +77,7 @@ def test_places_outside_the_image_are_refused(processed):
 
 
 def test_without_a_result_no_material_is_reported(tmp_path):
-    judged_products(tmp_path, "none", careless=True)
+    write_judged_products(tmp_path, "none", careless=True)
     answer = probe(tmp_path, 0.0, 0.0)
     assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
     assert {p.name for p in read_result(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
@@ -143,7 +143,7 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
 
 
 def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):
-    judged_products(tmp_path / "none", "none")
+    write_judged_products(tmp_path / "none", "none")
     with refused(ErrorCode.NO_DATA):
         compare(processed / "one", tmp_path / "none")
 
@@ -187,7 +187,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize("change", DAMAGED.values(), ids=DAMAGED)
 def test_images_whose_arrays_do_not_belong_together_are_refused(tmp_path, change):
-    folder = judged_products(tmp_path / "a", "good")
+    folder = write_judged_products(tmp_path / "a", "good")
     with np.load(folder / "image.npz") as stored:
         image = dict(stored)
     np.savez(folder / "image.npz", **change(image))
@@ -201,7 +201,7 @@ def test_images_whose_arrays_do_not_belong_together_are_refused(tmp_path, change
 
 
 def test_a_pipe_in_place_of_the_image_blocks_no_reader(tmp_path):
-    folder = judged_products(tmp_path / "a", "good")
+    folder = write_judged_products(tmp_path / "a", "good")
     (folder / "image.npz").unlink()
     os.mkfifo(folder / "image.npz")
     for look in (lambda: probe(folder, 0.0, 0.0), lambda: thumbnail(Pixels(folder))):

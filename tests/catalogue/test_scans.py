@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 from msgspec import structs
 from tests.support.page.live_view import open_control
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.store.facts import load_facts
 
 from polysight.catalogue import NOTES_FILE, PROGRAM_FOLDER, Notes, Scans, find_program, read_notes, scans, write_notes
@@ -32,7 +32,7 @@ def root(processed: Path, tmp_path: Path) -> Path:
     for name, kept_facts in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):
         (tmp_path / name / MANIFEST).write_bytes(b"".join(manifest.encode_line(f) for f in kept_facts))
         os.utime(tmp_path / name / MANIFEST, (1e9, 1e9))
-    judged_products(tmp_path / "out" / "one", "none")
+    write_judged_products(tmp_path / "out" / "one", "none")
     (tmp_path / "empty").mkdir()
     return tmp_path
 
@@ -99,7 +99,7 @@ def test_what_has_not_changed_is_not_read_again(root, monkeypatch):
     assert opened == []
 
 
-def age_files(root: Path) -> None:
+def backdate_files(root: Path) -> None:
     """Set all files' times to long ago, because files that were written a moment ago are read again."""
     for path in root.rglob("*"):
         os.utime(path, (1e9, 1e9))
@@ -107,7 +107,7 @@ def age_files(root: Path) -> None:
 
 def test_what_has_not_changed_is_not_read_again_after_a_restart(root, monkeypatch):
     index = root / ".polysight" / "list.json"
-    age_files(root)
+    backdate_files(root)
     before = Scans(root, index=index).list()
     write_notes(root / "done", Notes("new"))
     read: list[str] = []
@@ -121,7 +121,7 @@ def test_what_has_not_changed_is_not_read_again_after_a_restart(root, monkeypatc
 def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
     """A file that is written twice within one step of its drive's clock keeps its time, and may keep its size."""
     index = root / ".polysight" / "list.json"
-    age_files(root)
+    backdate_files(root)
     write_notes(root / "done", Notes("cat"))
     written = (root / "done" / NOTES_FILE).stat()
     Scans(root, index=index).list()
@@ -190,7 +190,7 @@ def test_another_thread_reads_on_only_when_one_makes_no_progress(root, monkeypat
 @pytest.mark.parametrize("kept", [0, 1, 0.5, 0.999])
 def test_a_damaged_or_foreign_index_changes_no_list(root, kept):
     index = root / ".polysight" / "list.json"
-    age_files(root)
+    backdate_files(root)
     listed = Scans(root, index=index).list()
     content = index.read_bytes()
     assert Scans(root, index=index).list() == listed

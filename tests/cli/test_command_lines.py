@@ -59,7 +59,7 @@ def test_options_that_would_do_nothing_are_refused(words, options):
         args.run(args)
 
 
-def refusal(*words: str) -> str:
+def read_refusal(*words: str) -> str:
     output = io.StringIO()
     with contextlib.redirect_stderr(output), pytest.raises(SystemExit):
         build_parser().parse_args(words)
@@ -79,25 +79,29 @@ def refusal(*words: str) -> str:
     ],
 )
 def test_a_number_that_is_none_is_refused_in_words(words, rule, text):
-    assert refusal(*words[:-1], f"{words[-1]}={text}").endswith(f"{text} is not {rule}")
+    assert read_refusal(*words[:-1], f"{words[-1]}={text}").endswith(f"{text} is not {rule}")
 
 
 def test_a_chirp_has_an_even_number_of_samples_at_least_8():
     for text in ("8", "10", "256"):
         assert build_parser().parse_args(["inspect", "a.bin", "--samples", text]).samples == int(text)
     for text in ("6", "9", "0", "-8"):
-        assert refusal("inspect", "a.bin", f"--samples={text}").endswith(f"{text} is not an even number, 8 or more")
+        assert read_refusal("inspect", "a.bin", f"--samples={text}").endswith(
+            f"{text} is not an even number, 8 or more"
+        )
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e5"])
 @pytest.mark.parametrize("place", ["{},0,40,40", "0,{},40,40", "0,0,{},40", "0,0,40,{}"])
 def test_a_metal_box_is_a_place_on_the_image(text, place):
-    assert place.format(text) in refusal("process", "s", "--out", "o", f"--metal-box={place.format(text)}")
+    assert place.format(text) in read_refusal("process", "s", "--out", "o", f"--metal-box={place.format(text)}")
 
 
 @pytest.mark.parametrize("text", ["nan", "inf", "0.499", "19.9", "10001", "-200"])
 def test_an_object_distance_is_one_in_the_lab(text):
-    assert refusal("plan", f"--object-distance-mm={text}").endswith(f"{text} is not a distance from 20 to 10000 mm")
+    assert read_refusal("plan", f"--object-distance-mm={text}").endswith(
+        f"{text} is not a distance from 20 to 10000 mm"
+    )
 
 
 @pytest.mark.parametrize("words", ["--columns 1", "--rows 1", "--width-mm 0.5", "--height-mm 0.9", "--step-x-mm 5000"])
@@ -109,7 +113,9 @@ def test_a_plan_without_an_aperture_is_refused(words):
 
 @pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e9"])
 def test_a_shift_of_the_plane_is_a_length_in_the_lab(text):
-    assert refusal("image", "s", "--out", "o", f"--depth={text}").endswith(f"{text} is not a shift of at most 1000 mm")
+    assert read_refusal("image", "s", "--out", "o", f"--depth={text}").endswith(
+        f"{text} is not a shift of at most 1000 mm"
+    )
 
 
 @pytest.mark.parametrize(
@@ -152,24 +158,24 @@ def test_the_orientation_of_strips_is_an_angle_and_their_scan(text, strips):
 
 @pytest.mark.parametrize("text", ["-180.5=a", "180.5=a", "nan=a", "a=b", "90", "90="])
 def test_strips_without_an_orientation_or_scan_are_refused(text):
-    assert text in refusal("leakage", "plate", f"--strips={text}")
+    assert text in read_refusal("leakage", "plate", f"--strips={text}")
 
 
 @pytest.mark.parametrize("text", ["20,0,-20,10", "20,0,20,10", "0,20,10,20", "0,20,10,-20", "1,2,3", "a,b,c,d"])
 def test_a_box_has_a_lower_left_and_an_upper_right_corner(text):
-    assert text in refusal("process", "s", "--out", "o", f"--metal-box={text}")
+    assert text in read_refusal("process", "s", "--out", "o", f"--metal-box={text}")
 
 
 @pytest.mark.parametrize("text", ["0", "", "0,", ",45"])
 def test_the_axis_of_a_turntable_has_two_places(text):
-    assert refusal("surface", "s", "--out", "o", f"--axis={text}").endswith(
+    assert read_refusal("surface", "s", "--out", "o", f"--axis={text}").endswith(
         f"{text!r} is not of the form X,Z in mm, e.g. 0,45"
     )
 
 
 @pytest.mark.parametrize("text", ["0,nan", "inf,0", "0,1001"])
 def test_the_axis_of_a_turntable_is_in_the_lab(text):
-    assert refusal("surface", "s", "--out", "o", f"--axis={text}").endswith("is not a shift of at most 1000 mm")
+    assert read_refusal("surface", "s", "--out", "o", f"--axis={text}").endswith("is not a shift of at most 1000 mm")
 
 
 def test_other_words_are_left_as_they_are():

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.paths import BIN
-from tests.support.processes import processes_naming, wait_for
+from tests.support.processes import list_processes_naming, wait_for
 
 MODULE = (sys.executable, "-m")
 PROGRAMS = [
@@ -43,10 +43,12 @@ def test_a_fork_has_its_own_words_parent_session_and_end(tmp_path: Path):
         assert program.stdout is not None
         assert program.stdout.readline().startswith(b"ready")
         words = " ".join(map(str, command))
-        assert {pid: line.rstrip() for pid, line in processes_naming(str(tmp_path)).items()} == {program.pid: words}
+        assert {pid: line.rstrip() for pid, line in list_processes_naming(str(tmp_path)).items()} == {
+            program.pid: words
+        }
         assert os.getsid(program.pid) == os.getpgid(program.pid) == program.pid
         status = Path(f"/proc/{program.pid}/status").read_text()
         assert f"PPid:\t{os.getpid()}\n" in status
         os.killpg(program.pid, signal.SIGKILL)
     assert program.returncode == -signal.SIGKILL
-    wait_for(lambda: not processes_naming(str(tmp_path)), "that nothing of it is left")
+    wait_for(lambda: not list_processes_naming(str(tmp_path)), "that nothing of it is left")

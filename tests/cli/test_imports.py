@@ -9,9 +9,9 @@ import pytest
 import scipy.signal
 from numpy.testing import assert_allclose
 from tests.support.paths import RIG_FILE
-from tests.support.products import judged_products
-from tests.support.rigs import published_rig
-from tests.support.scenes import small_scene
+from tests.support.products import write_judged_products
+from tests.support.rigs import load_published_rig
+from tests.support.scenes import write_small_scene
 
 from polysight.cli.main import FAMILIES
 from polysight.imaging import TAPERS, window_weights
@@ -59,20 +59,20 @@ def test_help_of_a_command_needs_no_numbers(command):
 
 @pytest.mark.parametrize("command", ["materials", "report", "permittivity"])
 def test_saved_products_are_shown_without_mathematics(tmp_path, command):
-    products = judged_products(tmp_path / "products", "good")
+    products = write_judged_products(tmp_path / "products", "good")
     (products / "report.html").write_text("<p>here</p>")
     assert list_loaded_modules(command, products) & HEAVY == set()
 
 
 def test_a_scan_is_validated_without_scipy(tmp_path):
-    (tmp_path / "scene.toml").write_text(small_scene(6, 3))
-    simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    (tmp_path / "scene.toml").write_text(write_small_scene(6, 3))
+    simulate(load_published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
     assert list_loaded_modules("validate", tmp_path / "scan") & (SCIPY | HEAVY) == set()
 
 
 def test_images_are_made_without_report_and_figures(tmp_path):
-    (tmp_path / "scene.toml").write_text(small_scene(6, 3))
-    simulate(published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
+    (tmp_path / "scene.toml").write_text(write_small_scene(6, 3))
+    simulate(load_published_rig(), load_scene(tmp_path / "scene.toml"), tmp_path / "scan")
     loaded = list_loaded_modules("image", tmp_path / "scan", "--out", tmp_path / "out")
     assert loaded & {"jinja2", "matplotlib", "polysight.report", "sklearn"} == set()
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from tests.support.paths import BIN, RIG_FILE
 from tests.support.processes import wait_for
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 
 POLYSIGHT = str(BIN / "polysight")
 
 
 @pytest.fixture
 def products(tmp_path) -> Path:
-    return judged_products(tmp_path / "products", "good")
+    return write_judged_products(tmp_path / "products", "good")
 
 
 def run_in_shell(line: str, folder: Path) -> tuple[int, str]:

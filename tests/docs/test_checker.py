@@ -14,7 +14,7 @@ from tests.support.processes import wait_for
 from tests.support.stage.processes import runs
 
 
-def page(tmp_path, text):
+def make_page(tmp_path, text):
     path = tmp_path / "page.md"
     path.write_text(text, encoding="utf-8")
     (tmp_path / "other.md").write_text("# Two words, `code` and more\n\n## Again\n\n## Again\n", encoding="utf-8")
@@ -63,7 +63,7 @@ trigger_in = 26
 
 
 def test_a_sound_page_has_no_faults(tmp_path):
-    assert page_faults(page(tmp_path, SOUND)) == []
+    assert page_faults(make_page(tmp_path, SOUND)) == []
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_a_sound_page_has_no_faults(tmp_path):
     ],
 )
 def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
-    faults = page_faults(page(tmp_path, f"# Page\n\n{text}\n"))
+    faults = page_faults(make_page(tmp_path, f"# Page\n\n{text}\n"))
     assert len(faults) == 1
     assert fault in faults[0]
     line = int(faults[0].split(":")[1])
@@ -104,7 +104,7 @@ def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
     assert line in (fence, fence + 1)
 
 
-def folder(tmp_path):
+def make_folder(tmp_path):
     """A folder to run in, and the runner's folder next to it."""
     copy = tmp_path / "scratch/copy"
     copy.mkdir(parents=True)
@@ -112,22 +112,22 @@ def folder(tmp_path):
 
 
 def test_a_failing_command_is_named_by_its_line(tmp_path):
-    copy = folder(tmp_path)
-    run = run_page(page(tmp_path, "# Page\n\n```sh\ntrue\n\necho seen\nls /gone\ntouch never\n```\n"), copy)
+    copy = make_folder(tmp_path)
+    run = run_page(make_page(tmp_path, "# Page\n\n```sh\ntrue\n\necho seen\nls /gone\ntouch never\n```\n"), copy)
     assert run.failed_line == 7
     assert "seen" in run.output
     assert not (copy / "never").exists()
 
 
 def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
-    run = run_page(page(tmp_path, "# Page\n\n```sh\nsleep 1000\n```\n"), folder(tmp_path), limit_s=1.0)
+    run = run_page(make_page(tmp_path, "# Page\n\n```sh\nsleep 1000\n```\n"), make_folder(tmp_path), limit_s=1.0)
     assert run.failed_line
 
 
 def test_the_commands_of_a_page_end_with_the_check(tmp_path):
     """A terminated check once left them running."""
     pid = tmp_path / "pid"
-    page(tmp_path, f"# Page\n\n```sh\necho $$ > {pid}.part\nmv {pid}.part {pid}\nsleep 10000\n```\n")
+    make_page(tmp_path, f"# Page\n\n```sh\necho $$ > {pid}.part\nmv {pid}.part {pid}\nsleep 10000\n```\n")
     check = subprocess.Popen(
         [sys.executable, "-m", "docs.check", "--run", str(tmp_path / "page.md")],
         cwd=ROOT,
@@ -146,7 +146,7 @@ def test_the_commands_of_a_page_end_with_the_check(tmp_path):
 
 def test_a_block_that_a_line_left_of_it_ends_is_found(tmp_path):
     """What follows would be shown as code."""
-    faults = page_faults(page(tmp_path, "# Page\n\n1. a\n\n   ```toml\n   x = 1\ny = 2\n   ```\n\n## Next\n"))
+    faults = page_faults(make_page(tmp_path, "# Page\n\n1. a\n\n   ```toml\n   x = 1\ny = 2\n   ```\n\n## Next\n"))
     assert len(faults) == 1
     assert ":10: a heading in a code block" in faults[0]
 

@@ -15,21 +15,21 @@ MODULES = (
 )  # fmt: skip
 
 
-def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+def list_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     """A parser and all its subcommands'."""
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             for sub in action.choices.values():
-                yield from leaves(sub)
+                yield from list_parsers(sub)
 
 
-def parsers() -> list[argparse.ArgumentParser]:
+def list_all_parsers() -> list[argparse.ArgumentParser]:
     all_parsers = [find_parser(module) for module in MODULES]
-    return [leaf for parser in all_parsers if parser is not None for leaf in leaves(parser)]
+    return [leaf for parser in all_parsers if parser is not None for leaf in list_parsers(parser)]
 
 
-@pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))
+@pytest.mark.parametrize("parser", list_all_parsers(), ids=lambda p: p.prog.replace(" ", "-"))
 def test_help_has_an_example_that_works(parser):
     text = parser.format_help()
     _, heading, examples = text.partition("example")
@@ -44,7 +44,7 @@ def test_help_has_an_example_that_works(parser):
 def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
     root = find_parser("polysight.cli.main")
     assert root is not None
-    for parser in [p for p in leaves(root) if p is not root]:
+    for parser in [p for p in list_parsers(root) if p is not root]:
         text = parser.format_help()
         usage, sentence, *_ = text.split("\n\n")
         assert usage.startswith(f"usage: {parser.prog}")
@@ -60,7 +60,7 @@ def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
         assert all(name in text for a in missing for name in a.option_strings), parser.prog
 
 
-@pytest.mark.parametrize("parser", parsers(), ids=lambda p: p.prog.replace(" ", "-"))
+@pytest.mark.parametrize("parser", list_all_parsers(), ids=lambda p: p.prog.replace(" ", "-"))
 def test_every_option_is_explained(parser):
     assert parser.description
     dumb = [a.dest for a in parser._actions if not a.help and not isinstance(a, argparse._SubParsersAction)]

@@ -6,7 +6,7 @@ import tomllib
 import numpy as np
 from docs.check.looking import page_faults
 from docs.check.pages import ROOT, all_pages, read_page
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, make_scene
 
 from polysight.acquisition import ScanCommand
@@ -86,7 +86,7 @@ def test_the_label_file_that_is_shown_can_be_learnt_from(tmp_path):
 def test_the_python_blocks_about_imaging_run(tmp_path, monkeypatch):
     """They use rooms behind the public interface, whose names change."""
     simulate(
-        published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "test"), tmp_path / "scans" / "points"
+        load_published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "test"), tmp_path / "scans" / "points"
     )
     monkeypatch.chdir(tmp_path)
     blocks = [block for block in read_page(ROOT / "docs/how-to/imaging.md").blocks if block.info == ("python", "run")]

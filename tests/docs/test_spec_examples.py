@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from docs.check.pages import ROOT, read_page
 from starlette.routing import Route
-from tests.support.radar.boards import native_rig
+from tests.support.radar.boards import make_native_rig
 
 from polysight.capture import dca1000
 from polysight.capture.card import EepromSettings
@@ -31,20 +31,20 @@ from polysight_shared.config import load_instrument
 SPEC = ROOT / "docs/spec"
 
 
-def text(page: str) -> str:
+def read_page_text(page: str) -> str:
     return (SPEC / page).read_text(encoding="utf-8")
 
 
-def rows(page: str, heading: str) -> list[list[str]]:
+def read_table_rows(page: str, heading: str) -> list[list[str]]:
     """Cells of every table row under a heading."""
-    section = re.split(rf"^#+ {heading}\n", text(page), flags=re.MULTILINE)[1].split("\n#")[0]
+    section = re.split(rf"^#+ {heading}\n", read_page_text(page), flags=re.MULTILINE)[1].split("\n#")[0]
     return [[c.strip() for c in line.strip("|").split("|")] for line in section.splitlines() if line.startswith("| ")]
 
 
-def shown_bytes(page: str, *labels: str) -> bytes:
+def read_shown_bytes(page: str, *labels: str) -> bytes:
     """The bytes after a label (a line's first words) in a text block of a page."""
     label = " +".join(map(re.escape, labels))
-    match = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", text(page), re.MULTILINE)
+    match = re.search(rf"^{label} +((?:[0-9a-f]{{2,12}} ?)+)(?: |$)", read_page_text(page), re.MULTILINE)
     assert match, labels
     return bytes.fromhex(match[1])
 
@@ -57,14 +57,16 @@ READERS = {
 }  # fmt: skip
 
 
-def wire_examples() -> list[tuple[str, bytes, dict[str, object]]]:
+def read_wire_examples() -> list[tuple[str, bytes, dict[str, object]]]:
     """(kind, bytes, content) of each `hex` block and the `json` block that follows it."""
     blocks = read_page(SPEC / "wire.md").blocks
     pairs = [(a, b) for a, b in itertools.pairwise(blocks) if a.language == "hex"]
     return [(a.info[1], bytes.fromhex(a.text), json.loads(b.text)) for a, b in pairs]
 
 
-@pytest.mark.parametrize(("kind", "raw", "content"), wire_examples(), ids=lambda v: v if isinstance(v, str) else "")
+@pytest.mark.parametrize(
+    ("kind", "raw", "content"), read_wire_examples(), ids=lambda v: v if isinstance(v, str) else ""
+)
 def test_wire_examples_hold_what_the_page_says(kind, raw, content):
     if kind == "journal":
         size, seq, crc = struct.unpack_from("<III", raw)
@@ -80,18 +82,18 @@ def test_wire_examples_hold_what_the_page_says(kind, raw, content):
 
 
 def test_there_are_examples_of_every_kind():
-    assert {kind for kind, _, _ in wire_examples()} == {"event", "command", "reply", "journal"}
+    assert {kind for kind, _, _ in read_wire_examples()} == {"event", "command", "reply", "journal"}
 
 
-def declared_types(union: object) -> list[type]:
+def list_declared_types(union: object) -> list[type]:
     return list(getattr(union, "__args__", ()))
 
 
 @pytest.mark.parametrize(
-    "message", [m for u in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply) for m in declared_types(u)]
+    "message", [m for u in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply) for m in list_declared_types(u)]
 )
 def test_the_page_names_every_message_and_field(message):
-    page = "\n".join(line for line in text("wire.md").splitlines() if f"`{message.__name__}`" in line)
+    page = "\n".join(line for line in read_page_text("wire.md").splitlines() if f"`{message.__name__}`" in line)
     assert page, message
     if issubclass(message, messages.Event):
         common = {f.encode_name for f in msgspec.structs.fields(messages.Event)}
@@ -107,7 +109,7 @@ def test_the_page_names_every_message_and_field(message):
 def test_types_follow_from_names_as_the_page_says():
     """Floats end in _mm, _mm_s or _us; everything else that is a number is an integer."""
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
-        for message in declared_types(union):
+        for message in list_declared_types(union):
             for field in msgspec.structs.fields(message):
                 # For any bounds
                 is_float = getattr(field.type, "__origin__", field.type) is float
@@ -115,9 +117,9 @@ def test_types_follow_from_names_as_the_page_says():
 
 
 def test_what_may_be_left_out():
-    answer = text("wire.md").split("These may be left out:")[1].split("\n*")[0]
+    answer = read_page_text("wire.md").split("These may be left out:")[1].split("\n*")[0]
     for union in (messages.AnyEvent, messages.AnyCommand, messages.AnyReply):
-        for message in declared_types(union):
+        for message in list_declared_types(union):
             for field in msgspec.structs.fields(message):
                 if field.default is not msgspec.NODEFAULT and field.name != "version":
                     assert f"`{field.encode_name}`" in answer, (message.__name__, field.encode_name)
@@ -127,7 +129,7 @@ def test_what_may_be_left_out():
 
 
 def test_stage_line_examples_are_a_dialogue():
-    example = text("stage-line.md").split("## Example")[1].split("```")[1]
+    example = read_page_text("stage-line.md").split("## Example")[1].split("```")[1]
     sent = []
     answered = []
     for line in re.findall(r"^(?:->|<-) \S.*\*[0-9A-F]{4}$", example, re.MULTILINE):
@@ -154,30 +156,30 @@ def test_card_requests():
         ("version", "request"): (dca1000.Code.VERSION, b""),
     }
     for labels, (code, data) in requests.items():
-        assert shown_bytes("dca1000.md", *labels) == dca1000.encode_request(code, data)
+        assert read_shown_bytes("dca1000.md", *labels) == dca1000.encode_request(code, data)
     settings = EepromSettings.of_board(load_instrument(ROOT / "instrument.toml").by_name("RH"), "12:34:56:78:90:13")
     request = dca1000.encode_request(dca1000.Code.CONFIGURE_EEPROM, settings.encode())
-    assert shown_bytes("dca1000.md", "EEPROM of RH", "request") == request
+    assert read_shown_bytes("dca1000.md", "EEPROM of RH", "request") == request
 
 
 def test_card_replies():
-    lines = re.findall(r"^ +reply +([0-9a-f ]+)$", text("dca1000.md"), re.MULTILINE)
+    lines = re.findall(r"^ +reply +([0-9a-f ]+)$", read_page_text("dca1000.md"), re.MULTILINE)
     replies = [dca1000.decode_reply(bytes.fromhex(line)) for line in lines]
     assert [r.code for r in replies] == [5, 3, 0x0E]
     assert [r.status for r in replies[:2]] == [0, 0]
     assert str(dca1000.decode_version(replies[2].status)) == "2.8"
-    ended = dca1000.decode_reply(shown_bytes("dca1000.md", "record completed", "status"))
+    ended = dca1000.decode_reply(read_shown_bytes("dca1000.md", "record completed", "status"))
     assert (ended.code, ended.status) == (dca1000.Code.STATUS, dca1000.Status.RECORD_COMPLETED)
 
 
 def test_card_status_bits():
-    bits = dict(re.findall(r"\| (\d+) \| ([A-Z_]+) (?=\|)", text("dca1000.md")))
+    bits = dict(re.findall(r"\| (\d+) \| ([A-Z_]+) (?=\|)", read_page_text("dca1000.md")))
     assert bits == {str(s.value.bit_length() - 1): s.name for s in dca1000.Status}
 
 
 def test_data_packet_headers():
     for label, number in (("first", 1), ("second", 2), ("46th", 46)):
-        header = shown_bytes("dca1000.md", label)
+        header = read_shown_bytes("dca1000.md", label)
         sequence, count = dca1000.decode_packet_header(header + b"x")
         assert (sequence, count) == (number, (number - 1) * dca1000.MAX_PAYLOAD_BYTES)
 
@@ -186,7 +188,7 @@ def test_data_packet_headers():
 
 
 def test_sub_blocks_are_those_of_the_published_rig():
-    rig = native_rig()
+    rig = make_native_rig()
     board_program = make_program(rig, rig.by_name("RH"))
     sent: list[Command] = [
         DEVICE_CONFIGURATION,
@@ -194,22 +196,22 @@ def test_sub_blocks_are_those_of_the_published_rig():
         *board_program.waveform,
         *board_program.make_frame_commands(rig.grid.columns * 16),
     ]
-    table = {row[0]: row[3] for row in rows("mmwavelink.md", "Sub-blocks")}
+    table = {row[0]: row[3] for row in read_table_rows("mmwavelink.md", "Sub-blocks")}
     for message in sent:
         number = f"0x{message.ID:04X}"
         answer = table[number]
         if answer == "see below":
-            raw = shown_bytes("mmwavelink.md", number)
+            raw = read_shown_bytes("mmwavelink.md", number)
         else:
             raw = bytes.fromhex(answer.strip("`"))
         assert raw == message.block().data, number
-    order = [row[0] for row in rows("mmwavelink.md", "Sub-blocks")]
+    order = [row[0] for row in read_table_rows("mmwavelink.md", "Sub-blocks")]
     places = [order.index(f"0x{message.ID:04X}") for message in sent]
     assert places == sorted(places)
 
 
 def test_the_page_names_every_sub_block_that_is_sent():
-    page = text("mmwavelink.md")
+    page = read_page_text("mmwavelink.md")
     numbers = {c.ID for c in vars(commands).values() if isinstance(c, type) and isinstance(getattr(c, "ID", None), int)}
     bare = {c.ID for c in vars(commands).values() if isinstance(c, commands.ConstantCommand)}
     assert len(numbers | bare) > 20
@@ -218,13 +220,13 @@ def test_the_page_names_every_sub_block_that_is_sent():
 
 def test_whole_messages():
     for label, number, message_kind in (("frame start", 3, 1), ("stop 4", 4, 4)):
-        answer = decode(shown_bytes("mmwavelink.md", f"{label}, sequence {number}"))
+        answer = decode(read_shown_bytes("mmwavelink.md", f"{label}, sequence {number}"))
         assert (answer.direction, answer.kind, answer.sequence) == (Direction.HOST_TO_RF, Kind.COMMAND, number)
         assert answer.blocks == (SubBlock(0x0140, struct.pack("<HH", message_kind, 0)),)
 
 
 def test_events():
-    table = {row[0]: row[1:] for row in rows("mmwavelink.md", "Events")[2:]}
+    table = {row[0]: row[1:] for row in read_table_rows("mmwavelink.md", "Events")[2:]}
     assert {int(number, 16): name for number, (name, *_) in table.items()} == {
         number: name for number, (name, _) in radar_messages._EVENTS.items()
     }
@@ -236,7 +238,7 @@ def test_events():
 def test_pages_name_files_that_exist():
     for page in sorted(SPEC.glob("*.md")):
         for path in re.findall(
-            r"`((?:host|shared|simulators|pi_controller|arduino_stage|tests)/[\w/.]+\w)`", text(page.name)
+            r"`((?:host|shared|simulators|pi_controller|arduino_stage|tests)/[\w/.]+\w)`", read_page_text(page.name)
         ):
             assert (ROOT / Path(path)).exists(), f"{page.name} names {path}"
 
@@ -250,13 +252,17 @@ def test_every_request_to_the_server_is_described(tmp_path):
     routes = [*make_app(front).routes, *reading_routes(site), *command_routes(site)]
     for method in ("GET", "POST"):
         served = {r.path for r in routes if isinstance(r, Route) and method in (r.methods or ())}
-        described = {path for row in rows("requests.md", method) for path in re.findall(r"`(/api/[^`]+)`", row[0])}
+        described = {
+            path for row in read_table_rows("requests.md", method) for path in re.findall(r"`(/api/[^`]+)`", row[0])
+        }
         assert described == {path for path in served if path.startswith("/api/")} - {"/api/{path:path}"}
 
 
 @pytest.mark.parametrize("part", [ScanList, ListedScan])
 def test_every_key_of_the_list_of_scans_is_described(part):
     described = {
-        key for row in rows("requests.md", "The list and its changes") for key in re.findall(r"`(\w+)`", row[0])
+        key
+        for row in read_table_rows("requests.md", "The list and its changes")
+        for key in re.findall(r"`(\w+)`", row[0])
     }
     assert {field.encode_name for field in msgspec.structs.fields(part)} <= described

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from tests.support.doctor.live_rig import SCENE, LiveRig, impatient_rig
+from tests.support.doctor.live_rig import SCENE, LiveRig, make_impatient_rig
 from tests.support.processes import Bench
 
 from polysight_shared.tables import to_builtins
@@ -17,7 +17,7 @@ from polysight_simulators.loopback import move_to_free_subnet
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
     """A simulated rig that runs, with its Pi."""
     folder = tmp_path_factory.mktemp("d")
-    (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(impatient_rig())))
+    (folder / "base.toml").write_text(tomli_w.dumps(to_builtins(make_impatient_rig())))
     (folder / "scene.toml").write_text(SCENE)
     with closing(Bench(folder)) as bench:
         options = (
@@ -40,5 +40,5 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveRig]:
 def deaf_rig(tmp_path: Path) -> LiveRig:
     """A rig file on a free subnet without any device."""
     path = tmp_path / "instrument.toml"
-    path.write_text(tomli_w.dumps(to_builtins(move_to_free_subnet(impatient_rig()))))
+    path.write_text(tomli_w.dumps(to_builtins(move_to_free_subnet(make_impatient_rig()))))
     return LiveRig(tmp_path, path)

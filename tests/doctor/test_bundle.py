@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 import zmq
-from tests.support.rigs import rig_table
+from tests.support.rigs import load_rig_table
 from tests.support.store.faulty_disk import FaultyDisk
 from zmq.auth import create_certificates
 
@@ -28,7 +28,7 @@ def place(tmp_path: Path) -> Path:
     create_certificates(keys, "host")
     create_certificates(keys, "pi")
     secret = (keys / "host.key_secret").read_text().split('secret-key = "')[1].split('"')[0]
-    table = rig_table()
+    table = load_rig_table()
     table["pi"] |= {"key_dir": str(keys)}
     table["radar"] |= {"trace_dir": str(tmp_path / "traces")}
     (tmp_path / "instrument.toml").write_text(f"# {secret}\n{tomli_w.dumps(table)}")
@@ -45,7 +45,7 @@ def place(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def contents(file: Path) -> dict[str, bytes]:
+def read_contents(file: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(file) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
 
@@ -55,7 +55,7 @@ def bundle(place: Path) -> dict[str, bytes]:
     rig = load_instrument(place / "instrument.toml")
     options = DoctorOptions(place / "instrument.toml", place / "scans")
     write_bundle(place / "found.zip", options, rig, [ok("all is well")], "ok all is well\n")
-    return contents(place / "found.zip")
+    return read_contents(place / "found.zip")
 
 
 def test_the_bundle_has_no_key(place: Path, bundle: dict[str, bytes]) -> None:
@@ -93,7 +93,7 @@ def test_the_command_writes_a_bundle_although_the_rig_file_is_damaged(tmp_path: 
     (tmp_path / "rig.toml").write_text("grid = ")
     out = tmp_path / "found.zip"
     assert main(["doctor", "--config", str(tmp_path / "rig.toml"), "--out", str(tmp_path), "--bundle", str(out)]) == 1
-    contents_of_bundle = contents(out)
+    contents_of_bundle = read_contents(out)
     assert json.loads(contents_of_bundle["findings.json"])[0]["verdict"] == "error"
     assert contents_of_bundle["rig.toml"] == b"grid = "
 

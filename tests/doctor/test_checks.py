@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from tests.support.calibration import filter_file
 from tests.support.doctor.case import QUICK, RIG, make_context
-from tests.support.rigs import programmed_rig
+from tests.support.rigs import make_programmed_rig
 
 from polysight.calibration.files import write_calibration
 from polysight.capture.card import CardSurvey
@@ -50,7 +50,7 @@ def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
 
 def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_text(tomli_w.dumps(to_builtins(programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
+    path.write_text(tomli_w.dumps(to_builtins(make_programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
     with CheckContext(DoctorOptions(path), QUICK) as context:
         finding = next(run_checks(context))
     assert (finding.where, finding.level) == ("config", "error")
@@ -61,12 +61,14 @@ def join_reasons(context, name):
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
-    context = make_context(programmed_rig(calibration={"hpf": str(write_calibration(filter_file(), tmp_path))}))
+    context = make_context(make_programmed_rig(calibration={"hpf": str(write_calibration(filter_file(), tmp_path))}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)
     assert join_reasons(dataclasses.replace(context, hello=real), "calibration") == "error"
-    assert join_reasons(make_context(programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
+    assert (
+        join_reasons(make_context(make_programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
+    )
 
 
 @pytest.mark.parametrize(
@@ -88,7 +90,7 @@ def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, public_mo
         (tmp_path / name).touch(its_mode)
         (tmp_path / name).chmod(its_mode)
     addresses = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-    assert check_keys(make_context(programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
+    assert check_keys(make_context(make_programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
 
 
 def test_the_kernel_reports_if_its_clock_is_synchronised():
@@ -96,8 +98,8 @@ def test_the_kernel_reports_if_its_clock_is_synchronised():
 
 
 def test_a_full_disk_and_a_slow_one(tmp_path):
-    assert check_disk(make_context(programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).level == "error"
-    small = programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
+    assert check_disk(make_context(make_programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).level == "error"
+    small = make_programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
     rate = check_disk(make_context(small, tmp_path)).facts["scan_bytes_s"]
     for factor, verdict in ((0.5, "error"), (1.5, "warning"), (3.0, "ok")):
         system = System(write_speed=lambda _folder, speed=factor * rate: speed)
@@ -117,7 +119,7 @@ def test_the_published_scan_takes_two_hours(tmp_path):
     assert finding.facts["bytes"] == 2 * 70_000 * 65_536
 
 
-def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
+def make_kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
     """A file system with sysfs and procfs of one interface, with the subnet 192.168.33.0/24."""
     net = tmp_path / "sys/class/net/eth7"
     (net / "statistics").mkdir(parents=True)
@@ -142,7 +144,7 @@ def kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
     ],
 )
 def test_an_unsuitable_network_interface_is_a_warning_and_unknown_values_are_ok(tmp_path, interface, verdict):
-    finding = check_network(make_context(RIG, system=kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
+    finding = check_network(make_context(RIG, system=make_kernel_root(tmp_path, **interface)), RIG.by_name("RH"))
     assert finding.level == verdict
     assert "eth7" in finding.what
 
@@ -154,7 +156,7 @@ def test_every_need_is_a_check_before_it():
         checked.add(check.name)
 
 
-def simulated_checks(failing):
+def replace_checks(failing):
     """All checks replaced: the one with this title fails, the others are ok."""
 
     def replace_check(check):
@@ -179,7 +181,7 @@ def simulated_checks(failing):
     ],
 )
 def test_only_checks_that_depend_on_a_failed_one_are_skipped(monkeypatch, failing, skipped):
-    monkeypatch.setattr(checks, "CHECKS", simulated_checks(failing))
+    monkeypatch.setattr(checks, "CHECKS", replace_checks(failing))
     findings = {f.where: f for f in run_checks(CheckContext(DoctorOptions(Path("x"))))}
     assert {name for name, f in findings.items() if f.level == "note"} == skipped
     assert all(failing in findings[name].what for name in skipped)
@@ -192,13 +194,13 @@ def test_receivers_must_keep_up_with_the_configured_rate_of_the_cards(tmp_path, 
     def measure(_rig, rates):
         return [LoadResult(r, r, 100, n) for r, n in zip(rates, lost, strict=True)], "nice -5"
 
-    finding = check_receivers(make_context(programmed_rig(), tmp_path, System(measure_receivers=measure)))
+    finding = check_receivers(make_context(make_programmed_rig(), tmp_path, System(measure_receivers=measure)))
     assert finding.level == verdict
     assert ("50.0 %" in finding.what) == bool(lost[2])
 
 
 def test_the_receivers_are_measured_with_packets_at_each_rate():
-    results, scheduling = measure_receivers(programmed_rig(), [500.0, 1000.0], seconds=0.2)
+    results, scheduling = measure_receivers(make_programmed_rig(), [500.0, 1000.0], seconds=0.2)
     assert scheduling
     assert [(r.wanted, r.sent) for r in results] == [(500.0, 200), (1000.0, 400)]
     assert all(r.reached > 0 for r in results)

@@ -8,7 +8,7 @@ import json
 import time
 
 import pytest
-from tests.support.calibration import board_filter, filter_file
+from tests.support.calibration import filter_file, read_board_filter
 from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
@@ -122,7 +122,7 @@ def test_a_scan_in_progress_is_not_disturbed(live):
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
-    filters = filter_file(rv=board_filter(172.5, 347.0))
+    filters = filter_file(rv=read_board_filter(172.5, 347.0))
     path = write_calibration(filters, live.folder / "calibration")
 
     def small(table):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from tests.support.processes import Bench
-from tests.support.rigs import rig_with
-from tests.support.simulated_rig import SCENE, Rig, running
+from tests.support.rigs import make_rig_with
+from tests.support.simulated_rig import SCENE, Rig, run_simulated_rig
 
 from polysight_shared.config import Instrument
 from polysight_simulators.loopback import move_to_free_subnet
@@ -16,7 +16,7 @@ from polysight_simulators.loopback import move_to_free_subnet
 @pytest.fixture(scope="session")
 def running_rig() -> Callable[..., AbstractContextManager[Rig]]:
     """`running_rig(folder, ...)`: a simulated rig for a block."""
-    return running
+    return run_simulated_rig
 
 
 @pytest.fixture
@@ -28,14 +28,14 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[Rig]:
-    with running(tmp_path) as new_rig:
+    with run_simulated_rig(tmp_path) as new_rig:
         yield new_rig
 
 
 @pytest.fixture
 def rig_without_compiler(tmp_path: Path) -> Iterator[Rig]:
     """A rig whose simulators find no compiler: its stage is the Python stand-in."""
-    with running(tmp_path, env={"PATH": str(tmp_path)}) as new_rig:
+    with run_simulated_rig(tmp_path, env={"PATH": str(tmp_path)}) as new_rig:
         yield new_rig
 
 
@@ -51,4 +51,4 @@ def lonely_instrument(tmp_path: Path) -> Instrument:
     """A rig file's content with addresses on a free loopback subnet, without devices."""
     pi = {"journal_dir": str(tmp_path / "journal")}
     stage = {"port": str(tmp_path / "ttyNONE")}
-    return move_to_free_subnet(rig_with(limits={"command_timeout_s": 0.6}, pi=pi, stage=stage))
+    return move_to_free_subnet(make_rig_with(limits={"command_timeout_s": 0.6}, pi=pi, stage=stage))

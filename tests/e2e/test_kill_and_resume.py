@@ -19,7 +19,7 @@ def rig(tmp_path, running_rig):
         yield new_rig
 
 
-def digests(path):
+def compute_digests(path):
     """SHA-256 of every file of every committed row."""
     files = [path / b.file for row in ScanFolder.load(path).committed_rows().values() for b in row.boards.values()]
     return {f: hashlib.sha256(f.read_bytes()).hexdigest() for name in files for f in (name, name.with_suffix(".idx"))}
@@ -28,7 +28,7 @@ def digests(path):
 def check_whole(rig, before):
     """The scan is finished and valid, and rows that were committed before have not changed."""
     path = rig.folder / "scan"
-    digests_after = digests(path)
+    digests_after = compute_digests(path)
     assert {file: digests_after[file] for file in before} == before
     assert len(ScanFolder.load(path).committed_rows()) == 6
     validated = rig.here("validate", path)
@@ -52,6 +52,6 @@ def test_interrupted(rig, times):
     assert f"polysight resume {path}" in ended.message
     assert 3 - times <= 6 - rows_to_come < 6
     assert times == 2 or not list(path.glob("raw/*/*.part")), "the running row was ended, not cut"
-    digests_before = digests(path)
+    digests_before = compute_digests(path)
     assert rig.polysight("resume", path, "--no-process").status == 0
     check_whole(rig, digests_before)

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from tests.support.paths import REPO
 from tests.support.products import skip_rendering
-from tests.support.scenes import small_scene
+from tests.support.scenes import write_small_scene
 from tests.support.store.facts import load_facts
 
 from polysight.pipeline import Pipeline
@@ -35,7 +35,7 @@ from polysight_shared.messages import RowStarted
 pytestmark = pytest.mark.slow
 KILLED_AT = REPO / "tests/support/killed_at.py"
 NO_RESULT = 7
-SCENE = small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)
+SCENE = write_small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)
 # The aperture is too small for the plate to be found by itself
 METAL = ["--metal", "0,0,50,50"]
 ROWS = 4
@@ -109,7 +109,7 @@ class Killed:
         self.note("host", self.hits)
         self.note("Pi", self.pi_hits)
         self.restart_pi()
-        self.rows = rows(rig.folder / "undisturbed")
+        self.rows = compute_row_digests(rig.folder / "undisturbed")
         self.image = image(rig.folder / "undisturbed")
 
     def start(self, places: Sequence[Place], *command: str | Path) -> tuple[Any, Path]:
@@ -179,16 +179,16 @@ class Killed:
         self.strike(kill, folder)
         again = []
         for place in [*kill.resumes, None]:
-            safe_before = safe(folder, self.rows)
+            safe_before = check_committed_rows(folder, self.rows)
             ended = self.scan(folder, [place] if place else list_kinds(RESUME_PLACES)).wait()
             assert ended.status == 0 or (place and ended.status == -signal.SIGKILL), f"{kill}\n{ended.err}"
             if place:
                 self.check_died(ended.status, place, self.hits)
             self.note("resume", self.hits)
-            assert safe_before.items() <= safe(folder, self.rows).items(), kill
-            again.append(len(retaken(folder)))
+            assert safe_before.items() <= check_committed_rows(folder, self.rows).items(), kill
+            again.append(len(list_retaken_rows(folder)))
         assert validate(folder) == [], kill
-        assert rows(folder) == self.rows, kill
+        assert compute_row_digests(folder) == self.rows, kill
         assert image(folder) == self.image, kill
         assert max(again) <= 1, kill
         started = [e for e in read_events(folder / "events.msgpack").events if isinstance(e, RowStarted)]
@@ -206,23 +206,23 @@ def has_begun(folder: Path) -> bool:
     return path.exists() and manifest.read(path).length > 0
 
 
-def rows(folder: Path) -> dict[str, str]:
+def compute_row_digests(folder: Path) -> dict[str, str]:
     """SHA-256 of every committed row of every board."""
     files = [b.file for row in ScanFolder.load(folder).committed_rows().values() for b in row.boards.values()]
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
 
 
-def safe(folder: Path, truth: dict[str, str]) -> dict[str, str]:
+def check_committed_rows(folder: Path, truth: dict[str, str]) -> dict[str, str]:
     """SHA-256 of the committed rows of an interrupted scan; all must be good. Empty if the scan is not begun."""
     if not has_begun(folder):
         return {}
     assert [f for f in validate(folder) if f.level == "error"] == []
-    row_states = rows(folder)
+    row_states = compute_row_digests(folder)
     assert row_states.items() <= truth.items()
     return row_states
 
 
-def retaken(folder: Path) -> set[int]:
+def list_retaken_rows(folder: Path) -> set[int]:
     """Rows that the last resume has retaken, by the manifest, without those that it rejected itself."""
     if not has_begun(folder):
         return set()
@@ -307,7 +307,7 @@ def test_pi_is_lost_with_its_journal(killed_rig: Killed):
     assert 0 < len(list_committed(folder)) < ROWS
     assert ended.message.startswith("polysight scan: the Pi at tcp://")
     assert "polysight-pi" in ended.message
-    safe_before = safe(folder, killed_rig.rows)
+    safe_before = check_committed_rows(folder, killed_rig.rows)
     refused = killed_rig.scan(folder).wait()
     assert refused.status == 5
     assert "the Pi at tcp://" in refused.message
@@ -318,9 +318,9 @@ def test_pi_is_lost_with_its_journal(killed_rig: Killed):
     resumed = killed_rig.scan(folder).wait()
     assert resumed.status == 0, resumed.err
     assert f"journal of this scan ends {known_events} events before" in " ".join(resumed.err.split())
-    assert safe_before.items() <= rows(folder).items()
-    assert (validate(folder), rows(folder)) == ([], killed_rig.rows)
-    assert len(retaken(folder)) <= 1
+    assert safe_before.items() <= compute_row_digests(folder).items()
+    assert (validate(folder), compute_row_digests(folder)) == ([], killed_rig.rows)
+    assert len(list_retaken_rows(folder)) <= 1
 
 
 def list_committed(folder: Path) -> list[int]:

@@ -11,8 +11,8 @@ import pytest
 import zmq
 from tests.support.page.chromium import DESK, PHONE, Browser
 from tests.support.processes import Program
-from tests.support.scenes import small_scene
-from tests.support.simulated_rig import Rig, running
+from tests.support.scenes import write_small_scene
+from tests.support.simulated_rig import Rig, run_simulated_rig
 
 from polysight.acquisition.pi_client import PiClient
 from polysight.catalogue import PROGRAM_FOLDER, find_program
@@ -21,7 +21,7 @@ from polysight_shared.messages import BeginRun
 from polysight_shared.raster import plan_raster
 
 ROWS = 40
-SCENE = small_scene(10, ROWS, step_mm=(10.0, 5.0))
+SCENE = write_small_scene(10, ROWS, step_mm=(10.0, 5.0))
 pytestmark = pytest.mark.slow
 
 
@@ -92,7 +92,7 @@ def _program(folder: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Lab]:
-    with running(tmp_path_factory.mktemp("lab"), time_scale=3.0, scene=SCENE) as rig:
+    with run_simulated_rig(tmp_path_factory.mktemp("lab"), time_scale=3.0, scene=SCENE) as rig:
         yield Lab(rig, browser)
 
 

@@ -33,18 +33,18 @@ for package in (polysight_pi, polysight_shared):
 """
 
 
-def alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
+def run_alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
     code = BLOCK.format(absent=set(absent)) + code
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
 def test_every_module_imports():
-    ended = alone(EVERYTHING, *HOST_ONLY)
+    ended = run_alone(EVERYTHING, *HOST_ONLY)
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_the_block_blocks():
-    assert "No module named 'numpy'" in alone("import numpy", *HOST_ONLY).stderr
+    assert "No module named 'numpy'" in run_alone("import numpy", *HOST_ONLY).stderr
 
 
 def test_gpio_without_gpiod_is_one_message():
@@ -53,7 +53,7 @@ def test_gpio_without_gpiod_is_one_message():
         "from polysight_shared.errors import PolysightError\n"
         "try:\n    load_gpiod()\nexcept PolysightError as e:\n    print(e)\n"
     )
-    ended = alone(code, *HOST_ONLY)
+    ended = run_alone(code, *HOST_ONLY)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert "gpiod" in ended.stdout
     assert "do: " in ended.stdout

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 import tomli_w
-from tests.support.rigs import rig_table
+from tests.support.rigs import load_rig_table
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.progress import ScanResult
@@ -23,7 +23,7 @@ PORTS = {"LS": 5000, "RH": 5001, "RV": 5002}
 
 def scan_three_rows(bench, radar: dict[str, Any], burst: dict[str, Any]) -> ScanResult:
     """Scan three rows of eight positions; every row is complete and each radar was armed once for it."""
-    table = rig_table()
+    table = load_rig_table()
     table["grid"] |= {"columns": COLUMNS, "rows": ROWS}
     table["burst"] |= burst
     table["limits"] |= {"end_of_record_s": 1.0, "row_retakes": 2, "command_timeout_s": 5.0}

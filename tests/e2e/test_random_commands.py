@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from docs.check.commands import find_parser
 from tests.support.paths import RIG_FILE
-from tests.support.scenes import small_scene
+from tests.support.scenes import write_small_scene
 
 from polysight.cli.main import main
 from polysight_simulators.__main__ import main as simulators
@@ -38,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A processed scan, and files that are not ours."""
     folder = tmp_path_factory.mktemp("random")
     shutil.copy(RIG_FILE, folder)
-    (folder / "scene.toml").write_text(small_scene(12, 4, pixels=30, pixel_mm=5.0, seed=1))
+    (folder / "scene.toml").write_text(write_small_scene(12, 4, pixels=30, pixel_mm=5.0, seed=1))
     (folder / "text.txt").write_text("hello\n")
     (folder / "random.bin").write_bytes(random.Random(1).randbytes(5000))
     (folder / "empty").touch()
@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def commands() -> dict[str, argparse.ArgumentParser]:
+def list_command_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that are drawn."""
     parser = find_parser("polysight.cli.main")
     assert parser is not None
@@ -83,7 +83,7 @@ def draw_words(parser: argparse.ArgumentParser, draw: random.Random) -> Iterator
                 yield draw_value(action, draw)
 
 
-def each_number(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str]]:
+def list_number_commands(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str]]:
     """Command lines of a command that give each number to each option with a value."""
     options = [action for action in parser._actions if action.option_strings and action.nargs != 0]
     places = ["scan" for action in parser._actions if not action.option_strings]
@@ -118,7 +118,7 @@ def check_end(words: list[str]) -> None:
 
 def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
     draw = random.Random(1)
-    parsers = commands()
+    parsers = list_command_parsers()
     cases = CASES_LONG * len(parsers) if request.config.getoption("--long") else CASES
     with chdir(folder):
         for _ in range(cases):
@@ -128,7 +128,7 @@ def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
 
 
 def test_each_option_takes_each_number_or_refuses_it(folder, monkeypatch, request):
-    lines = [words for name, parser in commands().items() for words in each_number(name, parser)]
+    lines = [words for name, parser in list_command_parsers().items() for words in list_number_commands(name, parser)]
     if not request.config.getoption("--long"):
         lines = random.Random(2).sample(lines, CASES // 3)
     with chdir(folder):

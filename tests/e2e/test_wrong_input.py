@@ -17,11 +17,11 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.processes import HANG_S
-from tests.support.scenes import small_scene
+from tests.support.scenes import write_small_scene
 
 from polysight_shared.tables import to_builtins
 
-SCENE = small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
+SCENE = write_small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
 
 
 def check_refusal(ended, *words: str, status: int | None = None) -> None:
@@ -178,7 +178,7 @@ def wires(bench):
     return path
 
 
-def listening(address: str) -> socket.socket:
+def listen_on(address: str) -> socket.socket:
     """A socket that holds a `tcp://` address."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     server = socket.create_server((host, int(port)))
@@ -211,7 +211,7 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
     table = to_builtins(lonely_instrument)
     table["limits"]["command_timeout_s"] = HANG_S
     lonely.write_text(tomli_w.dumps(table))
-    with listening(lonely_instrument.pi.command_address):
+    with listen_on(lonely_instrument.pi.command_address):
         scan = bench.start("polysight", "scan", "--config", lonely, "--out", "s")
         bench.wait_for(lambda: "connect" in scan.err, "the scan says that it connects")
         scan.interrupt()

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from tests.support.paths import REPO
-from tests.support.rigs import rig_table, rig_with
+from tests.support.rigs import load_rig_table, make_rig_with
 
 from polysight.materials import Library
 from polysight_simulators.scene import decode_scene, simulate
@@ -21,7 +21,7 @@ def run(name: str) -> dict:
     return runpy.run_path(str(SCRIPTS / f"{name}.py"))
 
 
-def code_lines(cells: str) -> list[str]:
+def list_code_lines(cells: str) -> list[str]:
     return [line for line in cells.splitlines() if line.strip() and not line.startswith("#")]
 
 
@@ -39,9 +39,9 @@ def test_raw_to_image(folder, rx):
     image = {"columns": 40, "rows": 40, "pixel_mm": 2.0}
     raw = {"name": "a point", "grid": grid, "burst": {"pulses": 2}, "image": image}
     scene = decode_scene({**raw, "points": [{"position_mm": [10.0, -6.0]}]}, "test")
-    antennas = {"rx_mm": rig_table()["antennas"]["rx_mm"][:rx]}
+    antennas = {"rx_mm": load_rig_table()["antennas"]["rx_mm"][:rx]}
     shutil.rmtree(folder / "out" / "points", ignore_errors=True)
-    simulate(rig_with(antennas=antennas), scene, folder / "out" / "points")
+    simulate(make_rig_with(antennas=antennas), scene, folder / "out" / "points")
     images = run("raw_to_image")["images"]
     row, column = np.unravel_index(np.argmax(np.abs(images.h_raw)), images.h_raw.shape)
     centre = (images.x_m.mean(), images.y_m.mean())
@@ -52,7 +52,7 @@ def test_raw_to_image(folder, rx):
 
 def test_raw_to_image_takes_twenty_lines():
     to_the_image, _, _ = (SCRIPTS / "raw_to_image.py").read_text(encoding="utf-8").rpartition("# %%")
-    assert len(code_lines(to_the_image)) <= LIMIT
+    assert len(list_code_lines(to_the_image)) <= LIMIT
 
 
 def test_own_scene_then_own_material(folder, capsys):
@@ -76,6 +76,6 @@ STEPS = sorted(path for path in SCRIPTS.glob("*.py") if path.stem != "bluesky_sc
 
 @pytest.mark.parametrize("script", STEPS, ids=lambda p: p.stem)
 def test_examples_hold_no_logic_and_no_private_names(script):
-    code = code_lines(script.read_text(encoding="utf-8"))
+    code = list_code_lines(script.read_text(encoding="utf-8"))
     assert not [line for line in code if line.lstrip().startswith(("def ", "class ", "if ", "while ", "try"))]
     assert not [line for line in code if "import _" in line or "._" in line]

@@ -111,11 +111,11 @@ def test_the_root_of_host_is_the_flow_and_rooms():
     assert len((HOST / "pipeline.py").read_text(encoding="utf-8").splitlines()) <= 135
 
 
-def rooms() -> list[Path]:
+def list_rooms() -> list[Path]:
     return sorted(p.parent for p in HOST.glob("*/__init__.py") if p.parent.name != "data")
 
 
-@pytest.mark.parametrize("room", rooms(), ids=lambda p: p.name)
+@pytest.mark.parametrize("room", list_rooms(), ids=lambda p: p.name)
 def test_the_front_of_each_room_describes_it(room):
     tree = ast.parse((room / "__init__.py").read_text(encoding="utf-8"))
     docstring = ast.get_docstring(tree) or ""
@@ -124,7 +124,7 @@ def test_the_front_of_each_room_describes_it(room):
     )
 
 
-def imports(file: Path) -> list[tuple[int, str]]:
+def list_imports(file: Path) -> list[tuple[int, str]]:
     return [(line, module) for line, _, module, _ in read_facts(file).imports if module]
 
 
@@ -138,7 +138,7 @@ def find_room(file: Path) -> str:
 def test_neighbours_import_only_from_a_rooms_front():
     past = []
     for file in (f for top in (HOST, PAPERS) for f in top.rglob("*.py")):
-        for line, module in imports(file):
+        for line, module in list_imports(file):
             parts = module.split(".")
             inside = (find_room(file), *ENTERED_BY_MODULE)
             if parts[0] == "polysight" and len(parts) > 2 and parts[1] not in inside and file != HOST / "__init__.py":
@@ -171,7 +171,7 @@ def test_only_simulators_use_simulators():
     wrong = [
         f"{f.relative_to(ROOT)}:{line} {module}"
         for f in files
-        for line, module in imports(f)
+        for line, module in list_imports(f)
         if module.startswith("polysight_simulators")
     ]
     assert wrong == []
@@ -180,7 +180,7 @@ def test_only_simulators_use_simulators():
 def test_worlds_know_nothing_of_ours():
     """Simulators judge the instrument, so they share no code and no assumption with it."""
     files = (ROOT / "worlds").rglob("*.py")
-    used = {module.split(".")[0] for file in files for _, module in imports(file)}
+    used = {module.split(".")[0] for file in files for _, module in list_imports(file)}
     assert used - set(sys.stdlib_module_names) == {"numpy", "scipy", "polysight_worlds"}
 
 
@@ -194,5 +194,5 @@ def test_the_pi_half_needs_only_what_its_wheel_brings():
     allowed = {*sys.stdlib_module_names, "polysight_pi", "polysight_shared", "gpiod", "msgpack", "msgspec", "serial"}
     allowed.add("zmq")
     files = [f for top in ("shared", "pi_controller") for f in (ROOT / top / PROJECTS[top]).glob("*.py")]
-    foreign_imports = {f"{f.name}: {m}" for f in files for _, m in imports(f) if m.split(".")[0] not in allowed}
+    foreign_imports = {f"{f.name}: {m}" for f in files for _, m in list_imports(f) if m.split(".")[0] not in allowed}
     assert foreign_imports == set()

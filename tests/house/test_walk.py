@@ -14,12 +14,12 @@ PROCESSED_FROM = 6
 """The first file of the processing; those before it run in the processes of a scan, which tests/e2e covers."""
 
 
-def stops() -> list[tuple[int, Path, str]]:
+def read_stops() -> list[tuple[int, Path, str]]:
     lines = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines()
     return [(int(m[1]), ROOT / m[2], m[3]) for m in map(ROW.match, lines) if m]
 
 
-def functions(file: Path) -> set[str]:
+def list_functions(file: Path) -> set[str]:
     """Names of functions, methods as `Class.method`."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     names = {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
@@ -29,13 +29,13 @@ def functions(file: Path) -> set[str]:
 
 
 def test_there_are_at_most_twelve_and_they_are_numbered():
-    assert [n for n, _, _ in stops()] == list(range(1, len(stops()) + 1))
-    assert 1 < len(stops()) <= 12
+    assert [n for n, _, _ in read_stops()] == list(range(1, len(read_stops()) + 1))
+    assert 1 < len(read_stops()) <= 12
 
 
-@pytest.mark.parametrize(("file", "name"), [(f, n) for _, f, n in stops()], ids=lambda v: getattr(v, "name", v))
+@pytest.mark.parametrize(("file", "name"), [(f, n) for _, f, n in read_stops()], ids=lambda v: getattr(v, "name", v))
 def test_every_stop_is_a_file_and_a_function(file, name):
-    assert name in functions(file)
+    assert name in list_functions(file)
 
 
 # Files of the host and of shared that one row passes from its raw bytes to a name; 51 in November 2026.
@@ -85,7 +85,7 @@ def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
 
 def test_a_scan_passes_the_stops_in_their_order(walk):
     calls, _ = walk
-    stop_numbers = {(str(file), name.rpartition(".")[2]): n for n, file, name in stops() if n >= PROCESSED_FROM}
+    stop_numbers = {(str(file), name.rpartition(".")[2]): n for n, file, name in read_stops() if n >= PROCESSED_FROM}
     passed = [stop_numbers[call] for call in calls if call in stop_numbers]
     assert passed == sorted(stop_numbers.values())
 

@@ -13,11 +13,11 @@ from polysight.imaging.spectral import IncrementalImager, SpectralImager
 from polysight_shared.errors import ErrorCode
 
 
-def _strict():
+def _load_strict():
     return importlib.import_module("array_api_strict"), None
 
 
-def _gpu():
+def _load_gpu():
     try:
         torch = importlib.import_module("torch")
     except ImportError:
@@ -32,7 +32,7 @@ def _gpu():
     return importlib.import_module("array_api_compat.cupy"), None
 
 
-@pytest.fixture(params=[_strict, _gpu], ids=["array-api-strict", "gpu"])
+@pytest.fixture(params=[_load_strict, _load_gpu], ids=["array-api-strict", "gpu"])
 def library(request):
     return request.param()
 
@@ -45,7 +45,7 @@ def aperture(make_rig):
     return Aperture(antennas, scan_offsets_m(rig), np.linspace(76.3e9, 79.7e9, 7), grid)
 
 
-def _back(array):
+def _copy_to_numpy(array):
     array = array.cpu() if hasattr(array, "cpu") else array
     return np.asarray(array.get() if hasattr(array, "get") else array)
 
@@ -70,7 +70,7 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make):
         (imager.samples(put(pixels)), plain.samples(pixels)),
     ):
         assert type(result) is type(put(samples))
-        assert np.abs(_back(result) - want).max() < 1e-5 * np.abs(want).max()
+        assert np.abs(_copy_to_numpy(result) - want).max() < 1e-5 * np.abs(want).max()
 
 
 def test_backproject_and_project_run_on_the_library_of_their_samples(library):
@@ -83,7 +83,7 @@ def test_backproject_and_project_run_on_the_library_of_their_samples(library):
     pixels = rng.standard_normal(7) + 1j
     for function, array in ((backproject, samples), (project, pixels)):
         result = function(xp.asarray(array, device=device), f, *places, reference)
-        np.testing.assert_allclose(_back(result), function(array, f, *places, reference), rtol=1e-9)
+        np.testing.assert_allclose(_copy_to_numpy(result), function(array, f, *places, reference), rtol=1e-9)
 
 
 def test_without_array_api_compat_other_libraries_are_refused(monkeypatch, aperture):

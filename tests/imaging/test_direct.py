@@ -7,7 +7,7 @@ from polysight.imaging import backproject, project
 from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
 
-def _phase_history(f, tx, rx, reference, points, amplitudes):
+def _compute_phase_history(f, tx, rx, reference, points, amplitudes):
     out = np.zeros((len(tx), f.size), complex)
     for point, amplitude in zip(points, amplitudes, strict=True):
         d = np.linalg.norm(point - tx, axis=1) + np.linalg.norm(point - rx, axis=1) - reference
@@ -23,7 +23,7 @@ def test_a_monostatic_radar_referenced_to_the_scene_centre_focuses_in_three_dime
     reference = 2 * np.linalg.norm(radar, axis=1)
     points = np.array([[1.0, -0.5, 0.2], [-1.5, 1.0, 0.0]])
     amplitudes = np.array([1.0, 0.5j])
-    samples = _phase_history(f, radar, radar, reference, points, amplitudes)
+    samples = _compute_phase_history(f, radar, radar, reference, points, amplitudes)
     axes = np.linspace(-2, 2, 81), np.linspace(-2, 2, 41)
     x, y = np.meshgrid(*axes)
     voxels = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.2)])

@@ -10,7 +10,7 @@ from polysight.imaging.focus import _interpolate_stack, focus_sweep
 PLACES_MM = [(-60, -55), (-10, -60), (58, -50), (-62, 5), (3, -4), (60, 8), (-55, 60), (8, 55), (61, 58)]
 
 
-def _swept(make_rig, points_rows, depth_mm=0.0, tilt_deg=(0.0, 0.0), noise=0.3):
+def _sweep_focus(make_rig, points_rows, depth_mm=0.0, tilt_deg=(0.0, 0.0), noise=0.3):
     """Points on a plane `depth_mm` behind the rig file's, with the tilt `tilt_deg` along x and y."""
     rig = make_rig(88, 41, 8.0, 8.0, pixels=(75, 75))
     grid = image_grid(rig)
@@ -31,7 +31,7 @@ def _swept(make_rig, points_rows, depth_mm=0.0, tilt_deg=(0.0, 0.0), noise=0.3):
 def test_a_plane_wrong_by_3_mm_or_1_degree_is_found_within_half_a_millimetre_and_0_2_degrees(
     make_rig, points_rows, depth_mm, tilt_deg
 ):
-    focus = _swept(make_rig, points_rows, depth_mm, tilt_deg)
+    focus = _sweep_focus(make_rig, points_rows, depth_mm, tilt_deg)
     assert focus.depth_mm == pytest.approx(depth_mm, abs=0.5)
     np.testing.assert_allclose(focus.tilt_deg, tilt_deg, atol=0.2)
     assert focus.gain >= 1 - 1e-6

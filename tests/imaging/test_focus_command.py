@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight import report
 from polysight.cli.main import main
@@ -19,7 +19,7 @@ SCENE = {
     "burst": {"pulses": 2},
     "points": [{"position_mm": [0.0, 0.0], "amplitude": [0.8, 0.0]}],
 }
-RIG = published_rig()
+RIG = load_published_rig()
 
 
 def test_focus_of_a_too_narrow_scan_writes_figure_and_numbers_that_are_not_certain(tmp_path, capsys):

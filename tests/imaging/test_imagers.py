@@ -44,15 +44,15 @@ def aperture(make_rig):
     return make
 
 
-def _noise(rng, shape):
+def _draw_noise(rng, shape):
     return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
 
 
-def _samples(aperture, rng):
+def _draw_samples(aperture, rng):
     """A point in noise, some positions missing."""
     pixels = np.zeros(aperture.grid.shape, complex)
     pixels[aperture.grid.shape[0] // 3, aperture.grid.shape[1] // 2] = 1j
-    samples = DirectImager(aperture).samples(pixels) + 0.3 * _noise(rng, aperture.shape)
+    samples = DirectImager(aperture).samples(pixels) + 0.3 * _draw_noise(rng, aperture.shape)
     return (samples * (rng.uniform(size=aperture.shape[2:]) > 0.1)).astype(np.complex64)
 
 
@@ -61,7 +61,7 @@ def _samples(aperture, rng):
 def test_spectral_and_row_by_row_equal_the_direct_sum(aperture, grid, shifts):
     rng = np.random.default_rng(1)
     a = aperture(*grid, shifts_m=None if shifts == "serpentine" else rng.uniform(-1e-3, 1e-3, grid[1]))
-    samples = _samples(a, rng)
+    samples = _draw_samples(a, rng)
     d = a.antennas.mirror_m(a.grid.z_m) - a.antennas.direct_m
     echo = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(d, a.frequencies_hz)).astype(np.complex64)
     weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
@@ -85,8 +85,8 @@ def test_every_imager_is_the_adjoint_of_its_forward_model(aperture, grid, make):
     rng = np.random.default_rng(2)
     a = aperture(*grid)
     imager = make(a)
-    pixels = _noise(rng, a.grid.shape)
-    samples = _noise(rng, a.shape)
+    pixels = _draw_noise(rng, a.grid.shape)
+    samples = _draw_noise(rng, a.shape)
     forward = np.vdot(imager.samples(pixels), samples)
     back = np.vdot(pixels, imager.image(samples))
     assert abs(forward - back) < 1e-5 * np.linalg.norm(pixels) * np.linalg.norm(imager.image(samples))
@@ -95,7 +95,7 @@ def test_every_imager_is_the_adjoint_of_its_forward_model(aperture, grid, make):
 def test_forward_models_agree(aperture):
     rng = np.random.default_rng(3)
     a = aperture(31, 12, 4.0, 4.0, (20, 16), 2.0)
-    pixels = _noise(rng, a.grid.shape)
+    pixels = _draw_noise(rng, a.grid.shape)
     spectral, rows, direct = (make(a).samples(pixels) for make in IMAGERS)
     for image in (spectral, rows):
         assert np.linalg.norm(image - direct) < 3e-5 * np.linalg.norm(direct)
@@ -104,7 +104,7 @@ def test_forward_models_agree(aperture):
 @pytest.mark.parametrize("make", IMAGERS)
 def test_a_common_phase_is_kept(aperture, make):
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
-    samples = _samples(a, np.random.default_rng(4))
+    samples = _draw_samples(a, np.random.default_rng(4))
     turned = make(a).image((samples * np.exp(0.7j)).astype(np.complex64))
     np.testing.assert_allclose(turned, make(a).image(samples) * np.exp(0.7j), atol=1e-6 * np.abs(turned).max())
 
@@ -112,8 +112,8 @@ def test_a_common_phase_is_kept(aperture, make):
 def test_a_row_added_again_replaces_the_earlier_one_in_any_order(aperture):
     rng = np.random.default_rng(5)
     a = aperture(15, 6, 4.0, 4.0, (12, 10), 2.0)
-    samples = _samples(a, rng)
-    wrong = _noise(rng, a.shape)
+    samples = _draw_samples(a, rng)
+    wrong = _draw_noise(rng, a.shape)
     none = np.zeros(15, np.float32)
     starts = a.offsets_m[:, 0, 0]
     imager = IncrementalImager(a)
@@ -127,7 +127,7 @@ def test_a_row_added_again_replaces_the_earlier_one_in_any_order(aperture):
 
 def test_kernels_computed_again_give_the_same_image(aperture):
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
-    samples = _samples(a, np.random.default_rng(6))
+    samples = _draw_samples(a, np.random.default_rng(6))
     warm = SpectralImager(a).image(samples)
     forget()
     np.testing.assert_array_equal(SpectralImager(a).image(samples), warm)
@@ -137,8 +137,8 @@ def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
     """Memory of transforms is reused, and imagers of one geometry share kernels and the last constant echo."""
     rng = np.random.default_rng(8)
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
-    samples = [_noise(rng, a.shape) for _ in range(2)]
-    echoes = [_noise(rng, a.shape[:2]) for _ in range(2)]
+    samples = [_draw_noise(rng, a.shape) for _ in range(2)]
+    echoes = [_draw_noise(rng, a.shape[:2]) for _ in range(2)]
     weights = rng.uniform(0, 1, a.shape[2:]).astype(np.float32)
     alone = []
     for y, echo in zip(samples, echoes, strict=True):
@@ -153,7 +153,7 @@ def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
 def test_another_geometry_gets_other_kernels(aperture):
     rng = np.random.default_rng(7)
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
-    samples = _noise(rng, a.shape)
+    samples = _draw_noise(rng, a.shape)
     lower = Aperture(a.antennas, a.offsets_m, a.frequencies_hz, replace(a.grid, z_m=a.grid.z_m + 5e-3))
     for geometry in (a, lower):
         spectral = SpectralImager(geometry).image(samples)
@@ -193,15 +193,15 @@ def test_kernels_larger_than_the_cache_are_kept_alone(made):
     assert keys == ["a"]
 
 
-def _jitter_x(offsets):
+def _shift_x(offsets):
     offsets[2, 3, 0] += 2e-5
 
 
-def _jitter_z(offsets):
+def _shift_z(offsets):
     offsets[2, 3, 2] += 2e-5
 
 
-def _sag(offsets):
+def _bend_y(offsets):
     offsets[2, :, 1] += np.linspace(0, 1e-4, offsets.shape[1])
 
 
@@ -209,7 +209,7 @@ def _lose_rows(offsets):
     offsets[3:, :, 1] += 1e-3
 
 
-@pytest.mark.parametrize("change", [_jitter_x, _jitter_z, _sag, _lose_rows])
+@pytest.mark.parametrize("change", [_shift_x, _shift_z, _bend_y, _lose_rows])
 def test_irregular_positions_are_imaged_directly_with_a_notice(aperture, change):
     a = aperture(9, 6, 4.0, 4.0, (8, 8), 2.0)
     assert isinstance(choose_imager(a)[0], SpectralImager)

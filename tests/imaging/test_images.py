@@ -39,7 +39,7 @@ def _build(rig, rows, **options):
     return builder
 
 
-def _peak(image, x_m, y_m):
+def _find_peak(image, x_m, y_m):
     """Place of the strongest pixel, refined by a parabola through its neighbours."""
     a = np.abs(image)
     iy, ix = np.unravel_index(np.argmax(a), a.shape)
@@ -226,7 +226,7 @@ def test_the_change_of_a_plane_over_the_sweep_is_what_its_reflectivity_changes(m
     np.testing.assert_allclose(dispersion.band_hz, ends)
 
 
-def _random_rows(rig, synced_row, rng):
+def _draw_rows(rig, synced_row, rng):
     """(board, index, row) of noise with a direct path, in random order, some rows twice, some positions missing."""
     columns = rig.grid.columns
     order = [(b.name, int(i)) for b in rig.receivers for i in rng.permutation(rig.grid.rows)]
@@ -240,7 +240,7 @@ def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig
     rng = np.random.default_rng(8)
     live = ImageBuilder(rig, live=True)
     plain = ImageBuilder(rig)
-    for name, index, row in _random_rows(rig, synced_row, rng):
+    for name, index, row in _draw_rows(rig, synced_row, rng):
         for builder in (live, plain):
             builder.add_row(name, index, row)
         now = live.current()
@@ -259,7 +259,7 @@ def test_a_gate_of_more_multiplications_than_one_product_may_have_is_applied(mak
     for most in (reduced._MAX_PRODUCT, 1):
         monkeypatch.setattr(reduced, "_MAX_PRODUCT", most)
         builder = ImageBuilder(rig)
-        for name, index, row in _random_rows(rig, synced_row, np.random.default_rng(8)):
+        for name, index, row in _draw_rows(rig, synced_row, np.random.default_rng(8)):
             builder.add_row(name, index, row)
         images.append(builder.finish())
     np.testing.assert_allclose(images[0].h_raw, images[1].h_raw, atol=1e-5 * np.abs(images[1].h_raw).max())
@@ -312,7 +312,7 @@ def test_a_row_far_from_its_planned_position_is_imaged_correctly(make_rig, synce
     """Beyond the range of the running sums the live image is computed from all rows."""
     rig = make_rig(15, 9, pixels=(16, 14))
     live = ImageBuilder(rig, live=True)
-    for name, index, row in _random_rows(rig, synced_row, np.random.default_rng(13)):
+    for name, index, row in _draw_rows(rig, synced_row, np.random.default_rng(13)):
         planned = row_offsets_m(rig, plan_raster(rig.grid).row(index))
         live.add_row(name, index, row, np.add(planned, [5e-3 if index == 3 else 0, 0]))
     np.testing.assert_array_equal(live.current().h_raw, live.finish().h_raw)
@@ -324,7 +324,7 @@ def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row)
     is_scanned = rng.uniform(size=(9, 15)) > 0.4
     masked = ImageBuilder(rig, live=True)
     never = ImageBuilder(rig)
-    for name, index, row in _random_rows(rig, synced_row, rng):
+    for name, index, row in _draw_rows(rig, synced_row, rng):
         masked.add_row(name, index, row)
         met = is_scanned[index][:: plan_raster(rig.grid).row(index).direction]
         never.add_row(name, index, synced_row(row.samples, row.valid & met))
@@ -346,7 +346,7 @@ def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_wit
             samples = _build(rig, lambda b, p=point, a=amplitude: points_rows(rig, b, [p], [a])).boards[board.name]
             fine = np.arange(-8, 9) * 2e-4
             image, _, _ = samples.image(replace(grid, x_m=point[0] + fine, y_m=point[1] + fine, pixel_m=2e-4))
-            x, y = _peak(image, point[0] + fine, point[1] + fine)
+            x, y = _find_peak(image, point[0] + fine, point[1] + fine)
             assert np.hypot(x - point[0], y - point[1]) < 0.1 * grid.pixel_m
             assert abs(np.angle(image[8, 8] / amplitude)) < 0.05
 

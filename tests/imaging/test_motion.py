@@ -18,7 +18,7 @@ def fast(rig):
     return msgspec.structs.replace(rig, grid=grid, stage=stage)
 
 
-def burst_mean(turns, rig):
+def average_over_burst(turns, rig):
     """A wave of `turns` cycles per position, averaged over the burst of each position."""
     pulse = (np.arange(rig.burst.pulses) - (rig.burst.pulses - 1) / 2) * rig.burst.period_us * 1e-6
     offsets = pulse * rig.stage.speed_mm_s / rig.grid.step_x_mm
@@ -31,7 +31,7 @@ def burst_mean(turns, rig):
 def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
     """The law holds for any part of the phase change that burst alignment has removed."""
     still = np.exp(2j * np.pi * turns * np.arange(COUNT))
-    average = burst_mean(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
+    average = average_over_burst(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
     valid = np.ones(COUNT, bool)
     turn = np.full(COUNT, 2 * np.pi * centre)
     undone = undo_burst_motion(average, valid, turn, burst_filters(fast))

@@ -44,7 +44,7 @@ def _cut(recording, axis, step_m, samples=None, reference_m=None):
     return np.abs(image) / s.size
 
 
-def _half_power_width(cut, step_m):
+def _measure_half_power_width(cut, step_m):
     peak = int(np.argmax(cut))
     low = peak - np.argmax(cut[peak::-1] < cut[peak] / np.sqrt(2))
     high = peak + np.argmax(cut[peak:] < cut[peak] / np.sqrt(2))
@@ -62,8 +62,8 @@ def test_recorded_pulses_of_an_aircraft_focus_to_their_bandwidth_and_aperture(re
     along_y = _cut(recording, 1, 0.06)
     assert abs(int(np.argmax(along_x)) - 30) * 0.02 < 0.1
     assert abs(int(np.argmax(along_y)) - 30) * 0.06 < 0.3
-    assert _half_power_width(along_x, 0.02) == pytest.approx(in_range, rel=0.2)
-    assert _half_power_width(along_y, 0.06) == pytest.approx(across, rel=0.2)
+    assert _measure_half_power_width(along_x, 0.02) == pytest.approx(in_range, rel=0.2)
+    assert _measure_half_power_width(along_y, 0.06) == pytest.approx(across, rel=0.2)
 
 
 def test_without_pulse_to_pulse_phase_or_with_a_wrong_range_there_is_no_focus(recording):

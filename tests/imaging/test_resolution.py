@@ -12,7 +12,7 @@ from polysight.imaging.resolution import compute_point_response, describe_board,
 from polysight_shared.geometry import specular_midpoint_m
 
 
-def _full(rig, **options):
+def _make_full_board(rig, **options):
     board = ImageBuilder(rig, **options).boards["RH"]
     board.valid[:] = True
     return board
@@ -20,7 +20,7 @@ def _full(rig, **options):
 
 @pytest.mark.parametrize(("columns", "rows", "step"), [(41, 41, 4.0), (350, 200, 2.0)])
 def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, columns, rows, step):
-    board = _full(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar")
+    board = _make_full_board(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar")
     response = compute_point_response(board.aperture, board.weights)
     np.testing.assert_allclose(response.width_mm, response.limit_mm, rtol=0.08)
     # A sinc's first sidelobe is -13.3 dB
@@ -28,7 +28,7 @@ def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, 
 
 
 def test_the_limit_is_that_of_the_plane_wave_formula_and_the_papers_is_not(make_rig):
-    board = _full(make_rig(41, 41, 4.0, 4.0, pixels=(31, 31)), taper="boxcar")
+    board = _make_full_board(make_rig(41, 41, 4.0, 4.0, pixels=(31, 31)), taper="boxcar")
     response = compute_point_response(board.aperture, board.weights)
     cos = np.cos(np.radians(54.93))
     wave = 3.82
@@ -41,7 +41,7 @@ def test_the_limit_is_that_of_the_plane_wave_formula_and_the_papers_is_not(make_
 
 def test_the_published_scan_reaches_what_the_simulation_of_its_geometry_says(make_rig):
     """5.4 x 3.6 mm without a taper; the paper's r lambda / L is 2.8 mm along its 0.7 m and 4.9 mm along its 0.4 m."""
-    board = _full(make_rig(350, 200, 2.0, 2.0, pixels=(150, 150)), taper="boxcar")
+    board = _make_full_board(make_rig(350, 200, 2.0, 2.0, pixels=(150, 150)), taper="boxcar")
     response = compute_point_response(board.aperture, board.weights)
     np.testing.assert_allclose(response.width_mm, (5.4, 3.6), atol=0.35)
     np.testing.assert_allclose(response.paper_mm, (2.7, 4.8), atol=0.15)
@@ -51,7 +51,9 @@ def test_a_taper_trades_width_for_sidelobes(make_rig):
     rig = make_rig(41, 41, 4.0, 4.0, pixels=(31, 31))
 
     def response_with(name):
-        board = _full(msgspec.structs.replace(rig, image=msgspec.structs.replace(rig.image, apodisation=name)))
+        board = _make_full_board(
+            msgspec.structs.replace(rig, image=msgspec.structs.replace(rig.image, apodisation=name))
+        )
         return compute_point_response(board.aperture, board.weights)
 
     none = response_with("none")
@@ -97,7 +99,7 @@ def test_without_data_there_is_no_response(make_rig):
 @pytest.mark.parametrize(("columns", "rows"), [(2, 41), (41, 2), (1, 41), (41, 1)])
 def test_an_axis_on_which_nothing_is_resolved_has_no_figures(make_rig, columns, rows):
     """The figures hold for a small part of the plane: a cell wider than the image has none."""
-    board = _full(make_rig(columns, rows, 4.0, 4.0, pixels=(31, 31)))
+    board = _make_full_board(make_rig(columns, rows, 4.0, 4.0, pixels=(31, 31)))
     response = compute_point_response(board.aperture, board.weights)
     for figures in (response.width_mm, response.limit_mm, response.paper_mm, response.sidelobe_db):
         assert np.isinf(figures).tolist() == [columns < 3, rows < 3]

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.imaging.images import MIN_SAMPLES, sub_bands
 from polysight.materials.layers import Spectrum
 from polysight_shared.errors import ErrorCode
 
-CHIRP = published_rig().chirp
+CHIRP = load_published_rig().chirp
 
 
 @given(st.integers(1, 15))

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tests.support.products import PIXEL, judged_products
+from tests.support.products import PIXEL, write_judged_products
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 
 import polysight.catalogue
@@ -49,7 +49,7 @@ COMMANDS = {
 def scan_before(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("before")
     for name in ("one", "two"):
-        judged_products(folder / name, "good")
+        write_judged_products(folder / name, "good")
     assert main(["label", str(folder / "two"), "--box", "plate=20,0,30,10", "--metal", "plate"]) == 0
     return folder
 

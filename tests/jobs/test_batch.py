@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 from tests.support.store.plain_scan import write_scan
 
@@ -62,7 +62,7 @@ def worker(tmp_path, monkeypatch):
     monkeypatch.setattr(many, "WORKER_COMMAND", (sys.executable, str(file)))
 
 
-def scans(folder, *names):
+def list_scan_paths(folder, *names):
     for name in names:
         (folder / name).mkdir(parents=True)
         (folder / name / "data_collection_cfg.json").write_text('{"total_x": 5, "total_y": 4}')
@@ -74,47 +74,47 @@ def make_job(data, out, **options):
     return batch.make_jobs([(data, Settings(**text))], out)[0]
 
 
-def jobs(folder, *names):
+def make_jobs_of(folder, *names):
     scans_found = batch.find_scans([folder])
     assert sorted(p.name for p in scans_found) == sorted(names)
     return batch.make_jobs([(data, Settings()) for data in scans_found], folder.parent / "out")
 
 
-def runs(folder):
+def read_runs(folder):
     return sorted((folder / "out" / "runs.txt").read_text().split())
 
 
 @pytest.mark.usefixtures("worker")
 def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
     names = ("a", "bad", "c", "killed")
-    scans(tmp_path / "in", *names)
-    first = batch.process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    list_scan_paths(tmp_path / "in", *names)
+    first = batch.process_many(make_jobs_of(tmp_path / "in", *names), tmp_path / "out", 2)
     assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
     assert [o.name for o in first] == list(names)
     answer = {o.name: o.message for o in first}
     assert answer["bad"] == "no row is recorded whole"
     assert "signal 9" in answer["killed"]
     assert first[0].memory_gb == 0.5
-    assert runs(tmp_path) == sorted(names)
+    assert read_runs(tmp_path) == sorted(names)
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
     assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
 
-    second_run = batch.process_many(jobs(tmp_path / "in", *names), tmp_path / "out", 2)
+    second_run = batch.process_many(make_jobs_of(tmp_path / "in", *names), tmp_path / "out", 2)
     assert [o.status for o in second_run] == ["skipped", "failed", "skipped", "failed"]
-    assert runs(tmp_path) == sorted([*names, "bad", "killed"])
+    assert read_runs(tmp_path) == sorted([*names, "bad", "killed"])
     assert "2 finished before, 2 to process" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("worker")
 def test_a_program_killed_after_its_mark_has_finished_its_scan(tmp_path):
-    scans(tmp_path / "in", "late")
-    (job,) = jobs(tmp_path / "in", "late")
+    list_scan_paths(tmp_path / "in", "late")
+    (job,) = make_jobs_of(tmp_path / "in", "late")
     assert many.run_scan(job).status == "done"
 
 
 @pytest.mark.usefixtures("worker")
 def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
-    (folder,) = scans(tmp_path / "in", "a")
+    (folder,) = list_scan_paths(tmp_path / "in", "a")
     library = tmp_path / "library.npz"
     rig = tmp_path / "rig.toml"
     library.write_bytes(b"1")
@@ -149,10 +149,10 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     """Notes, programs of the page, exports and labels are not data; manifest, rows, calibration and truth are."""
     folder = write_scan(tmp_path / "in" / "scan")
     sample_file = folder / "samples" / "RH.npy"
-    batch.process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    batch.process_many(make_jobs_of(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
     def done():
-        return batch.is_finished(jobs(tmp_path / "in", "scan")[0])
+        return batch.is_finished(make_jobs_of(tmp_path / "in", "scan")[0])
 
     no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
     for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):
@@ -173,22 +173,22 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
             file.write_bytes(state_before)
             os.utime(file, ns=(times, times))
         assert done(), name
-    drop(ScanFolder.load(folder), raw_digests(folder), tmp_path / "out" / "scan")
-    batch.process_many(jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    drop(ScanFolder.load(folder), read_raw_digests(folder), tmp_path / "out" / "scan")
+    batch.process_many(make_jobs_of(tmp_path / "in", "scan"), tmp_path / "out", 1)
     assert done()
     sample_file.write_text("other samples")
     assert not done()  # these are the remaining files
 
 
-def raw_digests(folder):
+def read_raw_digests(folder):
     committed = ScanFolder.load(folder).committed_rows()
     return {name: {row: take.boards[name].crc32 for row, take in committed.items()} for name in ("RH", "RV")}
 
 
 @pytest.mark.usefixtures("worker")
 def test_ended_early_its_programs_end_too(tmp_path):
-    scans(tmp_path / "in", "slow", "slow2")
-    todo = jobs(tmp_path / "in", "slow", "slow2")
+    list_scan_paths(tmp_path / "in", "slow", "slow2")
+    todo = make_jobs_of(tmp_path / "in", "slow", "slow2")
     results = many.run_here(todo, 2)
     # Slow2, which is not slow
     first = next(results)
@@ -199,7 +199,7 @@ def test_ended_early_its_programs_end_too(tmp_path):
 
 
 def test_names_folders_and_what_is_a_scan(tmp_path):
-    scans_found = scans(tmp_path / "unsynced", "s1", "s2")
+    scans_found = list_scan_paths(tmp_path / "unsynced", "s1", "s2")
     (tmp_path / "unsynced" / "notes").mkdir()
     raw = tmp_path / "raw" / "s1"
     raw.mkdir(parents=True)
@@ -207,7 +207,7 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     assert batch.find_scans([tmp_path / "unsynced"]) == scans_found
     assert batch.find_scans([raw, scans_found[1]]) == [raw, scans_found[1]]
     assert batch.find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
-    products = judged_products(tmp_path / "products", "good")
+    products = write_judged_products(tmp_path / "products", "good")
     assert batch.find_scans([products]) == [products]
     with refused(ErrorCode.NAME_TAKEN, "s1"):
         batch.make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
@@ -240,7 +240,7 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
 
 @pytest.mark.usefixtures("worker")
 def test_a_wrong_folder_fails_and_the_exit_status_shows_it(tmp_path, capsys):
-    scans(tmp_path / "in", "a", "bad")
+    list_scan_paths(tmp_path / "in", "a", "bad")
     command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
     assert main([*command, "--jobs", "1"]) == 1
     assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
@@ -254,7 +254,7 @@ def test_a_wrong_folder_fails_and_the_exit_status_shows_it(tmp_path, capsys):
 def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "dask", None)
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    scans(tmp_path / "in", "a")
+    list_scan_paths(tmp_path / "in", "a")
     command = ["process", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--dask", "tcp://127.0.0.1:1"]
     assert main(command) == 2
     assert "pip install distributed" in capsys.readouterr().err
@@ -263,8 +263,8 @@ def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatc
 @pytest.mark.usefixtures("worker")
 def test_a_dask_cluster_does_the_same(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
-    scans(tmp_path / "in", "a", "bad", "c")
-    todo = jobs(tmp_path / "in", "a", "bad", "c")
+    list_scan_paths(tmp_path / "in", "a", "bad", "c")
+    todo = make_jobs_of(tmp_path / "in", "a", "bad", "c")
     # Threads of this process replace the workers; each still starts its own programs.
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp"
@@ -279,8 +279,8 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 @pytest.mark.usefixtures("worker")
 def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
     """A Dask worker that is killed after the mark has its scan sent to another one."""
-    scans(tmp_path / "in", "a")
-    (job,) = jobs(tmp_path / "in", "a")
+    list_scan_paths(tmp_path / "in", "a")
+    (job,) = make_jobs_of(tmp_path / "in", "a")
     assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
     second_run = batch.process_many([job], tmp_path / "out", 1, again=True)
@@ -301,7 +301,7 @@ batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys
 
 
 def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
-    scans(tmp_path / "in", "a")
+    list_scan_paths(tmp_path / "in", "a")
     answer = tmp_path / "pid"
     starter = subprocess.Popen([sys.executable, "-c", STARTER, str(tmp_path / "in" / "a"), str(answer)])
     try:
@@ -330,8 +330,8 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
         f"batch.WORKER_COMMAND = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
     )
     names = ("a", "b", "slow", "c")
-    scans(tmp_path / "in", *names)
-    todo = jobs(tmp_path / "in", *names)
+    list_scan_paths(tmp_path / "in", *names)
+    todo = make_jobs_of(tmp_path / "in", *names)
     with (
         dask.config.set({"distributed.worker.preload": [str(preload)]}),
         distributed.LocalCluster(
@@ -347,7 +347,7 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     """The real program processes a simulated scan and a damaged one; then both are marked as finished."""
     plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
     scene = make_scene(plate, name="plate", columns=13, rows=15, image={"columns": 30, "rows": 30, "pixel_mm": 4.0})
-    simulate(published_rig(), decode_scene(scene, "t"), tmp_path, layout="authors")
+    simulate(load_published_rig(), decode_scene(scene, "t"), tmp_path, layout="authors")
     broken = tmp_path / "unsynced" / "broken"
     broken.mkdir()
     (broken / "data_collection_cfg.json").write_text("{")

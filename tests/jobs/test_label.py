@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser, main
@@ -20,14 +20,14 @@ NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
 @pytest.fixture
 def products(tmp_path):
     """Products of a scan with three patches: the metal reference, one named PET, one not judged."""
-    return judged_products(tmp_path / "out", "good")
+    return write_judged_products(tmp_path / "out", "good")
 
 
-def boxes(folder):
+def load_boxes(folder):
     return read_labels(folder / "labels.json")
 
 
-def answering(*answers):
+def script_answers(*answers):
     """Answers to questions, and the questions that were asked."""
     remaining = list(answers)
     questions = []
@@ -44,7 +44,7 @@ def answering(*answers):
 def test_patches_get_names_by_their_numbers(products, capsys):
     assert main(["label", str(products), *NAMED]) == 0
     answer = capsys.readouterr().out
-    named_boxes = boxes(products)
+    named_boxes = load_boxes(products)
     assert list(named_boxes.boxes) == ["copper", "\u6a61\u6728"]
     assert (named_boxes.unit, named_boxes.metal, named_boxes.by_hand) == ("mm", "copper", True)
     # 9 mm inside the patch
@@ -60,20 +60,20 @@ def test_boxes_are_drawn_moved_renamed_and_removed(products):
     assert main(["label", scan, "--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet"]) == 0
     assert main(["label", scan, "--rename", "sheet=tin plate", "--specimen", "oak=board 7"]) == 0
     assert main(["label", scan, "--box", "oak#left=20,0,30,10"]) == 0
-    named_boxes = boxes(products)
+    named_boxes = load_boxes(products)
     assert list(named_boxes.boxes) == ["tin plate", "oak", "oak#left"]
     assert named_boxes.metal == "tin plate"
     assert [named_boxes.specimen(n) for n in named_boxes.boxes] == [None, "board 7", "left"]
     assert main(["label", scan, "--remove", "oak", "--box", "oak=0,-20,10,-5"]) == 0
-    assert boxes(products).boxes["oak"] == (0, -20, 10, -5)
-    assert boxes(products).specimen("oak") is None
+    assert load_boxes(products).boxes["oak"] == (0, -20, 10, -5)
+    assert load_boxes(products).specimen("oak") is None
 
 
 def test_a_patch_declared_as_metal_is_named_metal(products):
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "2=oak"]) == 0
-    assert (list(boxes(products).boxes), boxes(products).metal) == (["metal", "oak"], "metal")
+    assert (list(load_boxes(products).boxes), load_boxes(products).metal) == (["metal", "oak"], "metal")
     assert main(["label", str(products), "--from-patches", "--metal", "1", "--rename", "1=x", "--rename", "2=oak"]) == 0
-    assert boxes(products).metal == "x"
+    assert load_boxes(products).metal == "x"
 
 
 def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
@@ -116,19 +116,19 @@ def test_a_folder_without_an_image_is_to_be_processed_first(tmp_path):
 
 
 def test_a_person_is_asked_for_each_patch(products, capsys):
-    ask, questions = answering("m", "PET", "pet", "PET", "2")
+    ask, questions = script_answers("m", "PET", "pet", "PET", "2")
     assert label(products, Edits(), ask=ask) == 0
-    assert list(boxes(products).boxes) == ["metal", "PET", "PET#2"]
-    assert boxes(products).metal == "metal"
+    assert list(load_boxes(products).boxes) == ["metal", "PET", "PET#2"]
+    assert load_boxes(products).metal == "metal"
     assert "named PET 80 %" in questions[1]
     # Pet and PET
     assert "the name pet" in capsys.readouterr().out
-    assert label(products, Edits(), ask=answering("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
-    assert boxes(products).metal == "glass"
+    assert label(products, Edits(), ask=script_answers("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
+    assert load_boxes(products).metal == "glass"
     state_before = (products / "labels.json").read_bytes()
     for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
         with refused(code):
-            label(products, Edits(), ask=answering(*answers)[0])
+            label(products, Edits(), ask=script_answers(*answers)[0])
     assert (products / "labels.json").read_bytes() == state_before
 
 
@@ -143,7 +143,7 @@ def test_without_a_terminal_patches_are_listed(products, capsys):
 
 def test_labels_of_a_scan_folder_are_saved_in_the_folder_of_its_rows(tmp_path):
     scan = tmp_path / "scan"
-    judged_products(scan / "products", "good")
+    write_judged_products(scan / "products", "good")
     (scan / "manifest.jsonl").write_text("")
     for folder_given in (scan, scan / "products"):
         assert main(["label", str(folder_given), *NAMED]) == 0
@@ -155,10 +155,10 @@ def test_labels_of_a_scan_folder_are_saved_in_the_folder_of_its_rows(tmp_path):
 def test_boxes_by_hand_outlive_products_of_the_same_scan_alone(products, scan_id, kept):
     write_json(products / "scan.json", {"scan_id": "one", "simulated": True})
     assert main(["label", str(products), *NAMED]) == 0
-    drawn = boxes(products)
+    drawn = load_boxes(products)
     with replace_products(products, scan_id) as new:
         (new / "labels.json").write_text(json.dumps({"labels": {"patch": [0, 0, 3, 3]}}))
-    assert (boxes(products) == drawn) == kept
+    assert (load_boxes(products) == drawn) == kept
     assert (products / "labels.png").exists() == kept
 
 
@@ -178,6 +178,6 @@ def test_boxes_that_another_command_saved_meanwhile_are_not_overwritten(products
     monkeypatch.setattr("polysight.jobs.label.apply_edits", edit_during_another_command)
     with refused(ErrorCode.MISMATCH, products):
         label(products, Edits(boxes=[("glass", (-40.0, 0.0, -20.0, 20.0))]))
-    assert list(boxes(products).boxes) == ["oak"]
+    assert list(load_boxes(products).boxes) == ["oak"]
     label(products, Edits(boxes=[("glass", (-40.0, 0.0, -20.0, 20.0))]))
-    assert list(boxes(products).boxes) == ["oak", "glass"]
+    assert list(load_boxes(products).boxes) == ["oak", "glass"]

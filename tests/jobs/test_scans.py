@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 from tests.support.page.live_view import open_control
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, make_scene
 
 from polysight.catalogue import NOTES_FILE, Notes, probe, read_notes
@@ -26,8 +26,8 @@ from polysight_simulators.scene import decode_scene, simulate
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A folder with a small simulated scan and with made-up products."""
-    simulate(published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "t"), tmp_path / "scans" / "one")
-    judged_products(tmp_path / "scans" / "two", "good")
+    simulate(load_published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "t"), tmp_path / "scans" / "one")
+    write_judged_products(tmp_path / "scans" / "two", "good")
     return tmp_path / "scans"
 
 
@@ -56,7 +56,7 @@ def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
 
 
 def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(root, capsys):
-    judged_products(root / ("long" * 40), "good")
+    write_judged_products(root / ("long" * 40), "good")
     (root / "two" / "operator.json").write_text(json.dumps({"notes": "a\u202eb\x1b[31m", "tags": ["t\u200fag\x07"]}))
     materials = root / "two" / "materials.json"
     materials.write_text(materials.read_text().replace("PET", "P\u202eET"))

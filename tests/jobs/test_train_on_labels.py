@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.paths import RIG_FILE
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 
 from polysight.cli.main import main
@@ -25,7 +25,7 @@ PLACES = (-40.0, 10.0), (40.0, -10.0)
 BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")
 
 
-def scene(seed: int) -> dict[str, Any]:
+def draw_scene(seed: int) -> dict[str, Any]:
     copper = {"name": "copper", "centre_mm": PLACES[0], "size_mm": [50.0, 50.0], "metal": True}
     board = {"name": "board", "centre_mm": PLACES[1], "size_mm": [50.0, 50.0], "permittivity": [3.2, 0.4]}
     return make_scene(copper, board, columns=15, rows=17, seed=seed, disturbances={"leakage_measured": 0.003})
@@ -35,7 +35,9 @@ def scene(seed: int) -> dict[str, Any]:
 def scans(tmp_path_factory) -> list[Path]:
     """Three scans of copper and a board without truth.json, as of a real rig. All have the same name."""
     folder = tmp_path_factory.mktemp("own")
-    simulated_scans = [simulate(published_rig(), decode_scene(scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)]
+    simulated_scans = [
+        simulate(load_published_rig(), decode_scene(draw_scene(s), "test"), folder / f"s{s}") for s in (1, 2, 3)
+    ]
     for scan in simulated_scans:
         (scan / "truth.json").unlink()
     return simulated_scans
@@ -103,12 +105,12 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
 
 
 def test_labels_override_the_truth_and_drawn_specimens_are_distinguished(tmp_path):
-    spread = {**scene(4), "specimen_spread": [0.02, 0.1]}
-    scan = simulate(published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
+    spread = {**draw_scene(4), "specimen_spread": [0.02, 0.1]}
+    scan = simulate(load_published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
     answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(load_training_scan(scan, RIG_FILE))]
     assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
     assert len({specimen for _, specimen, _ in answer}) == 2
-    again = simulate(published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
+    again = simulate(load_published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
     redrawn = {e.specimen for e in make_entries(load_training_scan(again, RIG_FILE))}
     assert not redrawn & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}

@@ -16,7 +16,7 @@ RNG = np.random.default_rng(1)
 GAIN = 3.0 * np.exp(0.7j)
 
 
-def content(n=90, gain=GAIN):
+def make_content(n=90, gain=GAIN):
     h = gain * (0.6 + 0.01 * RNG.standard_normal(n))
     v = 0.5 * (0.15 + 0.01 * RNG.standard_normal(n)).astype(complex)
     metal_h = gain * np.ones(40)
@@ -36,7 +36,7 @@ def content(n=90, gain=GAIN):
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 def test_values_come_out_relative_to_the_reference(tmp_path, protocol):
     path = tmp_path / "PET_55.pkl"
-    path.write_bytes(pickle.dumps(content(), protocol=protocol))
+    path.write_bytes(pickle.dumps(make_content(), protocol=protocol))
     entry = read_material(path)
     assert (entry.name, entry.scan, entry.incidence_deg, entry.reference) == ("PET", "scan_12", 55.0, "copper")
     assert entry.thickness_mm == 0.5
@@ -51,7 +51,7 @@ def test_values_come_out_relative_to_the_reference(tmp_path, protocol):
 )
 def test_a_thickness_may_be_a_text(tmp_path, answer, mm):
     path = tmp_path / "PET_55.pkl"
-    path.write_bytes(pickle.dumps(content(4) | {"thickness": answer}))
+    path.write_bytes(pickle.dumps(make_content(4) | {"thickness": answer}))
     assert read_material(path).thickness_mm == mm
 
 
@@ -67,14 +67,16 @@ def test_texts_of_a_file_are_lines_without_control_characters(tmp_path):
 @pytest.mark.parametrize("angle", [float("nan"), float("inf"), 0, -55, 90, 550])
 def test_an_angle_that_is_none_is_refused(tmp_path, angle):
     path = tmp_path / "PET_55.pkl"
-    path.write_bytes(pickle.dumps(content(4) | {"incident_angle": angle}))
+    path.write_bytes(pickle.dumps(make_content(4) | {"incident_angle": angle}))
     with refused(ErrorCode.FILE_FOREIGN, "incident_angle"):
         read_material(path)
 
 
 def test_older_names_of_numpy_are_read(tmp_path):
     path = tmp_path / "PET_55.pkl"
-    path.write_bytes(pickle.dumps(content(), protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+    path.write_bytes(
+        pickle.dumps(make_content(), protocol=2).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    )
     assert read_material(path).name == "PET"
 
 
@@ -82,8 +84,8 @@ def test_older_names_of_numpy_are_read(tmp_path):
     "thing",
     [
         np.arange(5), np.arange(5.0), [], ["values"], "text", 3, None, {}, np.zeros((), [("values", float)]),
-        {"values": np.arange(5), "ref_values": 3}, content() | {"values": np.zeros(0)},
-        content() | {"incident_angle": 10**400}, content() | {"incident_angle": []},
+        {"values": np.arange(5), "ref_values": 3}, make_content() | {"values": np.zeros(0)},
+        make_content() | {"incident_angle": 10**400}, make_content() | {"incident_angle": []},
     ],
 )  # fmt: skip
 def test_a_pickle_of_something_else_is_not_a_material_file(tmp_path, thing):
@@ -104,7 +106,7 @@ class Hostile:
 def test_a_hostile_file_is_refused_and_does_nothing(tmp_path):
     target = tmp_path / "ran"
     path = tmp_path / "evil_55.pkl"
-    path.write_bytes(pickle.dumps(content() | {"name": Hostile(target)}))
+    path.write_bytes(pickle.dumps(make_content() | {"name": Hostile(target)}))
     with refused(ErrorCode.FILE_FOREIGN, "system"):
         read_material(path)
     assert not target.exists()
@@ -121,7 +123,7 @@ def test_no_other_name_is_admitted(tmp_path, module, name):
 
 
 def test_damaged_files_are_errors_at_every_length(tmp_path):
-    content_bytes = pickle.dumps(content(4))
+    content_bytes = pickle.dumps(make_content(4))
     path = tmp_path / "x.pkl"
     for n in range(0, len(content_bytes), 7):
         path.write_bytes(content_bytes[:n])
@@ -132,7 +134,7 @@ def test_damaged_files_are_errors_at_every_length(tmp_path):
 @pytest.mark.parametrize("broken", [{"values": [np.ones(2), np.ones(3), np.ones(2)]}, {"ref_values": [[0], [0], [0]]}])
 def test_other_forms_are_errors(tmp_path, broken):
     path = tmp_path / "x.pkl"
-    path.write_bytes(pickle.dumps(content() | broken))
+    path.write_bytes(pickle.dumps(make_content() | broken))
     with pytest.raises(DataError):
         read_material(path)
 

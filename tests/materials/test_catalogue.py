@@ -32,14 +32,14 @@ ITU = {
 }
 
 
-def value(name: str) -> tuple[complex, float]:
+def look_up(name: str) -> tuple[complex, float]:
     """Permittivity and frequency in GHz of a material of the catalogue."""
     material = materials.find_material(name)
     assert material is not None, name
     return material.permittivity, material.frequency_hz / 1e9
 
 
-def debye(water_c: float, ghz: float) -> complex:
+def compute_debye_water(water_c: float, ghz: float) -> complex:
     """Double-Debye water of ITU-R P.527-6, as in Liebe, Hufford, Manabe (1991)."""
     theta = 300 / (water_c + 273.15) - 1
     static = 77.66 + 103.3 * theta
@@ -77,7 +77,7 @@ def test_every_source_is_used_and_every_value_has_one():
 @pytest.mark.parametrize("name", ITU)
 def test_building_materials_follow_the_recommendation(name):
     a, b, c, d, lowest_ghz, highest_ghz = ITU[name]
-    eps, ghz = value(name)
+    eps, ghz = look_up(name)
     assert lowest_ghz <= ghz <= highest_ghz
     loss = c * ghz**d / (2 * math.pi * VACUUM * ghz * 1e9)
     assert eps == pytest.approx(a * ghz**b - 1j * loss, rel=3e-3)
@@ -85,8 +85,8 @@ def test_building_materials_follow_the_recommendation(name):
 
 @pytest.mark.parametrize("celsius", [0, 5, 20, 37])
 def test_water_is_the_double_debye_formula(celsius):
-    eps, ghz = value(f"water at {celsius} degrees")
-    assert eps == pytest.approx(debye(celsius, ghz), rel=3e-3)
+    eps, ghz = look_up(f"water at {celsius} degrees")
+    assert eps == pytest.approx(compute_debye_water(celsius, ghz), rel=3e-3)
 
 
 def test_names_of_one_material():

@@ -17,7 +17,7 @@ from polysight_shared.errors import ErrorCode
 SUGAR = {"water": 0.0, "sugar (1.3%)": 1.3, "sugar (3.8%)": 3.8, "sugar (5.1%)": 5.1, "sugar (7.4%)": 7.4}
 
 
-def entry(name, angle_rad, scan="a", incidence_deg=55.0):
+def make_entry(name, angle_rad, scan="a", incidence_deg=55.0):
     p = np.full(9, np.tan(angle_rad) * np.exp(0.3j), np.complex64)
     return Entry(
         name=name,
@@ -30,9 +30,9 @@ def entry(name, angle_rad, scan="a", incidence_deg=55.0):
     )
 
 
-def library():
+def make_library_of_sugar():
     """Five concentrations in three scans each, on a line of -400 percent a radian."""
-    return Library(tuple(entry(name, 1.2 - p / 400, f"scan{k}") for name, p in SUGAR.items() for k in range(3)))
+    return Library(tuple(make_entry(name, 1.2 - p / 400, f"scan{k}") for name, p in SUGAR.items() for k in range(3)))
 
 
 def write_materials(folder: Path, entries: Iterable[Entry]) -> None:
@@ -53,7 +53,7 @@ def test_angle_of_metal_is_45_degrees():
 
 
 def test_an_exact_line_is_recovered_and_concentrations_left_out_are_predicted():
-    result = fit_concentration(library(), {"water": 0.0})
+    result = fit_concentration(make_library_of_sugar(), {"water": 0.0})
     assert result.line.slope == pytest.approx(-400.0, rel=1e-4)
     assert result.median_error < 1e-3
     assert len(result.left_out) == 15
@@ -62,7 +62,7 @@ def test_an_exact_line_is_recovered_and_concentrations_left_out_are_predicted():
 
 def test_a_concentration_is_judged_without_its_own_patches():
     """One concentration lies off the line, which the error of the line shows."""
-    entries = [*library().entries, *(entry("sugar (9.0%)", 1.25, f"scan{i}") for i in range(3))]
+    entries = [*make_library_of_sugar().entries, *(make_entry("sugar (9.0%)", 1.25, f"scan{i}") for i in range(3))]
     result = fit_concentration(Library(tuple(entries)), {"water": 0.0})
     judged = [r for r in result.left_out if r.true_percent == 9.0]
     assert all(abs(r.percent - 9.0) > 5.0 for r in judged)
@@ -91,8 +91,10 @@ def test_concentrations_are_read_from_names_unless_they_are_given():
 
 def test_what_cannot_be_fitted_is_refused():
     with refused(ErrorCode.NOT_ENOUGH_DATA):
-        fit_concentration(Library(tuple(e for e in library().entries if e.name in ("sugar (1.3%)", "sugar (3.8%)"))))
-    mixed = [*library().entries, entry("sugar (9.9%)", 1.1, incidence_deg=60.0)]
+        fit_concentration(
+            Library(tuple(e for e in make_library_of_sugar().entries if e.name in ("sugar (1.3%)", "sugar (3.8%)")))
+        )
+    mixed = [*make_library_of_sugar().entries, make_entry("sugar (9.9%)", 1.1, incidence_deg=60.0)]
     with refused(ErrorCode.MISMATCH, "60.0"):
         fit_concentration(Library(tuple(mixed)))
     with refused(ErrorCode.NOT_ENOUGH_DATA):
@@ -103,10 +105,10 @@ def test_what_cannot_be_fitted_is_refused():
 def test_a_library_and_published_files_are_taken_as_typed(tmp_path, capsys, form):
     path = tmp_path / "sugar.npz"
     if form == "library":
-        library().save(path)
+        make_library_of_sugar().save(path)
     else:
         path = tmp_path / "materials"
-        write_materials(path, library().entries)
+        write_materials(path, make_library_of_sugar().entries)
     assert main(["concentration", str(path), "--value", "water=0", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["median_error_percent"] < 1e-3
@@ -119,8 +121,8 @@ def test_a_library_and_published_files_are_taken_as_typed(tmp_path, capsys, form
 
 def test_a_material_that_is_not_used_is_named(tmp_path, capsys):
     path = tmp_path / "library.npz"
-    known_library = library()
-    Library((*known_library.entries, entry("copper", 0.785), entry("water", 0.7)), {}, "").save(path)
+    known_library = make_library_of_sugar()
+    Library((*known_library.entries, make_entry("copper", 0.785), make_entry("water", 0.7)), {}, "").save(path)
     assert main(["concentration", str(path), "--value", "water=0"]) == 0
     (note,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note")]
     assert "copper" in note

@@ -29,7 +29,7 @@ def draw_pixels(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, m
     return Samples(x, names, groups, (s * len(means) + m).ravel())
 
 
-def together(one, other):
+def join_samples(one, other):
     return Samples(
         *(np.concatenate([getattr(s, k) for s in (one, other)]) for k in ("x", "names", "groups", "patches"))
     )
@@ -115,7 +115,7 @@ def test_a_stranger_does_not_shift_the_others():
     assert joint.distance[:5] == pytest.approx(alone.distance, abs=1e-3)
 
 
-def with_metal(samples, stray):
+def add_metal(samples, stray):
     """The same scans with a metal patch: no error of scan or patch, and one stray pixel a patch, the first or last."""
     rng = np.random.default_rng(7)
     scans = np.unique(samples.groups)
@@ -128,11 +128,11 @@ def with_metal(samples, stray):
     x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
     patches = samples.patches.max() + 1 + np.repeat(np.arange(scans.size), n)
     metal = Samples(x, np.full(len(x), "metal"), np.repeat(scans, n), patches)
-    return together(samples, metal)
+    return join_samples(samples, metal)
 
 
 def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
-    samples = with_metal(draw_pixels(8), 0)
+    samples = add_metal(draw_pixels(8), 0)
     turned = samples.take(np.arange(len(samples.x))[::-1])
     model = ErrorDiscriminant().fit(samples)
     turned_model = ErrorDiscriminant().fit(turned)
@@ -144,8 +144,8 @@ def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
 @pytest.mark.parametrize("stray", [0, 5])
 def test_metal_with_a_stray_pixel_does_not_change_the_results_of_others(stray):
     """The reference has no error of its own, so its patch does not change the results of others."""
-    model = ErrorDiscriminant().fit(with_metal(draw_pixels(8), 0))
-    test = with_metal(draw_pixels(9, scans=1), stray)
+    model = ErrorDiscriminant().fit(add_metal(draw_pixels(8), 0))
+    test = add_metal(draw_pixels(9, scans=1), stray)
     without_metal = test.take(test.names != "metal")
     alone = model.by_scan(without_metal.x, without_metal.patches)
     beside = model.by_scan(test.x, test.patches)
@@ -168,7 +168,7 @@ def add_lonely_material(samples, scans=1):
     only = draw_pixels(11, scans=scans, means=[[-1.5, -3.5, 1.5]])
     names = np.full(len(only.x), "lonely")
     lonely_samples = Samples(only.x, names, only.groups, samples.patches.max() + 1 + only.patches)
-    return together(samples, lonely_samples)
+    return join_samples(samples, lonely_samples)
 
 
 @pytest.mark.parametrize("model", [DISCRIMINANT_MODEL, PAPER_MODEL])

@@ -29,12 +29,12 @@ PUBLISHED = np.array([
 EPS = np.array([2.6 - 0.01j, 3.5 - 0.8j, 4.0 - 0.4j, 4.7 - 0.7j, 5.1 - 1.1j, 4.75 - 2.4j, 6.3 - 0.2j, 7.5 - 0.3j])
 
 
-def measured_ratio(t, a, b, rho=0j):
+def compute_measured_ratio(t, a, b, rho=0j):
     """V / H of a true t, relative to metal that the same rig sees."""
     return (1 + rho) * (1 + a) / (1 + b) * (t + b) / (1 + a * t)
 
 
-def world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):
+def draw_world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):
     """Measurement of half spaces relative to metal by a rig of this leakage, by Eq. 2, independent of the code."""
     a, b = leak
     theta = THETA + angle
@@ -49,11 +49,11 @@ def world(rng, leak, noise=0.003, dull=0.03, angle=0.0, reference=0.0, eps=EPS):
     return [PatchMeasurement(complex(r), noise, THETA, float(s)) for r, s in zip(ratio, level, strict=True)]
 
 
-def drawn_leakage(rng):
+def draw_leakage(rng):
     return 0.1 * rng.random() * np.exp(2j * np.pi * rng.random())
 
 
-def distances(found, eps=EPS):
+def compute_distances(found, eps=EPS):
     out = []
     for p, truth in zip(found.patches, eps, strict=True):
         errors = p.permittivity - truth
@@ -84,9 +84,9 @@ def test_ratio_there_and_back(ar, ai, br, bi, rr, ri, tr, ti):
     b = complex(br, bi)
     rho = complex(rr, ri)
     t = complex(tr, ti)
-    assert true_ratio(measured_ratio(t, a, b, rho), a, b, rho) == pytest.approx(t, abs=1e-12)
+    assert true_ratio(compute_measured_ratio(t, a, b, rho), a, b, rho) == pytest.approx(t, abs=1e-12)
     # Metal is the reference, with any leakage
-    assert measured_ratio(1.0, a, b) == pytest.approx(1.0)
+    assert compute_measured_ratio(1.0, a, b) == pytest.approx(1.0)
 
 
 @given(parts, parts)
@@ -100,7 +100,7 @@ def test_slope_is_the_derivative(tr, ti):
 def test_without_errors_the_truth_comes_back():
     leak = (0.04 + 0.02j, -0.03j)
     result = invert(
-        world(np.random.default_rng(0), leak, 1e-9, 0.0), RigPrior(1e-6, leak, 1e-6, True, reference_std=1e-6)
+        draw_world(np.random.default_rng(0), leak, 1e-9, 0.0), RigPrior(1e-6, leak, 1e-6, True, reference_std=1e-6)
     )
     for p, truth in zip(result.patches, EPS, strict=True):
         assert p.permittivity == pytest.approx(truth, rel=2e-5)
@@ -111,16 +111,16 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
     d = []
     for seed in range(60 if request.config.getoption("--long") else 12):
         rng = np.random.default_rng(seed)
-        leak = (drawn_leakage(rng), drawn_leakage(rng))
+        leak = (draw_leakage(rng), draw_leakage(rng))
         angle = 2e-3 * rng.standard_normal()
         reference = 0.005 * complex(*rng.standard_normal(2))
-        patches = world(rng, leak, angle=angle, reference=reference)
+        patches = draw_world(rng, leak, angle=angle, reference=reference)
         if measured:
             measured_leakage = tuple(x + 0.003 * complex(*rng.standard_normal(2)) for x in leak)
         else:
             measured_leakage = (0j, 0j)
         prior = RigPrior(2e-3, measured_leakage, 0.003 if measured else 0.041, measured, reference_std=0.005)
-        d += distances(invert(patches, prior))
+        d += compute_distances(invert(patches, prior))
     d = np.array(d)
     # The patches of a scene share leakage, angle and reference: 12 scenes are not 96 independent draws.
     assert 0.58 < np.mean(d < 2.279) < 0.80
@@ -131,14 +131,14 @@ def test_regions_hold_the_truth_as_often_as_they_say(measured, request):
 def test_leakage_that_was_not_measured_is_within_the_error_bars_whatever_its_phase():
     for phase in np.linspace(0, 2 * np.pi, 8, endpoint=False):
         leak = 0.05 * np.exp(1j * phase)
-        result = invert(world(np.random.default_rng(1), (leak, leak)), RigPrior(2e-3))
-        assert np.sqrt(np.mean(distances(result)) / 2) < 1.5
+        result = invert(draw_world(np.random.default_rng(1), (leak, leak)), RigPrior(2e-3))
+        assert np.sqrt(np.mean(compute_distances(result)) / 2) < 1.5
         assert all(p.dominated_by == "leakage" for p in result.patches)
 
 
 def test_leakage_is_found_from_evenly_lit_plates():
     leak = (0.05j, 0.05j)
-    patches = world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
+    patches = draw_world(np.random.default_rng(2), leak, noise=5e-4, dull=0.0)
     result = invert(patches, RigPrior(1e-5, reference_std=5e-4, brightness_range=(0.002, 0.002)))
     assert result.leakage_std[1] < 0.3 * result.prior_std  # leakage of s into V, which matters most
     for p, truth in zip(result.patches, EPS, strict=True):
@@ -146,7 +146,7 @@ def test_leakage_is_found_from_evenly_lit_plates():
 
 
 def test_shares_add_up_and_a_better_measurement_shrinks_what_it_dominates():
-    patches = world(np.random.default_rng(3), (0j, 0j))
+    patches = draw_world(np.random.default_rng(3), (0j, 0j))
     wide = invert(patches, RigPrior(2e-3))
     measured = invert(patches, RigPrior(2e-3, (0j, 0j), 0.001, True))
     for a, b in zip(wide.patches, measured.patches, strict=True):
@@ -170,7 +170,7 @@ def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
     for noise in noises:
         patches = [
             PatchMeasurement(s.inverse_ratio, noise, THETA, None)
-            for s in world(np.random.default_rng(4), (0j, 0j), 1e-9, eps=eps)
+            for s in draw_world(np.random.default_rng(4), (0j, 0j), 1e-9, eps=eps)
         ]
         result = invert(patches, RigPrior(1e-4, (0j, 0j), 1e-4, True, reference_std=1e-4))
         ratios.append(np.sqrt(np.trace(result.patches[0].covariance)) / noise)
@@ -178,7 +178,7 @@ def test_drawn_covariance_agrees_with_the_slope_where_both_hold():
 
 
 def test_a_thin_sheet_does_not_pull_the_others():
-    patches = world(np.random.default_rng(5), (0j, 0j), dull=0.01)
+    patches = draw_world(np.random.default_rng(5), (0j, 0j), dull=0.01)
     odd = [
         *patches[:-1],
         PatchMeasurement(patches[-1].inverse_ratio, patches[-1].std, THETA, 0.3 * patches[-1].brightness),
@@ -199,7 +199,7 @@ def test_ratio_error_is_that_of_draws():
     b = prior.leakage_std * (z[:, 2] + 1j * z[:, 3])
     rho = prior.reference_std * (z[:, 4] + 1j * z[:, 5])
     for value, stated in zip(t, ratio_error(result, prior, t), strict=True):
-        deviations = np.array([measured_ratio(value, *x) - value for x in zip(a, b, rho, strict=True)])
+        deviations = np.array([compute_measured_ratio(value, *x) - value for x in zip(a, b, rho, strict=True)])
         assert stated == pytest.approx(np.sqrt(np.mean(np.abs(deviations) ** 2) / 2), rel=0.06)
 
 
@@ -207,11 +207,11 @@ def test_ratio_error_is_that_of_draws():
 def test_paint_on_the_metal_is_found_out_and_does_not_carry_the_permittivities_off(paint_mm):
     rng = np.random.default_rng(11)
     prior = RigPrior(1e-3, leakage_std=0.01, leakage_measured=True)
-    patches = paint(world(rng, (0.003j, 0.004)), paint_mm)
+    patches = paint(draw_world(rng, (0.003j, 0.004)), paint_mm)
     found = invert(patches, prior, KINDS)
     assert found.painted > 0.8
     assert found.paint_mm == pytest.approx(paint_mm, abs=0.04)
-    assert sum(d < 5.99 for d in distances(found)) >= 7
+    assert sum(d < 5.99 for d in compute_distances(found)) >= 7
 
 
 def test_paint_that_only_may_be_there_is_in_every_error_bar():
@@ -223,10 +223,10 @@ def test_paint_that_only_may_be_there_is_in_every_error_bar():
         parts = 0.041 * rng.standard_normal(4)
         eps = EPS * (1 + 0.02 * rng.standard_normal(EPS.size))
         eps = eps.real + 1j * eps.imag * np.exp(0.3 * rng.standard_normal(EPS.size))
-        plates = world(rng, (complex(*parts[:2]), complex(*parts[2:])), noise=0.006, eps=eps)
+        plates = draw_world(rng, (complex(*parts[:2]), complex(*parts[2:])), noise=0.006, eps=eps)
         found = invert(paint(plates, rng.uniform(0.05, 0.2)), RigPrior(1e-3), KINDS)
         probabilities.append(found.painted)
-        held += [d < 5.99 for d in distances(found, eps)]
+        held += [d < 5.99 for d in compute_distances(found, eps)]
     assert 0.05 < min(probabilities) < max(probabilities) < 0.95
     assert np.mean(held) > 0.87
 
@@ -234,8 +234,8 @@ def test_paint_that_only_may_be_there_is_in_every_error_bar():
 def test_bare_metal_is_not_called_painted():
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        leak = (drawn_leakage(rng) / 3, drawn_leakage(rng) / 3)
-        found = invert(world(rng, leak), RigPrior(1e-3, leakage_std=0.025), KINDS)
+        leak = (draw_leakage(rng) / 3, draw_leakage(rng) / 3)
+        found = invert(draw_world(rng, leak), RigPrior(1e-3, leakage_std=0.025), KINDS)
         assert found.painted < 0.2
 
 
@@ -243,7 +243,7 @@ def test_paint_is_an_error_of_the_reference_from_a_probability_of_a_fifth():
     """Less probable paint leaves the reference its own error; two scenes, one of each."""
     probabilities = []
     for seed in range(2):
-        patches = paint(world(np.random.default_rng(seed), (0.003j, 0.004)), 0.03)
+        patches = paint(draw_world(np.random.default_rng(seed), (0.003j, 0.004)), 0.03)
         found = invert(patches, RigPrior(1e-3, leakage_std=0.01, leakage_measured=True), KINDS)
         probabilities.append(found.painted)
         assert (np.diag(found.nuisance_covariance)[5] > 2) == (found.painted > 0.2)
@@ -257,7 +257,7 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     kinds = Kinds([*list_literature_kinds(), *plates], float(THETA))
     # With 0.05 one draw of four has 0.89: two of the plates have nearly the same V / H, and count for less than two.
     prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
-    turned = world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
+    turned = draw_world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
     model = SceneLikelihood(turned, prior, kinds)
     particles, _, _ = sample_posterior(model, np.random.default_rng(draw))
     assert model.has_moved(particles).mean() > 0.9
@@ -268,7 +268,7 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
 def test_images_with_the_other_sign_of_phase_are_distinguished_from_ours():
     rng = np.random.default_rng(3)
     prior = RigPrior(1e-3, leakage_std=0.01)
-    measurements = world(rng, (0.01, -0.01j))
+    measurements = draw_world(rng, (0.01, -0.01j))
     mirrored_measurements, their_prior = mirror_phases(measurements, prior)
     right = invert(measurements, prior, KINDS)
     wrong = invert(mirrored_measurements, their_prior, KINDS)
@@ -283,7 +283,7 @@ def test_images_with_the_other_sign_of_phase_are_distinguished_from_ours():
 def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evidence):
     rng = np.random.default_rng(4)
     prior = RigPrior(1e-3, leakage_std=0.01)
-    measurements = world(rng, (0j, 0j))
+    measurements = draw_world(rng, (0j, 0j))
     right = invert(measurements, prior, KINDS)
     wrong = replace(invert(*mirror_phases(measurements, prior), KINDS), log_evidence=right.log_evidence + evidence)
     joined, other = join_signs(right, wrong, 0.3)
@@ -300,7 +300,7 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
 
 
 def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():
-    patches = world(np.random.default_rng(4), (0.03, 0.02j), eps=EPS[:5])
+    patches = draw_world(np.random.default_rng(4), (0.03, 0.02j), eps=EPS[:5])
     measured = RigPrior(2e-3, (0.03 + 0j, 0.02j), 0.003, True)
     unmeasured = RigPrior(2e-3)
     found = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
@@ -320,7 +320,7 @@ def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_p
     inside_68 = []
     inside_95 = []
     for _ in range(20):
-        exact = world(rng, (0j, 0j), noise=0.0, dull=0.0, eps=np.full(10, 4.0 - 0.4j))
+        exact = draw_world(rng, (0j, 0j), noise=0.0, dull=0.0, eps=np.full(10, 4.0 - 0.4j))
         size = 0.01 * np.sqrt(3.0 / rng.chisquare(3.0, 10)) * np.sqrt(5.991 / 19.1)
         errors = size * (rng.standard_normal(10) + 1j * rng.standard_normal(10))
         patches = [
@@ -350,21 +350,21 @@ def test_plates_of_one_foreign_material_do_not_turn_the_boards(eps):
         rng = np.random.default_rng(seed)
         error = 0.003 * (rng.standard_normal(2) + 1j * rng.standard_normal(2))
         prior = RigPrior(1e-3, (complex(error[0]), complex(error[1])), 0.003, True, channels_known=True, moved=0.5)
-        result = invert(world(rng, (0j, 0j), noise=0.002, dull=0.1, eps=plates), prior, kinds)
-        inside += [distance < 5.991 for distance in distances(result, plates)]
+        result = invert(draw_world(rng, (0j, 0j), noise=0.002, dull=0.1, eps=plates), prior, kinds)
+        inside += [distance < 5.991 for distance in compute_distances(result, plates)]
     assert np.mean(inside) > 0.9
 
 
 def test_plates_are_of_one_material_if_their_ratios_agree_within_their_errors():
     rng = np.random.default_rng(0)
-    alike = world(rng, (0j, 0j), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
-    others = world(rng, (0j, 0j), noise=0.002, eps=np.array([2.6 - 0.01j, 7.5 - 0.3j]))
+    alike = draw_world(rng, (0j, 0j), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
+    others = draw_world(rng, (0j, 0j), noise=0.002, eps=np.array([2.6 - 0.01j, 7.5 - 0.3j]))
     same = compute_probability_of_same_material([*alike, *others])
     assert np.diag(same) == pytest.approx(1)
     assert same == pytest.approx(same.T)
     assert same[:5, :5].min() > 0.5
     assert same[:5, 5:].max() < 1e-6
     # Leakage is common to all plates: it hardly changes which of them agree.
-    leaking = world(np.random.default_rng(0), (0.05j, 0.04), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
+    leaking = draw_world(np.random.default_rng(0), (0.05j, 0.04), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
     assert compute_probability_of_same_material(leaking) == pytest.approx(same[:5, :5], abs=0.05)
     assert compute_probability_of_same_material([]).shape == (0, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 from tests.support.paths import RIG_FILE
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight import multilayer
 from polysight.cli.main import main
@@ -17,7 +17,7 @@ from polysight.materials.sub_bands import bands_of_row
 from polysight.results import NoResult, ScanMaterials
 
 THETA = np.radians(55.0)
-CHIRP = published_rig().chirp
+CHIRP = load_published_rig().chirp
 BANDS = Spectrum.from_chirp(CHIRP, 4)
 RANGE = (0.3e-3, 6e-3)
 NEAR = (1e-3, 2.4e-3)
@@ -28,7 +28,7 @@ OWN = 3e-4
 COMMON = 3e-3
 
 
-def shared_covariance(own=OWN, common=COMMON, bands=4):
+def make_shared_covariance(own=OWN, common=COMMON, bands=4):
     """An error that all bands share, in addition to one of each."""
     place = common * np.tile(np.eye(2), (bands, 1))
     return own**2 * np.eye(2 * bands) + place @ place.T
@@ -36,7 +36,7 @@ def shared_covariance(own=OWN, common=COMMON, bands=4):
 
 def measure_bands(stack, offset=0j, theta_std=0.0, covariance=None):
     q, h = predict(stack, BANDS, THETA)
-    covariance = shared_covariance() if covariance is None else covariance
+    covariance = make_shared_covariance() if covariance is None else covariance
     sigma = np.sqrt(np.diag(covariance)[::2])
     return Bands(
         spectrum=BANDS,
@@ -60,7 +60,7 @@ def measure_bands(stack, offset=0j, theta_std=0.0, covariance=None):
     ids=["sheet in air", "sheet on metal", "film behind a wall"],
 )
 def test_permittivity_and_thickness_come_back(true, asked):
-    fit = fit_layer(measure_bands(true, covariance=shared_covariance(1e-5, 1e-5)), asked, THETA, RANGE)
+    fit = fit_layer(measure_bands(true, covariance=make_shared_covariance(1e-5, 1e-5)), asked, THETA, RANGE)
     assert fit.permittivity == pytest.approx(SHEET.permittivity, rel=1e-4)
     assert fit.thickness_m == pytest.approx(1.7e-3, rel=1e-4)
     assert not fit.ambiguous
@@ -85,7 +85,7 @@ def test_an_error_that_all_bands_share_is_not_a_misfit_and_moves_little():
 def test_differences_between_bands_are_known_better_than_each():
     """With the same error of each band, the thickness is more certain if most of the error is common to all bands."""
     alone = np.eye(8) * (OWN**2 + COMMON**2)
-    shared = fit_layer(measure_bands([SHEET], covariance=shared_covariance()), [Layer("sheet")], THETA, NEAR)
+    shared = fit_layer(measure_bands([SHEET], covariance=make_shared_covariance()), [Layer("sheet")], THETA, NEAR)
     independent = fit_layer(measure_bands([SHEET], covariance=alone), [Layer("sheet")], THETA, NEAR)
     assert shared.std_thickness_m < 0.7 * independent.std_thickness_m
 
@@ -140,7 +140,7 @@ def test_other_forms_are_refused_with_those_that_are_known(text, capsys):
 def folder(tmp_path):
     """Products of a sheet on metal, which has no permittivity as a single interface."""
     q, h = predict([SHEET, PLATE], BANDS, THETA)
-    covariance = shared_covariance()
+    covariance = make_shared_covariance()
     ratio = 1 / q
     edges = [(b.first_hz, b.last_hz) for b in sub_bands(CHIRP, 4)]
     bands = [

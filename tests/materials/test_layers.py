@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.materials.layers import Bands, Layer, LayerFit, Spectrum, check_range, check_stack, fit_layer, predict
 from polysight.polarimetry import permittivity_from_ratio, ratio_from_permittivity
@@ -15,7 +15,7 @@ from polysight_shared.errors import ConfigError, ErrorCode
 THETA = np.radians(55.0)
 WATER = 9.37 - 18.0j
 GLASS = Layer("glass", 5.5 - 0.05j, 3e-3)
-CHIRP = published_rig().chirp
+CHIRP = load_published_rig().chirp
 BANDS = Spectrum.from_chirp(CHIRP, 4)
 
 

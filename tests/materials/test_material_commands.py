@@ -20,13 +20,13 @@ def test_a_report_of_images_alone_lists_the_missing_results(tmp_path):
 def test_classifiers_are_judged_under_both_splits_as_typed(tmp_path, capsys):
     rng = np.random.default_rng(4)
 
-    def entry(scan: int, name: str, q: complex) -> Entry:
+    def make_entry(scan: int, name: str, q: complex) -> Entry:
         inverse = q + 0.01 * (rng.standard_normal(12) + 1j * rng.standard_normal(12))
         h = (0.7 + 0.01 * rng.standard_normal(12)).astype(np.float32)
         p = (1 / inverse).astype(np.complex64)
         return Entry(name, f"scan {scan}", h, np.abs(h * inverse).astype(np.float32), p, 55.0, simulated=True)
 
-    entries = [entry(i, name, q) for i in range(3) for name, q in (("near", 0.2), ("far", 0.4 + 0.1j))]
+    entries = [make_entry(i, name, q) for i in range(3) for name, q in (("near", 0.2), ("far", 0.4 + 0.1j))]
     Library(tuple(entries)).save(tmp_path / "two.npz")
     assert main(["classify", str(tmp_path / "two.npz"), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)

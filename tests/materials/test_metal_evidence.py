@@ -18,7 +18,7 @@ EPS = [
 ]  # fmt: skip
 
 
-def scene(rng, plates, metal, patterns_db=1.0):
+def draw_scene(rng, plates, metal, patterns_db=1.0):
     """Patches relative to the one that is brightest in both channels; True if that is metal; and its V / H."""
     eps = rng.choice(EPS, plates, replace=False)
     eps = eps.real * np.exp(0.03 * rng.standard_normal(plates)) + 1j * eps.imag * np.exp(
@@ -54,12 +54,12 @@ def scenes(request):
 @pytest.mark.parametrize("plates", [1, 2, 3, 4, 6, 9])
 def test_no_dielectric_is_taken_for_metal(plates, scenes):
     for seed in range(scenes):
-        patches, _, channel = scene(np.random.default_rng([plates, seed]), plates, False)
+        patches, _, channel = draw_scene(np.random.default_rng([plates, seed]), plates, False)
         assert not metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough
 
 
 def test_evidence_of_a_dielectric_reference_does_not_depend_on_the_paint_of_metal():
-    patches, _, _ = scene(np.random.default_rng(0), 3, False)
+    patches, _, _ = draw_scene(np.random.default_rng(0), 3, False)
     priors = [RigPrior(3e-3, painted=probability) for probability in (0.0, 0.5)]
     evidence = [log_evidence_of_dielectric(patches, prior, KINDS, 0.0) for prior in priors]
     assert evidence[0] == evidence[1]
@@ -71,7 +71,7 @@ def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plat
     doubted = []
     for seed in range(max(5, scenes // 2)):
         for metal in (True, False):
-            patches, is_metal, _ = scene(np.random.default_rng([plates, seed]), plates, metal)
+            patches, is_metal, _ = draw_scene(np.random.default_rng([plates, seed]), plates, metal)
             evidence = metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), None, KINDS)
             if is_metal:
                 assert evidence.culprit is None
@@ -84,7 +84,7 @@ def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plat
 def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     recognised = []
     for seed in range(scenes):
-        patches, metal, channel = scene(np.random.default_rng([plates, seed]), plates, True)
+        patches, metal, channel = draw_scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
         recognised.append(metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough)
     assert np.mean(recognised) >= least
@@ -104,20 +104,20 @@ def test_a_patch_that_looks_the_same_is_not_evidence():
     assert not evidence.enough
 
 
-def relative_to(label, bare, channel_ratio_db=-1.0, refused=()):
+def make_relative_scene(label, bare, channel_ratio_db=-1.0, refused=()):
     evidence = MetalEvidence(bare, bare, 8, channel_ratio_db)
     return SimpleNamespace(metal=SimpleNamespace(label=label, evidence=evidence), refused=dict.fromkeys(refused))
 
 
 def test_the_reference_is_the_best_shown_metal_of_those_that_may_be_one():
-    brightest = relative_to(1, 5.0)
-    bare = relative_to(2, 9.0)
+    brightest = make_relative_scene(1, 5.0)
+    bare = make_relative_scene(2, 9.0)
     assert find_most_like_metal([brightest, bare]).metal.label == 2
     assert find_most_like_metal([bare, brightest]).metal.label == 2
-    assert find_most_like_metal([brightest, relative_to(2, 9.0, channel_ratio_db=-9.0)]).metal.label == 1
-    assert find_most_like_metal([brightest, relative_to(2, 9.0, refused=[2])]).metal.label == 1
-    assert find_most_like_metal([brightest, relative_to(2, 9.0, refused=[1])]).metal.label == 2
-    nothing_like_metal = [relative_to(1, 5.0, refused=[1, 2]), relative_to(2, 9.0, refused=[1, 2])]
+    assert find_most_like_metal([brightest, make_relative_scene(2, 9.0, channel_ratio_db=-9.0)]).metal.label == 1
+    assert find_most_like_metal([brightest, make_relative_scene(2, 9.0, refused=[2])]).metal.label == 1
+    assert find_most_like_metal([brightest, make_relative_scene(2, 9.0, refused=[1])]).metal.label == 2
+    nothing_like_metal = [make_relative_scene(1, 5.0, refused=[1, 2]), make_relative_scene(2, 9.0, refused=[1, 2])]
     assert find_most_like_metal(nothing_like_metal).metal.label == 1
 
 

@@ -23,7 +23,7 @@ from polysight.materials.train import score, splits
 from polysight_shared.errors import ErrorCode
 
 
-def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, angle=0.0):
+def draw_samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, angle=0.0):
     """Materials in a row of V/H; `offset`: what all pixels of a patch share (placement, reference)."""
     rng = np.random.default_rng(seed)
     x = []
@@ -42,7 +42,7 @@ def samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=0, an
     return Samples(np.concatenate(x), np.array(names), np.array(group), np.array(patch))
 
 
-def permute_names(data, seed=0):
+def shuffle_names(data, seed=0):
     """The same pixels with the names shuffled among the patches."""
     first = np.unique(data.patches, return_index=True)[1]
     dealt = np.random.default_rng(seed).permutation(data.names[first])
@@ -51,12 +51,12 @@ def permute_names(data, seed=0):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_learns_what_is_there_to_learn(model):
-    assert score(samples(groups=4, noise=0.003), model).pixels > 0.97
+    assert score(draw_samples(groups=4, noise=0.003), model).pixels > 0.97
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_no_model_finds_what_is_not_there(model):
-    data = samples(materials=4)
+    data = draw_samples(materials=4)
     rng = np.random.default_rng(1)
     noise = Samples(rng.standard_normal(data.x.shape), data.names, data.groups, data.patches)
     assert score(noise, model).pixels == pytest.approx(0.25, abs=0.08)
@@ -64,15 +64,15 @@ def test_no_model_finds_what_is_not_there(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_with_shuffled_names_no_model_is_better_than_chance(model):
-    data = samples(groups=8, pixels=12, offset=0.02, noise=0.002)
-    scores = [score(permute_names(data, seed), model) for seed in range(4)]
+    data = draw_samples(groups=8, pixels=12, offset=0.02, noise=0.002)
+    scores = [score(shuffle_names(data, seed), model) for seed in range(4)]
     assert np.mean([s.pixels for s in scores]) == pytest.approx(1 / 6, abs=0.1)
     assert np.mean([s.patches for s in scores]) == pytest.approx(1 / 6, abs=0.12)
 
 
 @pytest.mark.parametrize("folds", [2, 3, 8])
 def test_groups_never_straddle_and_every_pixel_is_judged_once(folds):
-    data = samples(groups=5, pixels=7)
+    data = draw_samples(groups=5, pixels=7)
     judged = np.zeros(data.names.size, int)
     for train, test in splits(data, folds=folds):
         assert not set(data.groups[train]) & set(data.groups[test])
@@ -84,7 +84,7 @@ def test_groups_never_straddle_and_every_pixel_is_judged_once(folds):
 
 def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the_same_specimen():
     """It holds for any folds: here the material's two groups are the smallest, and would come into one fold."""
-    data = samples(materials=2, groups=10, pixels=20)
+    data = draw_samples(materials=2, groups=10, pixels=20)
     last = np.isin(data.groups, ["s7", "s8", "s9"])
     first_pixels = np.isin(np.arange(data.names.size), np.unique(data.patches, return_index=True)[1])
     data = data.take(np.where(last, first_pixels, data.names == "m0"))
@@ -97,7 +97,7 @@ def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the
 
 def test_scans_are_left_out_if_joined_ones_share_no_material():
     """Two pairs of scans, each of its own specimen and materials: if joined, nothing can be judged, without NaN."""
-    data = samples(materials=4, groups=4, pixels=9)
+    data = draw_samples(materials=4, groups=4, pixels=9)
     in_first = np.isin(data.groups, ["s0", "s1"])
     data = data.take(in_first == np.isin(data.names, ["m0", "m1"]))
     specimens = np.where(np.isin(data.groups, ["s0", "s1"]), "a", "b")
@@ -107,7 +107,7 @@ def test_scans_are_left_out_if_joined_ones_share_no_material():
 
 
 def test_a_split_by_pixel_divides_patches_and_is_reported_as_optimistic():
-    data = samples(groups=5, pixels=7)
+    data = draw_samples(groups=5, pixels=7)
     assert all(set(data.patches[train]) & set(data.patches[test]) for train, test in splits(data, by_pixel=True))
     assert "optimistic" in score(data, DISCRIMINANT_MODEL, by_pixel=True).split
 
@@ -124,12 +124,12 @@ def test_a_split_by_pixel_needs_two_pixels_of_a_material():
 
 def test_a_split_by_pixel_flatters():
     """Common errors of a patch's pixels are memorised if its pixels are on both sides of the split."""
-    data = samples(pixels=10, offset=0.03, noise=0.003)
+    data = draw_samples(pixels=10, offset=0.03, noise=0.003)
     assert score(data, PAPER_MODEL, by_pixel=True).pixels > score(data, PAPER_MODEL).pixels + 0.15
 
 
 def test_order_does_not_matter():
-    data = samples(groups=4, offset=0.02)
+    data = draw_samples(groups=4, offset=0.02)
     shuffled = data.take(np.random.default_rng(5).permutation(data.names.size))
     assert score(shuffled, DISCRIMINANT_MODEL).pixels == pytest.approx(score(data, DISCRIMINANT_MODEL).pixels, abs=1e-9)
 
@@ -150,7 +150,7 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
             return np.full(len(x), self.name), np.zeros(len(x))
 
     monkeypatch.setitem(MODELS, "spy", lambda _: Spy())
-    data = samples()
+    data = draw_samples()
     copied = Samples(data.x.copy(), data.names, data.groups, data.patches)
     # Twins within a patch
     copied.x[1::2] = copied.x[::2]
@@ -163,15 +163,15 @@ def test_no_pixel_of_a_test_scan_is_ever_trained_on(monkeypatch):
 def test_a_second_angle_helps():
     """The KNN; the discriminant is in test_discriminant."""
     model = PAPER_MODEL
-    first_angle = samples(groups=6, pixels=12, offset=0.02, seed=1)
-    both_angles = first_angle.join(samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
+    first_angle = draw_samples(groups=6, pixels=12, offset=0.02, seed=1)
+    both_angles = first_angle.join(draw_samples(groups=6, pixels=12, offset=0.02, seed=2, angle=0.05))
     assert both_angles.x.shape[1] == 2 * first_angle.x.shape[1]
     assert score(both_angles, model).pixels > score(first_angle, model).pixels
 
 
 def test_joining_angles_pairs_whole_patches():
-    first_angle = samples(groups=3, pixels=5)
-    two = samples(groups=3, pixels=4, seed=2)
+    first_angle = draw_samples(groups=3, pixels=5)
+    two = draw_samples(groups=3, pixels=4, seed=2)
     renamed = Samples(two.x, two.names, np.char.add("at 55 ", two.groups), two.patches + 1000)
     for second_angle in (two, renamed):
         both_angles = first_angle.join(second_angle)
@@ -189,7 +189,7 @@ def test_joining_angles_pairs_whole_patches():
 
 
 def test_channels_alone_know_less():
-    data = samples(groups=4, offset=0.005)
+    data = draw_samples(groups=4, offset=0.005)
     together = score(data, DISCRIMINANT_MODEL)
     assert all(score(data, DISCRIMINANT_MODEL, c).pixels <= together.pixels + 0.02 for c in CHANNELS)
     for table in (together.confusion, together.patch_confusion):
@@ -199,15 +199,15 @@ def test_channels_alone_know_less():
 
 def test_one_scan_is_refused():
     with refused(ErrorCode.NOT_ENOUGH_DATA):
-        score(samples(groups=1), PAPER_MODEL)
+        score(draw_samples(groups=1), PAPER_MODEL)
 
 
 def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
     """lambda_H |dH| + lambda_V |dV| with no P is a Manhattan distance, which scikit-learn computes by itself."""
     from sklearn.neighbors import KNeighborsClassifier
 
-    data = samples(noise=0.02)
-    queries = samples(noise=0.02, seed=9)
+    data = draw_samples(noise=0.02)
+    queries = draw_samples(noise=0.02, seed=9)
     our_names, _ = PaperKnn(weights=Weights(3.0, 0.7, 0.0, neighbours=7)).fit(data).by_pixel(queries.x)
     scaled = [d.x[:, :2] * [3.0, 0.7] for d in (data, queries)]
     sklearn_names = KNeighborsClassifier(7, metric="manhattan").fit(scaled[0], data.names).predict(scaled[1])
@@ -216,7 +216,7 @@ def test_the_paper_s_distance_is_what_scikit_learn_votes_with():
 
 
 def test_a_channel_without_information_gets_a_small_weight():
-    data = samples(groups=5, pixels=10)
+    data = draw_samples(groups=5, pixels=10)
     noisy = data.x.copy()
     noisy[:, 0] += np.random.default_rng(3).standard_normal(len(noisy))
     without_h = fit_weights(Samples(noisy, data.names, data.groups, data.patches))
@@ -229,7 +229,7 @@ def test_a_channel_without_information_gets_a_small_weight():
 
 def test_one_strange_specimen_does_not_open_a_material_to_everything():
     """The KNN's reach of a material is at most three times the materials' median."""
-    data = samples(groups=6, noise=0.003)
+    data = draw_samples(groups=6, noise=0.003)
     strange = data.patches == data.patches[data.names == "m2"][0]
     moved = data.x.copy()
     moved[strange] += 5 * np.ptp(data.x, axis=0)

@@ -94,7 +94,7 @@ def test_a_thin_plate_that_fits_no_half_space_is_a_possible_layer():
     assert not set(names) & set(LIBRARY)
 
 
-def layer_probability(plates: int, brightness_std: float) -> tuple[float, float]:
+def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float, float]:
     """Median probability of a possible layer, of drawn thin plates and of the half spaces of the same ratios.
 
     The plates are sheets of 0.5 to 3 mm in air, their ratios and brightnesses are from multilayer's r_s and r_p.
@@ -120,13 +120,13 @@ def layer_probability(plates: int, brightness_std: float) -> tuple[float, float]
 
 
 def test_brightness_distinguishes_thin_plates_from_half_spaces_of_the_same_ratio():
-    thin, thick = layer_probability(60, brightness_std=0.05)
+    thin, thick = compute_layer_probability(60, brightness_std=0.05)
     assert thin > 0.5
     assert thick < 0.05
 
 
 def test_brightness_of_unevenly_lit_plates_is_weak_evidence():
-    thin, thick = layer_probability(60, brightness_std=0.6)
+    thin, thick = compute_layer_probability(60, brightness_std=0.6)
     assert abs(thin - thick) < 0.2
 
 
@@ -146,7 +146,7 @@ def test_a_patch_that_is_a_layer_with_a_chance_of_one_in_four_is_measured_as_no_
 BAND_HZ = (76.3e9, 79.75e9)
 
 
-def dispersion(change: np.ndarray, std: float = 0.01) -> PatchDispersion:
+def make_dispersion(change: np.ndarray, std: float = 0.01) -> PatchDispersion:
     return PatchDispersion(change, np.full(3, std), BAND_HZ)
 
 
@@ -162,10 +162,10 @@ def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
         logs = [np.log(np.array(multilayer(*stack, centre_hz + part * width_hz, ANGLES[0]))) for part in (-0.05, 0.05)]
         of_s, of_p = (logs[1] - logs[0]) / 0.1
         change = np.array([of_s.real, (of_p - of_s).real, (of_p - of_s).imag])
-        layered.append(float(np.mean(compute_layer_odds(dispersion(change), ANGLES[0]))))
+        layered.append(float(np.mean(compute_layer_odds(make_dispersion(change), ANGLES[0]))))
     assert np.median(layered) > 1e3
     half_spaces = [
-        float(np.mean(compute_layer_odds(dispersion(x), ANGLES[0]))) for x in 0.01 * rng.standard_normal((100, 3))
+        float(np.mean(compute_layer_odds(make_dispersion(x), ANGLES[0]))) for x in 0.01 * rng.standard_normal((100, 3))
     ]
     assert np.median(half_spaces) < 0.1
     assert max(half_spaces) < 1
@@ -173,13 +173,13 @@ def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
 
 def test_an_uncertain_change_over_the_sweep_is_not_evidence():
     for std in (30.0, 1e60):
-        unknown = compute_layer_odds(dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
+        unknown = compute_layer_odds(make_dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
         assert np.median(unknown) == pytest.approx(1, abs=0.05)
 
 
 def test_a_change_of_any_size_has_finite_odds():
     for change in (0.0, 1.0, 1e3, 1e9):
-        odds = compute_layer_odds(dispersion(np.full(3, change), std=0.006), ANGLES[0])
+        odds = compute_layer_odds(make_dispersion(np.full(3, change), std=0.006), ANGLES[0])
         assert np.isfinite(odds).all()
         assert (odds > 0).all()
 
@@ -189,8 +189,8 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
     kinds = Kinds([wood, *list_literature_kinds()], ANGLES[0], with_sheets=True)
     t = complex(inverse_ratio(2.6 - 0.1j, ANGLES[0]))
     evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5)
-    still = name_patch((kinds,), (replace(evidence, dispersion=dispersion(np.zeros(3))),), np.array([[t]])).verdict
-    changing = dispersion(np.array([0.2, -0.1, 0.3]))
+    still = name_patch((kinds,), (replace(evidence, dispersion=make_dispersion(np.zeros(3))),), np.array([[t]])).verdict
+    changing = make_dispersion(np.array([0.2, -0.1, 0.3]))
     rippled = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).verdict
     assert still.name == "wood"
     assert still.confidence > 0.9

@@ -10,21 +10,21 @@ from polysight.polarimetry import PlaneReference, permittivity_from_ratio, ratio
 THETA = np.radians(55.0)
 
 
-def pixels(eps, sigma, n, rng):
+def draw_pixels(eps, sigma, n, rng):
     q = 1 / ratio_from_permittivity(eps, THETA)
     return np.ones(n, complex), q + sigma * (rng.standard_normal(n) + 1j * rng.standard_normal(n))
 
 
 def test_the_error_grows_towards_metal():
     sizes = [
-        estimate_permittivity(*pixels(eps, 0.004, 500, np.random.default_rng(3)), THETA).real_std
+        estimate_permittivity(*draw_pixels(eps, 0.004, 500, np.random.default_rng(3)), THETA).real_std
         for eps in (2.0 - 0.1j, 4.0 - 0.1j, 8.0 - 0.1j, 16.0 - 0.1j)
     ]
     assert sizes == sorted(sizes)
     step = 1e-6
     q = 1 / ratio_from_permittivity(4.0 - 0.1j, THETA)
     slope = abs(permittivity_from_ratio(q + step, THETA) - permittivity_from_ratio(q - step, THETA)) / (2 * step)
-    h, v = pixels(4.0 - 0.1j, 0.004, 4000, np.random.default_rng(4))
+    h, v = draw_pixels(4.0 - 0.1j, 0.004, 4000, np.random.default_rng(4))
     assert estimate_permittivity(h, v, THETA).real_std == pytest.approx(slope * 0.004, rel=0.05)
 
 
@@ -53,7 +53,7 @@ def test_a_shifted_plate_stays_within_its_error_bar(synthetic, request):
     assert np.sqrt(np.mean(np.square(z))) < 1.2
 
 
-def errors_beside_metal_apart(scene, lit, segmentation):
+def measure_with_separate_metal(scene, lit, segmentation):
     """Patch number to the error of its real part, with metal that was measured only at the pixels `lit`."""
     ones = np.ones(scene.h.shape, complex)
     metal = PlaneReference(ones, ones, lit, scene.x_m, scene.y_m, spread=1e-3, how="drawn")
@@ -66,12 +66,12 @@ def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synt
     scene = synthetic(3, noise=0.002)
     segmentation = scene.analyse().segmentation
     everywhere = np.ones(scene.h.shape, bool)
-    inside = errors_beside_metal_apart(scene, everywhere, segmentation)
+    inside = measure_with_separate_metal(scene, everywhere, segmentation)
     beside = next(p for p in segmentation.patches if p.label in inside)
     columns = np.flatnonzero(beside.mask.any(axis=0))
     lit = everywhere.copy()
     lit[:, columns[-1] - 7 :] = False
-    at_border = errors_beside_metal_apart(scene, lit, segmentation)
+    at_border = measure_with_separate_metal(scene, lit, segmentation)
     assert at_border[beside.label] > 1.2 * inside[beside.label]
 
 

@@ -23,7 +23,7 @@ PLACES_M = [(x, y) for y in (-0.064, 0.0, 0.064) for x in (-0.064, 0.0, 0.064)]
 ORIGIN_M = PLACES_M[4]
 
 
-def plates(ratio=0.25, seed=0):
+def draw_plates(ratio=0.25, seed=0):
     """H and V of copper and three dielectrics of one ratio, 46 mm wide, with noise 40 dB below."""
     rng = np.random.default_rng(seed)
     h, v = np.zeros((2, SIDE, SIDE), complex)
@@ -37,7 +37,7 @@ def plates(ratio=0.25, seed=0):
     ]
 
 
-def images(h, v):
+def make_images(h, v):
     return Images(h, v, AXIS, AXIS, np.ones(h.shape, bool))
 
 
@@ -48,12 +48,12 @@ def dim_copper(h, v):
     v = v.copy()
     h[20:43, 20:43] *= np.sqrt(light)
     v[20:43, 20:43] *= light
-    return images(h, v)
+    return make_images(h, v)
 
 
 def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
     """By the median of V / H, which differs from the root mean square by some per cent."""
-    scene = dim_copper(*plates())
+    scene = dim_copper(*draw_plates())
     found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     metal = metal_by_label(int(found.labels[30, 30]), found)
     relative = divide_by_reference(scene, metal, None)
@@ -65,7 +65,7 @@ def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
 
 def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
     errors = []
-    for scene in (images(*plates()), dim_copper(*plates())):
+    for scene in (make_images(*draw_plates()), dim_copper(*draw_plates())):
         found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
         known = KnownScene(segmentation=found, metal=int(found.labels[30, 30]))
         result = analyse(scene, Optics(np.radians(55.0)), known)
@@ -77,16 +77,16 @@ def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
 
 @pytest.mark.parametrize("shift_px", [(0.0, 1.5), (-2.0, 1.0), (1.2, 0.0)])
 def test_images_of_h_and_v_that_lie_apart_are_laid_on_each_other(shift_px):
-    h, v = plates()
+    h, v = draw_plates()
     moved = ndimage.shift(v, shift_px, order=3)
-    aligned, apart_mm = align(images(h, moved))
+    aligned, apart_mm = align(make_images(h, moved))
     assert apart_mm == pytest.approx((2 * shift_px[1], 2 * shift_px[0]), abs=0.4)
     inside = np.s_[10:110, 10:110]
     assert np.abs(aligned.v - v)[inside].mean() < 0.5 * np.abs(moved - v)[inside].mean()
 
 
 def test_images_that_lie_on_each_other_are_left_alone():
-    pair = images(*plates())
+    pair = make_images(*draw_plates())
     aligned, apart_mm = align(pair)
     assert apart_mm == (0.0, 0.0)
     assert np.array_equal(aligned.v, pair.v)
@@ -95,7 +95,7 @@ def test_images_that_lie_on_each_other_are_left_alone():
 def test_noise_has_no_place():
     rng = np.random.default_rng(1)
     h, v = rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE))
-    assert align(images(h, v))[1] == (0.0, 0.0)
+    assert align(make_images(h, v))[1] == (0.0, 0.0)
 
 
 def make_scatter(slope_of, slope_std=0.1):
@@ -223,26 +223,26 @@ def test_bent_plates_are_not_a_ripple():
 
 
 def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
-    h, v = plates()
-    pair = images(h, v)
+    h, v = draw_plates()
+    pair = make_images(h, v)
     patches = segment(h, v, AXIS, AXIS).patches
     metal = next(p for p in patches if np.median(np.abs(v[p.interior])) > 0.8)
     assert find_halo(metal.interior, patches, pair).level == 0
     glow = 0.3 * ndimage.gaussian_filter(metal.mask.astype(float), 8.0)
-    halo = find_halo(metal.interior, patches, images(h, v + glow))
+    halo = find_halo(metal.interior, patches, make_images(h, v + glow))
     assert halo.level > 0.005
     assert max(halo.around, key=lambda label: halo.around[label]) == metal.label
-    assert find_halo(metal.interior, patches, images(h + glow, v + glow)).level == 0
+    assert find_halo(metal.interior, patches, make_images(h + glow, v + glow)).level == 0
 
 
 def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
     """A dielectric that is declared as metal does not overdrive the receiver."""
-    h, v = plates()
+    h, v = draw_plates()
     patches = segment(h, v, AXIS, AXIS).patches
     by_level = sorted(patches, key=lambda patch: float(np.median(np.abs(v[patch.interior]))))
     glow = 0.3 * ndimage.gaussian_filter(by_level[-1].mask.astype(float), 8.0)
-    assert find_halo(by_level[-1].interior, patches, images(h, v + glow)).level > 0
-    assert find_halo(by_level[0].interior, patches, images(h, v + glow)).level == 0
+    assert find_halo(by_level[-1].interior, patches, make_images(h, v + glow)).level > 0
+    assert find_halo(by_level[0].interior, patches, make_images(h, v + glow)).level == 0
 
 
 @pytest.mark.parametrize(("left_px", "lies_in_halo"), [(59, True), (61, False)])

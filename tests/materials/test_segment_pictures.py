@@ -23,7 +23,7 @@ PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
 """Folder of the published rig's own picture and its boxes, which is not part of the repository."""
 
 
-def ripple(rng, amplitude, phase_rad):
+def draw_ripple(rng, amplitude, phase_rad):
     """A multiplicative error of these standard deviations, correlated over some 15 mm."""
     fields = [ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 7.5 / PIXEL_MM) for _ in range(2)]
     real, imag = (field / field.std() for field in fields)
@@ -44,7 +44,7 @@ def draw(seed, plates, strips=1.8, amplitude=0.25, phase_deg=13.0, background_db
     share = np.sqrt(0.5)
     out = []
     for channel in (h, v):
-        rippled = channel * ripple(rng, share * amplitude, share * np.radians(phase_deg))
+        rippled = channel * draw_ripple(rng, share * amplitude, share * np.radians(phase_deg))
         noise = (rng.standard_normal((SIDE, SIDE)) + 1j * rng.standard_normal((SIDE, SIDE))) * 10 ** (
             background_db / 20
         )
@@ -53,7 +53,7 @@ def draw(seed, plates, strips=1.8, amplitude=0.25, phase_deg=13.0, background_db
     return out
 
 
-def raster(levels_db, ratios, gap_px):
+def draw_raster(levels_db, ratios, gap_px):
     """Plates of 46 mm in rows of three, `gap_px` apart."""
     size = 23
     first = (SIDE - 3 * size - 2 * gap_px) // 2
@@ -64,12 +64,12 @@ def raster(levels_db, ratios, gap_px):
     }
 
 
-def boxes_px(found):
+def convert_boxes_to_px(found):
     return [tuple(round(b / PIXEL_MM + SIDE / 2) for b in patch.box_mm) for patch in found.patches]
 
 
 def assert_found(found, plates, tolerance_px=4):
-    boxes = boxes_px(found)
+    boxes = convert_boxes_to_px(found)
     assert len(boxes) == len(plates), boxes
     for plate in plates:
         assert any(np.abs(np.subtract(plate, box)).max() <= tolerance_px for box in boxes), (plate, boxes)
@@ -83,23 +83,23 @@ RATIOS = [COPPER, 0.2, 0.22 + 0.05j, 0.3, 0.35 - 0.1j, 0.19, 0.5, 0.28, 0.2]
 def test_rippled_plates_with_bright_strips_and_narrow_gaps_are_found(seed, gap_px):
     """Levels as in a real picture: 1.2 times metal's to a quarter of it."""
     levels = np.random.default_rng(seed).permutation([0.0, 1.0, -4.0, 1.5, 1.0, -6.0, 1.5, -8.0, -11.0])
-    plates = raster(levels, RATIOS, gap_px)
+    plates = draw_raster(levels, RATIOS, gap_px)
     assert_found(segment(*draw(seed, plates), AXIS, AXIS), plates)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_plates_25_db_below_the_brightest_are_found(seed):
-    plates = raster([0.0, -12.0, -25.0, -18.0, -1.0, -22.0], RATIOS[:6], 10)
+    plates = draw_raster([0.0, -12.0, -25.0, -18.0, -1.0, -22.0], RATIOS[:6], 10)
     assert_found(segment(*draw(seed, plates, amplitude=0.12, background_db=-48.0), AXIS, AXIS), plates)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_sheets_that_only_h_shows_are_found(seed):
-    plates = raster([0.0, -6.0, -16.0, -3.0], [COPPER, 0.0, 0.0, 0.2], 10)
+    plates = draw_raster([0.0, -6.0, -16.0, -3.0], [COPPER, 0.0, 0.0, 0.2], 10)
     assert_found(segment(*draw(seed, plates, background_db=-40.0), AXIS, AXIS), plates)
 
 
-def band_limited_noise(rng, level_db):
+def draw_band_limited_noise(rng, level_db):
     """Complex noise [2, SIDE, SIDE] of this level with resolution cells of some 4 mm."""
     parts = [ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 1.0) for _ in range(4)]
     noise = np.array([parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]])
@@ -109,16 +109,16 @@ def band_limited_noise(rng, level_db):
 @pytest.mark.parametrize("noise_db", [-20.0, -14.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_sheet_whose_v_is_noise_is_one_plate_of_one_kind(seed, noise_db):
-    plates = raster([0.0, -3.0], [COPPER, 0.01], 12)
+    plates = draw_raster([0.0, -3.0], [COPPER, 0.01], 12)
     h, v = draw(seed, plates, strips=1.0, amplitude=0.02, phase_deg=1.0, background_db=-60.0)
-    v = v + band_limited_noise(np.random.default_rng(seed), noise_db)[1]
+    v = v + draw_band_limited_noise(np.random.default_rng(seed), noise_db)[1]
     usable = np.ones(h.shape, bool)
     found, _ = patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
     dark = background(h, v, found, usable)
     assert [check_patch(patch, h, v, dark, 0.05) for patch in found.patches] == [None, None]
 
 
-def uneven_light(seed):
+def draw_uneven_light(seed):
     """An amplitude [SIDE, SIDE] that varies by 5 dB (standard deviation) over some 100 mm."""
     field = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((SIDE, SIDE)), 20.0)
     return 10 ** (5.0 * field / field.std() / 20)
@@ -127,10 +127,10 @@ def uneven_light(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_plates_are_found_over_an_uneven_background_whose_levels_overlap_with_theirs(seed):
     """A table in the antennas' pattern and reflections of the direct path; one threshold does not separate them."""
-    plates = raster([0.0, -12.0, -13.0, -11.0, -10.0, -12.0, -14.0], [COPPER, 0.1, 0.2, 0.1, 0.2, 0.15, 0.1], 12)
+    plates = draw_raster([0.0, -12.0, -13.0, -11.0, -10.0, -12.0, -14.0], [COPPER, 0.1, 0.2, 0.1, 0.2, 0.15, 0.1], 12)
     channels = np.array(draw(seed, plates, strips=1.0, amplitude=0.15, background_db=-60.0))
-    background = band_limited_noise(np.random.default_rng(seed), -24.0) * uneven_light(seed + 50)
-    boxes = boxes_px(segment(*(channels + background), AXIS, AXIS))
+    background = draw_band_limited_noise(np.random.default_rng(seed), -24.0) * draw_uneven_light(seed + 50)
+    boxes = convert_boxes_to_px(segment(*(channels + background), AXIS, AXIS))
     found = [any(np.abs(np.subtract(plate, box)).max() <= 4 for box in boxes) for plate in plates]
     assert sum(found) >= 6
     assert len(boxes) <= len(plates) + 1
@@ -138,7 +138,7 @@ def test_plates_are_found_over_an_uneven_background_whose_levels_overlap_with_th
 
 @pytest.mark.parametrize("seed", range(6))
 def test_band_limited_noise_alone_holds_no_plate(seed):
-    assert not segment(*band_limited_noise(np.random.default_rng(seed), 0.0), AXIS, AXIS).patches
+    assert not segment(*draw_band_limited_noise(np.random.default_rng(seed), 0.0), AXIS, AXIS).patches
 
 
 def test_halves_are_as_far_apart_as_their_median_ratios():
@@ -177,7 +177,7 @@ def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     assert (refusal_cause is not None and "border" in refusal_cause.what) is cut
 
 
-def refusal(h, v, box, amplitude_of_metal=0.0):
+def find_refusal(h, v, box, amplitude_of_metal=0.0):
     segmentation, _ = patches_from_labels({"plate": box}, AXIS, AXIS)
     patch = segmentation.patches[0]
     uneven = max(amplitude_of_metal, halves_apart(h, v, patch.interior) if amplitude_of_metal else 0.0)
@@ -189,7 +189,7 @@ def test_metal_that_ripples_as_real_metal_does_is_one_material(seed):
     """25 % and 13 degrees; its halves are compared with its own, as for a metal reference."""
     plates = {(60, 60, 88, 88): (0.0, COPPER)}
     h, v = draw(seed, plates, strips=1.0)
-    assert refusal(h, v, (64, 64, 84, 84), amplitude_of_metal=0.1) is None
+    assert find_refusal(h, v, (64, 64, 84, 84), amplitude_of_metal=0.1) is None
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -197,12 +197,12 @@ def test_metal_that_ripples_as_real_metal_does_is_one_material(seed):
 def test_metal_and_a_dielectric_in_one_box_are_not(seed, other):
     plates = {(60, 60, 74, 88): (0.0, COPPER), (74, 60, 88, 88): (0.0, other)}
     h, v = draw(seed, plates, strips=1.0, amplitude=0.1, phase_deg=5.0)
-    assert refusal(h, v, (62, 62, 86, 86)) is not None
+    assert find_refusal(h, v, (62, 62, 86, 86)) is not None
 
 
 def test_clutter_of_a_plates_size_is_counted_but_no_patch():
     rng = np.random.default_rng(3)
-    plates = raster([0.0, 0.0, -3.0], [COPPER, 0.25, 0.25], 10)
+    plates = draw_raster([0.0, 0.0, -3.0], [COPPER, 0.25, 0.25], 10)
     h, v = draw(3, plates)
     field = ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 6)
     clutter = 10 ** ((-24 + 4 * field / field.std()) / 20)
@@ -229,7 +229,7 @@ def test_a_plate_cut_off_from_a_larger_patch_is_reported(seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
     """Fringes over the scan shift the whole picture; each channel's copies have a place of their own."""
-    plates = raster([0.0, -3.0, 0.0, -2.0, -1.0, 0.0], RATIOS[:6], 8)
+    plates = draw_raster([0.0, -3.0, 0.0, -2.0, -1.0, 0.0], RATIOS[:6], 8)
     h, v = draw(seed, plates, amplitude=0.1, phase_deg=6.0)
     assert find_copies(segment(h, v, AXIS, AXIS).patches, h, v, PIXEL_MM) is None
     doubled = h + 0.16 * np.roll(h, (30, 45), axis=(0, 1))
@@ -241,7 +241,7 @@ def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
 
 def test_weak_plates_one_pitch_away_are_not_copies_if_both_channels_show_them():
     """Cups and sheets of a grid lie where a shift by one pitch would copy others, 16 dB weaker in H."""
-    plates = raster([0.0, 0.0, 0.0, 0.0], [COPPER, 0.3, 0.25, 0.35], 8)
+    plates = draw_raster([0.0, 0.0, 0.0, 0.0], [COPPER, 0.3, 0.25, 0.35], 8)
     h, v = draw(5, plates, amplitude=0.05, phase_deg=3.0)
     weak = 0.16 * np.roll(h, (30, 45), axis=(0, 1))
     # Their own ratios have nothing to do with those of the plates beside them.

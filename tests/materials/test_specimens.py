@@ -107,7 +107,7 @@ def test_probabilities_of_unseen_specimens_are_calibrated():
     assert np.mean(sure) == pytest.approx(np.mean(right), abs=0.08)
 
 
-def entries(samples):
+def make_entries(samples):
     """A library of the same patches."""
     out = []
     for p in np.unique(samples.patches):
@@ -132,7 +132,7 @@ def entries(samples):
 
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_what_the_library_lacks_gets_no_name_from_any_model(model):
-    classifier = Classifier(entries(draw_pixels((0.01, 0.05), 12, 3)), model=model, angles_deg=[60.0])
+    classifier = Classifier(make_entries(draw_pixels((0.01, 0.05), 12, 3)), model=model, angles_deg=[60.0])
     strange = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
     test = draw_pixels((0.01, 0.05), 1, 9, kinds=strange)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
@@ -161,7 +161,7 @@ def test_liquids_of_a_small_library_are_seldom_called_unknown(own, monkeypatch):
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_only_models_with_probabilities_report_that_no_other_material_is_near(model):
     samples = draw_pixels((0.01, 0.05), 12, 3)
-    classifier = Classifier(entries(samples), model=model, angles_deg=[60.0])
+    classifier = Classifier(make_entries(samples), model=model, angles_deg=[60.0])
     test = draw_pixels((0.0, 0.0), 1, 4)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
     whys = [
@@ -174,7 +174,7 @@ def test_only_models_with_probabilities_report_that_no_other_material_is_near(mo
 
 def test_a_patch_unlike_every_material_is_reported_with_the_nearest():
     """It is named for any distance, so that a person knows where to begin."""
-    classifier = Classifier(entries(draw_pixels((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
+    classifier = Classifier(make_entries(draw_pixels((0.01, 0.05), 12, 5)), model="discriminant", angles_deg=[60.0])
     x = draw_pixels((0.0, 0.0), 1, 3, kinds={"glass": 7.5 - 0.05j, "water": 9.4 - 18j})
     named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])
     permittivities = classifier.permittivities

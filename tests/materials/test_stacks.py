@@ -1,7 +1,7 @@
 """Plates that are not half spaces do not change the estimated errors of the rig, for example liquids behind glass."""
 
 import numpy as np
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.materials.inversion import RigPrior, invert
 from polysight.materials.kinds import Kinds, PatchMeasurement, list_literature_kinds
@@ -16,7 +16,7 @@ MEASURED = ((-0.213 + 0.39j, 0.308), (-0.429 + 0.464j, 0.253), (-0.314 + 0.416j,
 
 
 def test_cups_behind_glass_keep_their_ratio_and_the_measured_leakage():
-    spectrum = Spectrum.from_chirp(published_rig().chirp)
+    spectrum = Spectrum.from_chirp(load_published_rig().chirp)
     true = []
     for share in (0.2, 0.0, 0.1):
         liquid = Layer("liquid", 9.37 - 5 * share - 1j * (18 - 20 * share))

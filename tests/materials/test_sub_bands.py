@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace as replace_fields
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.imaging import Images
 from polysight.imaging.images import SubBand
@@ -17,12 +17,12 @@ from polysight.results import ComplexNumber, PatchFigures, to_plain
 
 THETA = np.radians(55.0)
 BAND = SubBand((0, 96), 76.3e9, 78.0e9)
-CHIRP = published_rig().chirp
+CHIRP = load_published_rig().chirp
 THICK = 4.0 - 0.4j
 INVERSE_STD = 0.01
 
 
-def channels(scene, valid) -> Images:
+def make_channels(scene, valid) -> Images:
     """Images as an image builder makes them: 0 where not valid."""
     h = np.where(valid, scene.h, 0).astype(np.complex64)
     v = np.where(valid, scene.v, 0).astype(np.complex64)
@@ -50,8 +50,8 @@ def cut_left_half(mask):
 def test_metal_that_a_sub_band_does_not_show_is_not_part_of_its_reference(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~cut_left_half(analysis.metal.mask)
-    full_rows = band_rows(analysis, [BAND], [channels(scene, everywhere)], (0, 0), 1.5)
-    cut = band_rows(analysis, [BAND], [channels(scene, without)], (0, 0), 1.5)
+    full_rows = band_rows(analysis, [BAND], [make_channels(scene, everywhere)], (0, 0), 1.5)
+    cut = band_rows(analysis, [BAND], [make_channels(scene, without)], (0, 0), 1.5)
     for patch in analysis.patches:
         (row_before,) = full_rows[patch.patch.label]
         (row_after,) = cut[patch.patch.label]
@@ -63,14 +63,14 @@ def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, analys
     dielectric = next(r for r in analysis.patches if r.patch.label != analysis.metal.label)
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~cut_left_half(dielectric.patch.interior)
-    rows = [band_rows(analysis, [BAND], [channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)]
+    rows = [band_rows(analysis, [BAND], [make_channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)]
     (row_before,), (row_after,) = (r[dielectric.patch.label] for r in rows)
     assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 
 
 def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
-    images = [channels(scene, everywhere), channels(scene, everywhere & ~analysis.metal.mask)]
+    images = [make_channels(scene, everywhere), make_channels(scene, everywhere & ~analysis.metal.mask)]
     rows = band_rows(analysis, [BAND, BAND], images, (0, 0), 1.5)
     for patch in analysis.patches:
         row_with_metal, row_without = rows[patch.patch.label]
@@ -95,7 +95,7 @@ def test_brightness_that_a_sub_band_changes_over_a_plate_is_an_error_of_that_ban
     """Echoes of the surroundings that change both channels alike do not change V / H and its error."""
     everywhere = np.ones(scene.h.shape, bool)
     ripple = 1 + 0.05 * np.sin(2 * np.pi * scene.x_m / 0.025)
-    images = channels(scene, everywhere)
+    images = make_channels(scene, everywhere)
     rippled = replace(images, h=(images.h * ripple).astype(np.complex64), v=(images.v * ripple).astype(np.complex64))
     rows = band_rows(analysis, [BAND, BAND], [images, rippled], (0, 0), 1.5)
     for patch in analysis.patches:

@@ -15,7 +15,7 @@ LEFT = 4 - 0.4j
 RIGHT = 9 - 2j
 
 
-def _scene():
+def _make_scene():
     """Metal below, two materials side by side above it; channels as complex64 [ny, nx], and boxes in pixels."""
     h = np.full((40, 60), -1, np.complex64)
     v = np.full((40, 60), -1, np.complex64)
@@ -27,7 +27,7 @@ def _scene():
 
 
 def test_each_box_is_filtered_by_itself():
-    h, _, segmentation, labels = _scene()
+    h, _, segmentation, labels = _make_scene()
     smoothed = smooth_inside(h, segmentation, 2.0)
     for name, eps in (("left", LEFT), ("right", RIGHT)):
         interior = next(p for p in segmentation.patches if p.label == labels[name]).interior
@@ -37,7 +37,7 @@ def test_each_box_is_filtered_by_itself():
 
 
 def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
-    h, v, segmentation, labels = _scene()
+    h, v, segmentation, labels = _make_scene()
     valid = np.ones(h.shape, bool)
     valid[:, :12] = valid[:, 58:] = False
     h[~valid] = v[~valid] = 0  # the sign of images

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.products import NAMES, PERMITTIVITY, REASON, judged_products
+from tests.support.products import NAMES, PERMITTIVITY, REASON, write_judged_products
 
 from polysight.cli.main import main
 from polysight.materials import PATCHES_FILE
@@ -17,7 +17,7 @@ from polysight.results.verdict import LEVELS
 NUMBERS = ("2.9", "0.2", "3.0")
 
 
-def with_pixels(folder: Path) -> Path:
+def write_products_with_pixels(folder: Path) -> Path:
     """Products that `classify` takes: with patches.npz of three patches of the simulated library's PET."""
     rows = [{"label": n, "centre_mm": [30.0 * n, 0.0], "truth": None, "pixels": 4} for n in (1, 2, 3)]
     places = np.concatenate([np.array([[30.0 * n + k, 0.0] for k in range(4)]) for n in (1, 2, 3)])
@@ -37,7 +37,7 @@ def with_pixels(folder: Path) -> Path:
 @pytest.mark.parametrize("command", ["materials", "permittivity"])
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_verdict_comes_first_and_decides_the_exit_status(tmp_path, capsys, command, level):
-    folder = str(judged_products(tmp_path, level, careless=True))
+    folder = str(write_judged_products(tmp_path, level, careless=True))
     status = main([command, folder])
     out = capsys.readouterr().out
     assert status == (NoResult.exit_status if level == "none" else 0)
@@ -57,7 +57,7 @@ def test_the_verdict_comes_first_and_decides_the_exit_status(tmp_path, capsys, c
 
 @pytest.mark.parametrize("command", ["materials", "permittivity"])
 def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
-    folder = str(judged_products(tmp_path, "none", careless=True))
+    folder = str(write_judged_products(tmp_path, "none", careless=True))
     assert main([command, folder, "--json"]) == NoResult.exit_status
     out = capsys.readouterr().out
     assert [word for word in NAMES if word in out] == []
@@ -70,7 +70,7 @@ def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
 
 
 def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
-    folder = judged_products(tmp_path, "none", careless=True)
+    folder = write_judged_products(tmp_path, "none", careless=True)
     status = main(["permittivity", str(folder), "--layer", "sheet,?,0.5"])
     answer = capsys.readouterr()
     assert status == NoResult.exit_status
@@ -80,7 +80,7 @@ def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_report_prints_the_verdict_and_the_path_of_the_page(tmp_path, capsys, level):
-    folder = judged_products(tmp_path, level)
+    folder = write_judged_products(tmp_path, level)
     (folder / "report.html").write_text("<html>", encoding="utf-8")
     assert main(["report", str(folder)]) == (NoResult.exit_status if level == "none" else 0)
     out = capsys.readouterr().out
@@ -91,8 +91,8 @@ def test_report_prints_the_verdict_and_the_path_of_the_page(tmp_path, capsys, le
 @pytest.mark.parametrize("as_json", [False, True])
 def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, capsys, as_json):
     options = ["--json"] if as_json else []
-    none = with_pixels(judged_products(tmp_path / "none", "none"))
-    good = with_pixels(judged_products(tmp_path / "good", "good"))
+    none = write_products_with_pixels(write_judged_products(tmp_path / "none", "none"))
+    good = write_products_with_pixels(write_judged_products(tmp_path / "good", "good"))
     assert main(["classify", str(none), *options]) == NoResult.exit_status
     out = capsys.readouterr().out
     if as_json:
@@ -110,7 +110,7 @@ def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, 
 
 
 def test_products_of_earlier_releases_print_no_verdict(tmp_path, capsys):
-    folder = str(judged_products(tmp_path, None))
+    folder = str(write_judged_products(tmp_path, None))
     for command in ("materials", "permittivity"):
         assert main([command, folder]) == 0
         out = capsys.readouterr().out

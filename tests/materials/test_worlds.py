@@ -14,7 +14,7 @@ from polysight_worlds.world import nine_places
 SIZE_M = (0.046, 0.046)
 
 
-def world(*stacks: Stack) -> World:
+def make_world(*stacks: Stack) -> World:
     """Copper and plates of these stacks, side by side."""
     places = nine_places(tuple(published_rig().centre_m))
     plates = [Plate("copper", places[4], SIZE_M, METAL)]
@@ -23,7 +23,7 @@ def world(*stacks: Stack) -> World:
     return World(tuple(plates))
 
 
-def half_space(permittivity: complex) -> Stack:
+def make_half_space(permittivity: complex) -> Stack:
     return Stack(below=permittivity)
 
 
@@ -47,8 +47,8 @@ def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least, reques
 @pytest.mark.slow
 def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
     """One plate along x, one along y, and a level one."""
-    stacks = (half_space(3.5 - 0.3j), half_space(4 - 0.4j), half_space(4 - 0.4j))
-    copper, level, *tilted = world(*stacks).plates
+    stacks = (make_half_space(3.5 - 0.3j), make_half_space(4 - 0.4j), make_half_space(4 - 0.4j))
+    copper, level, *tilted = make_world(*stacks).plates
     along = replace(tilted[0], tilt_x_deg=5.0)
     across = replace(tilted[1], tilt_y_deg=5.0)
     analysis, plates = analyse_world(simulate(World((copper, level, along, across))))
@@ -66,12 +66,12 @@ def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
     [
         Stack(((2.6 - 0.02j, 0.8e-3),), 1.0),
         Stack(((5.0 - 0.1j, 3e-3),), 9.4 - 18j),
-        half_space(12 - 9j),
+        make_half_space(12 - 9j),
     ],
     ids=["a thin sheet", "liquid behind glass", "a lossy plate"],
 )
 def test_declared_copper_is_never_withdrawn(beside):
-    analysis, _ = analyse_world(simulate(world(half_space(4 - 0.4j), beside)))
+    analysis, _ = analyse_world(simulate(make_world(make_half_space(4 - 0.4j), beside)))
     assert not analysis.metal.evidence.against
     assert analysis.metal.certain or analysis.metal.evidence.culprit is not None
 
@@ -79,7 +79,9 @@ def test_declared_copper_is_never_withdrawn(beside):
 @pytest.mark.slow
 @pytest.mark.parametrize("eps", [2.6 - 0.01j, 4 - 0.4j, 5 - 1.1j])
 def test_a_dielectric_declared_as_metal_is_found_out(eps):
-    analysis, _ = analyse_world(simulate(world(half_space(3.0 - 0.1j), half_space(eps))), declared="plate 1")
+    analysis, _ = analyse_world(
+        simulate(make_world(make_half_space(3.0 - 0.1j), make_half_space(eps))), declared="plate 1"
+    )
     assert analysis.metal.evidence.against
 
 
@@ -88,7 +90,7 @@ def test_a_dielectric_declared_as_metal_is_found_out(eps):
     "coat", [(3.2 - 0.1j, 0.15e-3), (2.7 - 0.02j, 1.8e-3)], ids=["paint", "a sheet of plastic on metal"]
 )
 def test_the_reference_is_bare_metal_though_coated_metal_is_brighter(coat):
-    pair = simulate(world(*map(half_space, (2.6 - 0.02j, 4 - 0.4j, 5 - 1.1j)), Stack((coat,), METAL.below)))
+    pair = simulate(make_world(*map(make_half_space, (2.6 - 0.02j, 4 - 0.4j, 5 - 1.1j)), Stack((coat,), METAL.below)))
     # As other plates, metal may be lit less than its neighbours.
     (left, bottom, right, top), *_ = (box for plate, box in pixel_boxes(pair) if plate.name == "copper")
     for channel in (pair.h, pair.v):

@@ -77,12 +77,12 @@ def draw_mutants(count: int, seed: int) -> list[Mutant]:
         if lines:
             occurrence = generator.randrange(len(lines))
             mutant = Mutant(file, operator, occurrence, lines[occurrence])
-            if mutate(mutant):
+            if apply_mutation(mutant):
                 mutants.add(mutant)
     return sorted(mutants, key=lambda m: (m.file, m.line, m.operator))
 
 
-def mutate(mutant: Mutant) -> str:
+def apply_mutation(mutant: Mutant) -> str:
     """Return the changed file's text; empty if it is not changed, or no Python without a warning."""
     original = (REPO / mutant.file).read_text(encoding="utf-8")
     mutated = mutate_code(original, get_operator(mutant.operator)(), mutant.occurrence)

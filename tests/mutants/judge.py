@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutants.draw import Mutant, mutate
+from tests.mutants.draw import Mutant, apply_mutation
 from tests.mutants.reach import PROJECTS, find_environment
 from tests.support.preloaded import LIBRARIES, PACKAGES
 
@@ -35,7 +35,7 @@ def judge(mutant: Mutant, tests: Sequence[str], copy: Path, timeout_s: float) ->
         return "unreached"
     path = copy / mutant.file
     original = path.read_text(encoding="utf-8")
-    path.write_text(mutate(mutant), encoding="utf-8")
+    path.write_text(apply_mutation(mutant), encoding="utf-8")
     try:
         failed = find_failure(copy, tests, timeout_s)
         return f"killed by {failed}" if failed else "survived"

@@ -60,7 +60,7 @@ class Reach:
         """Tests that may notice a mutant, those of its room first, then the quickest, until `limit_s` are full."""
         tests = set(self.tests.get(str(mutant), ()))
         files = set(self.files.get(str(mutant), ()))
-        tests |= {test for test in self.seconds if _file_of(test) in files}
+        tests |= {test for test in self.seconds if _cut_file(test) in files}
         tests -= set(self.failed)
 
         folder = TESTS_OF_ROOM.get(mutant.room, mutant.room)
@@ -107,7 +107,7 @@ def find_environment(copy: Path) -> dict[str, str]:
     return {"PYTHONPATH": os.pathsep.join(str(copy / top) for top in PROJECTS)}
 
 
-def _file_of(test: str) -> str:
+def _cut_file(test: str) -> str:
     return test.partition("::")[0]
 
 
@@ -156,7 +156,7 @@ def read_marks(mutants: Sequence[Mutant], log: Path, reports: Iterable[Path]) ->
         if phase == "(call)":
             tests[name].add(test)
         else:
-            files[name].add(_file_of(test))
+            files[name].add(_cut_file(test))
     reach.tests = {name: sorted(values) for name, values in tests.items()}
     reach.files = {name: sorted(values) for name, values in files.items()}
     return reach
@@ -173,19 +173,19 @@ def load(file: Path) -> Reach:
 def find_marks(mutant: Mutant) -> list[tuple[Path, int]]:
     """Files and lines of the statements that come to a mutant: its own in a function, else the users of its name."""
     tree = _parse(mutant.file)
-    function = _innermost(tree, mutant.line, (ast.FunctionDef, ast.AsyncFunctionDef))
+    function = _find_innermost(tree, mutant.line, (ast.FunctionDef, ast.AsyncFunctionDef))
     if function is not None:
-        return [(mutant.file, _statement_line(function, mutant.line))]
-    class_of = _innermost(tree, mutant.line, (ast.ClassDef,))
-    statement = _innermost(tree, mutant.line, (ast.Assign, ast.AnnAssign))
-    names = {_name_of(target) for target in _targets(statement)}
-    marks = {mark for name in names for mark in _users(mutant.file, name, in_class=class_of is not None)}
+        return [(mutant.file, _find_statement_line(function, mutant.line))]
+    class_of = _find_innermost(tree, mutant.line, (ast.ClassDef,))
+    statement = _find_innermost(tree, mutant.line, (ast.Assign, ast.AnnAssign))
+    names = {_name_of(target) for target in _list_targets(statement)}
+    marks = {mark for name in names for mark in _find_users(mutant.file, name, in_class=class_of is not None)}
     if class_of is not None:
         # A field's default matters to those who make one.
-        marks |= set(_users(mutant.file, class_of.name, in_class=False))
+        marks |= set(_find_users(mutant.file, class_of.name, in_class=False))
     if not marks:
         functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
-        marks = {(mutant.file, _first_line(f)) for f in functions}
+        marks = {(mutant.file, _find_first_line(f)) for f in functions}
     return sorted(marks)
 
 
@@ -194,13 +194,13 @@ def _parse(file: Path) -> ast.Module:
     return ast.parse((REPO / file).read_text(encoding="utf-8"))
 
 
-def _innermost(tree: ast.AST, line: int, kinds: tuple[type, ...]) -> Any:
+def _find_innermost(tree: ast.AST, line: int, kinds: tuple[type, ...]) -> Any:
     nodes: list[Any] = [n for n in ast.walk(tree) if isinstance(n, kinds)]
     nodes = [n for n in nodes if n.lineno <= line <= n.end_lineno]
     return max(nodes, key=lambda n: n.lineno, default=None)
 
 
-def _targets(statement: ast.AST | None) -> Iterable[ast.expr]:
+def _list_targets(statement: ast.AST | None) -> Iterable[ast.expr]:
     if isinstance(statement, ast.Assign):
         return statement.targets
     if isinstance(statement, ast.AnnAssign):
@@ -212,7 +212,7 @@ def _name_of(target: ast.expr) -> str:
     return target.id if isinstance(target, ast.Name) else ""
 
 
-def _users(file: Path, name: str, in_class: bool) -> Iterator[tuple[Path, int]]:
+def _find_users(file: Path, name: str, in_class: bool) -> Iterator[tuple[Path, int]]:
     """Statements in functions that use a name of a file: by itself there and where it is imported, or as attribute."""
     if not name:
         return
@@ -228,12 +228,12 @@ def _users(file: Path, name: str, in_class: bool) -> Iterator[tuple[Path, int]]:
             by_itself = isinstance(node, ast.Name) and node.id == name and is_imported and not in_class
             as_attribute = isinstance(node, ast.Attribute) and node.attr == name
             if by_itself or as_attribute:
-                function = _innermost(tree, node.lineno, (ast.FunctionDef, ast.AsyncFunctionDef))
+                function = _find_innermost(tree, node.lineno, (ast.FunctionDef, ast.AsyncFunctionDef))
                 if function is not None:
-                    yield other, _statement_line(function, node.lineno)
+                    yield other, _find_statement_line(function, node.lineno)
 
 
-def _first_line(function: Any) -> int:
+def _find_first_line(function: Any) -> int:
     """Line of a function's first statement after its docstring."""
     body = function.body
     has_text = isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant)
@@ -246,9 +246,9 @@ def _start(statement: Any) -> int:
     return min([statement.lineno, *(d.lineno for d in decorators)])
 
 
-def _statement_line(function: Any, line: int) -> int:
+def _find_statement_line(function: Any, line: int) -> int:
     """Line before which a mark may stand: of the innermost statement of a function that holds a line."""
-    mark_line = _first_line(function)
+    mark_line = _find_first_line(function)
     blocks = [function.body]
     while blocks:
         for statement in blocks.pop():

@@ -10,7 +10,7 @@ from tests.support.page.chromium import Browser, find_chromium
 from tests.support.processes import wait_for
 
 
-def running_in_group(group: int) -> set[int]:
+def list_running_in_group(group: int) -> set[int]:
     """Numbers of the processes of this group that have not ended."""
     running = set()
     for folder in Path("/proc").iterdir():
@@ -30,7 +30,7 @@ def test_a_browser_that_ended_leaves_no_process(tmp_path, leader_is_killed):
         pytest.skip("no chromium here: sudo apt-get install chromium")
     with Browser(tmp_path) as browser:
         group = browser.process_group
-        assert len(running_in_group(group)) > 1
+        assert len(list_running_in_group(group)) > 1
         if leader_is_killed:
             os.kill(group, signal.SIGKILL)
-    wait_for(lambda: not running_in_group(group), "the end of the browser's processes")
+    wait_for(lambda: not list_running_in_group(group), "the end of the browser's processes")

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 import zmq
 from tests.support.processes import HANG_S, wait_for
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from zmq.utils.monitor import recv_monitor_message
 
 from polysight.page.watch import PiListener
@@ -15,7 +15,7 @@ from polysight_shared import messages as m
 from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import EVENT_TOPIC, create_observer, create_publisher, make_server_context
 
-RIG = published_rig()
+RIG = load_published_rig()
 OF = {"scan_id": "mine", "t_mono_ns": 1}
 
 
@@ -53,7 +53,7 @@ def capture(point: int, scan: str = "mine") -> m.Capture:
     )  # fmt: skip
 
 
-def row_finished(status: m.RowStatus) -> m.RowFinished:
+def make_row_finished(status: m.RowStatus) -> m.RowFinished:
     return m.RowFinished(**OF, seq=9, row_index=7, take=2, status=status, points=1, edges=1, bursts=1, pulses=1)
 
 
@@ -71,7 +71,7 @@ def test_a_row_is_shown_while_it_runs_and_rows_of_other_scans_are_not(pi):
     tell(capture(4))
     wait_for(lambda: listener.state.point == 5, "the newest point")
     assert (listener.state.row, listener.state.take, listener.state.state) == (7, 2, "running")
-    tell(row_finished("done"))
+    tell(make_row_finished("done"))
     wait_for(lambda: listener.state.row == -1, "the row's end")
 
 
@@ -79,10 +79,10 @@ def test_faults_stay_until_a_row_ends_well(pi):
     tell, listener = pi
     tell(m.Fault(**OF, seq=4, number=101, problem="the stage does not answer"))
     wait_for(lambda: listener.state.faults, "the fault")
-    tell(row_finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
+    tell(make_row_finished("fault"), m.Heartbeat(**OF, seq=9, state="fault", period_ms=100))
     wait_for(lambda: listener.state.state == "fault", "the state")
     assert listener.state.faults[0].level == "error"
-    tell(row_finished("done"))
+    tell(make_row_finished("done"))
     wait_for(lambda: not listener.state.faults, "that it is over")
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.catalogue import PHASE_COLOURS, colour_bar, draw
 from polysight.imaging import Images
@@ -18,7 +18,7 @@ NY = 8
 NX = 11
 
 
-def pixels(png: bytes) -> np.ndarray:
+def decode_pixels(png: bytes) -> np.ndarray:
     return imread(io.BytesIO(png), format="png")
 
 
@@ -32,7 +32,7 @@ def images() -> Images:
 
 
 def test_smallest_y_is_at_the_bottom(images):
-    picture = pixels(draw(images)["h_amplitude"].png)
+    picture = decode_pixels(draw(images)["h_amplitude"].png)
     assert picture.shape == (NY, NX, 4)
     light = picture[..., :3].sum(axis=-1)
     assert np.unravel_index(light.argmax(), light.shape) == (NY - 1, NX - 1)
@@ -42,22 +42,22 @@ def test_what_no_row_has_lit_is_transparent(images):
     is_lit = np.ones((NY, NX), bool)
     is_lit[:3] = False
     for picture in draw(replace(images, valid=is_lit)).values():
-        assert (pixels(picture.png)[-3:, :, 3] == 0).all()
-    assert (pixels(draw(replace(images, valid=is_lit))["h_amplitude"].png)[:-3, :, 3] == 1).all()
+        assert (decode_pixels(picture.png)[-3:, :, 3] == 0).all()
+    assert (decode_pixels(draw(replace(images, valid=is_lit))["h_amplitude"].png)[:-3, :, 3] == 1).all()
 
 
 def test_nothing_lit_is_drawn_all_the_same(images):
     nothing = replace(images, valid=np.zeros((NY, NX), bool))
-    assert all((pixels(p.png)[..., 3] == 0).all() for p in draw(nothing).values())
+    assert all((decode_pixels(p.png)[..., 3] == 0).all() for p in draw(nothing).values())
 
 
 def test_phase_is_cyclic_and_comes_round(images):
     angles = np.linspace(-np.pi, np.pi, NX, dtype=np.float32)
     turned = np.tile(np.exp(1j * angles).astype(np.complex64), (NY, 1))
-    row = pixels(draw(replace(images, h=turned))["h_phase"].png)[0, :, :3]
+    row = decode_pixels(draw(replace(images, h=turned))["h_phase"].png)[0, :, :3]
     assert np.abs(row[0] - row[-1]).max() < 0.02
     assert np.abs(row[0] - row[NX // 2]).max() > 0.3
-    ends = pixels(colour_bar(PHASE_COLOURS))[0]
+    ends = decode_pixels(colour_bar(PHASE_COLOURS))[0]
     assert np.abs(ends[0] - ends[-1]).max() < 0.02
 
 
@@ -69,7 +69,7 @@ def test_phases_fade_with_the_level_below_the_brightest_pixels(images, picture, 
     h = np.ones((NY, NX), np.complex64)
     # The picture's first row
     h[-1, 3] = 10 ** (level_db / 20)
-    drawn = pixels(draw(replace(images, h=h, v=np.ones_like(h)))[picture].png)
+    drawn = decode_pixels(draw(replace(images, h=h, v=np.ones_like(h)))[picture].png)
     assert drawn[0, 3, 3] == pytest.approx(opacity, abs=0.01)
     assert (np.delete(drawn[..., 3].ravel(), 3) == 1).all()
 
@@ -79,12 +79,12 @@ def test_phase_of_p_is_the_difference(images):
     v = images.v * np.exp(0.25j).astype(np.complex64)
     p = draw(replace(images, h=h, v=v))["p_phase"].png
     same = draw(replace(images, h=images.h * np.exp(0.75j).astype(np.complex64)))["p_phase"].png
-    assert np.allclose(pixels(p), pixels(same), atol=0.01)
+    assert np.allclose(decode_pixels(p), decode_pixels(same), atol=0.01)
 
 
 @pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
 def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
-    chirp = published_rig().chirp
+    chirp = load_published_rig().chirp
     f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     echo = 1 + 0.3 * np.exp(2j * np.pi * f * path_m / SPEED_OF_LIGHT_M_S)
     samples = np.tile(echo.astype(np.complex64), (4, 5, 1))

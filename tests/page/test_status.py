@@ -35,7 +35,7 @@ def history(finished):
     return history
 
 
-def status(history, signs=LIVELY, heard=RUNNING, shown=ShownResults(), **more):  # noqa: B008
+def judge_status(history, signs=LIVELY, heard=RUNNING, shown=ShownResults(), **more):  # noqa: B008
     return judge(Inputs(FOLDER, history, signs, heard, shown, **more))
 
 
@@ -44,30 +44,30 @@ def make_signs(command, doing="rows"):
 
 
 def test_all_is_well_needs_nothing_done(history):
-    s = status(history)
+    s = judge_status(history)
     assert (s.level, s.do) == ("good", "")
     assert "Row 1" in s.detail
 
 
 def test_a_dead_program_outranks_everything_but_the_end(history):
     killed_signs = replace(make_signs("abort"), alive=False, killed=True, alive_s=1.7e9, pi_silent_s=99.0)
-    s = status(history, killed_signs, replace(RUNNING, state="fault"))
+    s = judge_status(history, killed_signs, replace(RUNNING, state="fault"))
     assert (s.level, s.headline) == ("bad", "The scan program was killed")
     assert f"polysight resume {FOLDER}" in s.do
     assert "1 of 3 rows are safe" in s.detail
     add_fact(history, {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request"})
-    assert status(history, killed_signs).headline == "Stopped on request"
+    assert judge_status(history, killed_signs).headline == "Stopped on request"
 
 
 def test_a_started_program_hangs_once_its_run_has_begun(history):
     """Before the program has written anything, the signs of life are those of the previous run."""
     lifeless = replace(LIVELY, alive=False)
     started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
-    assert status(history, lifeless, program=started).key == "frozen"
+    assert judge_status(history, lifeless, program=started).key == "frozen"
     resumed = replace_struct(started, started_utc="2100-01-01T00:00:00+00:00")
-    assert status(history, lifeless, program=resumed).key == "resuming"
+    assert judge_status(history, lifeless, program=resumed).key == "resuming"
     add_fact(history, {"fact": "scan_resumed", "resumed_utc": "2100-01-01T00:00:01+00:00"})
-    s = status(history, lifeless, program=resumed)
+    s = judge_status(history, lifeless, program=resumed)
     assert (s.key, s.press) == ("frozen", ("abort", "resume"))
 
 
@@ -78,14 +78,14 @@ def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
     history = begin_history(facts[0])
     quiet = replace(LIVELY, life=None)
     between_rows = replace(RUNNING, row=-1)
-    s = status(history, quiet, between_rows, program=started)
+    s = judge_status(history, quiet, between_rows, program=started)
     assert (s.key, s.press) == ("starting", ())
     add_fact(history, next(f for f in facts if f["fact"] == "row_committed"))
-    assert status(history, quiet, between_rows, program=started).key == "rows"
+    assert judge_status(history, quiet, between_rows, program=started).key == "rows"
     add_fact(history, {"fact": "scan_resumed", "resumed_utc": "2090-01-01T00:00:01+00:00"})
-    assert status(history, quiet, between_rows, program=started).key == "resuming"
-    assert status(history, quiet, program=started).key == "rows"
-    assert status(history, LIVELY, between_rows, program=started).key == "rows"
+    assert judge_status(history, quiet, between_rows, program=started).key == "resuming"
+    assert judge_status(history, quiet, program=started).key == "rows"
+    assert judge_status(history, LIVELY, between_rows, program=started).key == "rows"
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
 def test_a_problem_is_shown_with_its_cause_and_remedy(history, signs, heard, word):
     add_fact(history, ROW | {"row": 0, "committed_utc": "2026-01-01T00:00:00Z"})
     history._row_seconds = [20.0]
-    s = status(history, signs, heard)
+    s = judge_status(history, signs, heard)
     assert word in s.headline
     assert s.level in ("warn", "bad")
     assert s.why
@@ -117,23 +117,23 @@ def test_every_fault_of_the_pi_has_words(history, number):
     assert notice.do
     lasting = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM, PiFault.TRIGGER_LINE_LOST, PiFault.JOURNAL_FULL)
     assert notice.level == "error" or number not in lasting
-    s = status(history, heard=replace(RUNNING, state="fault", faults=(notice,)))
+    s = judge_status(history, heard=replace(RUNNING, state="fault", faults=(notice,)))
     assert (s.level, s.why, s.do) == ("bad", notice.why, notice.do)
 
 
 def test_a_row_taken_again_is_a_warning_for_a_while(history):
     add_fact(history, REJECTED)
-    s = status(history, heard=replace(RUNNING, take=2))
+    s = judge_status(history, heard=replace(RUNNING, take=2))
     assert s.level == "warn"
     assert "Row 1 is retaken" in s.headline
     assert "polysight card" in s.do
     for row, level in ((1, "warn"), (0, "warn"), (1, "good")):
         add_fact(history, ROW | {"row": row})
-        assert status(history).level == level
+        assert judge_status(history).level == level
 
 
 def test_an_rx_without_a_signal_is_reported(history):
-    s = status(history, shown=ShownResults(sync={"RH": {0: RowSync(0.02, 0.004, 0, dead_rx=(3,))}}))
+    s = judge_status(history, shown=ShownResults(sync={"RH": {0: RowSync(0.02, 0.004, 0, dead_rx=(3,))}}))
     assert s.level == "warn"
     assert "RX3 of RH gives no signal" in s.headline + s.detail
 
@@ -141,19 +141,19 @@ def test_an_rx_without_a_signal_is_reported(history):
 @pytest.mark.parametrize(("direct_rad", "masked", "level"), [(0.004, 0, "good"), (0.3, 0, "warn"), (0.004, 2, "warn")])
 def test_rows_without_a_direct_path_are_not_well(history, direct_rad, masked, level):
     pictures = ShownResults(sync={"RH": {0: RowSync(0.02, direct_rad, masked)}})
-    s = status(history, shown=pictures)
+    s = judge_status(history, shown=pictures)
     assert s.level == level
     assert bool(s.do) == (level == "warn")
 
 
 def test_requests_are_shown_with_their_sender_until_they_are_carried_out(history):
-    s = status(history, make_signs("pause"))
+    s = judge_status(history, make_signs("pause"))
     assert (s.headline, s.press) == ("Pausing after this row", ("continue", "stop", "abort"))
     assert "the page" in s.detail
     add_fact(history, {"fact": "scan_paused", "paused_utc": "2026-01-01T00:00:00Z"})
-    assert status(history, make_signs("pause")).headline == "Paused"
-    assert status(history, make_signs("stop")).press == ("abort",)
-    assert status(history, make_signs("abort")).headline == "Stopping now"
+    assert judge_status(history, make_signs("pause")).headline == "Paused"
+    assert judge_status(history, make_signs("stop")).press == ("abort",)
+    assert judge_status(history, make_signs("abort")).headline == "Stopping now"
 
 
 def test_an_abort_is_not_a_fault(history):
@@ -163,11 +163,11 @@ def test_an_abort_is_not_a_fault(history):
     fault = make_fault_notice(Fault(scan_id="s", seq=1, t_mono_ns=1, number=PiFault.ABORTED, problem="aborted"))
     history.notices.append(fault)
     stopped = replace(RUNNING, state="fault", faults=(fault,))
-    assert status(history, make_signs("abort"), stopped).key == "aborting"
+    assert judge_status(history, make_signs("abort"), stopped).key == "aborting"
     assert [notice.level for notice in history.notices] == ["note", "note"]
     end = {"fact": "scan_ended", "exit_status": "abort", "reason": "stopped on request", "asked": "abort"}
     add_fact(history, end | {"asker": "the page"})
-    s = status(history, replace(LIVELY, alive=False, life=None))
+    s = judge_status(history, replace(LIVELY, alive=False, life=None))
     assert (s.key, s.press) == ("aborted", ("resume", "repeat"))
     assert "the page" in s.detail
     # The program's last message, which is that of an error.
@@ -179,29 +179,29 @@ def test_an_abort_is_not_a_fault(history):
 def test_there_is_no_result_before_materials(history):
     for row in (1, 2):
         add_fact(history, ROW | {"row": row})
-    assert status(history, heard=replace(RUNNING, state="homing")).key == "homing_again"
-    assert status(history, heard=replace(RUNNING, row=-1)).key == "finishing"
+    assert judge_status(history, heard=replace(RUNNING, state="homing")).key == "homing_again"
+    assert judge_status(history, heard=replace(RUNNING, row=-1)).key == "finishing"
     add_fact(history, {"fact": "scan_ended", "exit_status": "success", "reason": ""})
     good = Verdict("good")
     # Its program still runs, and has not reported that it computes materials.
-    assert status(history).key == "finishing"
-    assert status(history, make_signs("", "materials"), verdict=good).key == "materials"
+    assert judge_status(history).key == "finishing"
+    assert judge_status(history, make_signs("", "materials"), verdict=good).key == "materials"
     assert make_snapshot(Inputs(FOLDER, history, make_signs("", "materials"), verdict=good)).verdict is None
     for level in ("good", "care", "none"):
-        assert status(history, replace(LIVELY, life=None), verdict=Verdict(level)).key == f"result_{level}"
+        assert judge_status(history, replace(LIVELY, life=None), verdict=Verdict(level)).key == f"result_{level}"
     running = Program("process", True, None, (), "2026-01-01T00:00:00", "")
-    assert status(history, replace(LIVELY, life=None), verdict=good, program=running).key == "processing"
+    assert judge_status(history, replace(LIVELY, life=None), verdict=good, program=running).key == "processing"
     killed = replace(make_signs("", "materials"), alive=False, killed=True)
-    assert "killed" in status(history, killed).detail
+    assert "killed" in judge_status(history, killed).detail
 
 
 def test_a_failed_start_is_shown_with_its_cause_and_offered_again():
     failure = Finding("error", "no Pi answers", "it is off", "switch it on")
     failed = Program("scan", False, 4, (), "2026-01-01T00:00:00", "")
-    s = status(None, program=failed, failure=failure)
+    s = judge_status(None, program=failed, failure=failure)
     assert (s.detail, s.why, s.do, s.press) == ("no Pi answers.", "it is off", "switch it on", ("again",))
     assert make_snapshot(Inputs(FOLDER, None, LIVELY, program=failed, failure=failure)).notices == [failure]
-    assert status(None, program=replace_struct(failed, running=True)).key == "starting"
+    assert judge_status(None, program=replace_struct(failed, running=True)).key == "starting"
 
 
 def test_no_state_shows_text_of_another_state():
@@ -214,21 +214,21 @@ def test_no_state_shows_text_of_another_state():
 def test_each_end_of_a_scan_is_described(history):
     ended = {"fact": "scan_ended", "exit_status": "fail", "reason": "the Pi did not answer"}
     add_fact(history, ended | {"why": "it is off", "remedy": "switch it on"})
-    s = status(history)
+    s = judge_status(history)
     assert (s.level, s.why, s.do) == ("bad", "It is off", "Switch it on")
     assert s.detail == "The Pi did not answer. 1 of 3 rows are safe."
     add_fact(history, ended)
-    assert f"polysight resume {FOLDER}" in status(history).do
+    assert f"polysight resume {FOLDER}" in judge_status(history).do
     for row in (1, 2):
         add_fact(history, ROW | {"row": row})
     add_fact(history, ended | {"exit_status": "success", "reason": "every row is committed"})
-    s = status(history, replace(LIVELY, life=None))
+    s = judge_status(history, replace(LIVELY, life=None))
     assert (s.level, s.do) == ("done", "")
 
 
 def test_without_a_scan_the_page_explains_how_to_begin_one():
-    assert f"polysight scan --out {FOLDER}" in status(None).do
+    assert f"polysight scan --out {FOLDER}" in judge_status(None).do
 
 
 def test_a_renamed_folder_is_reported_as_missing(history):
-    assert status(history, gone=True).headline == "The scan's folder is gone"
+    assert judge_status(history, gone=True).headline == "The scan's folder is gone"

@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from msgspec.structs import replace
 from tests.support.page.live_view import GrowingScan
 from tests.support.processes import wait_for
-from tests.support.products import REASON, judged_products
+from tests.support.products import REASON, write_judged_products
 from tests.support.store.facts import parse_fact
 
 from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, SignOfLife, read_start_ticks
@@ -255,7 +255,7 @@ def test_the_verdict_follows_the_products(tmp_path):
     assert tail.look("") is None
     for level in ("care", "none", None, "good"):
         shutil.rmtree(tmp_path / "products", ignore_errors=True)
-        judged_products(tmp_path / "products", level)
+        write_judged_products(tmp_path / "products", level)
         verdict = tail.look("")
         assert (verdict.level if verdict else None) == level
     (tmp_path / "products" / "materials.json").write_text("{", encoding="utf-8")
@@ -263,7 +263,7 @@ def test_the_verdict_follows_the_products(tmp_path):
 
 
 def test_images_before_materials_and_earlier_products_are_not_a_result(tmp_path):
-    judged_products(tmp_path / "products", "good")
+    write_judged_products(tmp_path / "products", "good")
     facts = ScanFacts.read(tmp_path / "products" / SCAN)
     write_json(tmp_path / "products" / SCAN, replace(facts, processed_utc="2026-01-01T00:00:00+00:00"))
     tail = ProductsTail(tmp_path)
@@ -275,7 +275,7 @@ def test_images_before_materials_and_earlier_products_are_not_a_result(tmp_path)
 
 def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
     growing.grow_until("row_committed")
-    judged_products(growing.path / "products", "care")
+    write_judged_products(growing.path / "products", "care")
     watch = watching(growing.path)
     watch.wait_for(lambda s: s["scan"] is not None)
     assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan

@@ -49,12 +49,12 @@ ERRORS = Errors(0.004, 0.01, leakage=0.05)
 ROWS = {m.number: m for m in table2()}
 
 
-def material(number):
+def make_material(number):
     m = ROWS[number]
     return Material(m.name, None if number == 1 else m.permittivity, m.thickness_mm)
 
 
-def angles(number):
+def list_angles(number):
     if number <= 23:
         return (60, 55)
     if number <= 32:
@@ -69,11 +69,11 @@ def dataset(tmp_path_factory):
     seed = 0
     for k in range(3):
         for number in CHOSEN:
-            for angle in angles(number):
+            for angle in list_angles(number):
                 seed += 1
                 write_material(
                     folder=folder / "materials",
-                    material=material(number),
+                    material=make_material(number),
                     angle_deg=angle,
                     scan=f"set{k}_{angle}",
                     pixels=60,
@@ -90,7 +90,7 @@ def dataset(tmp_path_factory):
         seed=999,
     )
     boxes = {"copper": (10, 10, 40, 40), "Acrylic (3 mm)": (60, 10, 90, 40), "ceramic": (10, 60, 40, 90)}
-    named = {"copper": material(1), "Acrylic (3 mm)": material(3), "ceramic": material(12)}
+    named = {"copper": make_material(1), "Acrylic (3 mm)": make_material(3), "ceramic": make_material(12)}
     for k in range(2):
         write_labels(
             folder=folder / "labels",
@@ -152,13 +152,13 @@ def test_the_figures_are_compared_with_the_published_values(out):
 
 
 def test_sugar_is_judged_at_the_angle_with_the_most_solutions_whatever_else_was_scanned_at_another(tmp_path):
-    def entry(name, percent, angle_deg):
+    def make_entry(name, percent, angle_deg):
         ratio = np.full(4, np.tan(np.radians(40 + percent / 10)), np.complex64)
         return Entry(name, "1", np.abs(ratio), np.ones(4, np.float32), ratio, angle_deg, True)
 
-    solutions = [entry(f"sugar ({percent}%)", percent, 60.0) for percent in (2, 4, 6, 8)]
-    others = [entry(f"solid {k}", 0, 55.0) for k in range(9)]
-    library = Library((entry("sugar (2%)", 2, 55.0), *others, *solutions))
+    solutions = [make_entry(f"sugar ({percent}%)", percent, 60.0) for percent in (2, 4, 6, 8)]
+    others = [make_entry(f"solid {k}", 0, 55.0) for k in range(9)]
+    library = Library((make_entry("sugar (2%)", 2, 55.0), *others, *solutions))
     data = AuthorsData(tmp_path, load_instrument(RIG_FILE), {MATERIALS: library}, {}, ())
     judged = authors_fig21(data).data[MATERIALS]
     assert judged["angle_deg"] == 60.0
@@ -311,7 +311,7 @@ def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, caps
         for number in (1, material_index):
             write_material(
                 folder=tmp_path / "materials",
-                material=material(number),
+                material=make_material(number),
                 angle_deg=60,
                 scan=f"set{k}",
                 pixels=30,
@@ -349,7 +349,7 @@ def test_few_scans_of_few_pixels_give_figures_or_are_refused(tmp_path, monkeypat
                 drawn = 100 * seed + 10 * k + number
                 write_material(
                     folder=folder,
-                    material=material(number),
+                    material=make_material(number),
                     angle_deg=60,
                     scan=f"set{k}",
                     pixels=pixels,

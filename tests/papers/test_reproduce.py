@@ -18,7 +18,7 @@ from polysight_shared.config import load_instrument
 from polysight_shared.errors import DataError
 
 
-def item(key="fig3", value=1.0):
+def make_item(key="fig3", value=1.0):
     figure = new_figure(3, 2)
     ax = figure.subplots()
     ax.plot([0, value])
@@ -36,7 +36,7 @@ def test_every_figure_is_stamped(monkeypatch, tmp_path):
         return save(canvas, *args, **kwargs)
 
     monkeypatch.setattr(FigureCanvasAgg, "print_png", spy)
-    report.write_item(tmp_path, item())
+    report.write_item(tmp_path, make_item())
     assert texts == ["SIMULATED"]
 
 
@@ -44,7 +44,7 @@ def test_the_page_is_one_file_that_calls_everything_simulated_and_names_what_is_
     def broken(_):
         raise DataError("no such image", "it was not made")
 
-    makers = {"fig3": lambda _: item(), "fig20": broken, "fig21": lambda _: item("fig21")}
+    makers = {"fig3": lambda _: make_item(), "fig20": broken, "fig21": lambda _: make_item("fig21")}
     monkeypatch.setattr(report, "MAKERS", makers)
     assert main(["reproduce", "--out", str(tmp_path), "fig3", "fig20"]) == 1
     page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")
@@ -81,7 +81,7 @@ def test_a_run_that_is_interrupted_has_a_page_and_a_second_one_names_what_is_not
 
 
 def test_the_files_hold_the_numbers(tmp_path):
-    report.write_item(tmp_path, item(value=2.5))
+    report.write_item(tmp_path, make_item(value=2.5))
     content = json.loads((tmp_path / "fig3.json").read_text())
     assert content["simulated"] is True
     assert content["n"] == 2.5

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.polarimetry import specular_incidence_rad
 from polysight_papers.sensys2026 import images, run as catalogue
@@ -28,7 +28,7 @@ def test_random_places_never_overlap_and_stay_on_the_plane(seed):
 
 
 def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
-    steep = published_rig()
+    steep = load_published_rig()
     near = load_instrument(front_on(RIG_FILE, tmp_path))
     assert np.degrees(specular_incidence_rad(steep)) == pytest.approx(55, abs=0.2)
     assert np.degrees(specular_incidence_rad(near)) < 2
@@ -38,7 +38,7 @@ def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
 def test_the_plane_of_fig13_is_seen_under_50_degrees():
     import msgspec
 
-    rig = published_rig()
+    rig = load_published_rig()
     rig = msgspec.structs.replace(
         rig, geometry=msgspec.structs.replace(rig.geometry, object_distance_mm=FIG13_DISTANCE_MM)
     )
@@ -47,7 +47,7 @@ def test_the_plane_of_fig13_is_seen_under_50_degrees():
 
 @pytest.mark.parametrize("if_hz", [210e3, 870e3, 1.81e6])
 def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
-    chirp = published_rig().chirp
+    chirp = load_published_rig().chirp
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     gains = np.array([1.0, 1j, -0.5, 0.25])[:, None, None]
     frequency, amplitude = tones((gains * 40 * np.exp(2j * np.pi * if_hz * t)).astype(np.complex64), chirp)
@@ -113,7 +113,7 @@ def test_names_stand_in_the_middle_of_the_plates():
 
 
 def test_the_smear_around_a_tone_rises_with_the_power_of_its_noise():
-    chirp = published_rig().chirp
+    chirp = load_published_rig().chirp
     noise = np.random.default_rng(1).standard_normal((1, 20, chirp.samples, 2)) @ [1, 1j]
     tone = np.exp(2j * np.pi * 0.2 * np.arange(chirp.samples))
     axes = Figure().add_subplot()

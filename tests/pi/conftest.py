@@ -12,7 +12,7 @@ import tomli_w
 from tests.support.pi.fakes import FakeStage
 from tests.support.pi.host_side import HostSide, Running
 from tests.support.pi.program import Process
-from tests.support.rigs import at_stage_port, published_rig, timed_by_the_program
+from tests.support.rigs import load_published_rig, set_stage_port, time_by_the_program
 
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
@@ -23,7 +23,7 @@ from polysight_simulators.wires import WireHub
 @pytest.fixture
 def instrument(tmp_path: Path) -> Instrument:
     """The published rig with a small grid, on ephemeral loopback ports."""
-    rig = published_rig()
+    rig = load_published_rig()
     replace = msgspec.structs.replace
     return replace(
         rig,
@@ -44,7 +44,7 @@ def instrument(tmp_path: Path) -> Instrument:
 @pytest.fixture
 def gpio_rig(instrument: Instrument, tmp_path: Path) -> Instrument:
     """With SYNC_IN on a GPIO line of the stand-in chip (polysight_simulators/gpio) at `tmp_path / "chip"`."""
-    rig = timed_by_the_program(instrument)
+    rig = time_by_the_program(instrument)
     return msgspec.structs.replace(rig, pi=msgspec.structs.replace(rig.pi, gpio_chip=str(tmp_path / "chip")))
 
 
@@ -99,7 +99,7 @@ def start(
 
         def start(rig: Instrument, *args: object, **environment: Any) -> tuple[Process, HostSide]:
             if not Path(rig.stage.port).exists():
-                rig = at_stage_port(rig, request.getfixturevalue("stage").port)
+                rig = set_stage_port(rig, request.getfixturevalue("stage").port)
             program = Process(write_config(rig), *args, **environment)
             started.enter_context(program)
             assert program.ready, program.popen.communicate()
@@ -113,7 +113,7 @@ def start(
 @pytest.fixture
 def pi(instrument: Instrument, stage: FakeStage, hub: Path) -> Iterator[Running]:
     """The whole Pi half in this process, over real sockets, a pty and simulated wires."""
-    running = Running(at_stage_port(instrument, stage.port), hub)
+    running = Running(set_stage_port(instrument, stage.port), hub)
     yield running
     running.close()
 

@@ -13,7 +13,7 @@ from hypothesis import given, strategies as st
 from tests.support.pi.fakes import FakeLines, gone
 from tests.support.processes import HANG_S
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig, timed_by_spi
+from tests.support.rigs import load_published_rig, time_by_spi
 
 from polysight_pi import lines as pi_lines, trigger
 from polysight_pi.lines import SpiWireLines
@@ -263,7 +263,7 @@ def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
 
 
 def test_the_published_burst_fits_every_pi_as_it_comes():
-    b = published_rig().burst
+    b = load_published_rig().burst
     burst = trigger.make_spi_burst(trigger.BurstSpec.from_burst(b))
     assert SpiWireLines.bufsiz == trigger.DEFAULT_BUFSIZ == 4096
     assert (burst.clock_hz, len(burst.data)) == (1_000_000, 2815)
@@ -361,7 +361,7 @@ def instrument(instrument, request):
     """The shipped wiring, and its alternative."""
     if request.param == "one-shot":
         return instrument
-    return timed_by_spi(instrument)
+    return time_by_spi(instrument)
 
 
 @pytest.fixture
@@ -371,7 +371,7 @@ def source(instrument):
 
 
 @pytest.fixture
-def rises(hub, instrument):
+def list_rises(hub, instrument):
     """Wire times of the next rising edges, each followed by its falling one."""
     with closing(WireClient(hub, listen=instrument.pi.sync_out)) as radar:
 

@@ -85,23 +85,23 @@ def test_faults_of_the_chip(on_chip, rig_with, settings, fault, name, words):
 
 
 def test_line_release(rig_with, tmp_path):
-    def levels_with(model, **settings):
+    def check_levels(model, **settings):
         (tmp_path / "model").write_bytes(model.encode() + b"\0")
         findings = check_lines(rig_with(**settings), tmp_path / "model", tmp_path)
         return [f.level for f in findings if f.where == "line release"]
 
     pi_4 = "Raspberry Pi 4 Model B Rev 1.4"
-    assert levels_with("QEMU Virtual Machine") == []
-    assert levels_with(pi_4, wiring="spi", sync_out=(10,)) == [], (
+    assert check_levels("QEMU Virtual Machine") == []
+    assert check_levels(pi_4, wiring="spi", sync_out=(10,)) == [], (
         "the kernel ends a transfer, and its last bits are low"
     )
     # An older kernel has no such parameter.
-    assert levels_with(pi_4) == ["warning"]
+    assert check_levels(pi_4) == ["warning"]
     parameters = tmp_path / "pinctrl_bcm2835" / "parameters"
     parameters.mkdir(parents=True)
     for value, level in (("Y", "warning"), ("N", "ok")):
         (parameters / "persist_gpio_outputs").write_text(value + "\n")
-        assert levels_with(pi_4) == [level]
+        assert check_levels(pi_4) == [level]
 
 
 @pytest.mark.parametrize("settings", [{"wiring": "gpiomem"}, {"wiring": "lines", "sync_out": (22, 23)}])

@@ -19,7 +19,7 @@ import pytest
 from tests.support.paths import REPO
 from tests.support.pi.program import WiresLog, require_stand_in_chip, run
 from tests.support.processes import wait_for
-from tests.support.rigs import timed_by_spi
+from tests.support.rigs import time_by_spi
 
 from polysight_pi.system import OTHERS_PRIORITY, TRIGGER_PRIORITY
 from polysight_shared import messages as m
@@ -74,13 +74,13 @@ def in_row(start, stage, hub, wires):
         host.home()
         host.start_row()
         host.wait(m.RowStarted)
-        wires.drive(*edge())
+        wires.drive(*make_edge())
         return program, host
 
     return in_row
 
 
-def edge(t_us=1_000_000):
+def make_edge(t_us=1_000_000):
     """An edge of the trigger; the first one is late enough on the wires to begin a row."""
     return WireEdge(t_us * 1000, TRIGGER, 1), WireEdge(t_us * 1000 + 20_000, TRIGGER, 0)
 
@@ -121,7 +121,7 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
 
 def test_an_edge_during_a_burst_ends_the_row_alone(long_bursts, in_row, wires):
     _, host = in_row(long_bursts)
-    wires.drive(*edge(1_001_000))
+    wires.drive(*make_edge(1_001_000))
     report = host.wait(m.RowFinished)
     assert (report.status, report.fault, report.bursts) == ("fault", PiFault.EDGE_DURING_BURST, 1), report.reason
     assert host.list_events(m.Fault)[-1].number == PiFault.EDGE_DURING_BURST
@@ -218,7 +218,7 @@ def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_pa
 @pytest.fixture
 def spi_rig(instrument, tmp_path):
     """The wiring without a one-shot, on a stand-in chip and a stand-in controller."""
-    instrument = timed_by_spi(instrument)
+    instrument = time_by_spi(instrument)
     devices = {"gpio_chip": str(tmp_path / "chip"), "spi_device": str(tmp_path / "spidev0.0")}
     return msgspec.structs.replace(instrument, pi=msgspec.structs.replace(instrument.pi, **devices))
 
@@ -300,18 +300,18 @@ def test_a_killed_program_leaves_the_line_low(spi_rig, start_homed, hub, wires, 
 def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_rig, write_config, hub, wires):
     """With the line low all the time."""
 
-    def findings(rig, **settings):
+    def read_findings(rig, **settings):
         environment = gpio.environment(rig.pi.gpio_chip, hub, spi=rig.pi.spi_device, exact="1", **settings)
         printed = run("check", "--json", "--config", write_config(rig), **environment).stdout
         return {f["name"]: f for f in json.loads(printed)}
 
-    right = findings(spi_rig)
+    right = read_findings(spi_rig)
     assert [right[name]["verdict"] for name in ("pulse width", "SYNC_IN line 10")] == ["ok", "ok"]
     for actual in ("400e6", "150e6"):
-        wrong = findings(spi_rig, core_hz=f"250e6,{actual}")["pulse width"]
+        wrong = read_findings(spi_rig, core_hz=f"250e6,{actual}")["pulse width"]
         assert (wrong["verdict"], "core_freq" in wrong["remedy"]) == ("fail", True)
     longer = replace(spi_rig, burst=replace(spi_rig.burst, pulses=16))
-    small = findings(longer, bufsiz="512")
+    small = read_findings(longer, bufsiz="512")
     assert "512 bytes" in small["SYNC_IN line 10"]["found"]
     assert "options spidev bufsiz=4096" in small["pulse width"]["remedy"]
     assert not wires.rises(MOSI)
@@ -327,7 +327,7 @@ def may_schedule():
     return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
 
-def priorities(pid):
+def read_priorities(pid):
     """Names of the threads of a process that have real-time priority."""
     tasks = [int(t.name) for t in Path(f"/proc/{pid}/task").iterdir()]
     return [os.sched_getparam(t).sched_priority for t in tasks if os.sched_getscheduler(t) == os.SCHED_FIFO]
@@ -339,8 +339,8 @@ def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig)
         pytest.skip("SCHED_FIFO is not permitted here: run as root, or with RLIMIT_RTPRIO")
     program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))
     # `ready` comes before the threads.
-    wait_for(lambda: TRIGGER_PRIORITY in priorities(program.popen.pid), "the trigger thread")
-    thread_priorities = priorities(program.popen.pid)
+    wait_for(lambda: TRIGGER_PRIORITY in read_priorities(program.popen.pid), "the trigger thread")
+    thread_priorities = read_priorities(program.popen.pid)
     assert thread_priorities.count(TRIGGER_PRIORITY) == 1
     # Main, stage, executor
     assert thread_priorities.count(OTHERS_PRIORITY) >= 3

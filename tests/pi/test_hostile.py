@@ -21,7 +21,7 @@ import msgspec
 import pytest
 import zmq
 from tests.support.pi.host_side import HostSide
-from tests.support.pi.program import WiresLog, resident_bytes
+from tests.support.pi.program import WiresLog, read_resident_bytes
 from tests.support.processes import HANG_S, wait_for
 
 from polysight_pi import executor as executors
@@ -141,11 +141,11 @@ def test_a_folder_in_the_journals_place_is_refused(pi, instrument):
 
 
 def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
-    bytes_before = resident_bytes()
+    bytes_before = read_resident_bytes()
     big = msgpack.packb({"type": "Hello", "version": "1.0", "host_release": "x" * (64 << 20)})
-    bytes_taken = resident_bytes() - bytes_before
+    bytes_taken = read_resident_bytes() - bytes_before
     assert stranger.ask(big, limit_s=1.0) is None
-    assert resident_bytes() - bytes_before < bytes_taken + BOUND_BYTES + (64 << 20), (
+    assert read_resident_bytes() - bytes_before < bytes_taken + BOUND_BYTES + (64 << 20), (
         "the sender's own copy and no second one"
     )
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
@@ -170,7 +170,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
         assert stranger.ask(draw(rng, valid)) is not None
         sent += 1
         if sent == 1_000:
-            bytes_before = resident_bytes()
+            bytes_before = read_resident_bytes()
         if host.subscriber.poll(0):
             event = m.unpack_event(host.subscriber.recv_multipart()[-1])
             if isinstance(event, m.RowFinished):
@@ -181,7 +181,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
                 host.until_state("ready", "fault")
                 host.start_row(take=taken + 1, owner="mine")
             host.must_accept(m.Alive(scan_id="scan", owner="mine"))
-    assert resident_bytes() - bytes_before < BOUND_BYTES
+    assert read_resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
     host.must_accept(m.Abort(owner="mine"))
     host.until_state("ready")
@@ -244,13 +244,13 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
             stage.say_raw(raw)
         ended.set()
 
-    bytes_before = resident_bytes()
+    bytes_before = read_resident_bytes()
     thread = threading.Thread(target=flood)
     thread.start()
     while not ended.wait(0.05):
         assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
     thread.join()
-    assert resident_bytes() - bytes_before < BOUND_BYTES
+    assert read_resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
     assert isinstance(pi.host.ask(m.Abort()), m.Accepted)
 
@@ -266,7 +266,7 @@ HIGHEST_BYTES = 400 << 20
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 
 
-def frame(body: bytes, flags: int = 0) -> bytes:
+def encode_frame(body: bytes, flags: int = 0) -> bytes:
     if len(body) < 256:
         return bytes([flags, len(body)]) + body
     return bytes([flags | LONG]) + len(body).to_bytes(8, "big") + body
@@ -278,7 +278,7 @@ def connect_peer(address: str, kind: bytes) -> socket.socket:
     peer = socket.create_connection((host, int(port)), timeout=HANG_S)
     peer.sendall(GREETING)
     peer.recv(len(GREETING), socket.MSG_WAITALL)
-    peer.sendall(frame(b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind, COMMAND))
+    peer.sendall(encode_frame(b"\x05READY\x0bSocket-Type" + len(kind).to_bytes(4, "big") + kind, COMMAND))
     return peer
 
 
@@ -296,8 +296,12 @@ def wait_a_turn(frames: bytes) -> bytes:
 
 
 ATTACKS = {
-    "a message of many frames": (0, b"DEALER", lambda: wait_a_turn(frame(b"", MORE) + frame(bytes(60_000), MORE) * 10)),
-    "subscriptions": (1, b"SUB", lambda: b"".join(frame(b"\x01" + os.urandom(1000)) for _ in range(50))),
+    "a message of many frames": (
+        0,
+        b"DEALER",
+        lambda: wait_a_turn(encode_frame(b"", MORE) + encode_frame(bytes(60_000), MORE) * 10),
+    ),
+    "subscriptions": (1, b"SUB", lambda: b"".join(encode_frame(b"\x01" + os.urandom(1000)) for _ in range(50))),
 }
 
 
@@ -311,13 +315,13 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     host.home()
     pid = program.popen.pid
     # As the program's own: with its memory locked it may hold more than the least limit from the start.
-    limit_bytes = max(MAX_BYTES, resident_bytes(pid) + SPARE_BYTES)
+    limit_bytes = max(MAX_BYTES, read_resident_bytes(pid) + SPARE_BYTES)
     highest = [0]
     ended = threading.Event()
 
     def watch() -> None:
         while not ended.wait(0.02):
-            highest[0] = max(highest[0], resident_bytes(pid))
+            highest[0] = max(highest[0], read_resident_bytes(pid))
 
     watcher = threading.Thread(target=watch)
     watcher.start()
@@ -362,7 +366,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
 
     wait_for(is_done, "a row", 120.0)
     with suppress(AssertionError):
-        wait_for(lambda: resident_bytes(pid) < HIGHEST_BYTES, "that its memory is free")
+        wait_for(lambda: read_resident_bytes(pid) < HIGHEST_BYTES, "that its memory is free")
     assert program.end()[0] == 0
 
 

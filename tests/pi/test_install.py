@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from tests.support.paths import REPO, RIG_FILE
 from tests.support.processes import HANG_S
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 PI = REPO / "pi_controller"
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
@@ -88,7 +88,7 @@ def test_the_unit_gives_what_the_program_asks_for(unit):
     assert int(service["LimitRTPRIO"]) >= 50
     assert service["LimitMEMLOCK"] == "infinity"
     assert {"gpio", "spi", "dialout"} <= set(service["SupplementaryGroups"].split())
-    rig = published_rig()
+    rig = load_published_rig()
     assert Path(rig.pi.journal_dir).is_relative_to(service["ReadWritePaths"])
     assert Path(rig.pi.journal_dir).is_relative_to(Path("/var/lib") / service["StateDirectory"])
     # The executor notifies the watchdog; a lost stage blocks it for 25 s.

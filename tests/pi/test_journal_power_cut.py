@@ -13,7 +13,7 @@ from polysight_shared.raster import RasterPlan
 PLAN = RasterPlan(3, 2, 1.0, 1.0)
 
 
-def events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
+def make_events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
     """Two rows, and the scan's end."""
     scan: list[tuple[type[m.AnyEvent], dict[str, Any]]] = [(m.RunStarted, {"plan": PLAN})]
     for row in PLAN:
@@ -35,7 +35,7 @@ def is_same_event(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, An
 def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
     position = 0
     ended = False
-    added = events()
+    added = make_events()
     while not ended:
         position += 1
         path = tmp_path / str(position)

@@ -10,7 +10,7 @@ import zmq
 from tests.support.paths import REPO, RIG_FILE
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused as expect_refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from zmq.auth import load_certificate
 
 from polysight.acquisition.pi_client import PiClient
@@ -151,7 +151,7 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
     shutil.copy(tmp_path / "other" / "host.key_secret", tmp_path / "mine")
     port = served_pi.command_address.rpartition(":")[2]
     events = served_pi.event_address.rpartition(":")[2]
-    rig = published_rig()
+    rig = load_published_rig()
     replace = msgspec.structs.replace
     pi = replace(
         rig.pi, command_address=f"tcp://0.0.0.0:{port}", event_address=f"tcp://0.0.0.0:{events}",
@@ -165,7 +165,7 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
 def test_a_server_without_keys_is_not_reported_as_refusing_this_hosts(tmp_path, context):
     """Either end may notice first: if the server does, it only hangs up, and the client connects again."""
     make_keys(tmp_path)
-    rig = published_rig()
+    rig = load_published_rig()
     replace = msgspec.structs.replace
     with context.socket(zmq.ROUTER) as keyless:
         address = f"tcp://0.0.0.0:{keyless.bind_to_random_port('tcp://127.0.0.1')}"

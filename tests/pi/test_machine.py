@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.paths import REPO
 from tests.support.pi.machine_bench import ROW, Bench
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.planning.forecast import row_motion_s
 from polysight_pi.executor import check_run, read_burst
@@ -397,13 +397,13 @@ def test_any_order_of_events(start, actions):
 # --- the table and its page -------------------------------------------------------------------------------------------
 
 
-def cells(row: str) -> list[list[str]]:
+def find_code_words_of_cells(row: str) -> list[list[str]]:
     """Words in backquotes of each cell of a table's row."""
     return [re.findall(r"`([^`]+)`", cell) for cell in row.strip("|").split("|")]
 
 
 def test_the_page_shows_the_rules():
-    table_rows = [cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
+    table_rows = [find_code_words_of_cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
     rules = [(e[0], tuple(s), tuple(next_states)) for e, s, next_states, *_ in (r for r in table_rows if len(r) == 4)]
     assert rules == [(r.event, tuple(r.states.split()), tuple(r.leads_to.split())) for r in RULES]
     answer = {
@@ -411,12 +411,16 @@ def test_the_page_shows_the_rules():
     }
     assert answer == {s: WIRE_STATE.get(s, s) for s in get_args(State)}
     limits = {
-        row[0][0]: float(n[0]) for row in table_rows if len(row) == 3 for n in [row_seconds(SPEC_PAGE, row[0][0])] if n
+        row[0][0]: float(n[0])
+        for row in table_rows
+        if len(row) == 3
+        for n in [read_row_seconds(SPEC_PAGE, row[0][0])]
+        if n
     }
     assert limits == TIMEOUTS_S
 
 
-def row_seconds(page: str, state: str) -> list[str]:
+def read_row_seconds(page: str, state: str) -> list[str]:
     line = next(x for x in page.splitlines() if x.startswith(f"| `{state}` |") and x.count("|") == 4)
     return re.findall(r"(\d+(?:\.\d+)?) s\b", line.split("|")[3])
 
@@ -440,7 +444,7 @@ def test_the_rules_are_whole():
     assert lasting == states, "losing the stage is answered in every state"
 
 
-RIG = published_rig()
+RIG = load_published_rig()
 replace = msgspec.structs.replace
 
 

@@ -19,7 +19,7 @@ from tests.support.pi.fakes import FakeDriver, FakeLines
 from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.rigs import at_stage_port
+from tests.support.rigs import set_stage_port
 
 from polysight_pi import executor as executors, system
 from polysight_pi.client import home_by_service, take_over
@@ -238,7 +238,7 @@ def test_an_old_row_does_not_move_the_stage_again(host, stage):
 
 def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
     """The journal has these events."""
-    rig = at_stage_port(instrument, stage.port)
+    rig = set_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:
             running.host.must_accept(running.host.begin())

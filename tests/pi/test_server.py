@@ -5,7 +5,7 @@ from contextlib import closing
 import msgspec
 from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S
-from tests.support.rigs import at_stage_port
+from tests.support.rigs import set_stage_port
 
 from polysight.acquisition.pi_client import HostHeartbeat
 from polysight_pi.lines import GpiodLines, SpiLines, WireLines
@@ -57,7 +57,7 @@ def test_only_pins_count_as_hardware():
 
 def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
     rig = msgspec.structs.replace(instrument, stage=msgspec.structs.replace(instrument.stage, heartbeat_ms=1000))
-    with closing(Running(at_stage_port(rig, stage.port), hub)) as pi:
+    with closing(Running(set_stage_port(rig, stage.port), hub)) as pi:
         pi.host.must_accept(pi.host.begin())
         pi.host.home()
         stage.stays_after = 2

@@ -13,7 +13,7 @@ import pytest
 from tests.support.pi.fakes import FakeStage
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.rigs import at_stage_port, published_rig
+from tests.support.rigs import load_published_rig, set_stage_port
 from tests.support.stage.processes import StageProcess
 
 from polysight_pi import stage
@@ -141,7 +141,7 @@ def test_a_sketch_that_does_not_know_the_newest_setting_is_named_as_old(
         return request(link, verb, *args)
 
     monkeypatch.setattr(StageLink, "request", old)
-    with pytest.raises(StageRefusedError) as e, BenchStage(at_stage_port(instrument, dry_stage.port).stage) as bench:
+    with pytest.raises(StageRefusedError) as e, BenchStage(set_stage_port(instrument, dry_stage.port).stage) as bench:
         bench.home()
     is_old = e.value.remedy == "flash the sketch of this release"
     assert is_old is (refused_parameter == Parameter.PINS)
@@ -165,13 +165,13 @@ def test_no_port_and_another_protocol(tmp_path, monkeypatch, connect):
 
 def test_other_steps_per_mm_are_refused_before_a_motion(dry_stage, instrument):
     dry_stage.steps = "160"
-    with refused(ErrorCode.MISMATCH, 160, 200), BenchStage(at_stage_port(instrument, dry_stage.port).stage):
+    with refused(ErrorCode.MISMATCH, 160, 200), BenchStage(set_stage_port(instrument, dry_stage.port).stage):
         pass
     assert [c.verb for c in dry_stage.seen] == ["HELLO"]
 
 
 def test_jog_and_home_by_hand(dry_stage, instrument):
-    with BenchStage(at_stage_port(instrument, dry_stage.port).stage) as stage:
+    with BenchStage(set_stage_port(instrument, dry_stage.port).stage) as stage:
         with pytest.raises(StageRefusedError):
             stage.jog(1, 1, 20)
         assert stage.home() == (0.0, 0.0)
@@ -218,7 +218,7 @@ def test_a_moving_stage_is_asked_again_to_clear_its_alarm_for_three_seconds(numb
     clock = itertools.count(0, 0.5)
     monkeypatch.setattr(stage.time, "monotonic", lambda: next(clock))
     monkeypatch.setattr(stage.time, "sleep", lambda _: None)
-    driver = stage.StageDriver(published_rig().stage, print)
+    driver = stage.StageDriver(load_published_rig().stage, print)
     driver._open_link = SimpleNamespace(request=refuse, send_byte=stops.append)
     with pytest.raises(StageRefusedError):
         driver.clear(stop=True)

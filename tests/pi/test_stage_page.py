@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from tests.support.page.asking import TOKEN, post
 from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
-from tests.support.page.live_view import Served, served_folder
+from tests.support.page.live_view import Served, serve_folder
 
 from polysight_shared import messages as m
 
@@ -23,7 +23,7 @@ def view(pi, instrument, write_config, tmp_path) -> Iterator[Served]:
     )
     config = write_config(msgspec.structs.replace(instrument, pi=addresses))
     (tmp_path / "scans").mkdir()
-    with served_folder(tmp_path / "scans", TOKEN, config=config) as view:
+    with serve_folder(tmp_path / "scans", TOKEN, config=config) as view:
         yield view
 
 
@@ -111,7 +111,7 @@ def test_a_pi_that_does_not_answer_is_reported_and_can_be_asked_again(
     limits = msgspec.structs.replace(instrument.limits, command_timeout_s=0.5)
     config = write_config(msgspec.structs.replace(instrument, pi=silent, limits=limits))
     (tmp_path / "scans").mkdir()
-    with served_folder(tmp_path / "scans", TOKEN, config=config) as view:
+    with serve_folder(tmp_path / "scans", TOKEN, config=config) as view:
         browser.visit(f"{view.address}/new#token={TOKEN}", PHONE)
         browser.wait("document.querySelector('.time')", "the plan")
         browser.value("document.querySelector('#stage > summary').click()")

@@ -18,7 +18,7 @@ import msgspec
 import pytest
 from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
-from tests.support.rigs import at_stage_port
+from tests.support.rigs import set_stage_port
 
 from polysight_pi import executor as executors, journal as journals, stage as stages
 from polysight_shared import messages as m
@@ -129,7 +129,7 @@ def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
     """A Pi without events is not late, however rarely it reports: otherwise the watchdog would end the service."""
     settings = msgspec.structs.replace(instrument.pi, heartbeat_ms=3_600_000)
     rig = msgspec.structs.replace(instrument, pi=settings)
-    with closing(Running(at_stage_port(rig, stage.port), hub)) as pi:
+    with closing(Running(set_stage_port(rig, stage.port), hub)) as pi:
         # Without a stage there are no statuses to send either
         stage.unplug()
         pi.host.until_state("fault")

@@ -12,7 +12,7 @@ from tests.pi_box.box import Box
 from tests.pi_box.uno import Uno
 from tests.support.paths import BIN, REPO
 from tests.support.pi.host_side import HostSide
-from tests.support.rigs import published_rig, timed_by_the_program
+from tests.support.rigs import load_published_rig, time_by_the_program
 
 from polysight_shared.config import Instrument
 from polysight_shared.tables import to_builtins
@@ -29,7 +29,7 @@ def print_figure(text: str) -> None:
 
 def rig_of_the_box() -> Instrument:
     """Return the published rig, with SYNC_IN by a GPIO line and a one-shot: QEMU has neither SPI nor a Pi's speed."""
-    rig = timed_by_the_program(published_rig())
+    rig = time_by_the_program(load_published_rig())
     replace = msgspec.structs.replace
     return replace(
         rig,

@@ -14,7 +14,7 @@ import pytest
 import zmq
 from tests.pi_box.installed import PROGRAM, InstalledPi, print_figure
 from tests.support.pi.host_side import HostSide
-from tests.support.rigs import at_stage_port, published_rig, timed_by_spi
+from tests.support.rigs import load_published_rig, set_stage_port, time_by_spi
 
 from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
@@ -162,7 +162,7 @@ def test_check_finds_everything_that_is_there(bench: InstalledPi):
 
 def test_check_of_a_rig_with_spi_names_it_and_nothing_else(bench: InstalledPi):
     """There is no SPI controller, as on a Pi where it is not enabled."""
-    bench.configure(at_stage_port(timed_by_spi(published_rig()), bench.rig.stage.port))
+    bench.configure(set_stage_port(time_by_spi(load_published_rig()), bench.rig.stage.port))
     findings = bench.check()
     assert {n for n, f in findings.items() if f["verdict"] == "fail"} == {"SYNC_IN line 10", "pulse width"}
     assert "dtparam=spi=on" in findings["SYNC_IN line 10"]["remedy"]

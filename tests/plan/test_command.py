@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
-from tests.support.rigs import rig_table, rig_with
+from tests.support.rigs import load_rig_table, make_rig_with
 from tests.support.scenes import EVERYWHERE, make_scene
 from tests.support.store.facts import load_facts
 
@@ -199,7 +199,7 @@ def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
 
 
 def test_noise_is_measured_in_a_scan_with_two_antennas(tmp_path):
-    two = rig_with(antennas={"rx_mm": rig_table()["antennas"]["rx_mm"][:2]})
+    two = make_rig_with(antennas={"rx_mm": load_rig_table()["antennas"]["rx_mm"][:2]})
     scene = make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, disturbances={"direct_snr_db": SNR_DB})
     scan = simulate(two, decode_scene(scene, "test"), tmp_path / "scan")
     assert measure_noise(ScanFolder.load(scan)).direct_snr_db == pytest.approx(SNR_DB, abs=0.7)

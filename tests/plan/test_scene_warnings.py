@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import tomli_w
-from tests.support.rigs import published_rig, rig_with
+from tests.support.rigs import load_published_rig, make_rig_with
 
 import polysight
 from polysight.cli.main import main
@@ -20,50 +20,50 @@ OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
 
 
-def plate(x_mm: float, y_mm: float = 0.0, side_mm: float = 45.0, **more: Any) -> dict[str, Any]:
+def make_plate(x_mm: float, y_mm: float = 0.0, side_mm: float = 45.0, **more: Any) -> dict[str, Any]:
     kind = {"permittivity": [4.0, 0.4]} | more
     return {"name": f"plate at {x_mm:g}, {y_mm:g}", "centre_mm": [x_mm, y_mm], "size_mm": [side_mm, side_mm], **kind}
 
 
-def topics(tmp_path: Path, *plates: dict[str, Any], grid: dict[str, Any] = GRID) -> list[str]:
+def list_topics(tmp_path: Path, *plates: dict[str, Any], grid: dict[str, Any] = GRID) -> list[str]:
     path = tmp_path / "scene.toml"
     path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": list(plates)}))
-    return [warning.where for warning in warn_of_scene(*read_scene(path, published_rig()))]
+    return [warning.where for warning in warn_of_scene(*read_scene(path, load_published_rig()))]
 
 
 def test_the_example_scene_needs_no_change():
-    assert not list(warn_of_scene(*read_scene(OWN_SCENE, published_rig())))
+    assert not list(warn_of_scene(*read_scene(OWN_SCENE, load_published_rig())))
 
 
 @pytest.mark.parametrize(
     ("plates", "expected"),
     [
-        ([plate(-30), plate(30)], ["gap"]),
-        ([plate(-40), plate(40)], []),
-        ([plate(-25, -40), plate(25, 40)], []),
-        ([plate(-60, background=True, side_mm=400.0), plate(0)], []),
-        ([plate(0, side_mm=15.0)], ["size", "size"]),
-        ([plate(150)], ["aperture"]),
-        ([plate(0, thickness_mm=1.2)], ["thickness"]),
-        ([plate(0, thickness_mm=40.0)], []),
+        ([make_plate(-30), make_plate(30)], ["gap"]),
+        ([make_plate(-40), make_plate(40)], []),
+        ([make_plate(-25, -40), make_plate(25, 40)], []),
+        ([make_plate(-60, background=True, side_mm=400.0), make_plate(0)], []),
+        ([make_plate(0, side_mm=15.0)], ["size", "size"]),
+        ([make_plate(150)], ["aperture"]),
+        ([make_plate(0, thickness_mm=1.2)], ["thickness"]),
+        ([make_plate(0, thickness_mm=40.0)], []),
         # They reflect nothing, so there is no ratio to be changed.
-        ([plate(0, thickness_mm=3.0, permittivity=[1.0, 0.0])], []),
-        ([plate(0, thickness_mm=0.0)], []),
+        ([make_plate(0, thickness_mm=3.0, permittivity=[1.0, 0.0])], []),
+        ([make_plate(0, thickness_mm=0.0)], []),
     ],
 )
 def test_each_fault_of_a_scene_is_named(tmp_path, plates, expected):
-    assert topics(tmp_path, *plates) == expected
+    assert list_topics(tmp_path, *plates) == expected
 
 
 @pytest.mark.parametrize("axis", ["columns", "rows"])
 def test_one_row_or_column_is_too_small_an_aperture(tmp_path, axis):
     """A single row resolves nothing across it: no size and no gap is large enough."""
-    assert set(topics(tmp_path, plate(-30), plate(30), grid=GRID | {axis: 1})) == {"aperture"}
+    assert set(list_topics(tmp_path, make_plate(-30), make_plate(30), grid=GRID | {axis: 1})) == {"aperture"}
 
 
 def test_plan_and_simulate_print_the_warning(tmp_path, capsys):
     path = tmp_path / "scene.toml"
-    plates = [plate(-30, metal=True) | {"permittivity": None}, plate(30)]
+    plates = [make_plate(-30, metal=True) | {"permittivity": None}, make_plate(30)]
     del plates[0]["permittivity"]
     grid = {"columns": 9, "rows": 9, "step_x_mm": 40.0, "step_y_mm": 40.0}
     path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "burst": {"pulses": 2}, "plates": plates}))
@@ -82,7 +82,7 @@ def test_proposals_are_for_the_scene_and_repeat_its_warnings(tmp_path, capsys):
     """Apertures of the plan have the same grid; plates are checked in each."""
     path = tmp_path / "scene.toml"
     grid = {"columns": 41, "rows": 21, "step_x_mm": 4.0, "step_y_mm": 4.0}
-    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": [plate(-30), plate(15)]}))
+    path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": [make_plate(-30), make_plate(15)]}))
     assert main(["plan", "--minutes", "30", "--scene", str(path), "--json"]) == 0
     plans = json.loads(capsys.readouterr().out)["plans"]
     assert plans
@@ -92,17 +92,17 @@ def test_proposals_are_for_the_scene_and_repeat_its_warnings(tmp_path, capsys):
 
 
 def test_a_text_of_the_scene_stays_a_text_in_the_lines_of_the_rig_file():
-    lines = rig_lines(rig_with(image={"apodisation": "taylor"}), published_rig())
+    lines = rig_lines(make_rig_with(image={"apodisation": "taylor"}), load_published_rig())
     assert tomllib.loads(lines) == {"image": {"apodisation": "taylor"}}
 
 
 @pytest.mark.parametrize(
     ("step_mm", "plates", "expected"),
     [
-        (5.0, [plate(-60), plate(60)], set()),
-        (12.0, [plate(-60), plate(60)], {"aliasing"}),
+        (5.0, [make_plate(-60), make_plate(60)], set()),
+        (12.0, [make_plate(-60), make_plate(60)], {"aliasing"}),
         # A plate that is larger than the image fills it without its ghosts, too.
-        (12.0, [plate(0, side_mm=420.0)], set()),
+        (12.0, [make_plate(0, side_mm=420.0)], set()),
     ],
 )
 def test_ghosts_by_wide_steps_are_reported_before_a_simulation(tmp_path, step_mm, plates, expected):

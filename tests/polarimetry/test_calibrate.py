@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight import polarimetry
 from polysight.imaging import Images
@@ -26,7 +26,7 @@ def make_images(h, v):
     return Images(h, v, np.arange(h.shape[1]) * 2e-3, np.arange(h.shape[0]) * 2e-3, np.ones(h.shape, bool))
 
 
-def channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
+def make_channels(eps, gain_h=1.0, gain_v=1.0, a=0.0, b=0.0, common=None, noise=0.0):
     """H and V of a metal and a dielectric plate with gains, leakage, a common phase per pixel and noise."""
     r_s = np.zeros(SHAPE, complex)
     r_p = np.zeros(SHAPE, complex)
@@ -54,7 +54,7 @@ def test_a_ratio_that_is_not_a_number_is_nan_and_warns_of_nothing(recwarn):
 
 @given(complex_gain, complex_gain)
 def test_metal_is_one_and_gain_is_recovered(gain_h, gain_v):
-    h, v = channels(4 - 0.4j, gain_h, gain_v)
+    h, v = make_channels(4 - 0.4j, gain_h, gain_v)
     out = polarimetry.calibrate(make_images(h, v), METAL)
     np.testing.assert_allclose(out.p[METAL], 1, rtol=1e-9)
     np.testing.assert_allclose(np.abs(out.h[METAL]), 1, rtol=1e-9)
@@ -64,7 +64,7 @@ def test_metal_is_one_and_gain_is_recovered(gain_h, gain_v):
 
 
 def test_metal_is_one_within_noise():
-    h, v = channels(4 - 0.4j, 2.0j, 0.7, noise=0.02)
+    h, v = make_channels(4 - 0.4j, 2.0j, 0.7, noise=0.02)
     p = polarimetry.calibrate(make_images(h, v), METAL).p[METAL]
     assert abs(p.mean() - 1) < 0.005
     assert np.abs(p - 1).max() < 0.02 / 0.7 * 6
@@ -72,7 +72,7 @@ def test_metal_is_one_within_noise():
 
 @given(complex_gain, st.floats(-200, 200), st.floats(-200, 200))
 def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
-    h, v = channels(3.78 - 0.7j, 1.3j, 0.8)
+    h, v = make_channels(3.78 - 0.7j, 1.3j, 0.8)
     reference = polarimetry.calibrate(make_images(h, v), METAL).p
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 100
     common = gain * np.exp(1j * (tilt_x * x + tilt_y * y))
@@ -83,7 +83,7 @@ def test_common_gain_and_distance_phase_do_not_change_p(gain, tilt_x, tilt_y):
 
 @given(leak, leak, complex_gain, complex_gain)
 def test_set_leakage_is_removed(a, b, gain_h, gain_v):
-    h, v = channels(4.69 - 0.7j, gain_h, gain_v, a, b)
+    h, v = make_channels(4.69 - 0.7j, gain_h, gain_v, a, b)
     out = polarimetry.calibrate(make_images(h, v), METAL)
     s, p = polarimetry.correct_leakage(out.h, out.v, a, b)
     r_s, r_p = polarimetry.fresnel(4.69 - 0.7j, THETA)
@@ -94,14 +94,14 @@ def test_set_leakage_is_removed(a, b, gain_h, gain_v):
 
 def test_metal_alone_does_not_separate_leakage_from_gain():
     """Two rigs with different leakage give the same values on metal, so leakage must be known."""
-    h1, _ = channels(4.0, 1.1, 1.0, 0.1, 0.0)
-    h2, _ = channels(4.0, 1.1 * 1.1, 1.0, 0.0, 0.0)
+    h1, _ = make_channels(4.0, 1.1, 1.0, 0.1, 0.0)
+    h2, _ = make_channels(4.0, 1.1 * 1.1, 1.0, 0.0, 0.0)
     np.testing.assert_allclose(h1[METAL], h2[METAL])
     assert abs(h1[PLATE][0] - h2[PLATE][0]) > 0.01
 
 
 def test_reference_over_the_whole_plane_removes_uneven_illumination():
-    h, v = channels(4 - 0.4j)
+    h, v = make_channels(4 - 0.4j)
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 40
     light_h = (1 + 0.3 * x) * np.exp(2j * y)
     light_v = (1.2 - 0.2 * y) * np.exp(1j * x)
@@ -112,7 +112,7 @@ def test_reference_over_the_whole_plane_removes_uneven_illumination():
 
 
 def test_dark_or_empty_metal_regions_are_refused():
-    h, v = channels(4.0)
+    h, v = make_channels(4.0)
     for mask in (np.zeros(SHAPE, bool), ~(METAL | PLATE)):
         with refused(ErrorCode.NO_DATA):
             polarimetry.calibrate(make_images(h, v), mask)
@@ -121,7 +121,7 @@ def test_dark_or_empty_metal_regions_are_refused():
 
 
 def test_single_precision_stays_single():
-    h, v = (a.astype(np.complex64) for a in channels(4.0, noise=0.01))
+    h, v = (a.astype(np.complex64) for a in make_channels(4.0, noise=0.01))
     out = polarimetry.calibrate(make_images(h, v), METAL)
     assert out.h.dtype == out.v.dtype == out.p.dtype == np.complex64
     assert polarimetry.correct_leakage(out.h, out.v, 0.05, 0.05)[0].dtype == np.complex64
@@ -142,7 +142,7 @@ def test_smoothing_keeps_constants_reduces_noise_and_respects_holes():
 
 
 def test_the_incidence_angle_is_that_of_the_specular_midpoint():
-    rig = published_rig()
+    rig = load_published_rig()
     assert np.degrees(polarimetry.specular_incidence_rad(rig)) == pytest.approx(
         np.mean([incidence_deg(rig, b) for b in rig.receivers]), abs=0.02
     )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.calibration import remaining
+from tests.support.calibration import compute_remaining
 from tests.support.refusals import refused
 
 from polysight.polarimetry import Leakage, leakage_from_images
@@ -34,7 +34,7 @@ def measure_standard(truth, wave, rng, noise=0.0, pixels=400):
     return h + noise * abs(truth.imbalance) * n[0] / np.sqrt(2), v + noise * n[1] / np.sqrt(2)
 
 
-def standard(truth, wave, rng, noise=0.0):
+def measure_metal_standard(truth, wave, rng, noise=0.0):
     return MetalStandard(common_direction(*measure_standard(truth, wave, rng, noise)), wave)
 
 
@@ -43,9 +43,9 @@ def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, 
     truth = Leakage(a, b, g, 0.0)
     rng = np.random.default_rng(seed)
     waves = (PLATE, strips_wave(UPRIGHT + turned, THETA), strips_wave(LYING + turned, THETA))
-    leakage = estimate_leakage([standard(truth, w, rng) for w in waves])
+    leakage = estimate_leakage([measure_metal_standard(truth, w, rng) for w in waves])
     np.testing.assert_allclose([leakage.h, leakage.v, leakage.imbalance], [a, b, g], rtol=1e-6, atol=1e-8)
-    assert remaining(leakage, truth) == pytest.approx((0, 0), abs=1e-7)
+    assert compute_remaining(leakage, truth) == pytest.approx((0, 0), abs=1e-7)
 
 
 @given(leak, leak, gain, seeds)
@@ -54,7 +54,9 @@ def test_with_noise_crosstalk_and_imbalance_stay_below_the_limits(a, b, g, seed)
     truth = Leakage(a, b, g, 0.0)
     rng = np.random.default_rng(seed)
     waves = (PLATE, strips_wave(UPRIGHT, THETA), strips_wave(LYING, THETA))
-    crosstalk, imbalance = remaining(estimate_leakage([standard(truth, w, rng, 0.05) for w in waves]), truth)
+    crosstalk, imbalance = compute_remaining(
+        estimate_leakage([measure_metal_standard(truth, w, rng, 0.05) for w in waves]), truth
+    )
     assert crosstalk < 0.01
     assert imbalance < 0.025
 
@@ -64,10 +66,10 @@ def test_more_orientations_give_a_least_squares_solution_and_a_residual(a, b, g,
     truth = Leakage(a, b, g, 0.0)
     rng = np.random.default_rng(seed)
     waves = [PLATE, *(strips_wave(np.radians(d), THETA) for d in (0, 45, 90, 135, -30))]
-    exact = estimate_leakage([standard(truth, w, rng) for w in waves])
+    exact = estimate_leakage([measure_metal_standard(truth, w, rng) for w in waves])
     assert exact.residual < 1e-7
-    assert remaining(exact, truth) == pytest.approx((0, 0), abs=1e-7)
-    wrong = [standard(truth, w, rng) for w in waves]
+    assert compute_remaining(exact, truth) == pytest.approx((0, 0), abs=1e-7)
+    wrong = [measure_metal_standard(truth, w, rng) for w in waves]
     # Wrong orientation
     wrong[3] = MetalStandard(wrong[3].measured, strips_wave(np.radians(75), THETA))
     assert estimate_leakage(wrong).residual > 0.02
@@ -78,8 +80,8 @@ def test_one_orientation_gives_the_axial_ratio_of_two_equal_boards(a, g, seed):
     truth = Leakage(a, a, g, 0.0)
     rng = np.random.default_rng(seed)
     for psi in (UPRIGHT, LYING, 0.4):
-        strips = standard(truth, strips_wave(psi, THETA), rng)
-        ratio = estimate_axial_ratio(standard(truth, PLATE, rng), strips)
+        strips = measure_metal_standard(truth, strips_wave(psi, THETA), rng)
+        ratio = estimate_axial_ratio(measure_metal_standard(truth, PLATE, rng), strips)
         assert ratio.h == ratio.v
         np.testing.assert_allclose(ratio.h, a, atol=1e-7)
 
@@ -119,8 +121,8 @@ def test_strips_agree_with_the_simulator_which_solves_for_the_current(psi, theta
 def test_insufficient_standards_are_refused():
     truth = Leakage(0.05, 0.05j, 1.0, 0.0)
     rng = np.random.default_rng(1)
-    plate = standard(truth, PLATE, rng)
-    upright = standard(truth, strips_wave(UPRIGHT, THETA), rng)
+    plate = measure_metal_standard(truth, PLATE, rng)
+    upright = measure_metal_standard(truth, strips_wave(UPRIGHT, THETA), rng)
     with refused(ErrorCode.NOT_ENOUGH_DATA, 2):
         estimate_leakage([plate, upright])
     with refused(ErrorCode.VALUES_CONFLICT):

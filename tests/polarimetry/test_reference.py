@@ -19,7 +19,7 @@ def make_images(h, v):
     return Images(np.broadcast_to(h, shape), np.broadcast_to(v, shape), X, Y, np.ones(shape, bool))
 
 
-def gains(rng, depth):
+def draw_gains(rng, depth):
     """Slowly varying gain of each channel over the plane."""
     y, x = np.meshgrid(Y / Y[-1], X / X[-1], indexing="ij")
     a = rng.uniform(-1, 1, (4, 3))
@@ -27,14 +27,14 @@ def gains(rng, depth):
     return [np.exp(depth * (waves[i] + 1j * waves[i + 2])) for i in (0, 1)]
 
 
-def noisy(image, rng, noise):
+def add_noise(image, rng, noise):
     return image + noise / np.sqrt(2) * (rng.standard_normal(image.shape) + 1j * rng.standard_normal(image.shape))
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-3.1, 3.1), st.floats(-100, 100))
 def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
     """A common phase of both channels, by distance or tilt of the plates, has no influence."""
-    light = gains(np.random.default_rng(seed), 0.1)
+    light = draw_gains(np.random.default_rng(seed), 0.1)
     common = np.exp(1j * (phase + tilt * X))[None, :]
     reference = plane_reference(make_images(-light[0] * common, -light[1] * common))
     r = fresnel(4 - 0.4j, THETA)
@@ -50,7 +50,7 @@ def test_gains_over_the_plane_are_divided_out(seed, phase, tilt):
 def test_speckle_of_the_plate_is_smoothed_and_measured():
     rng = np.random.default_rng(3)
     ones = np.ones((Y.size, X.size), complex)
-    reference = plane_reference(make_images(noisy(ones, rng, 0.05), noisy(ones, rng, 0.05)))
+    reference = plane_reference(make_images(add_noise(ones, rng, 0.05), add_noise(ones, rng, 0.05)))
     p = (reference.h / reference.v)[reference.valid]
     assert np.std(p) < 0.01
     # Each part of V / H: two channels, half of each
@@ -60,7 +60,7 @@ def test_speckle_of_the_plate_is_smoothed_and_measured():
 def test_weak_parts_and_the_rim_are_masked():
     rng = np.random.default_rng(4)
     h = np.where(X[None, :] < 0.07, 1.0, 0.01) * np.ones((Y.size, 1), complex)
-    reference = plane_reference(make_images(noisy(h, rng, 0.01), noisy(h, rng, 0.01)), smooth_mm=4.0)
+    reference = plane_reference(make_images(add_noise(h, rng, 0.01), add_noise(h, rng, 0.01)), smooth_mm=4.0)
     assert reference.valid[:, X < 0.06].all()
     assert not reference.valid[:, X > 0.068].any()
     assert np.isnan(reference.h[:, -1]).all()
@@ -71,7 +71,7 @@ def test_weak_parts_and_the_rim_are_masked():
 
 
 def test_facts_of_a_reference_hold_the_variation_of_the_gains_over_the_plane():
-    reference = plane_reference(make_images(*gains(np.random.default_rng(5), 0.02)))
+    reference = plane_reference(make_images(*draw_gains(np.random.default_rng(5), 0.02)))
     assert reference.facts().ratio_variation_db > 0.01
 
 
@@ -100,6 +100,6 @@ def test_a_scene_with_other_plates_than_the_metal_is_refused(permittivity):
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.02, 0.12))
 def test_a_metal_plate_alone_is_taken_however_small_and_unevenly_lit(seed, width_m):
-    light = gains(np.random.default_rng(seed), 0.1)
+    light = draw_gains(np.random.default_rng(seed), 0.1)
     at_plate = np.where((width_m > X)[None, :], 1.0, 0.02)
     plane_reference(make_images(light[0] * at_plate, light[1] * at_plate), smooth_mm=2.0)

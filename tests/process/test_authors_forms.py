@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from tests.support.pipelines import make_pipeline
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.cli.main import main
 from polysight.store.open import open_source
@@ -19,7 +19,7 @@ from polysight_shared.errors import ErrorCode
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate, write_cube
 
-RIG = published_rig()
+RIG = load_published_rig()
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
 SCENE = {
     "name": "two plates",
@@ -32,13 +32,13 @@ SCENE = {
 }
 
 
-def images(folder):
+def read_images(folder):
     """Both images of a recording, and its pipeline."""
     pipeline = make_pipeline(open_source(folder, SMALL))
     return pipeline.form_images(), pipeline
 
 
-def correlation(a, b, channel):
+def correlate(a, b, channel):
     """Normalised correlation of two images where both are valid; 1 is the same up to a factor."""
     valid_in_both = a.valid & b.valid
     x = getattr(a, channel)[valid_in_both]
@@ -50,7 +50,7 @@ def correlation(a, b, channel):
 def quiet(tmp_path_factory):
     """A scan without disturbances, row by row: its image is the reference for the others."""
     scene = decode_scene(SCENE, "t").with_disturbances(ideal=True)
-    return images(simulate(RIG, scene, tmp_path_factory.mktemp("rows"), layout="authors"))[0]
+    return read_images(simulate(RIG, scene, tmp_path_factory.mktemp("rows"), layout="authors"))[0]
 
 
 def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
@@ -58,12 +58,12 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
     folder = simulate(
         RIG, scene, tmp_path, layout="authors", by_columns=True, zero_filling=False, skipped={("RV", 3): {0, 7}}
     )
-    image, pipeline = images(folder)
+    image, pipeline = read_images(folder)
     assert image.h.shape == quiet.h.shape == (50, 60)
     np.testing.assert_allclose(image.x_m, quiet.x_m, atol=1e-12)
     np.testing.assert_allclose(image.y_m, quiet.y_m, atol=1e-12)
     for channel in ("h", "v"):
-        assert correlation(image, quiet, channel) > 0.98
+        assert correlate(image, quiet, channel) > 0.98
     facts = pipeline.quality.notes["recording"]
     assert facts.direction == "col"
     assert facts.boards["RV"]["positions_missing"] == 2
@@ -77,9 +77,9 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
 )
 def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_path, form):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path, **form)
-    image, pipeline = images(folder)
+    image, pipeline = read_images(folder)
     for channel in ("h", "v"):
-        assert correlation(image, quiet, channel) > 0.999
+        assert correlate(image, quiet, channel) > 0.999
     assert set(pipeline.quality.notes["recording"].cubes) == {"RH", "RV"}
     assert pipeline.quality.result().boards["RH"].positions_masked == 0
 
@@ -97,9 +97,9 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
         cube[:, 4, 5] = 0
         cube[:, 5, 6] = np.nan
         np.save(file, cube)
-    image, pipeline = images(folder)
+    image, pipeline = read_images(folder)
     for channel in ("h", "v"):
-        assert correlation(image, quiet, channel) > 0.99
+        assert correlate(image, quiet, channel) > 0.99
     assert pipeline.quality.result().boards["RH"].positions_masked == 2
 
 

@@ -5,7 +5,7 @@ import pytest
 import tomli_w
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import read_output
-from tests.support.rigs import rig_with
+from tests.support.rigs import make_rig_with
 from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.store.open import open_source
@@ -16,7 +16,7 @@ BANDS = 2
 COLUMNS = 13
 ROWS = 17
 IMAGE = {"columns": 50, "rows": 40, "pixel_mm": 4.0}
-RIG = rig_with(image=IMAGE)
+RIG = make_rig_with(image=IMAGE)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
             assert np.corrcoef(a, b)[0, 1] > 0.8
     # scan.json contains the rig of the images: rows along x, as in the rig file.
     pipeline.finish(tmp_path)
-    assert grid_written(tmp_path) == (COLUMNS, ROWS)
+    assert read_written_grid(tmp_path) == (COLUMNS, ROWS)
     bands = [s["bands"] for s in read_json(tmp_path / "materials.json")["segments"]]
     assert bands
     assert all(len(b) == BANDS for b in bands)
@@ -51,10 +51,10 @@ def test_sub_bands_have_the_pixels_of_the_whole_band(scan, tmp_path):
 def test_the_image_command_writes_the_same_rig(scan, tmp_path):
     (tmp_path / "rig.toml").write_bytes(tomli_w.dumps(to_builtins(RIG)).encode())
     read_output("image", scan, "--config", tmp_path / "rig.toml", "--out", tmp_path / "out")
-    assert grid_written(tmp_path / "out") == (COLUMNS, ROWS)
+    assert read_written_grid(tmp_path / "out") == (COLUMNS, ROWS)
 
 
-def grid_written(out) -> tuple[int, int]:
+def read_written_grid(out) -> tuple[int, int]:
     rig = read_json(out / "scan.json")["instrument"]
     assert (rig["image"]["columns"], rig["image"]["rows"]) == (IMAGE["columns"], IMAGE["rows"])
     return rig["grid"]["columns"], rig["grid"]["rows"]

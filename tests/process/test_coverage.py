@@ -24,7 +24,7 @@ PULSES = 2
 FRAMES = 2 * COLUMNS * ROWS * PULSES
 
 
-def without_rows(scan: Path, to: Path, *rows: int) -> Path:
+def copy_without_rows(scan: Path, to: Path, *rows: int) -> Path:
     """A copy of a scan without the lines of these rows in its manifest."""
     shutil.copytree(scan, to)
     lines = (to / MANIFEST).read_bytes().splitlines(keepends=True)
@@ -35,7 +35,7 @@ def without_rows(scan: Path, to: Path, *rows: int) -> Path:
 
 @pytest.mark.parametrize("command", ["process", "image"])
 def test_missing_rows_are_counted_as_absent(two_plates, tmp_path, command):
-    scan = without_rows(two_plates, tmp_path / "scan", 1, 15)
+    scan = copy_without_rows(two_plates, tmp_path / "scan", 1, 15)
     out = tmp_path / "out"
     output = read_output(command, scan, "--out", out, *(["--metal", METAL] if command == "process" else []))
     coverage = read_json(out / "quality.json")["coverage"]

@@ -2,7 +2,7 @@
 
 from benchmarks.coverage import Cubes
 from tests.support.paths import EXAMPLES
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.materials import match_truth, truth_plates
 from polysight.pipeline import Pipeline
@@ -13,7 +13,7 @@ from polysight_simulators.scene.simulated_scan import truth
 
 def test_each_plate_of_the_demo_has_a_permittivity_and_half_of_them_their_names():
     """The samples are perfectly synchronised; the table that shines through is not reported as a layer."""
-    rig = published_rig()
+    rig = load_published_rig()
     scene = load_scene(EXAMPLES / "demo.toml")
     pipeline = Pipeline(Cubes(rig, scene), Settings())
     for row in pipeline.source.rows():

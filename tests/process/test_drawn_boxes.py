@@ -11,7 +11,7 @@ from polysight.process import Inputs, convert_boxes_to_patches
 from polysight.settings import DEFAULT
 
 
-def again(scan, path):
+def analyse_again(scan, path):
     inputs = Inputs(labels=read_labels(path))
     scene = convert_boxes_to_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
@@ -35,7 +35,7 @@ def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(image_scene, tm
 
     path = tmp_path / "drawn.json"
     path.write_text(json.dumps({"labels": {"mine": pixels(other_plate.box_mm), "copper foil": pixels(copper.box_mm)}}))
-    result, names = again(scan, path)
+    result, names = analyse_again(scan, path)
     assert names == {1: "mine", 2: "copper foil"}
     assert result.metal.label == 2
     assert np.nanmedian(np.abs(result.p[result.metal.mask])) == pytest.approx(1, abs=0.02)

@@ -64,7 +64,7 @@ def analyse_file(path, rig, **settings):
     return analyse_given_images(pair, Settings(model="none", **settings), Inputs(), rig)[0]
 
 
-def permittivities(scan):
+def list_permittivities(scan):
     return {(round(s.centre_x_mm), round(s.centre_y_mm)): s.permittivity for s in scan.segments}
 
 
@@ -74,8 +74,8 @@ def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, sav
     by_file = analyse_file(save_images(), rig)
     assert {s.box for s in by_folder.segments} == set(BOXES)
     assert len(by_file.segments) == len(by_folder.segments)
-    upside_down = {(x, -y): e for (x, y), e in permittivities(by_file).items()}
-    for place, e in permittivities(by_folder).items():
+    upside_down = {(x, -y): e for (x, y), e in list_permittivities(by_file).items()}
+    for place, e in list_permittivities(by_folder).items():
         near = min(upside_down, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
         assert np.hypot(near[0] - place[0], near[1] - place[1]) < 5
         assert (e is None) == (upside_down[near] is None)
@@ -107,7 +107,7 @@ def test_the_direction_of_an_axis_does_not_matter(save_images, pair, rig):
     downwards = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **turned), rig)
     np.testing.assert_array_equal(upwards.images.h, downwards.images.h)
     np.testing.assert_array_equal(upwards.images.raised_m, downwards.images.raised_m)
-    assert permittivities(upwards) == permittivities(downwards)
+    assert list_permittivities(upwards) == list_permittivities(downwards)
     assert upwards.images.x_m[0] == 1.3
 
 

@@ -8,7 +8,7 @@ from polysight.materials.segment import axis_mm, box_mask
 from polysight.polarimetry import calibrate, correct_leakage, ratio_from_permittivity
 
 
-def plate_mask(scan, name, rim_mm=11.0):
+def make_plate_mask(scan, name, rim_mm=11.0):
     """Pixels of a plate without its rim of about a resolution cell; bool [ny, nx]."""
     x0, y0, x1, y1 = next(p.box_mm for p in scan.plates if p.name == name)
     box = (x0 + rim_mm, y0 + rim_mm, x1 - rim_mm, y1 - rim_mm)
@@ -21,7 +21,7 @@ def name_materials(scan):
     )
 
 
-def correlation(a, b):
+def correlate(a, b):
     return abs(np.vdot(a, b)) / np.sqrt(np.vdot(a, a).real * np.vdot(b, b).real)
 
 
@@ -52,7 +52,7 @@ def test_synchronisation_undoes_every_disturbance(image_scene):
     for channel in ("h", "v"):
         on = getattr(disturbed.images, channel)[valid_in_both]
         ideal_values = getattr(ideal.images, channel)[valid_in_both]
-        assert correlation(on, ideal_values) > 0.995, channel
+        assert correlate(on, ideal_values) > 0.995, channel
 
 
 def test_a_scene_without_disturbances_has_no_jump_of_the_phase(image_scene):
@@ -65,7 +65,7 @@ def test_metal_gives_one_at_every_pixel_within_noise(image_scene):
     """A metal plate over the whole plane, referenced to its middle: P = 1 everywhere, up to the noise of a pixel."""
     scan = image_scene("metal-plate")
     other_scene = image_scene("metal-plate", seed=1003)
-    plate_pixels = plate_mask(scan, "copper", rim_mm=150.0)
+    plate_pixels = make_plate_mask(scan, "copper", rim_mm=150.0)
     assert plate_pixels.sum() > 1000
     middle = box_mask((-20, -20, 20, 20), scan.images.x_m, scan.images.y_m)
     first = calibrate(scan.images, middle).p[plate_pixels]
@@ -80,13 +80,13 @@ OTHER = {"hv_gain_db": -3.0, "leakage_h": [0.08, 0.03], "leakage_v": [0.08, 0.03
 
 
 def test_the_set_gain_is_recovered_and_does_not_reach_the_images(image_scene):
-    def gains_db(scan):
+    def compute_gains_db(scan):
         h, v = (np.abs(scan.images.rx_gains[b.name]).mean() for b in scan.rig.receivers)
-        c = calibrate(scan.images, plate_mask(scan, "copper"))
+        c = calibrate(scan.images, make_plate_mask(scan, "copper"))
         return 20 * np.log10(h / v), 20 * np.log10(abs(c.metal_h) / abs(c.metal_v))
 
-    received, image = gains_db(image_scene("nine-materials"))
-    received_other, image_other = gains_db(image_scene("nine-materials", **OTHER))
+    received, image = compute_gains_db(image_scene("nine-materials"))
+    received_other, image_other = compute_gains_db(image_scene("nine-materials", **OTHER))
     assert received - received_other == pytest.approx(1.5 + 3.0, abs=0.1)
     assert image == pytest.approx(image_other, abs=0.1)
 
@@ -95,10 +95,10 @@ def test_the_set_gain_is_recovered_and_does_not_reach_the_images(image_scene):
 def test_the_set_leakage_is_recovered_from_a_known_material(image_scene, disturbances):
     scan = image_scene("nine-materials", **disturbances)
     leakage = complex(*disturbances.get("leakage_h", [0.05, 0.0]))
-    c = calibrate(scan.images, plate_mask(scan, "copper"))
+    c = calibrate(scan.images, make_plate_mask(scan, "copper"))
     theta = scan.pipeline.find_materials(scan.images, known_scene=KnownScene(plates=scan.plates)).theta_rad[0, 0]
     true = complex(ratio_from_permittivity(4.75 - 2.43j, theta))
-    plate_pixels = plate_mask(scan, "ceramic")
+    plate_pixels = make_plate_mask(scan, "ceramic")
     measured = np.sum(c.h[plate_pixels]) / np.sum(c.v[plate_pixels])
     estimate = (measured - true) / (1 - measured * true)  # from P = (t + a) / (1 + a t)
     assert abs(estimate - leakage) < 0.012

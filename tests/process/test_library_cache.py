@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.materials import SIMULATED_LIBRARY, Library
 from polysight.process import load_classifier
@@ -15,18 +15,18 @@ def test_a_library_is_fitted_once_and_again_when_its_file_was_replaced(tmp_path)
     file = tmp_path / "library.npz"
     shutil.copy(SIMULATED_LIBRARY, file)
     settings = Settings(library=str(file))
-    first = load_classifier(settings, published_rig())
+    first = load_classifier(settings, load_published_rig())
     assert first is not None
-    assert load_classifier(settings, published_rig()) is first
+    assert load_classifier(settings, load_published_rig()) is first
 
     library = Library.load(SIMULATED_LIBRARY)
     fewer = Library(tuple(e for e in library.entries if e.name != library.names[0]), library.fit)
     fewer.save(tmp_path / "fewer.npz")
     (tmp_path / "fewer.npz").replace(file)
-    second = load_classifier(settings, published_rig())
+    second = load_classifier(settings, load_published_rig())
     assert second is not None
     assert set(first.names) - set(second.names) == {library.names[0]}
 
     file.unlink()
     with pytest.raises(DataError, match="no such library"):
-        load_classifier(settings, published_rig())
+        load_classifier(settings, load_published_rig())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.calibration import remaining
+from tests.support.calibration import compute_remaining
 
 from polysight.cli.main import main
 from polysight.imaging import Images
@@ -69,13 +69,13 @@ def scan(rig: Instrument, tmp_path_factory):
     return make
 
 
-def remaining_at_same_plate(found: Leakage, truth: Leakage) -> tuple[float, float]:
+def compute_remaining_leakage(found: Leakage, truth: Leakage) -> tuple[float, float]:
     """Remaining crosstalk and imbalance after both rigs measured the same plate."""
 
     def relative(x: Leakage) -> Leakage:
         return Leakage(x.h, x.v, (1 + x.v) / (1 + x.h), 0.0)
 
-    return remaining(relative(found), relative(truth))
+    return compute_remaining(relative(found), relative(truth))
 
 
 def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan, capsys):
@@ -86,7 +86,7 @@ def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan
     printed = json.loads(capsys.readouterr().out)
     leakage = Leakage(complex(*printed["leakage_h"]), complex(*printed["leakage_v"]), 1.0, 0.0)
     truth = Leakage(complex(*LEAKAGE["leakage_h"]), complex(*LEAKAGE["leakage_v"]), 1.0, 0.0)
-    crosstalk, imbalance = remaining_at_same_plate(leakage, truth)
+    crosstalk, imbalance = compute_remaining_leakage(leakage, truth)
     assert crosstalk < 0.01
     assert imbalance < 0.025
     assert printed["simulated"]
@@ -123,7 +123,7 @@ def test_layers_are_recovered_where_a_half_space_is_wrong(scan, reference, rig, 
     assert not fit.warnings()
 
 
-def slope_over_sweep(stack: list[dict], band_hz: tuple[float, float]) -> np.ndarray:
+def compute_slope_over_sweep(stack: list[dict], band_hz: tuple[float, float]) -> np.ndarray:
     """Change of ln |r_s|, ln |r_p / r_s| and its phase over a band, by the slope in its middle."""
     eps = [complex(x["permittivity"][0], -x["permittivity"][1]) for x in stack]
     thick_m = [x.get("thickness_mm", np.inf) / 1e3 for x in stack]
@@ -148,7 +148,7 @@ def test_the_change_over_the_sweep_is_that_of_the_plate_if_metal_was_scanned_sep
     assert measured is not None
     expected = np.zeros(3)
     if name != "plate":
-        expected = slope_over_sweep(PLATES[name].get("layers", [PLATES[name]]), measured.band_hz)
+        expected = compute_slope_over_sweep(PLATES[name].get("layers", [PLATES[name]]), measured.band_hz)
     # The slope in the middle of the band is not quite that over the window.
     assert (np.abs(measured.change - expected) < 0.05 * np.abs(expected) + 3 * measured.std).all()
     assert measured.std[0] < 0.05

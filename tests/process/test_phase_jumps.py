@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
-from tests.support.mangled_scans import PLATES, SCENE, distances
+from tests.support.mangled_scans import PLATES, SCENE, compute_distances
 from tests.support.pipelines import make_pipeline
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 
 from polysight.process.quality import PhaseJump, find_phase_jumps
@@ -23,10 +23,10 @@ from polysight_worlds.world import nine_places
 EMPTY: dict[str, Any] = SCENE | {"plates": []}
 
 
-def jumping(board: str, row: int, degrees: float) -> Cubes:
+def make_jumping_cubes(board: str, row: int, degrees: float) -> Cubes:
     """Cubes of the six plates whose echo in one board is turned from a row on; the direct path is not."""
-    cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
-    direct = Cubes(published_rig(), decode_scene(EMPTY, "test"))._cubes[board].mean(axis=(1, 2, 3), keepdims=True)
+    cubes = Cubes(load_published_rig(), decode_scene(SCENE, "test"))
+    direct = Cubes(load_published_rig(), decode_scene(EMPTY, "test"))._cubes[board].mean(axis=(1, 2, 3), keepdims=True)
     echoes = cubes._cubes[board][:, row:] - direct
     cubes._cubes[board][:, row:] = direct + echoes * np.exp(1j * np.radians(degrees)).astype(np.complex64)
     return cubes
@@ -34,7 +34,7 @@ def jumping(board: str, row: int, degrees: float) -> Cubes:
 
 @pytest.mark.parametrize(("board", "row", "degrees"), [("RV", 14, 30.0), ("RV", 24, -30.0), ("RH", 16, 25.0)])
 def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degrees):
-    cubes = jumping(board, row, degrees)
+    cubes = make_jumping_cubes(board, row, degrees)
     pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
     findings = pipeline.examine(pipeline.form_images())
     (jump,) = pipeline.quality.boards[board].find_phase_jumps()
@@ -42,13 +42,13 @@ def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degr
     assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=6)
     assert findings.verdict.level == "care"
     assert f"{board}: the phase of the echo jumps" in findings.verdict.reasons[0].what
-    inside = distances(cubes, findings)
+    inside = compute_distances(cubes, findings)
     assert len(inside) == len(PLATES)
     assert max(inside) < 9
 
 
 def test_no_jump_is_found_without_one():
-    for cubes in (jumping("RV", 20, 0.0), jumping("RV", 20, 2.0)):
+    for cubes in (make_jumping_cubes("RV", 20, 0.0), make_jumping_cubes("RV", 20, 2.0)):
         pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
         assert not any(board.find_phase_jumps() for board in pipeline.quality.boards.values())
 
@@ -74,7 +74,7 @@ def test_no_drawn_scene_has_a_jump_of_its_own(request):
     """With other limits every sixth had one, which was taken out of its images."""
     rng = np.random.default_rng(3)
     for _ in range(40 if request.config.getoption("--long") else 1):
-        pipeline = make_pipeline(Cubes(published_rig(), decode_scene(draw_scene(rng), "test")))  # type: ignore[arg-type]
+        pipeline = make_pipeline(Cubes(load_published_rig(), decode_scene(draw_scene(rng), "test")))  # type: ignore[arg-type]
         assert not any(board.find_phase_jumps() for board in pipeline.quality.boards.values())
 
 
@@ -85,7 +85,7 @@ def test_rows_too_far_apart_or_too_few_have_no_jump(columns, rows, step_mm):
         {"name": "mine", "centre_mm": [34.0, 0.0], "size_mm": [46.0, 60.0], "permittivity": [4.0, 0.4]},
     ]
     scene = make_scene(*plates, columns=columns, rows=rows, step_mm=step_mm, image={"columns": 40, "rows": 30})
-    pipeline = make_pipeline(Cubes(published_rig(), decode_scene(scene, "test")))  # type: ignore[arg-type]
+    pipeline = make_pipeline(Cubes(load_published_rig(), decode_scene(scene, "test")))  # type: ignore[arg-type]
     assert not any(board.find_phase_jumps() for board in pipeline.quality.boards.values())
 
 
@@ -131,7 +131,7 @@ def test_each_of_several_jumps_is_found_one_by_one(independent_rows, jumps):
 
 
 def test_rows_are_turned_back_by_all_jumps_and_the_longest_section_keeps_its_phase(monkeypatch):
-    pipeline = make_pipeline(Cubes(published_rig(), decode_scene(EMPTY, "test")))  # type: ignore[arg-type]
+    pipeline = make_pipeline(Cubes(load_published_rig(), decode_scene(EMPTY, "test")))  # type: ignore[arg-type]
     board = pipeline.quality.boards["RV"]
     monkeypatch.setattr(board, "find_phase_jumps", lambda: (PhaseJump(4, 0.5), PhaseJump(25, -0.2)))
     turned: dict[str, Any] = {}

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
-from tests.support.mangled_scans import PLATES, SCENE, Mangle, Mangled, distances
+from tests.support.mangled_scans import PLATES, SCENE, Mangle, Mangled, compute_distances
 from tests.support.pipelines import make_pipeline
-from tests.support.rigs import published_rig, rig_with
+from tests.support.rigs import load_published_rig, make_rig_with
 
 from polysight.jobs.process import LiveProcessing
 from polysight.settings import Settings
@@ -31,7 +31,7 @@ def reorder(board: str, *order: int) -> Mangle:
     return mangle
 
 
-def with_order(rig: Instrument, board: str, *order: int) -> Instrument:
+def reorder_rx(rig: Instrument, board: str, *order: int) -> Instrument:
     boards = [msgspec.structs.replace(b, rx_order=order) if b.name == board else b for b in rig.boards]
     return msgspec.structs.replace(rig, boards=tuple(boards))
 
@@ -53,7 +53,7 @@ def test_with_the_order_in_the_rig_file_the_images_are_the_same(six_plates, proc
     class Corrected(Mangled):
         def __init__(self) -> None:
             super().__init__(six_plates, reorder("RV", 4, 3, 1, 2))
-            self.instrument = with_order(six_plates.instrument, "RV", 4, 3, 1, 2)
+            self.instrument = reorder_rx(six_plates.instrument, "RV", 4, 3, 1, 2)
 
     pipeline = make_pipeline(Corrected())  # type: ignore[arg-type]
     images = pipeline.form_images()
@@ -61,7 +61,7 @@ def test_with_the_order_in_the_rig_file_the_images_are_the_same(six_plates, proc
     np.testing.assert_allclose(images.v, expected.v, atol=2e-5 * np.abs(expected.v).max())
     findings = pipeline.examine(images)
     assert pipeline.quality.result().boards["RV"].rx_order == []
-    assert len(distances(six_plates, findings)) == len(PLATES)
+    assert len(compute_distances(six_plates, findings)) == len(PLATES)
 
 
 def test_the_right_order_and_a_dead_rx_are_not_reported_as_another_order(process_six_plates):
@@ -76,9 +76,9 @@ def test_the_right_order_and_a_dead_rx_are_not_reported_as_another_order(process
 
 @pytest.mark.parametrize(("board", "order"), [("RV", (2, 1, 3, 4)), ("RH", (4, 3, 2, 1))])
 def test_another_order_in_cubes_is_reported(process_six_plates, board, order):
-    cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
+    cubes = Cubes(load_published_rig(), decode_scene(SCENE, "test"))
     # The phases before synchronisation: only such a cube has the order of its RX in the direct path.
-    setups = {b.name: BoardSetup.from_rig(published_rig(), b) for b in cubes.instrument.receivers}
+    setups = {b.name: BoardSetup.from_rig(load_published_rig(), b) for b in cubes.instrument.receivers}
 
     def mangle(name: str, row: int, samples: np.ndarray) -> None:
         path = setups[name].path
@@ -107,13 +107,13 @@ def test_an_order_that_is_none_is_refused(order):
         table["boards"][1]["rx_order"] = list(order)
 
     with pytest.raises(ConfigError, match="rx_order"):
-        rig_with(write)
+        make_rig_with(write)
 
 
 @pytest.mark.parametrize("board", [0, 1])
 def test_phases_of_a_place_show_the_order_in_spite_of_the_channels(board):
     """Of geometry alone: every order of four RX is found, or one with the same image; none is found without a swap."""
-    rig = published_rig()
+    rig = load_published_rig()
     path = BoardSetup.from_rig(rig, rig.receivers[board]).path
     expected = rx_order._expect_phases(path)
     rng = np.random.default_rng(3)

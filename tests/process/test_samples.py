@@ -33,7 +33,7 @@ def process_scan(folder: Path, samples: SampleUse = "keep", **settings: Any) -> 
     return make_pipeline(ScanFolder.load(folder), samples=samples, **settings)
 
 
-def same(one: Images, other: Images) -> bool:
+def are_same_images(one: Images, other: Images) -> bool:
     same_pixels = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in PIXELS)
     return same_pixels and np.array_equal(one.illumination.footprints, other.illumination.footprints)
 
@@ -68,14 +68,14 @@ def kept(_processed: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(_processed, tmp_path / "scan"))
 
 
-def without_raw(folder: Path) -> Path:
+def remove_raw(folder: Path) -> Path:
     shutil.rmtree(folder / "raw")
     return folder
 
 
 def test_images_and_quality_from_samples_are_bit_exact(from_raw: Pipeline, expected: Images, kept: Path) -> None:
-    reprocessed = process_scan(without_raw(kept))
-    assert same(reprocessed.form_images(), expected)
+    reprocessed = process_scan(remove_raw(kept))
+    assert are_same_images(reprocessed.form_images(), expected)
     for key in ("boards", "coverage"):
         assert getattr(reprocessed.quality.result(), key) == getattr(from_raw.quality.result(), key)
 
@@ -84,9 +84,9 @@ def test_rows_on_several_threads_make_the_same_products(from_raw: Pipeline, expe
     threaded = Pipeline(ScanFolder.load(scan), samples="keep")
     rows = list(threaded.source.rows())
     assert list(map_rows(threaded.add_row, rows, threads=4)) == rows
-    assert same(threaded.form_images(), expected)
+    assert are_same_images(threaded.form_images(), expected)
     assert threaded.quality.result().boards == from_raw.quality.result().boards
-    assert same(process_scan(without_raw(scan)).form_images(), expected)
+    assert are_same_images(process_scan(remove_raw(scan)).form_images(), expected)
 
 
 def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,16 +113,16 @@ def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_samples_with_sub_bands_can_be_used_without_them(expected: Images, scan: Path) -> None:
     first = process_scan(scan, bands=3)
-    reprocessed = process_scan(without_raw(scan), bands=3)
+    reprocessed = process_scan(remove_raw(scan), bands=3)
     for first_item, second_item in zip(reprocessed.sub_bands.finish(), first.sub_bands.finish(), strict=True):
-        assert same(first_item, second_item)
-    assert same(process_scan(scan).form_images(), expected)
+        assert are_same_images(first_item, second_item)
+    assert are_same_images(process_scan(scan).form_images(), expected)
 
 
 def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> None:
     processed_again = process_scan(kept, bands=2)
     assert len(processed_again.sub_bands.finish()) == 2
-    assert process_scan(without_raw(kept), bands=2).sub_bands.bands == processed_again.sub_bands.bands
+    assert process_scan(remove_raw(kept), bands=2).sub_bands.bands == processed_again.sub_bands.bands
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> Non
 )
 def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: dict[str, Any]) -> None:
     expected = process_scan(two_plates, "none", **view).form_images()
-    reprocessed = process_scan(without_raw(kept), **view).form_images()
+    reprocessed = process_scan(remove_raw(kept), **view).form_images()
     np.testing.assert_array_equal(reprocessed.x_m, expected.x_m)
     pairs = [(reprocessed.h_raw, expected.h_raw), (reprocessed.v_raw, expected.v_raw)]
     pairs += zip(reprocessed.illumination.footprints, expected.illumination.footprints, strict=True)
@@ -143,7 +143,7 @@ def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
     beyond = 1e3 * PLANE_REACH_M + 200
     process_scan(kept, depth_mm=beyond)
     with pytest.raises(DataError):
-        process_scan(without_raw(kept), depth_mm=beyond)
+        process_scan(remove_raw(kept), depth_mm=beyond)
 
 
 def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
@@ -172,8 +172,8 @@ def test_damaged_samples_are_made_again(expected: Images, kept: Path, what: str)
         array.unlink()
     else:
         array.write_bytes(array.read_bytes()[:-3000])
-    assert same(process_scan(kept).form_images(), expected)
-    assert same(process_scan(without_raw(kept)).form_images(), expected)
+    assert are_same_images(process_scan(kept).form_images(), expected)
+    assert are_same_images(process_scan(remove_raw(kept)).form_images(), expected)
 
 
 def test_rows_with_other_raw_data_are_synchronised_again(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,7 +202,7 @@ def test_a_scan_is_processed_even_if_samples_cannot_be_written(
     expected: Images, scan: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (scan / "samples").write_text("a file is in the way")
-    assert same(process_scan(scan).form_images(), expected)
+    assert are_same_images(process_scan(scan).form_images(), expected)
     assert str(scan / "samples") in caplog.text
 
 
@@ -247,7 +247,7 @@ def test_samples_are_kept_only_if_their_paths_are_those_of_every_other_image(nee
 def test_an_invalid_head_is_ignored(expected: Images, kept: Path, head) -> None:
     path = kept / "samples" / "samples.json"
     path.write_text(json.dumps(head(json.loads(path.read_text()))))
-    assert same(process_scan(kept, "read").form_images(), expected)
+    assert are_same_images(process_scan(kept, "read").form_images(), expected)
 
 
 @pytest.mark.parametrize(
@@ -266,8 +266,8 @@ def test_a_row_with_invalid_figures_is_made_again(expected: Images, kept: Path, 
     entry = facts[4]["boards"]["RH"]
     entry["figures"] = change if change is None else {**entry["figures"], **change}
     path.write_bytes(b"".join(encode_line({k: v for k, v in f.items() if k != "crc"}) for f in facts))
-    assert same(process_scan(kept).form_images(), expected)
-    assert same(process_scan(without_raw(kept)).form_images(), expected)
+    assert are_same_images(process_scan(kept).form_images(), expected)
+    assert are_same_images(process_scan(remove_raw(kept)).form_images(), expected)
 
 
 def damage_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarray], None]) -> None:
@@ -310,8 +310,8 @@ def test_rows_of_dead_receivers_are_kept(
     damage_raw(monkeypatch, one_rx)
     first = process_scan(scan)
     assert not caplog.text
-    processed_again = process_scan(without_raw(scan))
-    assert same(processed_again.form_images(), first.form_images())
+    processed_again = process_scan(remove_raw(scan))
+    assert are_same_images(processed_again.form_images(), first.form_images())
     assert processed_again.quality.result().boards == first.quality.result().boards
 
 

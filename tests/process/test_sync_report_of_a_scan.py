@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from tests.support.processes import read_output
-from tests.support.rigs import published_rig, rig_table, rig_with
+from tests.support.rigs import load_published_rig, load_rig_table, make_rig_with
 from tests.support.scenes import EVERYWHERE, make_scene
 from tests.support.store.facts import load_facts
 
@@ -34,7 +34,7 @@ def scan(make_scan, tmp_path_factory):
     )
     head = make_header("hpf", [SourceScan("sweep", "sweep", True, 3)])
     path = write_calibration(FilterFile(**head, boards={"RH": true_filter, "RV": true_filter}), folder / "calibration")
-    true = rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
+    true = make_rig_with(chirp={"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}, calibration={"hpf": str(path)})
     scene_changes = {"seed": 3, "disturbances": {"direct_snr_db": 20.0, "sync_uncertainty_ns": SYNC_NS}}
     scan = make_scan(
         folder / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES, **scene_changes), true
@@ -51,7 +51,7 @@ def _believe_programmed(scan):
 
 
 def test_a_scan_with_two_antennas_has_a_report_and_an_image(make_scan, tmp_path):
-    two = rig_with(antennas={"rx_mm": rig_table()["antennas"]["rx_mm"][:2]})
+    two = make_rig_with(antennas={"rx_mm": load_rig_table()["antennas"]["rx_mm"][:2]})
     scan = make_scan(tmp_path / "scan", make_scene(EVERYWHERE, columns=COLUMNS, rows=ROWS, pulses=PULSES), two)
     read_output("sync-report", scan, "--out", tmp_path / "report")
     read_output("image", scan, "--out", tmp_path / "image")
@@ -65,7 +65,7 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
     report = read_json(tmp_path / "report" / "sync.json")
     quality = read_json(tmp_path / "image" / "quality.json")
     assert report["simulated"] is True
-    slope = published_rig().chirp.slope_hz_per_s
+    slope = load_published_rig().chirp.slope_hz_per_s
     for name in ("RH", "RV"):
         figures = report["boards"][name]
         stages = report["boards"][name]["stages"]

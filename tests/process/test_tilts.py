@@ -20,14 +20,14 @@ TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5,
 @pytest.fixture(scope="module")
 def tilted_images(rig):
     """Images of six plates of one material, each tilted as TILTS_DEG; and of the same six, level."""
-    return [_images(rig, tilts) for tilts in (TILTS_DEG, [(0.0, 0.0)] * 6)]
+    return [_form_images(rig, tilts) for tilts in (TILTS_DEG, [(0.0, 0.0)] * 6)]
 
 
-def _images(rig, tilts, size=None):
-    return _pipeline(rig, tilts, size).form_images()
+def _form_images(rig, tilts, size=None):
+    return _make_pipeline(rig, tilts, size).form_images()
 
 
-def _pipeline(rig, tilts, size=None):
+def _make_pipeline(rig, tilts, size=None):
     plates = [
         {
             "name": "a",
@@ -43,11 +43,11 @@ def _pipeline(rig, tilts, size=None):
     return make_pipeline(Cubes(rig, decode_scene(scene, "tilts")))
 
 
-def _insides(images):
+def _make_inside_masks(images):
     return [box_mask((x - 12, y - 12, x + 12, y + 12), images.x_m, images.y_m) for x, y in PLACES]
 
 
-def _ratios(h, v, masks):
+def _compute_ratios(h, v, masks):
     return np.array([np.median((v[m] / h[m]).real) + 1j * np.median((v[m] / h[m]).imag) for m in masks])
 
 
@@ -65,7 +65,7 @@ def _turn_polarisation():
 
 def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
     images = tilted_images[0]
-    rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in _insides(images)]
+    rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in _make_inside_masks(images)]
     assert np.degrees(rises) == pytest.approx(np.array(TILTS_DEG), abs=0.12)
 
 
@@ -73,8 +73,8 @@ def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
 def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
     """A scan that ends close to the plates has more positions on one side of them."""
     columns, rows = grid
-    images = _images(rig, [(0.0, 0.0)] * 6, {"columns": columns, "rows": rows})
-    insides = _insides(images)
+    images = _form_images(rig, [(0.0, 0.0)] * 6, {"columns": columns, "rows": rows})
+    insides = _make_inside_masks(images)
     plates = [box_mask((x - 22.5, y - 22.5, x + 22.5, y + 22.5), images.x_m, images.y_m) for x, y in PLACES]
     apparent_deg = np.degrees([images.illumination.estimate_rise(images.h, images.v, inside) for inside in insides])
     pairs = zip(insides, plates, strict=True)
@@ -85,8 +85,8 @@ def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
 
 @pytest.mark.parametrize(("plates", "by_phase"), [(3, False), (4, True), (6, True)])
 def test_phases_of_four_plates_which_can_contradict_a_plane_decide_it(rig, plates, by_phase):
-    pipeline = _pipeline(rig, [(0.0, 0.0)] * 6, {"columns": 25, "rows": 25})
-    insides = _insides(pipeline.form_images())[:plates]
+    pipeline = _make_pipeline(rig, [(0.0, 0.0)] * 6, {"columns": 25, "rows": 25})
+    insides = _make_inside_masks(pipeline.form_images())[:plates]
     found = find_plane(pipeline.samples.filled, insides)
     assert (found.plates, found.by_phase) == (plates, by_phase)
     assert (found.offset_std_m < 1e-4) is by_phase
@@ -94,13 +94,13 @@ def test_phases_of_four_plates_which_can_contradict_a_plane_decide_it(rig, plate
 
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted_images):
     images, level = tilted_images
-    masks = _insides(images)
+    masks = _make_inside_masks(images)
     rises = [images.illumination.estimate_rise(images.h, images.v, mask) for mask in masks]
     corrected = correct_tilt(images, masks, rises)
     h_turned, ratio_turned = _turn_polarisation()
-    truth = _ratios(level.h, level.v, masks) * ratio_turned
-    state_before = np.abs(_ratios(images.h, images.v, masks) / truth - 1)
-    state_after = np.abs(_ratios(corrected.h, corrected.v, masks) / truth - 1)
+    truth = _compute_ratios(level.h, level.v, masks) * ratio_turned
+    state_before = np.abs(_compute_ratios(images.h, images.v, masks) / truth - 1)
+    state_after = np.abs(_compute_ratios(corrected.h, corrected.v, masks) / truth - 1)
     assert state_before.max() > 0.02
     assert state_after.max() < 0.02  # the turn is a first order in the rise
     brightness = [np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks] / np.abs(h_turned)
@@ -112,7 +112,7 @@ def test_tilts_follow_a_transposed_image(tilted_images):
     images = tilted_images[0]
     turned = images.transpose()
     assert (images.illumination.across, turned.illumination.across) == (1, 0)
-    for mask in _insides(images):
+    for mask in _make_inside_masks(images):
         rise = images.illumination.estimate_rise(images.h, images.v, mask)
         transposed_rise = turned.illumination.estimate_rise(turned.h, turned.v, mask.T)
         assert transposed_rise[::-1] == pytest.approx(rise, abs=1e-9)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.support.processes import read_output
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.cli.main import main
@@ -15,7 +15,7 @@ MORE = {"name": "rubber", "centre_mm": [-40.0, -50.0], "size_mm": [50.0, 50.0], 
 NAMES = ("PET", "copper", "rubber")
 
 
-def scene(name: str):
+def make_scene_named(name: str):
     """A scene with the same power cycle under another name."""
     return make_scene(COPPER, PET, MORE, columns=15, rows=21, pulses=1, seed=7) | {"name": name}
 
@@ -23,14 +23,14 @@ def scene(name: str):
 @pytest.fixture
 def rig_file(tmp_path):
     path = tmp_path / "rig.toml"
-    path.write_bytes(tomli_w.dumps(to_builtins(published_rig())).encode())
+    path.write_bytes(tomli_w.dumps(to_builtins(load_published_rig())).encode())
     return path
 
 
 def test_scans_and_their_scenes_give_the_same_library(make_scan, rig_file, tmp_path):
     (tmp_path / "scenes").mkdir()
-    (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(scene("second")).encode())
-    scan = make_scan(tmp_path / "first", scene("first"))
+    (tmp_path / "scenes" / "second.toml").write_bytes(tomli_w.dumps(make_scene_named("second")).encode())
+    scan = make_scan(tmp_path / "first", make_scene_named("first"))
     out = tmp_path / "library.npz"
     options = ("--simulate", tmp_path / "scenes", "--config", rig_file, "--out", out)
     output = read_output("train", scan, *options)

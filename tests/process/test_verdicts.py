@@ -22,7 +22,7 @@ PLATES = {
 }  # fmt: skip
 
 
-def world(names=tuple(PLATES), disturbances=None, **scene):
+def make_scene(names=tuple(PLATES), disturbances=None, **scene):
     plates = [
         {"name": n, "centre_mm": PLATES[n][0], "size_mm": [46.0, 46.0]}
         | ({"metal": True} if PLATES[n][1] is None else {"permittivity": PLATES[n][1]})
@@ -59,10 +59,10 @@ def examine(rig):
 @pytest.fixture(scope="module")
 def plain(examine):
     """Results for all plates with a rig whose leakage was measured."""
-    return examine(world(disturbances={"leakage_measured": 0.003}))
+    return examine(make_scene(disturbances={"leakage_measured": 0.003}))
 
 
-def distances(findings, true):
+def compute_distances(findings, true):
     """Squared distance of each patch's true permittivity in its region."""
     out = []
     for r in findings.analysis.patches:
@@ -75,18 +75,18 @@ def distances(findings, true):
     return np.array(out)
 
 
-def reasons(findings):
+def join_reasons(findings):
     return "; ".join(r.what for r in findings.verdict.reasons)
 
 
-def silent(findings):
+def has_no_results(findings):
     return all(r.name is None and r.permittivity is None and r.ratio is None for r in findings.analysis.rows())
 
 
 def test_a_measured_rig_and_a_plain_scene_are_good(plain):
     findings, true = plain
-    assert findings.verdict.level == "good", reasons(findings)
-    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+    assert findings.verdict.level == "good", join_reasons(findings)
+    assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
     assert sum(r.verdict is not None and r.verdict.name.startswith(true[r.patch.label].name)
                for r in findings.analysis.patches) >= 4  # fmt: skip
     (reference,) = [r for r in findings.analysis.rows() if r.metal_reference]
@@ -95,29 +95,31 @@ def test_a_measured_rig_and_a_plain_scene_are_good(plain):
 
 def test_an_undeclared_thin_sheet_is_reported_and_affects_no_other_patch(examine):
     # A millimetre of acrylic is half a wavelength thick: it hardly reflects, and has the ratio of another material.
-    scene = world(disturbances={"leakage_measured": 0.003})
+    scene = make_scene(disturbances={"leakage_measured": 0.003})
     plates = tuple(msgspec.structs.replace(p, thickness_mm=1.0) if p.name == "acrylic" else p for p in scene.plates)
     findings, true = examine(msgspec.structs.replace(scene, plates=plates))
     (label,) = [label for label, plate in true.items() if plate.name == "acrylic"]
     assert findings.verdict.level == "care"
-    assert f"patch {label} " in reasons(findings)
+    assert f"patch {label} " in join_reasons(findings)
     other_items = {k: plate for k, plate in true.items() if k != label}
-    assert np.sqrt(distances(findings, other_items).mean() / 2) < 1.5
+    assert np.sqrt(compute_distances(findings, other_items).mean() / 2) < 1.5
 
 
 # Two plates: test_products_without_a_result_hold_images_and_no_name
 @pytest.mark.parametrize("names", [("ceramic", "acrylic", "PET", "wood", "rubber"), ("ceramic",)])
 def test_without_metal_there_is_no_result(examine, names):
-    findings, _ = examine(world(names))
+    findings, _ = examine(make_scene(names))
     assert findings.verdict.level == "none"
     assert not findings.analysis.metal.certain
-    assert "metal" in reasons(findings)
-    assert silent(findings)
+    assert "metal" in join_reasons(findings)
+    assert has_no_results(findings)
 
 
 @pytest.mark.parametrize("leak", [(0.0, 0.0), (0.0, 0.05), (-0.05, 0.05)])
 def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
-    findings, true = examine(world(disturbances={"leakage_h": list(leak), "leakage_v": list(leak), "crystal_ppm": {}}))
+    findings, true = examine(
+        make_scene(disturbances={"leakage_h": list(leak), "leakage_v": list(leak), "crystal_ppm": {}})
+    )
     if leak == (0.0, 0.0):  # the rig file must not say that there is no leakage
         assert findings.verdict.level == "good"
         return
@@ -132,16 +134,16 @@ def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
     for found, std in zip(inversion.leakage, inversion.leakage_std, strict=True):
         assert abs(found - complex(*leak)) < 4 * std
     assert {e.dominated_by for e in inversion.patches} <= {"leakage", "metal reference", "scatter"}
-    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+    assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
 
 
 @pytest.mark.parametrize("shift_mm", [10.0, -8.0])
 def test_a_shifted_plane_is_found_and_reported(examine, shift_mm):
-    findings, true = examine(world(plane_shift_mm=shift_mm, disturbances={"leakage_measured": 0.003}))
+    findings, true = examine(make_scene(plane_shift_mm=shift_mm, disturbances={"leakage_measured": 0.003}))
     assert 1e3 * findings.plane.offset_m == pytest.approx(shift_mm, abs=0.5)
-    assert "plane" in reasons(findings)
-    assert distances(findings, true).max() < 14.0
-    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+    assert "plane" in join_reasons(findings)
+    assert compute_distances(findings, true).max() < 14.0
+    assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
 
 
 @pytest.mark.parametrize(
@@ -155,19 +157,19 @@ def test_a_shifted_plane_is_found_and_reported(examine, shift_mm):
 )
 def test_plates_of_other_heights_are_not_a_tilt_and_keep_their_permittivities(examine, heights_mm):
     # 12 mm nearer to the radars the angle of incidence is larger by 0.7 degrees.
-    scene = world(disturbances={"leakage_measured": 0.003})
+    scene = make_scene(disturbances={"leakage_measured": 0.003})
     plates = tuple(msgspec.structs.replace(p, height_mm=heights_mm.get(p.name, 0.0)) for p in scene.plates)
     findings, true = examine(msgspec.structs.replace(scene, plates=plates))
     raised = findings.plane.to_dict()["raised_mm"]
     assert sorted(raised) == pytest.approx(sorted(heights_mm.values()), abs=0.5)
     np.testing.assert_allclose(np.degrees(findings.plane.tilt_rad), 0, atol=0.2)
     assert findings.verdict.level == "good"
-    assert distances(findings, true).max() < 14.0
-    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+    assert compute_distances(findings, true).max() < 14.0
+    assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
 
 
 def test_a_raised_plate_keeps_its_angle_in_images_and_maps(rig, tmp_path):
-    scene = world(disturbances={"leakage_measured": 0.003})
+    scene = make_scene(disturbances={"leakage_measured": 0.003})
     plates = tuple(msgspec.structs.replace(p, height_mm=-20.0 * (p.name == "rubber")) for p in scene.plates)
     pipeline, _ = form_images(Cubes(rig, msgspec.structs.replace(scene, plates=plates)))
     pipeline.finish(tmp_path)
@@ -184,37 +186,37 @@ def test_a_raised_plate_keeps_its_angle_in_images_and_maps(rig, tmp_path):
 
 
 def test_a_tilted_plane_is_found(examine):
-    findings, true = examine(world(plane_tilt_deg=[0.8, -0.6], disturbances={"leakage_measured": 0.003}))
+    findings, true = examine(make_scene(plane_tilt_deg=[0.8, -0.6], disturbances={"leakage_measured": 0.003}))
     np.testing.assert_allclose(np.degrees(findings.plane.tilt_rad), [0.8, -0.6], atol=0.2)
-    assert "tilted" in reasons(findings)
-    assert np.sqrt(distances(findings, true).mean() / 2) < 1.5
+    assert "tilted" in join_reasons(findings)
+    assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
 
 
 def test_a_weak_direct_path_is_reported(examine):
-    findings, _ = examine(world(disturbances={"direct_loss_db": 12.0}))
+    findings, _ = examine(make_scene(disturbances={"direct_loss_db": 12.0}))
     assert findings.verdict.level == "care"
-    assert "direct path" in reasons(findings)
+    assert "direct path" in join_reasons(findings)
 
 
 def test_an_empty_table_is_not_a_result(examine):
-    findings, _ = examine(world(()))
+    findings, _ = examine(make_scene(()))
     assert findings.verdict.level == "none"
-    assert silent(findings)
+    assert has_no_results(findings)
 
 
 @pytest.mark.parametrize("plates", [tuple(PLATES), ()], ids=["plates", "noise"])
 def test_without_a_direct_path_there_is_no_result(rig, tmp_path, plates):
     small = {"columns": 31, "rows": 25, "step_x_mm": 14.0, "step_y_mm": 10.0}
-    folder = simulate(rig, world(plates, {"direct_loss_db": "absent"}, grid=small), tmp_path / "scan")
+    folder = simulate(rig, make_scene(plates, {"direct_loss_db": "absent"}, grid=small), tmp_path / "scan")
     pipeline, images = form_images(open_source(folder, None))
     findings = pipeline.examine(images)
     assert findings.verdict.level == "none"
     assert "direct path" in findings.verdict.reasons[0].what
-    assert silent(findings)
+    assert has_no_results(findings)
 
 
 def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
-    pipeline, _ = form_images(Cubes(rig, world(("ceramic", "wood"))))
+    pipeline, _ = form_images(Cubes(rig, make_scene(("ceramic", "wood"))))
     products = pipeline.finish(tmp_path / "out")
     assert products.exit_status == 7
     content = json.loads((tmp_path / "out/materials.json").read_text())

@@ -6,7 +6,7 @@ from typing import Annotated
 import msgspec
 import pytest
 import scipy.io
-from tests.support.products import changed, judged_products, make_result
+from tests.support.products import make_result, replace_results, write_judged_products
 
 from polysight.products import patch_dataset, read_products
 from polysight.products.exports import pack_csv, pack_mat
@@ -25,13 +25,13 @@ class RoughPatch(PatchFigures, frozen=True, kw_only=True):
 
 @pytest.fixture
 def scan(tmp_path):
-    saved = read_products(judged_products(tmp_path, "good"))
+    saved = read_products(write_judged_products(tmp_path, "good"))
     scan = make_result(saved.images, {"segments": []}, {})
     patches = [
         RoughPatch(**{name: getattr(patch, name) for name in patch.__struct_fields__}, roughness_mm=0.25)
         for patch in saved.segments
     ]
-    return changed(scan, materials=ScanMaterials(segments=patches))
+    return replace_results(scan, materials=ScanMaterials(segments=patches))
 
 
 def test_a_declared_figure_is_a_column_of_the_tables(scan, tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import tomli_w
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 from tests.support.store.facts import load_facts
 
@@ -35,7 +35,7 @@ METAL = ["--metal", "-36,0,30,40"]
 def recorded_scan(tmp_path_factory) -> Path:
     """A simulated scan, and its products."""
     folder = tmp_path_factory.mktemp("recorded")
-    simulate(published_rig(), decode_scene(SCENE, "test"), folder / "scan")
+    simulate(load_published_rig(), decode_scene(SCENE, "test"), folder / "scan")
     assert main(["process", str(folder / "scan"), "--out", str(folder / "out"), *METAL]) == 0
     return folder
 
@@ -46,7 +46,7 @@ def made_folder(recorded_scan, tmp_path) -> Path:
     return Path(shutil.copytree(recorded_scan, tmp_path / "lab"))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def read_contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
@@ -54,7 +54,7 @@ def process(made_folder: Path, *more: object) -> int:
     return main(["process", str(made_folder / "scan"), "--out", str(made_folder / "out"), *map(str, more)])
 
 
-def boxes(made_folder: Path, labels: dict[str, list[float]]) -> Path:
+def write_boxes(made_folder: Path, labels: dict[str, list[float]]) -> Path:
     (made_folder / "mine.json").write_text(json.dumps({"labels": labels}))
     return made_folder / "mine.json"
 
@@ -79,17 +79,17 @@ def test_labels_among_the_products_that_they_replace(made_folder):
     ],
 )
 def test_an_invalid_input_changes_nothing(made_folder, option, path, value, capsys):
-    boxes(made_folder, {"far": [4000, 0, 4010, 10]})
-    state_before = contents(made_folder)
+    write_boxes(made_folder, {"far": [4000, 0, 4010, 10]})
+    state_before = read_contents(made_folder)
     assert process(made_folder, option, made_folder / path) == 3
     assert value in capsys.readouterr().err
-    assert contents(made_folder) == state_before
+    assert read_contents(made_folder) == state_before
 
 
 def test_a_report_is_not_replaced_by_images_without_one(made_folder, capsys):
-    state_before = contents(made_folder / "out")
+    state_before = read_contents(made_folder / "out")
     assert process(made_folder, "--metal", "900,900,10,10") == 3
-    assert contents(made_folder / "out") == state_before
+    assert read_contents(made_folder / "out") == state_before
     shutil.rmtree(made_folder / "out")
     assert process(made_folder, "--metal", "900,900,10,10") == 3
     assert str(made_folder / "out" / "image.npz") in capsys.readouterr().err.splitlines()[-1]
@@ -98,12 +98,14 @@ def test_a_report_is_not_replaced_by_images_without_one(made_folder, capsys):
 
 def test_products_whose_raw_rows_were_dropped_stay(made_folder, capsys):
     assert main(["drop-raw", str(made_folder / "scan"), "--products", str(made_folder / "out"), "--yes"]) == 0
-    state_before = contents(made_folder / "out")
-    other_scan = simulate(published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made_folder / "other")
+    state_before = read_contents(made_folder / "out")
+    other_scan = simulate(
+        load_published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made_folder / "other"
+    )
     for command in ("process", "image"):
         assert main([command, str(other_scan), "--out", str(made_folder / "out")]) == 2
         assert ScanFolder.load(made_folder / "scan").scan_id in capsys.readouterr().err
-    assert contents(made_folder / "out") == state_before
+    assert read_contents(made_folder / "out") == state_before
 
 
 @pytest.fixture
@@ -133,7 +135,7 @@ def test_at_another_angle_than_the_librarys_nothing_is_named(made_folder, other_
 @pytest.fixture
 def no_pi(made_folder) -> Path:
     """A rig file with an address at which no Pi answers."""
-    table = to_builtins(published_rig())
+    table = to_builtins(load_published_rig())
     table["pi"] |= {"command_address": "tcp://127.0.0.1:1", "event_address": "tcp://127.0.0.1:2"}
     table["limits"] |= {"command_timeout_s": 0.2}
     (made_folder / "rig.toml").write_text(tomli_w.dumps(table))
@@ -145,7 +147,7 @@ def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made_fold
     assert main([*scan, "--library", str(other_angle)]) == 5
     message = capsys.readouterr().err
     assert 0 < message.index("other.npz") < message.index("127.0.0.1:1")
-    far_box = boxes(made_folder, {"far": [4000, 0, 4010, 10]})
+    far_box = write_boxes(made_folder, {"far": [4000, 0, 4010, 10]})
     for option in (["--labels", made_folder / "no.json"], ["--labels", far_box],
                    ["--library", made_folder / "no.npz"], ["--truth", no_pi]):  # fmt: skip
         assert main([*scan, *map(str, option)]) == 3

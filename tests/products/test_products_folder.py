@@ -76,7 +76,7 @@ def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, ex
     """With an atomic swap this holds at every moment; otherwise from the start of the next run."""
     done = iter(range(step, -1, -1))
 
-    def dies(call):
+    def die_after(call):
         def dying(*args, **kwargs):
             if next(done, 0) == 0:
                 raise Killed
@@ -89,7 +89,7 @@ def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, ex
             (Path, "mkdir"), (Path, "rename"), (Path, "write_bytes"), (Path, "unlink"), (shutil, "rmtree"),
             (products_folder, "_exchange"), (products_folder, "sync_folder"), (fcntl, "flock"),
         ):  # fmt: skip
-            patched.setattr(owner, name, dies(getattr(owner, name)))
+            patched.setattr(owner, name, die_after(getattr(owner, name)))
         replace(out)
     if exchange == "one step":
         assert read(out) in (OLD, NEW)

@@ -12,7 +12,7 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.cli.main import main
 from polysight.imaging import Images, sub_bands
@@ -24,7 +24,7 @@ from polysight_shared.files import write_atomically
 from polysight_shared.tables import to_builtins
 
 # Rig file in the current folder
-HERE = published_rig()
+HERE = load_published_rig()
 # Rig of the scan: another slope, another window
 USED = msgspec.structs.replace(
     HERE, chirp=msgspec.structs.replace(HERE.chirp, slope_hz_per_s=HERE.chirp.slope_hz_per_s * 0.4, adc_start_us=9.0)
@@ -34,7 +34,7 @@ STACK = ["glass,5.5,0.05,3", "water,?"]
 ANGLE_DEG = 55.0
 
 
-def ratio_entry(inverse: complex) -> dict:
+def make_ratio_entry(inverse: complex) -> dict:
     ratio = 1 / inverse
     return {"ratio": {"real": ratio.real, "imag": ratio.imag}, "inverse_ratio_std": 0.005}
 
@@ -46,12 +46,12 @@ def folder(tmp_path, monkeypatch):
     whole_band = predict(layers, Spectrum.from_chirp(USED.chirp, 1), np.radians(ANGLE_DEG))[0]
     parts = predict(layers, Spectrum.from_chirp(USED.chirp, 3), np.radians(ANGLE_DEG))[0]
     bands = [
-        ratio_entry(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
+        make_ratio_entry(complex(q)) | {"first_hz": b.first_hz, "last_hz": b.last_hz}
         for q, b in zip(parts, sub_bands(USED.chirp, 3), strict=True)
     ]
     row = {"label": 3, "name": "liquid", "incidence_deg": ANGLE_DEG, "permittivity": None, "bands": bands}
     made_folder = tmp_path / "made"
-    write_json(made_folder / "materials.json", {"segments": [row | ratio_entry(complex(whole_band[0]))]})
+    write_json(made_folder / "materials.json", {"segments": [row | make_ratio_entry(complex(whole_band[0]))]})
     write_json(made_folder / "scan.json", {"scan_id": "s", "simulated": True, "instrument": to_builtins(USED)})
     shutil.copy(RIG_FILE, tmp_path / "instrument.toml")
     monkeypatch.chdir(tmp_path)

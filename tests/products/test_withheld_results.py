@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 import xarray
-from tests.support.products import NAMES, judged_products
+from tests.support.products import NAMES, write_judged_products
 from tests.support.refusals import refused
 
 from polysight import open_scan
@@ -22,7 +22,7 @@ from polysight_shared.errors import ErrorCode
 
 @pytest.mark.parametrize("level", ["good", "care", "none"])
 def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
-    folder = judged_products(tmp_path / "one", level)
+    folder = write_judged_products(tmp_path / "one", level)
     out = tmp_path / "out"
     assert main(["export", str(folder), "--netcdf", "--mat", "--csv", "--out", str(out)]) == 0
     reasons = json.loads((folder / "materials.json").read_text(encoding="utf-8"))["verdict"]["reasons"]
@@ -41,7 +41,7 @@ def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
 
 def test_without_a_result_no_export_names_anything(tmp_path):
     """Results are withheld even if the files contain names, as written by a faulty program."""
-    folder = judged_products(tmp_path / "one", "none", careless=True)
+    folder = write_judged_products(tmp_path / "one", "none", careless=True)
     out = tmp_path / "out"
     assert any(name in (folder / "materials.json").read_text(encoding="utf-8") for name in NAMES)
     assert main(["export", str(folder), "--mat", "--csv", "--out", str(out)]) == 0
@@ -60,7 +60,7 @@ def test_without_a_result_no_export_names_anything(tmp_path):
 
 
 def test_withholding_keeps_positions_and_does_not_change_usable_results(tmp_path):
-    folder = judged_products(tmp_path / "good", "good")
+    folder = write_judged_products(tmp_path / "good", "good")
     usable = ScanMaterials.read(folder / "materials.json")
     assert usable is not None
     hidden = msgspec.structs.replace(usable, verdict=Verdict("none"))
@@ -75,7 +75,7 @@ def test_loss_is_minus_imag_in_the_covariance_too(tmp_path):
     assert (spread.real_std, spread.loss_std, spread.covariance) == pytest.approx((0.2, 0.3, 0.01))
     draws = np.random.default_rng(1).multivariate_normal([3, -1], [[0.04, -0.01], [-0.01, 0.09]], 200_000)
     np.testing.assert_allclose(np.cov(draws[:, 0], -draws[:, 1]), spread.matrix, rtol=0.03)
-    scan = open_scan(judged_products(tmp_path / "one", "good"))
+    scan = open_scan(write_judged_products(tmp_path / "one", "good"))
     pet = scan.materials().sel(patch=2)
     given_covariance = read_products(scan.folder).segments[1].permittivity.covariance
     assert float(pet["permittivity_real_loss_covariance"]) == pytest.approx(-given_covariance[0][1])
@@ -85,7 +85,7 @@ def test_loss_is_minus_imag_in_the_covariance_too(tmp_path):
 
 
 def test_products_of_earlier_releases_are_read_as_before(tmp_path):
-    folder = judged_products(tmp_path / "one", None)
+    folder = write_judged_products(tmp_path / "one", None)
     scan = open_scan(folder)
     products = read_products(folder)
     assert scan.verdict is None

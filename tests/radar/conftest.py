@@ -1,7 +1,7 @@
 """Boards under native control, in virtual time."""
 
 import pytest
-from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, VirtualClock, make_native_rig
 
 from polysight_shared.config import Instrument
 from polysight_simulators.radars import RadarBoard, make_image
@@ -9,7 +9,7 @@ from polysight_simulators.radars import RadarBoard, make_image
 
 @pytest.fixture
 def rig() -> Instrument:
-    return native_rig()
+    return make_native_rig()
 
 
 @pytest.fixture

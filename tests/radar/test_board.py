@@ -32,7 +32,7 @@ def radar(rig, words, clock) -> RadarBoard:
     return RadarBoard("LS", words, clock, make_program(rig, rig.by_name("LS")))
 
 
-def pulses(board: simulated.RadarBoard, clock, count: int, period_s: float = PERIOD_S) -> None:
+def send_pulses(board: simulated.RadarBoard, clock, count: int, period_s: float = PERIOD_S) -> None:
     for _ in range(count):
         board.trigger()
         clock.sleep(period_s)
@@ -46,9 +46,9 @@ def test_from_off_to_done(radar, board, clock):
     assert radar.state is State.ARMED
     radar.note_pulses()
     assert radar.state is State.RUNNING
-    pulses(board, clock, FRAMES - 1)
+    send_pulses(board, clock, FRAMES - 1)
     assert radar.poll() is State.RUNNING
-    pulses(board, clock, 1)
+    send_pulses(board, clock, 1)
     assert radar.poll() is State.DONE
 
 
@@ -96,18 +96,18 @@ def test_a_board_is_armed_only_after_the_radar_reported_it(radar, monkeypatch):
 
 def test_a_board_that_missed_a_pulse_stays_armed(radar, board, clock):
     radar.arm(FRAMES)
-    pulses(board, clock, FRAMES - 1)
+    send_pulses(board, clock, FRAMES - 1)
     clock.sleep(10.0)
     assert radar.poll() is State.ARMED
 
 
 def test_remaining_frames_are_stopped_before_arming_again(radar, board, clock):
     radar.arm(FRAMES)
-    pulses(board, clock, 3)
+    send_pulses(board, clock, 3)
     radar.arm(FRAMES)
-    pulses(board, clock, FRAMES - 1)
+    send_pulses(board, clock, FRAMES - 1)
     assert radar.poll() is State.ARMED
-    pulses(board, clock, 1)
+    send_pulses(board, clock, 1)
     assert radar.poll() is State.DONE
 
 
@@ -123,7 +123,7 @@ def test_a_stop_is_never_sent_during_a_frame(radar, board, clock):
 def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, clock):
     for frames in (FRAMES, FRAMES, 16):
         radar.arm(frames)
-        pulses(board, clock, frames)
+        send_pulses(board, clock, frames)
         assert radar.poll() is State.DONE
     assert board.executed.count(Frame.ID) == board.executed.count(FrameApply.ID) == 2
     assert board.executed.count(FrameControl.ID) == 3
@@ -170,14 +170,14 @@ def test_other_events_are_not_faults(radar, board, number, data):
 
 def test_an_early_pulse_is_fatal_and_the_next_arming_resets_the_board(radar, board, clock):
     radar.arm(FRAMES)
-    pulses(board, clock, 2, 1e-4)
+    send_pulses(board, clock, 2, 1e-4)
     assert radar.poll() is State.FAULT
     assert "not triggered" in radar.reason
     radar.arm(FRAMES)
     assert radar.state is State.ARMED
     assert radar.reason == ""
     assert board.executed.count(RF_POWER_UP.ID) == 2
-    pulses(board, clock, FRAMES)
+    send_pulses(board, clock, FRAMES)
     assert radar.poll() is State.DONE
 
 
@@ -226,7 +226,7 @@ def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
     loops, frames = struct.unpack_from("<2H", board.settings[0x0102], 6)
     chirps = struct.unpack_from("<I", board.settings[0x40C0])[0]
     assert (loops, frames, chirps) == (16, FRAMES, 16)
-    pulses(board, clock, FRAMES, 5e-3)
+    send_pulses(board, clock, FRAMES, 5e-3)
     assert radar.poll() is State.DONE
 
 

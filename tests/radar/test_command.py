@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import tomli_w
-from tests.support.radar.boards import with_radar
+from tests.support.radar.boards import change_radar_table
 
 from polysight.cli.main import main
 from polysight.radar.commands import make_program
@@ -231,7 +231,7 @@ def test_a_replay_names_the_line_that_differs(tmp_path, act):
 def test_a_replay_with_another_rig_file_reports_the_first_different_line(rig, rig_file, capsys, tmp_path):
     trace = str(tmp_path / "day.jsonl")
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
-    path = rig_file(with_radar(rig, rx_gain_db=40))
+    path = rig_file(change_radar_table(rig, rx_gain_db=40))
     assert run(path, "replay", trace) == 1
     assert re.search(r"line \d+ of the trace", capsys.readouterr().out)
 
@@ -276,7 +276,7 @@ def test_devices_pipes_folders_and_huge_files_are_refused_unread(rig, rig_file, 
         with path.open("wb") as file:
             file.truncate(3 * 2**30)
     text = "bytes" if kind == "sparse" else "not a regular file"
-    with_it = with_radar(rig, firmware=str(path))
+    with_it = change_radar_table(rig, firmware=str(path))
     rig_path = rig_file()
     for file, args in ((rig_path, ("firmware", "RH", str(path))), (rig_path, ("replay", str(path)))):
         assert run(file, *args) == 3

@@ -4,7 +4,7 @@ import zlib
 
 import pytest
 from hypothesis import given, settings, strategies as st
-from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, make_native_rig
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard, State
@@ -13,13 +13,13 @@ from polysight.radar.firmware import CHUNK_TIMEOUT_S, TO_RAM, check_image, read_
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
-RIG = native_rig()
+RIG = make_native_rig()
 DATA = make_image()
 IMAGE = check_image(DATA, "image.bin")
 FIRST_GENERATION = make_image(rom=bytes((1, 2, 5, 0, 18, 1, 1)))
 
 
-def with_crc(data: bytes) -> bytes:
+def append_crc(data: bytes) -> bytes:
     return data + zlib.crc32(data).to_bytes(4, "little")
 
 
@@ -34,12 +34,12 @@ def with_crc(data: bytes) -> bytes:
         (DATA + b"\0", "7940"),
         (DATA[:-4], "CRC"),
         (DATA[:5000] + bytes((DATA[5000] ^ 4,)) + DATA[5001:], "CRC-32"),
-        (with_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
-        (with_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
+        (append_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
+        (append_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
         (FIRST_GENERATION, "AWR1243"),
-        (with_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "generation 6"),
-        (with_crc(DATA[:0x880] + b"CPRR" + DATA[0x884:-4]), "1 program parts"),
-        (with_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
+        (append_crc(DATA[:0x8B8] + bytes((6, 2, 0, 13)) + DATA[0x8BC:-4]), "generation 6"),
+        (append_crc(DATA[:0x880] + b"CPRR" + DATA[0x884:-4]), "1 program parts"),
+        (append_crc(DATA[:0x8C8] + bytes((6, 4, 1, 13)) + DATA[0x8CC:-4]), "its patches are 6.4.1.13"),
     ],
 )
 def test_a_file_that_is_not_an_image_is_refused_with_the_reason(data, why):

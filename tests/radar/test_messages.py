@@ -10,7 +10,7 @@ from polysight_shared.errors import ProtocolError
 
 
 @st.composite
-def message(draw) -> m.Message:
+def draw_message(draw) -> m.Message:
     ident = draw(st.integers(0, 1023))
     numbers = st.integers(0, 31).map(lambda n: ident * 32 + n)
     sizes = st.binary(max_size=40).filter(lambda b: len(b) % 4 == 0)
@@ -26,7 +26,7 @@ def message(draw) -> m.Message:
     )
 
 
-@given(message())
+@given(draw_message())
 def test_round_trip(original: m.Message):
     raw = m.encode(original)
     assert len(raw) % 4 == 0
@@ -34,7 +34,7 @@ def test_round_trip(original: m.Message):
     assert m.decode_header(raw).length == len(raw) - 4
 
 
-@given(message(), st.data())
+@given(draw_message(), st.data())
 def test_any_flipped_bit_is_detected(original: m.Message, data):
     raw = bytearray(m.encode(original))
     bit = data.draw(st.integers(0, 8 * len(raw) - 1))

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.support.radar.boards import BoardWords, with_radar
+from tests.support.radar.boards import BoardWords, change_radar_table
 from tests.support.refusals import refused
 
 from polysight.radar import board as boards
@@ -128,14 +128,14 @@ def test_two_names_for_one_board_are_refused(rig, usb, clock):
 def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path, monkeypatch, die):
     """Two boards would share a file, but gains and filters differ between boards."""
 
-    def without_die(execute):
+    def refuse_die_id(execute):
         return lambda number, *rest: (6, b"", 0.0) if number == GET_DIE_ID.ID else execute(number, *rest)
 
     for board in usb.boards.values():
         board.cores.die_number = 0
         if die == "not told":
-            monkeypatch.setattr(board.cores, "execute", without_die(board.cores.execute))
-    rig_with_calibration = with_radar(rig, calibration_dir=str(tmp_path))
+            monkeypatch.setattr(board.cores, "execute", refuse_die_id(board.cores.execute))
+    rig_with_calibration = change_radar_table(rig, calibration_dir=str(tmp_path))
     with NativeRadars(rig_with_calibration, usb.open, clock) as radars:
         assert list(tmp_path.iterdir()) == []
         assert str(radars.report()).count("its calibration is not saved") == len(usb.boards)
@@ -179,7 +179,7 @@ def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock)
     def never(serial: str) -> BoardWords:
         raise AssertionError(f"{serial} was opened")
 
-    wrong = with_radar(rig, rx_gain_db=31)
+    wrong = change_radar_table(rig, rx_gain_db=31)
     with refused(ErrorCode.VALUE_INVALID, "RX gain step"):
         NativeRadars(wrong, never, clock)
     with NativeRadars(rig, usb.open, clock) as native_radars, refused(ErrorCode.VALUE_INVALID, "frames"):
@@ -213,7 +213,7 @@ def run_row(radars, usb) -> dict[str, RadarState]:
     return {name: s.state for name, s in radars.states().items()}
 
 
-def traces(radars) -> list[dict[str, str]]:
+def load_traces(radars) -> list[dict[str, str]]:
     result = radars.report()["traces"]
     assert isinstance(result, list)
     return result
@@ -243,12 +243,12 @@ def test_a_link_that_cannot_be_reopened_is_a_fault_of_that_board_only(radars, us
 
 
 def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
-    traced_rig = with_radar(rig, trace_dir=str(tmp_path / "traces"))
+    traced_rig = change_radar_table(rig, trace_dir=str(tmp_path / "traces"))
     with NativeRadars(traced_rig, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
         usb.unplug(0.0)
         assert run_row(radars, usb) == ALL_DONE
-        result = traces(radars)
+        result = load_traces(radars)
     files = sorted((tmp_path / "traces").iterdir())
     assert sorted(t["file"] for t in result) == [str(f) for f in files]
     assert [read_trace(f)[0]["board"] for f in files] == ["LS", "RH", "RH", "RV"]
@@ -263,10 +263,10 @@ def test_every_link_of_a_scan_is_traced_and_replays(rig, usb, clock, tmp_path):
 
 def test_a_full_disk_ends_a_trace_but_no_row(rig, usb, clock, tmp_path, monkeypatch):
     monkeypatch.setattr("polysight.radar.control.new_trace", lambda *_: Path("/dev/full"))
-    traced_rig = with_radar(rig, trace_dir=str(tmp_path))
+    traced_rig = change_radar_table(rig, trace_dir=str(tmp_path))
     with NativeRadars(traced_rig, usb.open, clock) as radars:
         assert run_row(radars, usb) == ALL_DONE
-        result = traces(radars)
+        result = load_traces(radars)
     assert len(result) == 3
     assert all("No space" in t["ended"] for t in result)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import pytest
-from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, VirtualClock, make_native_rig
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import make_program
@@ -21,7 +21,7 @@ from polysight.radar.firmware import Image, check_image
 from polysight_shared.errors import DeviceError
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
-RIG = native_rig()
+RIG = make_native_rig()
 IMAGE = check_image(make_image(), "image.bin")
 FRAMES = 4
 NOISE = r"disturbed|CRC|checksum|sync word"
@@ -97,7 +97,7 @@ def _flip_once(rng: random.Random) -> Case:
     return Case("one flipped bit", NOISE, act)
 
 
-def _noise(rng: random.Random) -> Case:
+def _make_noise_case(rng: random.Random) -> Case:
     draws = random.Random(rng.random())
     share = rng.choice((0.01, 0.05, 0.3))
     return Case(
@@ -107,7 +107,7 @@ def _noise(rng: random.Random) -> Case:
     )
 
 
-def _event(rng: random.Random) -> Case:
+def _make_event_case(rng: random.Random) -> Case:
     number, data, cause = rng.choice(
         (
             (0x1002, struct.pack("<BBH", rng.randrange(7), rng.randrange(9), 100) + bytes(28), "RF core fault"),
@@ -140,8 +140,8 @@ def draw(rng: random.Random) -> tuple[Case, int]:
     once = [f for f in Fault if f is not Fault.REFUSE and f is not Fault.REFUSE_BARE]
     cases = {
         "flip": lambda: _flip_once(rng),
-        "noise": lambda: _noise(rng),
-        "event": lambda: _event(rng),
+        "noise": lambda: _make_noise_case(rng),
+        "event": lambda: _make_event_case(rng),
         "flood": lambda: _flood(rng),
         "unplug": lambda: Case("unplugged", "unplugged", lambda w: setattr(w.board, "plugged", False)),
         "power": lambda: Case("power lost", SILENT, lambda w: w.board.switch_power(False)),
@@ -254,7 +254,7 @@ def clean() -> Simulated:
     return outcome.board
 
 
-def accepted_rightly(found: Outcome, clean: Simulated) -> bool:
+def is_rightly_accepted(found: Outcome, clean: Simulated) -> bool:
     """Return True if the board of a completed row has the settings of a sound one and has made its frames.
 
     A board that loses power at the last poll of the host has lost its settings.
@@ -277,7 +277,7 @@ def test_random_faults(clean, request):
         assert outcome.seconds < LONGEST_S, (number, case.name, transfer)
         kinds[case.name.split(" 0x")[0]] += 1
         if outcome.error is None:
-            assert accepted_rightly(outcome, clean), (number, case.name, transfer)
+            assert is_rightly_accepted(outcome, clean), (number, case.name, transfer)
             continue
         failed += 1
         text = f"{outcome.error.what} {outcome.error.why} {' '.join(outcome.radar.warnings)}"

@@ -157,7 +157,7 @@ def test_a_refusal_of_another_sequence_is_late():
     assert "late" in line.warnings[0]
 
 
-def chunk(remaining: int, block: int, data: bytes) -> bytes:
+def encode_chunk(remaining: int, block: int, data: bytes) -> bytes:
     """One of an answer's chunks, from the simulated device's encoder."""
     raw = bytearray(
         encode_message(
@@ -177,13 +177,15 @@ def chunk(remaining: int, block: int, data: bytes) -> bytes:
 
 
 def test_an_answer_in_chunks_is_joined():
-    line, _ = connect(chunk(2, 0x40E0, bytes(16)), chunk(1, 0x40E1, b"abcd"), chunk(0, 0x40E2, b"efgh"))
+    line, _ = connect(
+        encode_chunk(2, 0x40E0, bytes(16)), encode_chunk(1, 0x40E1, b"abcd"), encode_chunk(0, 0x40E2, b"efgh")
+    )
     assert [b.data for b in line.call(GET_MAIN_VERSION).blocks] == [bytes(16), b"abcd", b"efgh"]
 
 
 @pytest.mark.parametrize("chunks", [[(1, 0x40E0)], [(2, 0x40E0), (0, 0x40E2)]], ids=["last", "middle"])
 def test_an_answer_with_a_missing_chunk_is_not_an_answer(chunks):
-    line, _ = connect(*[chunk(*fields, bytes(16)) for fields in chunks])
+    line, _ = connect(*[encode_chunk(*fields, bytes(16)) for fields in chunks])
     with refused(ErrorCode.NO_ANSWER):
         line.call(GET_MAIN_VERSION)
 

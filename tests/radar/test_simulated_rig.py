@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import list_constraints, make_program
@@ -22,7 +22,7 @@ EMPTY = decode_scene({"name": "the direct path alone"}, "test")
 
 
 def test_the_derived_rig_keeps_all_constraints_and_has_every_address(tmp_path: Path):
-    rig = derive(published_rig(), EMPTY, tmp_path, native=True)
+    rig = derive(load_published_rig(), EMPTY, tmp_path, native=True)
     assert rig.radar.control == "native"
     assert [c for c in list_constraints(rig, 5600) if not c.holds] == []
     assert len({b.usb_serial for b in rig.radar.native.values()}) == 3

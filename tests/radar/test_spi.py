@@ -2,7 +2,7 @@
 
 import pytest
 from hypothesis import given, settings, strategies as st
-from tests.support.radar.boards import BoardWords, VirtualClock, native_rig
+from tests.support.radar.boards import BoardWords, VirtualClock, make_native_rig
 from tests.support.refusals import refused
 
 from polysight.radar.board import RadarBoard
@@ -44,15 +44,15 @@ def link(words, clock, sent) -> Link:
     return connection
 
 
-def commands(sent: list[bytes]):
+def decode_commands(sent: list[bytes]):
     return [decode(raw) for raw in sent if raw != READY_TO_READ]
 
 
 def test_sequence_numbers_count_on_and_wrap(link, sent):
     for _ in range(20):
         link.call(GET_TEMPERATURES)
-    assert [m.sequence for m in commands(sent)] == [(2 + n) % 16 for n in range(20)]
-    assert not any(m.retry for m in commands(sent))
+    assert [m.sequence for m in decode_commands(sent)] == [(2 + n) % 16 for n in range(20)]
+    assert not any(m.retry for m in decode_commands(sent))
     assert link.warnings == []
 
 
@@ -66,31 +66,31 @@ def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sen
     state_before = list(board.executed)
     board.inject(fault)
     link.call(LOW_POWER_OFF)
-    assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (2, True)]
+    assert [(m.sequence, m.retry) for m in decode_commands(sent)] == [(2, False), (2, True)]
     # Executed once
     assert board.executed == [*state_before, LOW_POWER_OFF.ID]
     assert "sent 2 times" in link.warnings[-1]
     link.call(LOW_POWER_OFF)
-    assert commands(sent)[-1].sequence == 3
+    assert decode_commands(sent)[-1].sequence == 3
 
 
 def test_a_nack_is_retried_with_a_new_sequence_number_without_the_flag(link, board, sent):
     board.inject(Fault.NACK)
     link.call(LOW_POWER_OFF)
-    assert [(m.sequence, m.retry) for m in commands(sent)] == [(2, False), (3, False)]
+    assert [(m.sequence, m.retry) for m in decode_commands(sent)] == [(2, False), (3, False)]
     assert board.executed[-1] == LOW_POWER_OFF.ID
 
 
 def test_words_before_the_sync_word_are_skipped(link, board, sent):
     board.inject(Fault.BAD_SYNC)
     link.call(LOW_POWER_OFF)
-    assert len(commands(sent)) == 1
+    assert len(decode_commands(sent)) == 1
 
 
 def test_an_event_between_command_and_answer_is_not_lost(link, board, sent):
     board.inject(Fault.EVENT_BETWEEN)
     link.call(LOW_POWER_OFF)
-    assert len(commands(sent)) == 1
+    assert len(decode_commands(sent)) == 1
     assert [e.id for e in link.poll()] == [CALIBRATION_REPORT]
     assert link.poll() == []
 
@@ -105,7 +105,7 @@ def test_a_refusal_is_an_error_without_a_retry(link, board, sent):
     board.inject(Fault.REFUSE)
     with refused(ErrorCode.REFUSED_BY_PEER, "RH", "LowPower", "error 6"):
         link.call(LOW_POWER_OFF)
-    assert len(commands(sent)) == 1
+    assert len(decode_commands(sent)) == 1
 
 
 def test_retries_are_limited(link, board, sent, clock):
@@ -113,7 +113,7 @@ def test_retries_are_limited(link, board, sent, clock):
     began = clock.time
     with refused(ErrorCode.NO_ANSWER):
         link.call(LOW_POWER_OFF)
-    assert [m.retry for m in commands(sent)] == [False, True, True]
+    assert [m.retry for m in decode_commands(sent)] == [False, True, True]
     assert clock.time - began == pytest.approx(ATTEMPTS * 1.0, rel=0.05)
 
 
@@ -128,7 +128,7 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     board.inject(fault)
     with refused(ErrorCode.NO_ANSWER):
         link.call(RF_POWER_UP)
-    assert len(commands(sent)) == 1
+    assert len(decode_commands(sent)) == 1
 
 
 def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(words, clock, sent, monkeypatch):
@@ -167,18 +167,18 @@ def test_an_event_that_does_not_come_is_a_timeout_with_its_number(link):
 
 # --- several commands, each disturbed --------------------------------------------------------------------------------
 
-RIG = native_rig()
+RIG = make_native_rig()
 LOST = st.sampled_from([Fault.NACK, Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
 HARMLESS = st.sampled_from([Fault.EVENT_BETWEEN, Fault.BAD_SYNC])
 
 
-def _faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
+def _draw_faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
     lost_words = st.lists(LOST, max_size=2)
     return st.one_of(lost_words, st.tuples(lost_words, HARMLESS).map(lambda t: [*t[0], t[1]]))
 
 
 @settings(deadline=None)
-@given(st.lists(_faults_of_one_command(), min_size=1, max_size=8))
+@given(st.lists(_draw_faults_of_one_command(), min_size=1, max_size=8))
 def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_of_each: list[list[Fault]]):
     """Twice only if the answer was lost and its retry was damaged, because a NACK requires a new sequence number."""
     clock = VirtualClock()

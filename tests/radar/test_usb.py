@@ -30,13 +30,13 @@ def bus(monkeypatch):
     return usb
 
 
-def chip(board: RadarBoard, serial: str, path: tuple[int, ...] = (1,)) -> usb_bus.Chip:
+def make_chip(board: RadarBoard, serial: str, path: tuple[int, ...] = (1,)) -> usb_bus.Chip:
     return usb_bus.Chip(UsbChip(board), serial, path)
 
 
 @pytest.fixture
 def plugged_chip(bus, board) -> usb_bus.Chip:
-    usb_chip = chip(board, "FT1234", (4, 2))
+    usb_chip = make_chip(board, "FT1234", (4, 2))
     bus.plug(usb_chip)
     return usb_chip
 
@@ -77,7 +77,7 @@ def test_slow_mode_is_one_word_a_transfer(plugged_chip):
 
 def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
     """pyftdi opens any of the chips when given a bus address alone, in the order of a set."""
-    other_chips = [chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
+    other_chips = [make_chip(RadarBoard(lambda: 0.0), "FT1234", (4, n)) for n in (1, 3, 4, 5, 6)]
     for other_chip in other_chips:
         bus.plug(other_chip)
 
@@ -90,7 +90,7 @@ def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
 
 
 def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, plugged_chip):
-    second_chip = chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
+    second_chip = make_chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
     bus.plug(second_chip)
     with refused(ErrorCode.VALUES_CONFLICT, "1-4.2, 1-4.3") as caught:
         open_usb("FT1234")
@@ -119,7 +119,7 @@ def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
     """pyftdi caches what it has enumerated, an empty bus, too."""
     with pytest.raises(DeviceError):
         open_usb("FT7")
-    bus.plug(chip(board, "FT7"))
+    bus.plug(make_chip(board, "FT7"))
     open_usb("FT7").close()
 
 
@@ -161,7 +161,7 @@ def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
 def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
     native = enumerate(rig.radar.native.values(), 1)
     boards = {n.place: RadarBoard(lambda: clock.time, flash=make_image(), die_number=k) for k, n in native}
-    chips = {place: chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
+    chips = {place: make_chip(b, place, (n,)) for n, (place, b) in enumerate(boards.items(), 1)}
     for usb_chip in chips.values():
         bus.plug(usb_chip)
 

@@ -6,7 +6,7 @@ import re
 import msgspec
 import pytest
 from hypothesis import example, given, settings, strategies as st
-from tests.support.radar.boards import native_rig, with_radar
+from tests.support.radar.boards import change_radar_table, make_native_rig
 from tests.support.refusals import refused
 
 from polysight.radar.commands import check_constraints, direct_if_hz, list_constraints, make_program
@@ -27,7 +27,7 @@ def change_rig(rig: Instrument, table: str, **values) -> Instrument:
     return copied_rig
 
 
-def broken(rig: Instrument, frames: int = FRAMES) -> set[str]:
+def list_broken_constraints(rig: Instrument, frames: int = FRAMES) -> set[str]:
     return {c.name for c in list_constraints(rig, frames) if not c.holds}
 
 
@@ -38,7 +38,7 @@ def change_receiver(rig: Instrument, **values) -> Instrument:
 
 def test_the_published_chirp_with_centred_receivers_holds(rig):
     check_constraints(rig, FRAMES)
-    assert broken(rig) == set()
+    assert list_broken_constraints(rig) == set()
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
 )
 def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name, table, values):
     wrong = change_rig(rig, table, **values)
-    assert name in broken(wrong)
+    assert name in list_broken_constraints(wrong)
     with pytest.raises(ConfigError) as caught:
         check_constraints(wrong, FRAMES)
     result = next(c for c in list_constraints(wrong, FRAMES) if c.name == name and not c.holds)
@@ -89,13 +89,13 @@ def test_76_ghz_is_inside_the_band_to_the_code(rig):
     transmitter = msgspec.structs.replace(rig.transmitter, start_offset_hz=0.0)
     for start, holds in ((76e9, True), (0x5471C71B * 3.6e9 / 2**26, True), (0x5471C71A * 3.6e9 / 2**26, False)):
         wrong = change_rig(rig, "chirp", start_hz=start)
-        assert (f"start frequency of {transmitter.name}" not in broken(wrong)) is holds
+        assert (f"start frequency of {transmitter.name}" not in list_broken_constraints(wrong)) is holds
 
 
 def test_only_simulated_radars_may_have_no_filters(rig):
     native = {n: NativeRadar(usb_serial=f"tcp://127.0.{k}.1:2000") for k, n in enumerate(rig.radar.native)}
-    served = with_radar(rig, native=native)
-    assert broken(change_rig(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
+    served = change_radar_table(rig, native=native)
+    assert list_broken_constraints(change_rig(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
 
 
 FLOATS = [("chirp", key) for key in ("start_hz", "slope_hz_per_s", "adc_start_us", "sample_rate_hz", "ramp_end_us")]
@@ -121,7 +121,7 @@ ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
 # The sum is infinite
 @example({("chirp", "start_hz"): 9e307}, {}, 9e307, 0)
 def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
-    rig = change_receiver(native_rig(), start_offset_hz=offset_hz)
+    rig = change_receiver(make_native_rig(), start_offset_hz=offset_hz)
     wrong = floats | ints
     for table in sorted({table for table, _ in wrong}):
         rig = change_rig(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
@@ -137,19 +137,19 @@ def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, fram
 @pytest.mark.parametrize(("frames", "holds"), [(0, False), (1, True), (65535, True), (65536, False)])
 def test_frame_counts(rig, frames, holds):
     """The value 0 would mean endless frames."""
-    assert ("frames" not in broken(rig, frames)) is holds
+    assert ("frames" not in list_broken_constraints(rig, frames)) is holds
 
 
 def test_pulse_gap(rig, monkeypatch):
     monkeypatch.setattr("polysight.radar.commands.TRIGGER_MARGIN_US", 149.0)
-    assert broken(rig) == {"pulse gap"}
+    assert list_broken_constraints(rig) == {"pulse gap"}
 
 
 def test_the_shortest_burst_period_leaves_300_us_after_the_chirps(rig):
     """idle + ramp + 0.01 + 300 us, and 200 us to the next pulse."""
     edge = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
-    assert "inter-frame time" not in broken(change_rig(rig, "burst", period_us=edge + 1e-6))
-    assert "inter-frame time" in broken(change_rig(rig, "burst", period_us=edge - 1e-3))
+    assert "inter-frame time" not in list_broken_constraints(change_rig(rig, "burst", period_us=edge + 1e-6))
+    assert "inter-frame time" in list_broken_constraints(change_rig(rig, "burst", period_us=edge - 1e-3))
 
 
 @pytest.mark.parametrize(("chirp_us", "holds"), [(228.51, True), (228.5, False), (300.0, False)])
@@ -157,35 +157,39 @@ def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
     """The radar's spacing is idle + ramp + 10 ns; the rig file must have the same."""
     burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=chirp_us, period_us=6000.0)
     many = msgspec.structs.replace(rig, burst=burst)
-    assert ("chirp spacing" not in broken(many)) is holds
+    assert ("chirp spacing" not in list_broken_constraints(many)) is holds
     result = next(c for c in list_constraints(many, FRAMES) if c.name == "chirp spacing")
     idle = float(result.remedy.split()[3].strip(","))
-    mended = with_radar(many, idle_us=idle)
-    assert "chirp spacing" not in broken(mended)
+    mended = change_radar_table(many, idle_us=idle)
+    assert "chirp spacing" not in list_broken_constraints(mended)
 
 
 def test_a_frame_of_many_chirps_needs_a_longer_period(rig):
     chirps = 16 * 228.51
     for period, holds in ((chirps + 500.0 + 1e-3, True), (chirps + 499.0, False)):
         burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=period)
-        assert ("inter-frame time" not in broken(msgspec.structs.replace(rig, burst=burst))) is holds
+        assert ("inter-frame time" not in list_broken_constraints(msgspec.structs.replace(rig, burst=burst))) is holds
 
 
 def test_a_usb_path_does_not_acknowledge_ldo_bypass(rig):
     native = {**rig.radar.native, "RH": NativeRadar(usb_path="1-4.2", ldo_bypass=True)}
-    wrong = with_radar(rig, native=native)
-    assert broken(wrong) == {"LDO bypass of RH"}
+    wrong = change_radar_table(rig, native=native)
+    assert list_broken_constraints(wrong) == {"LDO bypass of RH"}
 
 
 def test_ldo_bypass_needs_this_boards_serial(rig):
-    def with_bypass(acknowledged: str) -> Instrument:
+    def acknowledge_bypass(acknowledged: str) -> Instrument:
         native = {**rig.radar.native, "RH": NativeRadar("FTRH", True, acknowledged)}
-        return with_radar(rig, native=native)
+        return change_radar_table(rig, native=native)
 
-    assert broken(with_bypass("")) == broken(with_bypass("FTRV")) == {"LDO bypass of RH"}
-    assert broken(with_bypass("FTRH")) == set()
+    assert (
+        list_broken_constraints(acknowledge_bypass(""))
+        == list_broken_constraints(acknowledge_bypass("FTRV"))
+        == {"LDO bypass of RH"}
+    )
+    assert list_broken_constraints(acknowledge_bypass("FTRH")) == set()
     with refused(ErrorCode.VALUE_INVALID, "LDO bypass"):
-        check_constraints(with_bypass("yes"), FRAMES)
+        check_constraints(acknowledge_bypass("yes"), FRAMES)
 
 
 def test_expected_if_is_slope_times_path_plus_offset(rig):
@@ -203,7 +207,7 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
 ])  # fmt: skip
 def test_if_budget(rig, mode, offset, holds):
     wrong = change_rig(change_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
-    assert ("IF budget of RH" not in broken(wrong)) is holds
+    assert ("IF budget of RH" not in list_broken_constraints(wrong)) is holds
 
 
 def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):

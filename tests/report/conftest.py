@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.rigs import rig_table
+from tests.support.rigs import load_rig_table
 
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
@@ -31,7 +31,7 @@ def folder(tmp_path: Path) -> Path:
     y = np.linspace(0.05, 0.15, 6)
     write_image(products / "image.npz", Images(h, v, x, y, rng.uniform(size=h.shape) < 0.8, h / v))
     write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
-    facts = {"scan_id": "s", "simulated": True, "versions": {"polysight": "0.1.0"}, "instrument": rig_table()}
+    facts = {"scan_id": "s", "simulated": True, "versions": {"polysight": "0.1.0"}, "instrument": load_rig_table()}
     write_json(products / "scan.json", facts)
     boards = {"RH": {"positions": 9, "positions_masked": 2, "rows_recorded": [0, 1, 5]}}
     write_json(products / "quality.json", {"boards": boards})

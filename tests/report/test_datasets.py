@@ -100,10 +100,10 @@ def test_images_alone_export_too(folder):
 
 
 def test_a_missing_package_is_named_with_the_command_that_installs_it(folder, monkeypatch, capsys):
-    def absent(name):
+    def raise_import_error(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(exports, "import_module", absent)
+    monkeypatch.setattr(exports, "import_module", raise_import_error)
     out = folder.parent / "out"
     assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == 2
     message = capsys.readouterr().err

@@ -80,7 +80,7 @@ def test_csv_keeps_every_digit(exported_folder):
     }
 
 
-def same(values, expected) -> bool:
+def are_same(values, expected) -> bool:
     """True if a column has these values; NaN and empty texts mean unknown ones."""
     if any(isinstance(e, str) for e in expected):
         return ["" if np.size(v) == 0 else v for v in values] == ["" if e is None else e for e in expected]
@@ -91,4 +91,4 @@ def test_matlab(exported_folder):
     content = scipy.io.loadmat(exported_folder / "image.mat", simplify_cells=True)["materials"]
     assert set(content) == set(EXPECTED)
     for name, expected in EXPECTED.items():
-        assert same(content[name], expected), name
+        assert are_same(content[name], expected), name

@@ -18,7 +18,7 @@ NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U00
 PERMITTIVITY = {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]}
 
 
-def row(label: int, name: str, truth: str) -> dict:
+def make_row(label: int, name: str, truth: str) -> dict:
     return {
         "label": label, "name": name, "confidence": 0.9, "metal_reference": False, "metal_like": False,
         "centre_mm": [0, 0], "box_mm": [-20, -20, 20, 20], "outline_mm": [], "permittivity": PERMITTIVITY,
@@ -27,12 +27,12 @@ def row(label: int, name: str, truth: str) -> dict:
     }  # fmt: skip
 
 
-def context(names: list[str]) -> ProcessedScan:
+def make_result_of_names(names: list[str]) -> ProcessedScan:
     image = np.full((12, 12), 0.5 + 0.1j, np.complex64)
     axis = np.linspace(-0.05, 0.05, 12)
     return make_result(
         Images(image, image / 2, axis, axis, np.ones((12, 12), bool), image * 2),
-        {"segments": [row(k, name, name) for k, name in enumerate(names, 1)]},
+        {"segments": [make_row(k, name, name) for k, name in enumerate(names, 1)]},
         {},
         facts=ScanFacts(scan_id=" ".join(names), simulated=True),
         plates=tuple(TruthPlate(name, (-20, -20, 20, 20), 4 - 0.4j) for name in names),
@@ -48,7 +48,7 @@ def strict():
 
 def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
     """All names in one report, because a report takes seconds; all of them in its title."""
-    html = unescape(write_report(tmp_path, context(NAMES)).read_text(encoding="utf-8"))
+    html = unescape(write_report(tmp_path, make_result_of_names(NAMES)).read_text(encoding="utf-8"))
     for number, name in enumerate(NAMES, 1):
         assert name in html
         if not is_drawable(name):
@@ -57,11 +57,11 @@ def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
 
 def test_the_page_lists_the_name_of_each_label():
     odd = "\U0010fffd木"
-    html = render(context([odd, "PET"]), {})
+    html = render(make_result_of_names([odd, "PET"]), {})
     assert f"patch 1: ?? is {odd}" in html
     assert f"plate 1: ?? is {odd}" in html
     assert "is PET" not in html
-    assert "fonts do not have" not in render(context(["PET"]), {})
+    assert "fonts do not have" not in render(make_result_of_names(["PET"]), {})
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from tests.support.page.chromium import PHONE
-from tests.support.products import changed, make_result, skip_rendering
-from tests.support.rigs import rig_table
+from tests.support.products import make_result, replace_results, skip_rendering
+from tests.support.rigs import load_rig_table
 
 from polysight.imaging import Images
 from polysight.materials import TruthPlate
@@ -86,7 +86,7 @@ QUALITY = {
 }
 
 
-def two_plates():
+def draw_two_plates():
     """Images H, V and their ratio, complex64 [61, 61], of two plates in noise; int32 labels of their pixels."""
     rng = np.random.default_rng(0)
     h = 0.02 * (rng.standard_normal((61, 61)) + 1j * rng.standard_normal((61, 61)))
@@ -107,7 +107,7 @@ def two_plates():
 @pytest.fixture(scope="module")
 def scan():
     """Two plates, one of them named wrong, and a third that was not found."""
-    h, v, p, segments = two_plates()
+    h, v, p, segments = draw_two_plates()
     x = np.linspace(-0.06, 0.06, 61)
     interior = np.zeros((61, 61), bool)
     interior[25:35, 40:50] = True
@@ -153,7 +153,7 @@ def test_a_phone_shows_nine_patches_and_many_reasons_in_as_much(scan, browser, t
     plate = MATERIALS[1] | {"name": "cardboard (rough, in two lines)"}
     patches = [MATERIALS[0], *(plate | {"label": number} for number in range(2, 10))]
     content = {"segments": patches, "library": "a library of nine materials from 16 scans. " * 10, "model": "knn"}
-    busy = changed(scan, quality=ScanQuality.decode(quality), materials=ScanMaterials.decode(content))
+    busy = replace_results(scan, quality=ScanQuality.decode(quality), materials=ScanMaterials.decode(content))
     assert busy.verdict is not None
     write_report(tmp_path, busy)
     browser.visit((tmp_path / "report.html").as_uri(), PHONE)
@@ -202,7 +202,9 @@ def test_every_output_is_labelled_as_simulated(page):
 
 def test_measured_data_is_not_called_simulated(scan, tmp_path):
     with skip_rendering():
-        html = write_report(tmp_path, changed(scan, facts=ScanFacts(simulated=False))).read_text(encoding="utf-8")
+        html = write_report(tmp_path, replace_results(scan, facts=ScanFacts(simulated=False))).read_text(
+            encoding="utf-8"
+        )
     assert "simulated" not in Page(html).words.lower()
 
 
@@ -246,13 +248,13 @@ def test_dark_and_invalid_images_do_not_fail(scan, tmp_path):
     assert write_report(tmp_path, make_result(dark, {}, {})).exists()
 
 
-def with_boards(scan, boards):
-    return changed(scan, plan=RasterPlan(6, 4, 10.0, 5.0), quality=ScanQuality.decode({"boards": boards}))
+def replace_boards(scan, boards):
+    return replace_results(scan, plan=RasterPlan(6, 4, 10.0, 5.0), quality=ScanQuality.decode({"boards": boards}))
 
 
 def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 2], [5, 6]]}, "rows_recorded": [0, 1, 2]}}
-    mask = find_masked_positions(with_boards(scan, boards))["RH"]
+    mask = find_masked_positions(replace_boards(scan, boards))["RH"]
     assert np.argwhere(mask).tolist() == [[2, 0], [2, 1], [2, 5], *([3, c] for c in range(6))]
 
 
@@ -262,7 +264,7 @@ def test_runs_and_their_mask_are_the_same(scan):
         rows = rng.uniform(size=(4, 6)) < share
         runs = {str(i): find_masked_runs(row) for i, row in enumerate(rows) if row.any()}
         masks = find_masked_positions(
-            with_boards(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}})
+            replace_boards(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}})
         )
         assert (masks["RH"] == rows).all()
 
@@ -270,8 +272,10 @@ def test_runs_and_their_mask_are_the_same(scan):
 def test_the_report_has_the_masked_data_the_gains_and_the_whole_rig_file(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
     gains = {"RH": [RxGain(0.0, 0.0), RxGain(1.25, -8.1)]}
-    rig = rig_table() | {"name": "a <rig>"}
-    answer = changed(with_boards(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig))
+    rig = load_rig_table() | {"name": "a <rig>"}
+    answer = replace_results(
+        replace_boards(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig)
+    )
     picture = png(coverage_figure(answer, find_masked_positions(answer)))
     page = Page(render(answer, {"coverage": picture}))
     assert base64.b64encode(picture).decode() in page.sources[0]
@@ -303,22 +307,22 @@ def test_the_imaging_table_has_a_column_for_each_board_and_marks_unknown_values(
     assert "direct sum" in table["caption"]
 
 
-def with_every_number(content, value):
+def replace_every_number(content, value):
     """The content with each number that is not a count replaced."""
     if isinstance(content, dict):
         # A result of a value that is not a number has no permittivity and no ratio.
         required = ("permittivity", "ratio", "seconds_per_stage")
-        return {key: item if key in required else with_every_number(item, value) for key, item in content.items()}
+        return {key: item if key in required else replace_every_number(item, value) for key, item in content.items()}
     if isinstance(content, list):
-        return [with_every_number(item, value) for item in content]
+        return [replace_every_number(item, value) for item in content]
     return value if isinstance(content, float) else content
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
     """New results may contain NaN or infinity; products have null instead."""
-    figures = with_every_number({"segments": MATERIALS, "quality": QUALITY}, value)
-    strange = changed(
+    figures = replace_every_number({"segments": MATERIALS, "quality": QUALITY}, value)
+    strange = replace_results(
         scan,
         materials=ScanMaterials.decode(
             {"segments": figures["segments"], "pixel_accuracy": value, "library": "", "model": "knn",
@@ -347,7 +351,7 @@ def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(sc
     figures = json.loads(json.dumps({"segments": [MATERIALS[0], foreign], "library": "", "model": "knn"}))
     figures |= {"pixel_accuracy": 0.5, "metal_reference": {"how": "given"}}
     with skip_rendering():
-        words = Page(render(changed(scan, materials=ScanMaterials.decode(figures)), {})).words
+        words = Page(render(replace_results(scan, materials=ScanMaterials.decode(figures)), {})).words
     assert shown in words
     assert ("✗ acrylic" in words) is (shown == "✗ acrylic")
     assert ("✓ acrylic" in words) is (shown == "✓ acrylic")
@@ -365,4 +369,4 @@ def test_a_scene_without_plates_to_name_has_no_count_of_them(scan):
     """Such as a metal plate alone, processed with itself as the reference."""
     assert scan.named_plates is not None
     metal = [plate for plate in scan.plates if plate.permittivity is None]
-    assert changed(scan, plates=metal).named_plates is None
+    assert replace_results(scan, plates=metal).named_plates is None

@@ -17,11 +17,11 @@ from tests.support.products import (
     NAMES,
     PERMITTIVITY,
     REASON,
-    changed,
-    judged_products,
     make_result,
-    segments,
+    make_segments,
+    replace_results,
     skip_rendering,
+    write_judged_products,
 )
 
 from polysight import open_scan
@@ -44,7 +44,7 @@ def write_products(folder, rows=None) -> ProcessedScan:
     interior = np.zeros(saved.h.shape, bool)
     interior[5:9, 12:16] = True
     content = json.loads((folder / "materials.json").read_text(encoding="utf-8"))
-    content |= {"segments": rows or segments("good"), "library": "Of its materials 1 could not be judged: copper."}
+    content |= {"segments": rows or make_segments("good"), "library": "Of its materials 1 could not be judged: copper."}
     return make_result(
         saved.images,
         {**content, "pixel_accuracy": 0.5, "model": "knn"},
@@ -75,7 +75,7 @@ def collect_texts(make) -> str:
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
-    folder = judged_products(tmp_path, level)
+    folder = write_judged_products(tmp_path, level)
     with skip_rendering():
         page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
     head = page[page.index("<main>") : page.index('<ul class="keys">')]
@@ -89,7 +89,7 @@ def test_the_page_begins_with_the_verdict_and_what_to_do(tmp_path, level):
 
 def test_reasons_of_less_weight_are_folded(tmp_path):
     """A phone shows three of twenty reasons before a section is opened."""
-    folder = judged_products(tmp_path, "care")
+    folder = write_judged_products(tmp_path, "care")
     verdict = {"level": "care", "reasons": [{**REASON, "what": f"reason {number}"} for number in range(1, 21)]}
     for name in ("quality.json", "materials.json"):
         content = json.loads((folder / name).read_text(encoding="utf-8"))
@@ -106,7 +106,7 @@ def test_reasons_of_less_weight_are_folded(tmp_path):
 
 @pytest.mark.parametrize("careless", [False, True])
 def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
-    folder = judged_products(tmp_path, "none", careless)
+    folder = write_judged_products(tmp_path, "none", careless)
     with skip_rendering():
         text = collect_texts(lambda: write_report(folder, write_products(folder)))
     text += collect_texts(lambda: open_scan(folder).plot())
@@ -119,7 +119,7 @@ def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_
 
 
 def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path):
-    folder = judged_products(tmp_path, "care")
+    folder = write_judged_products(tmp_path, "care")
     page = unescape(write_report(folder, write_products(folder)).read_text(encoding="utf-8"))
     assert "2.90 ± 0.20" in page
     assert "0.20 ± 0.10" in page
@@ -130,9 +130,9 @@ def test_usable_results_are_shown_with_errors_and_where_they_come_from(tmp_path)
 
 
 def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
-    folder = judged_products(tmp_path, None)
+    folder = write_judged_products(tmp_path, None)
     with skip_rendering():
-        page = unescape(write_report(folder, write_products(folder, segments(None))).read_text(encoding="utf-8"))
+        page = unescape(write_report(folder, write_products(folder, make_segments(None))).read_text(encoding="utf-8"))
     assert 'class="verdict' not in page
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page
@@ -165,11 +165,11 @@ def test_an_ellipse_holds_its_share_of_draws(share, mixed):
 
 def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
     rows = [
-        {**segments("good")[1], "label": 3 * i + k + 1, "name": f"polyethylene, high density, sheet {i} {k}",
+        {**make_segments("good")[1], "label": 3 * i + k + 1, "name": f"polyethylene, high density, sheet {i} {k}",
          "box_mm": [16 * k - 24, 16 * i - 24, 16 * k - 10, 16 * i - 10]}
         for i in range(3) for k in range(3)
     ]  # fmt: skip
-    scan = changed(write_products(judged_products(tmp_path, "good"), rows), pixel_names={}, plates=())
+    scan = replace_results(write_products(write_judged_products(tmp_path, "good"), rows), pixel_names={}, plates=())
     fig = Figure(figsize=(4.6, 4.6), dpi=160, layout="constrained")
     FigureCanvasAgg(fig)
     labels = draw_materials(fig.add_subplot(), scan)
@@ -213,16 +213,16 @@ def test_a_legend_takes_just_the_room_below_the_axes(names):
 
 
 def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):
-    scan = write_products(judged_products(tmp_path, "good"))
+    scan = write_products(write_judged_products(tmp_path, "good"))
     p = np.exp(1j * np.radians(np.where(np.arange(30) % 2, 170.0, -170.0)))[None, :] * np.ones((20, 1))
-    limits = phase_limits_deg(changed(scan, images=replace(scan.images, p=p)))
+    limits = phase_limits_deg(replace_results(scan, images=replace(scan.images, p=p)))
     assert limits is not None
     low, high = limits
     assert high - low < 40
     assert any(low <= 170 + turn <= high and low <= 190 + turn <= high for turn in (-360, 0))
-    assert phase_limits_deg(changed(scan, materials=None)) is None
+    assert phase_limits_deg(replace_results(scan, materials=None)) is None
     random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
-    assert phase_limits_deg(changed(scan, images=replace(scan.images, p=random))) is None
+    assert phase_limits_deg(replace_results(scan, images=replace(scan.images, p=random))) is None
 
 
 @pytest.mark.parametrize("key", BUDGET)

@@ -17,10 +17,10 @@ from pathlib import Path
 import msgspec
 import pytest
 from tests.support.page.asking import TOKEN, ask, get, post
-from tests.support.page.live_view import Served, open_control, served_folder
+from tests.support.page.live_view import Served, open_control, serve_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import wait_for
-from tests.support.products import judged_products, name_check_plate
+from tests.support.products import name_check_plate, write_judged_products
 
 from polysight.acquisition.control import ALIVE_FILE, CONTROL_FOLDER, SignOfLife, read_start_ticks
 from polysight.products import SCAN, write_json
@@ -36,14 +36,14 @@ from polysight_shared.errors import ErrorCode
 def scans(tmp_path: Path) -> Path:
     """A folder of two processed scans."""
     for name in ("one", "two"):
-        judged_products(tmp_path / name / "products", "care")
+        write_judged_products(tmp_path / name / "products", "care")
         (tmp_path / name / "program").mkdir()
     return tmp_path
 
 
 @pytest.fixture
 def view(scans: Path) -> Iterator[Served]:
-    with served_folder(scans, TOKEN, config=RIG_FILE) as served:
+    with serve_folder(scans, TOKEN, config=RIG_FILE) as served:
         yield served
 
 
@@ -125,7 +125,7 @@ def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
     assert len(done) == 1
     assert ask(view, "/api/compare?a=two&b=one")[0] == 200
     shutil.rmtree(scans / "one" / "products")
-    judged_products(scans / "one" / "products", "care")
+    write_judged_products(scans / "one" / "products", "care")
     assert ask(view, "/api/compare/p?a=one&b=two")[0] == 200
     # Other products are compared again
     assert len(done) == 3
@@ -261,7 +261,7 @@ def test_a_page_gets_products_of_one_generation(view, scans):
     assert get(view, "/api/scan?scan=one")["generation"] == generation
     assert ask(view, f"/api/map/h_amplitude?scan=one&generation={generation}")[0] == 200
     shutil.move(scans / "one" / "products", scans / "old")
-    judged_products(scans / "one" / "products", "none")
+    write_judged_products(scans / "one" / "products", "none")
     status, body, _ = ask(view, f"/api/map/h_amplitude?scan=one&generation={generation}")
     assert (status, json.loads(body)["code"]) == (409, ErrorCode.MISMATCH)
     result = get(view, "/api/result?scan=one")
@@ -278,7 +278,7 @@ def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(
     def process_again() -> None:
         while not ended.is_set():
             with replace_products(out, "s") as new:
-                judged_products(new, "none" if next(generations) % 2 else "good")
+                write_judged_products(new, "none" if next(generations) % 2 else "good")
 
     worker = threading.Thread(target=process_again)
     worker.start()

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.serve.test_processes import Server, serving
+from tests.serve.test_processes import Server, run_server
 from tests.support.page.asking import post
 from tests.support.page.live_view import open_control
 from tests.support.paths import REPO
@@ -39,7 +39,7 @@ VIEWS = 4
 
 
 @contextmanager
-def attacking(port: int, attack: Attack, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def run_attack(port: int, attack: Attack, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Clients of another process, which runs for the block."""
     command = [sys.executable, "-m", "tests.serve.attackers", str(port), *map(str, attack), str(VIEWS)]
     with (folder / "attackers.txt").open("wb") as told:
@@ -69,7 +69,7 @@ def test_an_abort_is_accepted_whatever_other_clients_request(processed: Path, tm
         shutil.copytree(processed / "one", tmp_path / "scans" / f"s{k}", ignore=shutil.ignore_patterns("figures"))
     (tmp_path / "state").mkdir()
     took_s = []
-    with serving(tmp_path / "scans", tmp_path / "state") as server, attacking(server.port, attack, tmp_path):
+    with run_server(tmp_path / "scans", tmp_path / "state") as server, run_attack(server.port, attack, tmp_path):
         # They report once a second; after the first report all are running.
         wait_for(lambda: "answers" in (tmp_path / "attackers.txt").read_text(), "the attack")
         for _ in range(attack.aborts):

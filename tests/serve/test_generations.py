@@ -4,8 +4,8 @@ import json
 
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, Browser
-from tests.support.page.live_view import served_folder
-from tests.support.products import judged_products
+from tests.support.page.live_view import serve_folder
+from tests.support.products import write_judged_products
 
 from polysight.products import replace_products
 
@@ -27,9 +27,9 @@ RECORD = f"""(() => {{
 def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_path, request):
     runs = LONG_RUNS if request.config.getoption("--long") else RUNS
     products = tmp_path / "one" / "products"
-    judged_products(products, GENERATIONS[0][0], seed=GENERATIONS[0][1])
+    write_judged_products(products, GENERATIONS[0][0], seed=GENERATIONS[0][1])
     (tmp_path / "one" / "program").mkdir()
-    with served_folder(tmp_path, TOKEN) as view:
+    with serve_folder(tmp_path, TOKEN) as view:
         browser.visit(f"{view.address}/scan?scan=one#token={TOKEN}", DESK)
         browser.wait("document.querySelector('#scale img')", "the first image")
         # The range of |P| follows from the patches; that of |H| is the same for all scans relative to metal.
@@ -48,7 +48,7 @@ def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_p
         for run in range(1, runs + 1):
             level, seed = GENERATIONS[run % 2]
             with replace_products(products, "s") as new:
-                judged_products(new, level, seed=seed)
+                write_judged_products(new, level, seed=seed)
             shown = json.dumps(parts[3])
             browser.wait(f"document.getElementById('scale').innerText !== {shown}", f"generation {run}")
             parts = browser.value(PARTS)

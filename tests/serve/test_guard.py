@@ -14,10 +14,10 @@ from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
-from tests.support.page.asking import TOKEN, ask, compute_digest, get, post, raw
-from tests.support.page.live_view import served_folder
+from tests.support.page.asking import TOKEN, ask, compute_digest, get, post, send_raw
+from tests.support.page.live_view import serve_folder
 from tests.support.processes import HANG_S
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
 
 from polysight.serve import ServerAddress, guard, server
@@ -34,14 +34,14 @@ READ = ("scan", "result", "thumbnail", "state", "map/h_amplitude", "file/image.n
 def scans(finished: Path, tmp_path: Path) -> Path:
     """A folder with a scan that was processed, next to a file that must not be served."""
     shutil.copytree(finished, tmp_path / "scans" / "one")
-    judged_products(tmp_path / "scans" / "one" / "products", "care")
+    write_judged_products(tmp_path / "scans" / "one" / "products", "care")
     (tmp_path / "secret.txt").write_text(SECRET)
     (tmp_path / "scans" / "out").symlink_to(tmp_path)
     return tmp_path / "scans"
 
 
 def test_other_host_names_are_refused(scans):
-    with served_folder(scans, TOKEN) as view:
+    with serve_folder(scans, TOKEN) as view:
         for host in ("localhost", "localhost:8080", "127.0.0.1", f"127.0.0.1:{view.port}", "[::1]:80"):
             assert ask(view, "/api/scans", Host=host)[0] == 200, host
         for host in FOREIGN_HOSTS:
@@ -52,7 +52,7 @@ def test_other_host_names_are_refused(scans):
 
 def test_other_sites_may_not_ask(scans):
     own_origin = "http://127.0.0.1"
-    with served_folder(scans, TOKEN) as view:
+    with serve_folder(scans, TOKEN) as view:
         state_before = compute_digest(scans)
         for origin in ("https://evil.example", "null", own_origin, f"{own_origin}:1", f"https://127.0.0.1:{view.port}"):
             status, reported = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
@@ -73,7 +73,7 @@ def test_other_sites_may_not_ask(scans):
 
 def test_a_declared_name_may_be_encrypted_by_a_proxy(scans):
     access = Access(TOKEN, loopback=False, hosts=("lab.example.org",), control=True)
-    with served_folder(scans, access=access) as view:
+    with serve_folder(scans, access=access) as view:
         for host, origin, expected in (
             ("lab.example.org", "https://lab.example.org", 200),
             ("lab.example.org:8443", "https://lab.example.org:8443", 200),
@@ -91,7 +91,7 @@ def test_a_declared_name_may_be_encrypted_by_a_proxy(scans):
 
 def test_beyond_loopback_reading_needs_the_token_too(scans):
     access = Access(TOKEN, loopback=False, control=True)
-    with served_folder(scans, access=access) as view:
+    with serve_folder(scans, access=access) as view:
         # An empty page that asks for the token
         assert ask(view, "/")[0] == 200
         for path in (
@@ -117,16 +117,19 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
 
 
 def test_large_bodies_are_refused_and_nothing_is_kept(scans):
-    with served_folder(scans, TOKEN) as view:
+    with serve_folder(scans, TOKEN) as view:
         state_before = compute_digest(scans)
         large = b"x" * (guard.BODY_BYTES + 1)
         status, _, _ = ask(view, "/api/notes?scan=one", "POST", large, **{TOKEN_HEADER: TOKEN})
         assert status == 413
         head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
         chunks = b"%x\r\n%s\r\n" % (len(large), large) * 3
-        assert b" 413 " in raw(view, f"{head}Transfer-Encoding: chunked\r\n\r\n".encode() + chunks + b"0\r\n\r\n")[:40]
+        assert (
+            b" 413 "
+            in send_raw(view, f"{head}Transfer-Encoding: chunked\r\n\r\n".encode() + chunks + b"0\r\n\r\n")[:40]
+        )
         for size in (17_000, 70_000, 1 << 20):
-            answer = raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * size + b"\r\n\r\n")[:40]
+            answer = send_raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * size + b"\r\n\r\n")[:40]
             assert b" 400 " in answer or b" 431 " in answer or answer == b""
         assert compute_digest(scans) == state_before
 
@@ -134,7 +137,7 @@ def test_large_bodies_are_refused_and_nothing_is_kept(scans):
 def test_open_connections_and_unread_answers_lock_no_client_out(scans):
     """300 clients send half a head, and 100 ask for pages and read none; the operator keeps its connection."""
     pages = b"GET /common.js HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n" * 300
-    with served_folder(scans, TOKEN) as view, ExitStack() as clients:
+    with serve_folder(scans, TOKEN) as view, ExitStack() as clients:
         operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
         for k in range(400):
             client = clients.enter_context(socket.create_connection(("127.0.0.1", view.port), HANG_S))
@@ -151,7 +154,7 @@ def test_open_connections_and_unread_answers_lock_no_client_out(scans):
 def test_of_too_many_connections_those_without_a_request_are_closed(scans, monkeypatch):
     """Neither an answered connection nor one whose request lies unread blocks new clients."""
     monkeypatch.setattr(server, "MAX_CONNECTIONS", 20)
-    with served_folder(scans, TOKEN) as view, ExitStack() as clients:
+    with serve_folder(scans, TOKEN) as view, ExitStack() as clients:
         operator = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
         operator.request("GET", "/api/scans")
         assert operator.getresponse().read()
@@ -175,7 +178,7 @@ def test_when_every_connection_has_a_request_the_next_one_is_answered_as_busy(sc
     monkeypatch.setattr(server, "ACCEPTED_AT_ONCE", 3)
     monkeypatch.setattr(CountedConnection, "has_unread_bytes", lambda _: True)
     answers = []
-    with served_folder(scans, TOKEN) as view, ExitStack() as clients:
+    with serve_folder(scans, TOKEN) as view, ExitStack() as clients:
         for _ in range(4 + 2 * 3):
             stream = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
             clients.callback(stream.close)
@@ -218,7 +221,7 @@ def test_a_download_that_is_aborted_leaves_no_file_open(scans):
     def is_open() -> bool:
         return large in [fd.resolve() for fd in Path("/proc/self/fd").iterdir()]
 
-    with served_folder(scans, TOKEN) as view, ExitStack() as clients:
+    with serve_folder(scans, TOKEN) as view, ExitStack() as clients:
         for _ in range(3):
             client = clients.enter_context(socket.create_connection(("127.0.0.1", view.port), HANG_S))
             client.sendall(b"GET /api/file/report.html?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
@@ -238,7 +241,7 @@ NAMES = (
 def test_no_name_leads_out_of_the_folder(scans, tmp_path):
     from urllib.parse import quote
 
-    with served_folder(scans, TOKEN) as view:
+    with serve_folder(scans, TOKEN) as view:
         state_before = compute_digest(tmp_path)
         for name in NAMES:
             quoted_name = quote(name, safe="")
@@ -259,14 +262,14 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
 
 def test_a_link_among_products_is_not_served(scans, tmp_path):
     (scans / "one" / "products" / "image.csv").symlink_to(tmp_path / "secret.txt")
-    with served_folder(scans) as view:
+    with serve_folder(scans) as view:
         assert "image.csv" not in [f["name"] for f in get(view, "/api/result?scan=one")["files"]]
         assert ask(view, "/api/file/image.csv?scan=one")[0] == 404
 
 
 def test_nothing_in_a_report_can_act(scans):
     (scans / "one" / "products" / "report.html").write_text("<script>fetch('/api/control/abort')</script>")
-    with served_folder(scans) as view:
+    with serve_folder(scans) as view:
         status, _, headers = ask(view, "/api/file/report.html?scan=one")
         policy = headers["content-security-policy"]
         assert status == 200
@@ -297,7 +300,7 @@ NO_HEADS = (b"", b"\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", b
             b"\0" * 3000)  # fmt: skip
 
 
-def hostile(port: int) -> list[bytes]:
+def list_hostile_requests(port: int) -> list[bytes]:
     """Malicious requests as bytes; some with the right token."""
     host_line = f"Host: 127.0.0.1:{port}"
     token = f"{TOKEN_HEADER}: {TOKEN}"
@@ -326,9 +329,9 @@ def hostile(port: int) -> list[bytes]:
 
 @pytest.mark.slow
 def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans, tmp_path):
-    with served_folder(scans, TOKEN) as view:
+    with serve_folder(scans, TOKEN) as view:
         state_before = compute_digest(tmp_path)
-        requests = list(islice(cycle(hostile(view.port)), 1000))
+        requests = list(islice(cycle(list_hostile_requests(view.port)), 1000))
         open_sockets: list[socket.socket] = []
 
         def send(part: list[bytes]) -> None:
@@ -371,8 +374,8 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
         with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
             ServerAddress("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
     place = ServerAddress("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
-    with served_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:
+    with serve_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))
         with urlopen(f"https://127.0.0.1:{view.port}/api/scans", timeout=HANG_S, context=trusted) as reply:
             assert json.load(reply)["scans"]
-        assert b"HTTP" not in raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        assert b"HTTP" not in send_raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")

@@ -3,8 +3,8 @@
 import random
 
 from tests.support.page.asking import get
-from tests.support.page.live_view import served_folder
-from tests.support.products import judged_products
+from tests.support.page.live_view import serve_folder
+from tests.support.products import write_judged_products
 
 from polysight.serve.site import ChangingList, ListedScan
 
@@ -47,8 +47,8 @@ def test_the_stamp_of_every_earlier_state_is_understood_and_nothing_else():
 
 def test_a_list_that_is_unchanged_is_not_sent_again(tmp_path):
     for name in ("one", "two"):
-        judged_products(tmp_path / name / "products", "care")
-    with served_folder(tmp_path) as view:
+        write_judged_products(tmp_path / name / "products", "care")
+    with serve_folder(tmp_path) as view:
         whole = get(view, "/api/scans")
         while any(scan["bytes"] is None for scan in whole["scans"]):
             whole = get(view, "/api/scans")

@@ -14,10 +14,10 @@ import msgspec
 import pytest
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import DESK, PHONE, Browser, find_axe
-from tests.support.page.live_view import Served, open_control, served_folder
+from tests.support.page.live_view import Served, open_control, serve_folder
 from tests.support.paths import RIG_FILE
 from tests.support.processes import HANG_S, wait_for
-from tests.support.products import REASON, judged_products, name_check_plate
+from tests.support.products import REASON, name_check_plate, write_judged_products
 from tests.support.scenes import COPPER, PET
 
 import polysight
@@ -135,7 +135,7 @@ def scans(processed: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def page(browser: Browser, scans: Path) -> Iterator[Page]:
-    with served_folder(scans, TOKEN, config=RIG_FILE) as view:
+    with serve_folder(scans, TOKEN, config=RIG_FILE) as view:
         yield Page(browser, view)
 
 
@@ -437,7 +437,7 @@ def test_notes_are_stored_in_the_folder_of_the_scan(page, scans):
 
 def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
     monkeypatch.setattr(programs, "LOOK_S", 1e6)
-    with served_folder(scans, TOKEN, config=RIG_FILE) as view:
+    with serve_folder(scans, TOKEN, config=RIG_FILE) as view:
         reloaded_page = Page(page.browser, view)
         reloaded_page.open("/new?from=one", PHONE)
         reloaded_page.browser.wait(
@@ -508,7 +508,7 @@ def test_the_page_follows_products_that_another_program_has_made(page, scans):
     judged = "document.getElementById('badges').innerText"
     assert "no result" not in page.browser.value(judged)
     shutil.move(scans / "one" / "products", scans / "old")
-    judged_products(scans / "one" / "products", "none")
+    write_judged_products(scans / "one" / "products", "none")
     page.browser.wait(f"{judged}.includes('no result')", "the new verdict")
     assert REASON["what"] in page.browser.text("reasons")
     page.browser.errors.clear()
@@ -518,8 +518,8 @@ def test_a_long_list_is_shown_while_it_is_read(browser, tmp_path, monkeypatch):
     """Each answer of this server has one scan more; the page asks again until it has all, and shows that meanwhile."""
     monkeypatch.setattr(reading, "LIST_S", 0.0)
     for k in range(6):
-        judged_products(tmp_path / "scans" / f"scan-{k}", "care")
-    with served_folder(tmp_path / "scans") as view:
+        write_judged_products(tmp_path / "scans" / f"scan-{k}", "care")
+    with serve_folder(tmp_path / "scans") as view:
         page = Page(browser, view)
         page.open("/?all", token="")
         browser.wait("document.querySelectorAll('#list li').length == 6", "all of them")
@@ -547,7 +547,7 @@ def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, s
 
 
 def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
-    with served_folder(scans) as view:
+    with serve_folder(scans) as view:
         page = Page(browser, view)
         for path in ("/", "/scan?scan=one"):
             page.open(path, token="")
@@ -559,7 +559,7 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
 
 def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, scans):
     """Tests share one browser, and ports are reused."""
-    with served_folder(scans) as view:
+    with serve_folder(scans) as view:
         page = Page(browser, view)
         page.open("/", token="of another server")
         page.open("/", token="")
@@ -640,10 +640,10 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
 def test_two_hundred_scans_are_shown_together(browser, tmp_path, monkeypatch):
     # A list that comes in parts shows other scans at its top with each, and their pictures.
     monkeypatch.setattr(reading, "LIST_S", math.inf)
-    judged_products(tmp_path / "made", "care")
+    write_judged_products(tmp_path / "made", "care")
     for k in range(200):
         shutil.copytree(tmp_path / "made", tmp_path / "scans" / f"week-{k % 10}" / f"scan-{k:03d}")
-    with served_folder(tmp_path / "scans") as view:
+    with serve_folder(tmp_path / "scans") as view:
         page = Page(browser, view)
         page.open("/?all", token="")
         browser.wait("document.querySelectorAll('#list li').length == 200", "all of them")

@@ -15,7 +15,7 @@ import pytest
 from tests.support.page.asking import ask, get, post
 from tests.support.page.live_view import open_control
 from tests.support.processes import HANG_S, wait_for
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
 
 from polysight.serve import server
@@ -56,7 +56,7 @@ class Server:
 
 
 @contextmanager
-def serving(root: Path, state: Path, *options: str, command: str = "serve") -> Iterator[Server]:
+def run_server(root: Path, state: Path, *options: str, command: str = "serve") -> Iterator[Server]:
     words = [sys.executable, "-m", "polysight", command, str(root), "--port", "0", *options]
     environment = os.environ | {"XDG_STATE_HOME": str(state)}
     program = subprocess.Popen(words, cwd=state, env=environment, stderr=subprocess.PIPE, text=True)
@@ -75,14 +75,14 @@ def serving(root: Path, state: Path, *options: str, command: str = "serve") -> I
 
 @pytest.fixture
 def scans(tmp_path: Path) -> Path:
-    judged_products(tmp_path / "scans" / "one" / "products", "care")
+    write_judged_products(tmp_path / "scans" / "one" / "products", "care")
     (tmp_path / "scans" / "one" / "program").mkdir()
     (tmp_path / "state").mkdir()
     return tmp_path / "scans"
 
 
 def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_started_again(scans, tmp_path):
-    with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop:
+    with run_server(scans, tmp_path / "state") as server, open_control(scans / "one") as stop:
         wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list")
         first = server.reading_process()
         assert first is not None
@@ -101,7 +101,7 @@ def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_starte
 
 def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_are_silent(scans, tmp_path):
     """More silent connections than are kept; a request that came with them is answered when the pages continue."""
-    with serving(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
+    with run_server(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
         assert ask(server, "/api/page")[2]["connection"] == "close"
         # Until it has its priority it looks like the door.
         wait_for(lambda: server.reading_process() is not None, "the reading process")
@@ -126,7 +126,7 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_are_si
 def test_the_live_view_of_one_scan_has_its_control_alone(scans, tmp_path):
     """`polysight preview`. Pause and resume are in e2e/test_operator_page, a killed scan is in tests/page."""
     (tmp_path / "scans" / "two").mkdir()
-    with serving(scans / "one", tmp_path / "state", "--control", command="preview") as server:
+    with run_server(scans / "one", tmp_path / "state", "--control", command="preview") as server:
         state = get(server, "/api/state")
         assert (state["control"], state["running"], state["status"]["headline"]) == (True, False, "No scan here yet")
         with open_control(scans / "one") as stop:
@@ -224,14 +224,14 @@ def test_only_a_whole_command_with_the_right_token_is_answered_at_the_door(head,
 
 
 def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_path, monkeypatch):
-    with serving(scans, tmp_path / "state") as server:
+    with run_server(scans, tmp_path / "state") as server:
         token = server.token
         status, _, headers = ask(server, "/api/session", "POST", {}, **{TOKEN_HEADER: token})
         assert status == 200
         cookie = headers["set-cookie"]
     path = tmp_path / "state" / "polysight" / "token"
     assert (path.stat().st_mode & 0o777, path.read_text()) == (0o600, token)
-    with serving(scans, tmp_path / "state") as server:
+    with run_server(scans, tmp_path / "state") as server:
         assert server.token == token
         _, _, headers = ask(server, "/api/session", "POST", {}, **{TOKEN_HEADER: token})
         # Another port has another name; the secret is the same.
@@ -250,7 +250,7 @@ def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_p
 
 def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
     """Then all clients have this machine's address and the proxy's name."""
-    with serving(scans, tmp_path / "state", "--allow-host", "lab.example.org") as server:
+    with run_server(scans, tmp_path / "state", "--allow-host", "lab.example.org") as server:
         token = {TOKEN_HEADER: server.token}
         for host in ("lab.example.org", "127.0.0.1"):
             for path in ("/api/scans", "/api/running"):
@@ -262,7 +262,7 @@ def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
 
 def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
     """A folder elsewhere may be on an unmounted drive: scans would fill another one."""
-    with serving(Path("scans"), tmp_path) as server:
+    with run_server(Path("scans"), tmp_path) as server:
         assert get(server, "/api/scans")["scans"] == []
     assert (tmp_path / "scans").is_dir()
     for folder, control in ((tmp_path / "drive" / "scans", True), (Path("only-shown"), False)):

@@ -12,10 +12,10 @@ import pytest
 import tomli_w
 import zmq
 from tests.support.page.asking import TOKEN, get, post
-from tests.support.page.live_view import served_folder
+from tests.support.page.live_view import serve_folder
 from tests.support.processes import HANG_S, wait_for
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.catalogue import PROGRAM_FOLDER, find_program
 from polysight.jobs.live_scan import _check_new
@@ -110,7 +110,7 @@ def test_a_scan_may_begin_in_a_folder_with_its_log_and_notes(tmp_path):
 @pytest.fixture
 def refusing_pi(tmp_path: Path) -> Iterator[tuple[Path, Callable[[], None]]]:
     """A rig file, and a function that makes its Pi refuse the next command; until then programs wait for an answer."""
-    rig = published_rig()
+    rig = load_published_rig()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     pi = context.socket(zmq.REP)
     pi.bind("tcp://127.0.0.1:*")
@@ -132,7 +132,7 @@ def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refus
     config, refuse = refusing_pi
     root = tmp_path / "scans"
     root.mkdir()
-    with served_folder(root, TOKEN, config=config) as view:
+    with serve_folder(root, TOKEN, config=config) as view:
         wrong = [
             {"name": "a"} | wrong_plan
             for wrong_plan in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from tests.support.page.asking import TOKEN
 from tests.support.page.chromium import Browser
-from tests.support.page.live_view import open_control, served_folder
+from tests.support.page.live_view import open_control, serve_folder
 from tests.support.paths import REPO
 from tests.support.processes import wait_for
 
@@ -60,13 +60,13 @@ def address(scans: Path, tmp_path: Path, browser: Browser) -> Iterator[str]:
     places = {f"XDG_{kind}_HOME": str(tmp_path / kind) for kind in ("DATA", "CONFIG")}
     # As `polysight serve --allow-host` makes it: all clients have this machine's address.
     access = Access(TOKEN, loopback=False, hosts=(NAME,), control=True)
-    with served_folder(scans, access=access) as view, (tmp_path / "caddy.log").open("wb") as log:
+    with serve_folder(scans, access=access) as view, (tmp_path / "caddy.log").open("wb") as log:
         (tmp_path / "Caddyfile").write_text(read_example(port, view.port))
         command = [caddy, "run", "--config", str(tmp_path / "Caddyfile")]
         proxy = subprocess.Popen(command, env=os.environ | places, stdout=log, stderr=log)
         browser.call("Security.setIgnoreCertificateErrors", ignore=True)
         try:
-            wait_for(lambda: _listens(port), "the proxy")
+            wait_for(lambda: _is_listening(port), "the proxy")
             yield f"https://{NAME}:{port}"
         finally:
             browser.open("about:blank")
@@ -75,7 +75,7 @@ def address(scans: Path, tmp_path: Path, browser: Browser) -> Iterator[str]:
             proxy.wait()
 
 
-def _listens(port: int) -> bool:
+def _is_listening(port: int) -> bool:
     try:
         socket.create_connection(("127.0.0.1", port)).close()
     except OSError:

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 from tests.support.page.asking import TOKEN, post
-from tests.support.page.live_view import served_folder
+from tests.support.page.live_view import serve_folder
 from tests.support.paths import RIG_FILE
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 from tests.support.refusals import refused
 
 from polysight.cli.main import build_parser
@@ -77,7 +77,7 @@ def test_a_plan_of_the_page_has_at_most_so_many_positions_after_its_steps():
 @pytest.fixture
 def root(tmp_path) -> Path:
     folder = tmp_path / "scans"
-    judged_products(folder / "one", "good")
+    write_judged_products(folder / "one", "good")
     (folder / "libraries").mkdir()
     (folder / "libraries" / "mine.npz").touch()
     return folder
@@ -92,7 +92,7 @@ def start_program(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
         collected.append([str(word) for word in words])
 
     monkeypatch.setattr(Programs, "start", start)
-    with served_folder(root, TOKEN, config=RIG_FILE) as view:
+    with serve_folder(root, TOKEN, config=RIG_FILE) as view:
         yield view, collected
 
 

@@ -14,7 +14,7 @@ import pytest
 import segno
 import uvicorn
 from tests.support.page.asking import TOKEN, ask
-from tests.support.page.live_view import open_control, served
+from tests.support.page.live_view import open_control, serve_view
 from tests.support.processes import HANG_S, wait_for
 
 from polysight.acquisition.control import ScanCommand
@@ -43,7 +43,7 @@ def desk(growing):
 
 def test_only_a_post_with_the_token_asks(desk, watching):
     folder, stop = desk
-    with served(watching(folder, control=True), TOKEN) as view:
+    with serve_view(watching(folder, control=True), TOKEN) as view:
         for headers in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}):
             for command in ScanCommand:
                 status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **headers)
@@ -60,7 +60,7 @@ def test_only_a_post_with_the_token_asks(desk, watching):
 def test_a_view_is_read_only_unless_control_is_allowed(desk, watching):
     folder, stop = desk
     watch = watching(folder)
-    with served(watch) as view:
+    with serve_view(watch) as view:
         for headers in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN}):
             status, body, _ = ask(view, "/api/control/abort", "POST", **headers)
             assert (status, json.loads(body)["code"]) == (403, ErrorCode.READ_ONLY)
@@ -71,13 +71,13 @@ def test_a_view_is_read_only_unless_control_is_allowed(desk, watching):
 def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
     compared = []
     monkeypatch.setattr(hmac, "compare_digest", lambda a, b: compared.append((a, b)) or False)
-    with served(watching(desk[0], control=True), TOKEN) as view:
+    with serve_view(watching(desk[0], control=True), TOKEN) as view:
         assert ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})[0] == 403
     assert (TOKEN.encode(), TOKEN.encode()) in compared
 
 
 def test_a_command_to_a_finished_scan_is_refused_with_a_remedy(finished, watching):
-    with served(watching(finished, control=True), TOKEN) as view:
+    with serve_view(watching(finished, control=True), TOKEN) as view:
         status, body, _ = ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})
     assert status == 409
     assert "polysight resume" in json.loads(body)["do"]
@@ -100,7 +100,7 @@ def test_the_page_needs_nothing_from_elsewhere():
 def test_a_page_that_never_reads_delays_no_other_client(growing, watching):
     watch = watching(growing.path, lapse_s=1e6)
     growing.live()
-    with served(watch) as view:
+    with serve_view(watch) as view:
         deaf = []
         for _ in range(8):
             connection = socket.socket()

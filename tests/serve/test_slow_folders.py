@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 from tests.support.page.asking import TOKEN, ask, post
-from tests.support.page.live_view import Served, served_folder
+from tests.support.page.live_view import Served, serve_folder
 from tests.support.processes import wait_for
-from tests.support.products import judged_products
+from tests.support.products import write_judged_products
 
 from polysight.catalogue import Scans, scans
 from polysight.serve import reading, site
@@ -50,14 +50,14 @@ def dead(monkeypatch: pytest.MonkeyPatch) -> Iterator[DeadFolder]:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     for name in ("alive", "dead", "other"):
-        judged_products(tmp_path / name / "products", "care")
+        write_judged_products(tmp_path / name / "products", "care")
         (tmp_path / name / "program").mkdir()
     return tmp_path
 
 
 @pytest.fixture
 def view(root: Path) -> Iterator[Served]:
-    with served_folder(root, TOKEN) as served:
+    with serve_folder(root, TOKEN) as served:
         yield served
 
 

@@ -4,9 +4,9 @@ import time
 
 import pytest
 from tests.support.page.chromium import DESK, PHONE, Browser
-from tests.support.page.live_view import GrowingScan, open_control, served
+from tests.support.page.live_view import GrowingScan, open_control, serve_view
 from tests.support.processes import wait_for
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.acquisition import STATES
 from polysight_simulators.loopback import move_to_free_subnet
@@ -27,7 +27,7 @@ def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
 def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size):
     watch = watching(finished)
     watch.wait_for(lambda s: s["pictures"]["rows"] == 3)
-    with served(watch) as view:
+    with serve_view(watch) as view:
         open_page(browser, view, size)
         browser.wait(f"{PICTURES}.length == 6 && {PICTURES}.every(i => i.naturalWidth == 12)", "six pictures")
         assert browser.text("headline") == "The scan is finished"
@@ -48,7 +48,7 @@ def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size
 
 def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
-    with served(watch) as view:
+    with serve_view(watch) as view:
         open_page(browser, view)
         assert browser.text("headline") == "No scan here yet"
         growing.live()
@@ -62,7 +62,7 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
 
 def test_buttons_reach_the_scan(browser, growing, watching):
     growing.grow_until("row_committed")
-    with open_control(growing.path) as stop, served(watching(growing.path, control=True), TOKEN) as view:
+    with open_control(growing.path) as stop, serve_view(watching(growing.path, control=True), TOKEN) as view:
         open_page(browser, view, token=TOKEN)
         browser.click("#pause")
         assert TOKEN not in browser.value("location.href")
@@ -83,15 +83,15 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 
 def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished, watching):
     """At an address of its own: a free port of 127.0.0.1 may be used by another program by then."""
-    rig = move_to_free_subnet(published_rig())
+    rig = move_to_free_subnet(load_published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished)
-    with served(watch, host=host, port=int(port)) as view:
+    with serve_view(watch, host=host, port=int(port)) as view:
         open_page(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert browser.text("headline") == STATES["offline"].headline
     # Some of its attempts to reconnect fail
     time.sleep(0.5)
-    with served(watch, host=host, port=int(port)):
+    with serve_view(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")
         browser.wait("document.getElementById('headline').innerText == 'The scan is finished'", "the state")

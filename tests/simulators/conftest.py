@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import Instrument
 from polysight_simulators.loopback import move_to_free_subnet
@@ -18,4 +18,4 @@ def sockets() -> Iterator[ExitStack]:
 
 @pytest.fixture
 def rig() -> Instrument:
-    return move_to_free_subnet(published_rig())
+    return move_to_free_subnet(load_published_rig())

@@ -5,19 +5,19 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.raster import plan_raster
 from polysight_shared.wires import WireMotion
 from polysight_simulators.cards.sync_in import Pulse, StageTrack, SyncInput
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
-RIG = published_rig()
+RIG = load_published_rig()
 # Ramp end 128.5 us + 150 us
 DEAD_NS = 278_500
 
 
-def pulses(times: list[int]) -> list[Pulse]:
+def make_pulses(times: list[int]) -> list[Pulse]:
     return [Pulse(i, t) for i, t in enumerate(times)]
 
 
@@ -25,7 +25,7 @@ def pulses(times: list[int]) -> list[Pulse]:
 def test_frames_never_start_closer_than_the_radar_can_and_every_other_pulse_is_counted(gaps: list[int]) -> None:
     times = list(np.cumsum(gaps, dtype=int))
     sync = SyncInput(RIG)
-    started = sync.select_starting(pulses(times))
+    started = sync.select_starting(make_pulses(times))
     assert all(b.t_ns - a.t_ns >= DEAD_NS for a, b in pairwise(started))
     assert len(started) + sync.too_soon == len(times)
 

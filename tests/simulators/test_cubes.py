@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.pipeline import Pipeline
 from polysight.store.scan_folder import ScanFolder
@@ -12,7 +12,7 @@ from polysight.sync.decimate import flatten, fold
 from polysight_simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
 from polysight_simulators.scene.radar import sample_frequencies_hz
 
-RIG = published_rig()
+RIG = load_published_rig()
 SCENE = decode_scene(
     {
         "name": "t",
@@ -34,7 +34,7 @@ SCENE = decode_scene(
 )
 
 
-def rows_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
+def synchronise_by_the_host(scene: Scene, folder: Path) -> dict[str, np.ndarray]:
     """Samples of a raw scan, synchronised, [rx, row, column, block of four samples] in ADC counts."""
     pipeline = Pipeline(ScanFolder.load(simulate(RIG, scene, folder / "scan")))
     rows_of_board: dict[str, list[np.ndarray]] = {"RH": [], "RV": []}
@@ -61,7 +61,7 @@ def test_a_synced_cube_equals_the_synchronised_raw_scan(tmp_path: Path) -> None:
     leakage = {"leakage_h": [0.1, 0.15], "leakage_v": [-0.1, 0.1]}
     scene = SCENE.with_disturbances(direct_snr_db="off", hv_drift=[0.2, 30.0], **leakage)
     assert RIG.chirp.linear_samples[0] == 0
-    for board, raw in rows_by_the_host(scene, tmp_path).items():
+    for board, raw in synchronise_by_the_host(scene, tmp_path).items():
         cube = synced_cube(RIG, scene, board)
         unlike_cube = synced_cube(RIG, scene.with_disturbances(leakage_h="off", leakage_v="off"), board)
         own_error = np.sqrt(np.mean(np.abs(find_deviation(raw, cube)) ** 2) / np.mean(np.abs(cube) ** 2))
@@ -86,7 +86,7 @@ def test_the_echo_of_v_drifts_as_in_the_scene_and_h_and_the_direct_path_do_not()
 
 
 def test_the_noise_is_that_of_averaged_bursts(tmp_path: Path) -> None:
-    for board, raw in rows_by_the_host(SCENE, tmp_path).items():
+    for board, raw in synchronise_by_the_host(SCENE, tmp_path).items():
         quiet = synced_cube(RIG, SCENE, board, noise=0.0)
         drawn = decimate_cube(synced_cube(RIG, SCENE, board) - quiet)
         power = np.mean(np.abs(find_deviation(raw, quiet)) ** 2)

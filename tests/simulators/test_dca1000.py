@@ -8,7 +8,7 @@ from polysight_simulators.cards.dca1000 import Card, Message, Network, Output
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
 
 
-def messages(outputs: list[Output]) -> list[bytes]:
+def list_messages(outputs: list[Output]) -> list[bytes]:
     return [o.payload for o in outputs if isinstance(o, Message)]
 
 
@@ -33,7 +33,7 @@ def messages(outputs: list[Output]) -> list[bytes]:
     ],
 )
 def test_requests_and_replies_byte_for_byte(request_hex: str, reply_hex: str) -> None:
-    assert messages(Card(HOME).command(bytes.fromhex(request_hex), 0.0)) == [bytes.fromhex(reply_hex)]
+    assert list_messages(Card(HOME).command(bytes.fromhex(request_hex), 0.0)) == [bytes.fromhex(reply_hex)]
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x5a\xa5\x09\x00", bytes(8), bytes.fromhex("a55a 0900 0000 eeaa")])
@@ -51,7 +51,7 @@ def test_no_bytes_break_the_card(junk: bytes) -> None:
 def test_the_eeprom_is_taken_at_the_next_power_cycle() -> None:
     card = Card(HOME)
     body = bytes.fromhex("1e21a8c0 b521a8c0 139078563412 6810 6910")
-    assert messages(card.command(bytes.fromhex("5aa5 0400 1200") + body + b"\xaa\xee", 0.0))[0][4] == 0
+    assert list_messages(card.command(bytes.fromhex("5aa5 0400 1200") + body + b"\xaa\xee", 0.0))[0][4] == 0
     assert card.network == HOME
     card.power_cycle()
     assert card.network == Network("192.168.33.30", "192.168.33.181", bytes.fromhex("123456789013"), 4200, 4201)

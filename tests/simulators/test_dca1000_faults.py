@@ -18,32 +18,32 @@ SIZE = 20
 EVERYTHING = Faults(loss=0.1, duplicate=0.1, reorder=0.1, truncate=0.1, corrupt=0.2)
 
 
-def rows(n: int) -> np.ndarray:
+def make_packets(n: int) -> np.ndarray:
     """Packets whose bytes are their number."""
     return np.repeat(np.arange(n, dtype=np.uint8)[:, None], SIZE, axis=1)
 
 
-def arrivals(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
+def send_all(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
     network = NetworkFaults(faults, seed, board, Counter())
-    data = rows(sum(sizes))
+    data = make_packets(sum(sizes))
     first = 0
     out = []
     for size in sizes:
         out += [r.tobytes() for part in network.transmit(data[first : first + size]) for r in part]
         first += size
-    assert (data == rows(sum(sizes))).all(), "what was sent stays as it was"
+    assert (data == make_packets(sum(sizes))).all(), "what was sent stays as it was"
     return out + [r.tobytes() for part in network.drain() for r in part]
 
 
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=4), st.integers(0, 99))
 def test_faults_do_not_depend_on_how_packets_are_grouped(sizes: list[int], seed: int) -> None:
-    assert arrivals(EVERYTHING, sizes, seed) == arrivals(EVERYTHING, [sum(sizes)], seed)
+    assert send_all(EVERYTHING, sizes, seed) == send_all(EVERYTHING, [sum(sizes)], seed)
 
 
 def test_the_same_seed_gives_the_same_faults_and_boards_differ() -> None:
-    assert arrivals(EVERYTHING, [200]) == arrivals(EVERYTHING, [200])
-    assert arrivals(EVERYTHING, [200]) != arrivals(EVERYTHING, [200], seed=2)
-    assert arrivals(EVERYTHING, [200]) != arrivals(EVERYTHING, [200], board="RV")
+    assert send_all(EVERYTHING, [200]) == send_all(EVERYTHING, [200])
+    assert send_all(EVERYTHING, [200]) != send_all(EVERYTHING, [200], seed=2)
+    assert send_all(EVERYTHING, [200]) != send_all(EVERYTHING, [200], board="RV")
 
 
 @pytest.mark.parametrize(
@@ -54,17 +54,17 @@ def test_the_same_seed_gives_the_same_faults_and_boards_differ() -> None:
     ],
 )
 def test_each_fault_alone(faults: Faults, numbers: list[int]) -> None:
-    assert arrivals(faults, [6]) == [bytes([n] * SIZE) for n in numbers]
+    assert send_all(faults, [6]) == [bytes([n] * SIZE) for n in numbers]
 
 
 def test_reordered_packets_all_arrive() -> None:
-    received = arrivals(Faults(reorder=0.2), [200])
-    assert received != [r.tobytes() for r in rows(200)]
-    assert sorted(received) == sorted(r.tobytes() for r in rows(200))
+    received = send_all(Faults(reorder=0.2), [200])
+    assert received != [r.tobytes() for r in make_packets(200)]
+    assert sorted(received) == sorted(r.tobytes() for r in make_packets(200))
 
 
 def test_truncated_packets_are_half() -> None:
-    assert arrivals(Faults(truncate=1.0), [2]) == [bytes([n] * (SIZE // 2)) for n in (0, 1)]
+    assert send_all(Faults(truncate=1.0), [2]) == [bytes([n] * (SIZE // 2)) for n in (0, 1)]
 
 
 def test_overflow_takes_the_second_half_of_single_frames() -> None:
@@ -79,7 +79,7 @@ def test_overflow_takes_the_second_half_of_single_frames() -> None:
 
 
 def test_a_corrupt_packet_has_one_bit_of_its_payload_turned() -> None:
-    for clean, corrupt in zip(rows(60), arrivals(Faults(corrupt=1.0), [60]), strict=True):
+    for clean, corrupt in zip(make_packets(60), send_all(Faults(corrupt=1.0), [60]), strict=True):
         turned = np.bitwise_xor(clean, np.frombuffer(corrupt, np.uint8))
         assert np.unpackbits(turned).sum() == np.unpackbits(turned[10:]).sum() == 1
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ErrorCode
@@ -22,9 +22,9 @@ PLATES = [
 ]
 
 
-def setup(**tables: Any) -> tuple[Instrument, Scene]:
+def make_scene_and_rig(**tables: Any) -> tuple[Instrument, Scene]:
     scene = decode_scene({"name": "t", "object_distance_mm": 499.0, "grid": GRID, **tables}, "t")
-    return apply_scene(published_rig(), scene), scene
+    return apply_scene(load_published_rig(), scene), scene
 
 
 def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samples: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samp
 
 
 def test_interpolation_between_frequencies_is_exact() -> None:
-    rig, scene = setup(plates=PLATES[:1])
+    rig, scene = make_scene_and_rig(plates=PLATES[:1])
     board = rig.receivers[0]
     samples = sample_frequencies_hz(rig)
     field = build_field(rig, scene, board, samples)
@@ -51,7 +51,9 @@ def test_interpolation_between_frequencies_is_exact() -> None:
 @pytest.mark.parametrize("role", ["receive_h", "receive_v"])
 def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
     size = [600.0, 500.0]
-    rig, scene = setup(plates=[{"name": "m", "centre_mm": [0.0, 0.0], "size_mm": size, "metal": True}], object_gain=1.0)
+    rig, scene = make_scene_and_rig(
+        plates=[{"name": "m", "centre_mm": [0.0, 0.0], "size_mm": size, "metal": True}], object_gain=1.0
+    )
     scene = scene.with_disturbances(leakage_h="off", leakage_v="off")
     board = rig.by_role(role)
     ant = optics.antennas(rig, board)
@@ -70,8 +72,8 @@ def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
 
 
 def test_echoes_add_up() -> None:
-    rig, both_plates = setup(plates=PLATES)
-    parts = [setup(plates=[p])[1] for p in PLATES]
+    rig, both_plates = make_scene_and_rig(plates=PLATES)
+    parts = [make_scene_and_rig(plates=[p])[1] for p in PLATES]
     offsets = np.array([[0.01, 0.02]])
     f = np.array([77e9, 80e9])
     for board in rig.receivers:
@@ -80,7 +82,7 @@ def test_echoes_add_up() -> None:
 
 
 def test_leakage_mixes_the_two_polarisations() -> None:
-    rig, scene = setup(plates=PLATES[1:2])
+    rig, scene = make_scene_and_rig(plates=PLATES[1:2])
     offsets = np.array([[0.05, 0.05]])
     f = np.array([78e9])
     h, v = rig.receivers
@@ -99,14 +101,14 @@ def test_leakage_mixes_the_two_polarisations() -> None:
 
 
 def test_a_point_at_the_specular_midpoint_equals_its_amplitude() -> None:
-    rig, scene = setup(points=[{"position_mm": [0.0, 0.0], "amplitude": [0.6, 0.0]}])
+    rig, scene = make_scene_and_rig(points=[{"position_mm": [0.0, 0.0], "amplitude": [0.6, 0.0]}])
     ideal = scene.with_disturbances(ideal=True)
     field_values = optics.field_exact(rig, ideal, rig.receivers[0], np.zeros((1, 2)), np.array([78e9]))
     assert np.isclose(abs(field_values[0, 0]), 0.6)
 
 
 def test_an_empty_scene_has_no_echo_and_offsets_outside_are_refused() -> None:
-    rig, scene = setup()
+    rig, scene = make_scene_and_rig()
     field = build_field(rig, scene, rig.receivers[0], sample_frequencies_hz(rig))
     assert np.all(field.interpolate(np.array([0.0]), np.array([0.0])) == 0)
     assert field.covers(np.array([0.14, 0.3]), np.array([0.1, 0.0])).tolist() == [True, False]
@@ -136,7 +138,7 @@ def test_scene_plates_choose_their_model() -> None:
 
 def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None:
     """Samples of a path tau have the phase +2 pi f tau, also inside the sheet."""
-    rig = published_rig()
+    rig = load_published_rig()
     theta = np.radians(55.0)
     thick_m = 0.1
     eps = 4.0

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_simulators.scene import decode_scene
@@ -13,19 +13,19 @@ from polysight_simulators.scene.optics import antennas, field_exact
 from polysight_simulators.scene.radar import SimulatedRig, high_pass, power_on, sample_frequencies_hz, sync_delay_s
 from polysight_simulators.scene.scene_file import draw_uniform
 
-RIG = published_rig()
+RIG = load_published_rig()
 GRID = {"columns": 9, "rows": 6, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "m", "centre_mm": [0.0, 0.0], "size_mm": [45.0, 45.0], "metal": True}
 POINT = {"position_mm": [12.0, -9.0], "amplitude": [0.5, 0.0]}
 
 
-def radar(seed: int = 1, tables: dict[str, Any] | None = None, **disturbances: Any) -> SimulatedRig:
+def make_radar(seed: int = 1, tables: dict[str, Any] | None = None, **disturbances: Any) -> SimulatedRig:
     """A rig with only the given disturbances."""
     raw = {"name": "t", "grid": GRID, **(tables or {}), "disturbances": {"ideal": True, **disturbances}}
     return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
 
 
-def default_radar(seed: int = 1, **disturbances: Any) -> SimulatedRig:
+def make_default_radar(seed: int = 1, **disturbances: Any) -> SimulatedRig:
     """A rig with the published disturbances, except as given."""
     raw = {"name": "t", "grid": GRID, "plates": [PLATE], "disturbances": disturbances}
     return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
@@ -39,8 +39,8 @@ ZERO = np.zeros(1)
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_a_point_target_alone_has_phase_2_pi_f_tau(board: str) -> None:
-    with_point = radar(tables={"points": [POINT]})
-    without = radar()
+    with_point = make_radar(tables={"points": [POINT]})
+    without = make_radar()
     x = np.array([0.0, 33.3, -41.7])
     y = np.array([0.0, 20.0, -24.9])
     echo = with_point.signals(board, x, y) - without.signals(board, x, y)
@@ -57,7 +57,7 @@ def test_a_point_target_alone_has_phase_2_pi_f_tau(board: str) -> None:
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_the_direct_path_alone_is_a_pure_tone(board: str) -> None:
-    rig = radar()
+    rig = make_radar()
     ant = antennas(rig.rig, rig.rig.by_name(board))
     f = sample_frequencies_hz(rig.rig)
     expected = (
@@ -72,21 +72,21 @@ def test_the_direct_path_alone_is_a_pure_tone(board: str) -> None:
 def test_pulses_do_not_depend_on_the_batch() -> None:
     x = np.linspace(-30, 30, 70)
     y = np.full(70, 5.0)
-    all_chirps = default_radar().chirps("RH", x, y)
-    batched_radar = default_radar()
+    all_chirps = make_default_radar().chirps("RH", x, y)
+    batched_radar = make_default_radar()
     parts = [batched_radar.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
     # A rounding of float32
     assert np.abs(all_chirps.astype(int) - np.concatenate(parts)).max() <= 1
-    late = default_radar().chirps("RH", x[40:], y[40:], first_chirp=40)
+    late = make_default_radar().chirps("RH", x[40:], y[40:], first_chirp=40)
     assert np.abs(all_chirps[40:].astype(int) - late).max() <= 1
 
 
 def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
     x = np.zeros(4)
     y = np.zeros(4)
-    first = default_radar(seed=5).chirps("RV", x, y, 0)
-    assert np.array_equal(first, default_radar(seed=5).chirps("RV", x, y, 0))
-    for chirps in (default_radar(seed=6).chirps("RV", x, y, 0), default_radar(seed=5).chirps("RV", x, y, 4)):
+    first = make_default_radar(seed=5).chirps("RV", x, y, 0)
+    assert np.array_equal(first, make_default_radar(seed=5).chirps("RV", x, y, 0))
+    for chirps in (make_default_radar(seed=6).chirps("RV", x, y, 0), make_default_radar(seed=5).chirps("RV", x, y, 4)):
         assert np.mean(first == chirps) < 0.1
 
 
@@ -103,8 +103,8 @@ def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> No
 
 
 def test_timing_shifts_the_if_by_slope_times_delay_and_turns_the_phase() -> None:
-    on = radar(sync_uncertainty_ns=5.0)
-    undisturbed = radar()
+    on = make_radar(sync_uncertainty_ns=5.0)
+    undisturbed = make_radar()
     n = 40
     ratio = on.signals("RH", np.zeros(n), np.zeros(n)) / undisturbed.signals("RH", np.zeros(n), np.zeros(n))
     h = on.rig.by_name("RH")
@@ -120,13 +120,13 @@ def test_timing_shifts_the_if_by_slope_times_delay_and_turns_the_phase() -> None
 
 
 def test_a_common_latency_cancels() -> None:
-    a = radar(sync_latency_ns=160.0).signals("RH", ZERO, ZERO)
-    b = radar().signals("RH", ZERO, ZERO)
+    a = make_radar(sync_latency_ns=160.0).signals("RH", ZERO, ZERO)
+    b = make_radar().signals("RH", ZERO, ZERO)
     assert np.abs(a - b).max() < 1e-5
 
 
 def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
-    rig = radar(sync_uncertainty_ns=5.0)
+    rig = make_radar(sync_uncertainty_ns=5.0)
     n = 2000
     d = rig.scene.disturbances
     pulses = np.arange(n)
@@ -139,8 +139,8 @@ def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
 
 
 def test_one_ppm_of_crystal_is_76_khz_and_a_slope_error() -> None:
-    on = radar(crystal_ppm={"receive_h": 1.0})
-    undisturbed = radar()
+    on = make_radar(crystal_ppm={"receive_h": 1.0})
+    undisturbed = make_radar()
     turn = np.angle(on.signals("RH", ZERO, ZERO)[0, 0] / undisturbed.signals("RH", ZERO, ZERO)[0, 0])
     t = np.arange(256) / on.rig.chirp.sample_rate_hz
     c2, c1, _ = np.polyfit(t, np.unwrap(turn) / 2 / np.pi, 2)
@@ -154,14 +154,14 @@ def test_start_offset_of_a_board_moves_its_if() -> None:
         RIG,
         boards=tuple(msgspec.structs.replace(b, start_offset_hz=5e5 if b.name == "RV" else 0.0) for b in RIG.boards),
     )
-    scene = radar().scene
+    scene = make_radar().scene
     ratio = SimulatedRig(moved, scene).signals("RV", ZERO, ZERO) / SimulatedRig(RIG, scene).signals("RV", ZERO, ZERO)
     step = np.angle(ratio[0, 0, 1:] / ratio[0, 0, :-1]) / 2 / np.pi * RIG.chirp.sample_rate_hz
     assert np.allclose(step, 5e5, atol=50)
 
 
 def test_phase_is_uniform_from_chirp_to_chirp() -> None:
-    rig = radar(random_phase=True)
+    rig = make_radar(random_phase=True)
     phase = np.angle(rig.signals("RH", np.zeros(4000), np.zeros(4000))[:, 0, 0])
     counts, _ = np.histogram(phase, 8, (-np.pi, np.pi))
     assert counts.min() > 400
@@ -171,8 +171,8 @@ def test_phase_is_uniform_from_chirp_to_chirp() -> None:
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
     for seed in range(3):
-        on = radar(seed, bend_hz=300e3, ripple_hz=3e3)
-        undisturbed = radar(seed)
+        on = make_radar(seed, bend_hz=300e3, ripple_hz=3e3)
+        undisturbed = make_radar(seed)
         turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / undisturbed.signals(board, ZERO, ZERO)[0, 0]))
         k = np.arange(192)
         rest = turn[:192] - np.polyval(np.polyfit(k, turn[:192], 1), k)
@@ -182,9 +182,9 @@ def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
 
 
 def test_each_path_goes_through_the_filter_at_its_own_if() -> None:
-    on = radar(tables={"points": [POINT]}, hpf=True, if_offset_hz=870e3)
-    undisturbed = radar(tables={"points": [POINT]}, if_offset_hz=870e3)
-    direct = radar(if_offset_hz=870e3).signals("RH", ZERO, ZERO)[0, 0]
+    on = make_radar(tables={"points": [POINT]}, hpf=True, if_offset_hz=870e3)
+    undisturbed = make_radar(tables={"points": [POINT]}, if_offset_hz=870e3)
+    direct = make_radar(if_offset_hz=870e3).signals("RH", ZERO, ZERO)[0, 0]
     echo = undisturbed.signals("RH", ZERO, ZERO)[0, 0] - direct
     ant = antennas(on.rig, on.rig.by_name("RH"))
     target = ant.centre_m + np.array([*POINT["position_mm"], 0.0]) / 1e3
@@ -198,8 +198,8 @@ def test_each_path_goes_through_the_filter_at_its_own_if() -> None:
 
 
 def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_next() -> None:
-    on = radar(3, rx_gain_spread_db=1.0, rx_phase_spread_deg=20.0)
-    undisturbed = radar(3)
+    on = make_radar(3, rx_gain_spread_db=1.0, rx_phase_spread_deg=20.0)
+    undisturbed = make_radar(3)
     gain = on.signals("RV", np.zeros(2), np.zeros(2)) / undisturbed.signals("RV", np.zeros(2), np.zeros(2))
     assert np.allclose(gain, gain[:1, :, :1], atol=1e-5)
     per_rx = gain[0, :, 0]
@@ -212,7 +212,7 @@ def test_gains_are_within_their_spread_fixed_for_a_power_cycle_and_new_in_the_ne
 
 
 def test_h_and_v_differ_by_the_set_gain() -> None:
-    on = radar(hv_gain_db=1.5)
+    on = make_radar(hv_gain_db=1.5)
     h = np.abs(on.signals("RH", ZERO, ZERO)[0, 0]).mean()
     v = np.abs(on.signals("RV", ZERO, ZERO)[0, 0]).mean()
     assert abs(20 * np.log10(h / v) - 1.5) < 1e-3
@@ -221,10 +221,10 @@ def test_h_and_v_differ_by_the_set_gain() -> None:
 def test_leakage_reaches_direct_path_and_object() -> None:
     tables = {"plates": [{**PLATE, "metal": False, "permittivity": [4.0, 0.4]}]}
     leak = [0.06, -0.03]
-    on = radar(tables=tables, leakage_v=leak)
-    undisturbed = radar(tables=tables)
-    empty_on = radar(leakage_v=leak)
-    empty_off = radar()
+    on = make_radar(tables=tables, leakage_v=leak)
+    undisturbed = make_radar(tables=tables)
+    empty_on = make_radar(leakage_v=leak)
+    empty_off = make_radar()
     ratio = empty_on.signals("RV", ZERO, ZERO) / empty_off.signals("RV", ZERO, ZERO)
     assert np.allclose(ratio, np.conj(1.06 - 0.03j), atol=1e-5)
     f = sample_frequencies_hz(on.rig)[[100]]
@@ -237,8 +237,8 @@ def test_leakage_reaches_direct_path_and_object() -> None:
 
 
 def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
-    on = radar(direct_snr_db=5.5, rx_gain_spread_db=1.0)
-    undisturbed = radar(rx_gain_spread_db=1.0)
+    on = make_radar(direct_snr_db=5.5, rx_gain_spread_db=1.0)
+    undisturbed = make_radar(rx_gain_spread_db=1.0)
     n = 160
     clean = undisturbed.signals("RH", ZERO, ZERO)
     noise = on.signals("RH", np.zeros(n), np.zeros(n)) - clean
@@ -254,7 +254,7 @@ def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
 
 
 def test_frames_contain_i_of_the_four_rx_then_q() -> None:
-    rig = radar(tables={"plates": [PLATE]}, adc_full_scale=4.0)
+    rig = make_radar(tables={"plates": [PLATE]}, adc_full_scale=4.0)
     signal = rig.signals("RH", np.zeros(2), np.zeros(2))
     frames = rig.chirps("RH", np.zeros(2), np.zeros(2))
     assert frames.shape == (2, 256, 8)
@@ -266,8 +266,8 @@ def test_frames_contain_i_of_the_four_rx_then_q() -> None:
 
 
 def test_clipping_is_bounded_and_counted() -> None:
-    loud = radar(adc_full_scale=0.5)
-    quiet = radar(adc_full_scale=2.0)
+    loud = make_radar(adc_full_scale=0.5)
+    quiet = make_radar(adc_full_scale=2.0)
     frames = loud.chirps("RH", ZERO, ZERO)
     expected = quiet.signals("RH", ZERO, ZERO).view(np.float32)
     assert frames.max() == 32767
@@ -279,8 +279,8 @@ def test_clipping_is_bounded_and_counted() -> None:
 
 
 def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
-    moving = radar(burst_motion=True)
-    still = radar()
+    moving = make_radar(burst_motion=True)
+    still = make_radar()
     assert np.allclose(moving.burst_mm(1), 20.0 * (0.2e-3 + np.arange(16) * 1.5e-3))
     assert np.allclose(still.burst_mm(-1), -0.229)
     for direction in (1, -1):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import Instrument
 from polysight_shared.geometry import incidence_deg
@@ -14,7 +14,7 @@ from polysight_simulators.scene.field import build_field, node_matrix
 from polysight_simulators.scene.optics import field_exact
 from polysight_simulators.scene.radar import sample_frequencies_hz
 
-RIG = published_rig()
+RIG = load_published_rig()
 GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "permittivity": [4.0, 0.4]}
 SIX = [
@@ -31,14 +31,14 @@ FLAT = [
 WAVE = 2 * np.pi * 78.5e9 / SPEED_OF_LIGHT_M_S
 
 
-def setup(**tables: Any) -> tuple[Instrument, Scene]:
+def make_scene_and_rig(**tables: Any) -> tuple[Instrument, Scene]:
     scene = decode_scene({"name": "t", "object_distance_mm": 499.0, "grid": GRID, **tables}, "t")
     return apply_scene(RIG, scene), scene
 
 
-def fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
+def compute_fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
     """The fast and the exact field at random offsets and three frequencies."""
-    rig, scene = setup(**tables)
+    rig, scene = make_scene_and_rig(**tables)
     board = rig.by_role(role)
     samples = sample_frequencies_hz(rig)
     field = build_field(rig, scene, board, samples)
@@ -49,7 +49,7 @@ def fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> 
     return fast, field_exact(rig, scene, board, offsets, samples[nodes], rx)
 
 
-def rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
+def compute_rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.abs(fast - exact) ** 2) / np.mean(np.abs(exact) ** 2)))
 
 
@@ -68,29 +68,33 @@ def rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
 )
 @pytest.mark.parametrize("role", ["receive_h", "receive_v"])
 def test_the_fast_field_equals_the_exact_sum(tables: dict[str, Any], bound: float, role: str) -> None:
-    assert rms_error(*fields(role=role, **tables)) < bound
+    assert compute_rms_error(*compute_fields(role=role, **tables)) < bound
 
 
 def test_a_rough_plate_is_the_same_in_both() -> None:
     rough = {**PLATE, "size_mm": [45.0, 36.0], "rough_mm": 0.3, "tilt_deg": [0.5, 0.2]}
-    assert rms_error(*fields(n=6, plates=[rough])) < 0.002
+    assert compute_rms_error(*compute_fields(n=6, plates=[rough])) < 0.002
 
 
 def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
-    rig, _ = setup()
+    rig, _ = make_scene_and_rig()
     board = rig.receivers[0]
     f = np.array([78.5e9])
     cos = np.cos(np.radians(incidence_deg(rig, board)))
-    flat = field_exact(rig, setup(plates=[{**PLATE, "height_mm": 0.0}])[1], board, np.zeros((1, 2)), f)[0, 0]
-    high = field_exact(rig, setup(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), f)[0, 0]
+    flat = field_exact(rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.0}])[1], board, np.zeros((1, 2)), f)[
+        0, 0
+    ]
+    high = field_exact(rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), f)[
+        0, 0
+    ]
     # Positive is farther: later
     assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)
 
 
 def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_rig() -> None:
-    rig, shifted = setup(plates=[PLATE], plane_shift_mm=1.5)
+    rig, shifted = make_scene_and_rig(plates=[PLATE], plane_shift_mm=1.5)
     assert rig.geometry.object_distance_mm == 499.0
-    nearer, distant = setup(plates=[PLATE], object_distance_mm=500.5)
+    nearer, distant = make_scene_and_rig(plates=[PLATE], object_distance_mm=500.5)
     board = rig.receivers[0]
     offsets = np.array([[0.01, -0.02], [0.04, 0.03]])
     f = np.array([77e9, 80e9])
@@ -100,21 +104,21 @@ def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_
 
 
 def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:
-    rig, _ = setup()
+    rig, _ = make_scene_and_rig()
     board = rig.receivers[0]
     samples = np.array([78.5e9])
     cos = np.cos(np.radians(incidence_deg(rig, board)))
     offsets = np.zeros(1)
 
-    def amplitude(rough_mm: float, seed: int) -> complex:
+    def compute_amplitude(rough_mm: float, seed: int) -> complex:
         plate = {**PLATE, "metal": True, "rough_mm": rough_mm, "rough_length_mm": 3.0}
         plate.pop("permittivity")
-        scene = setup(plates=[plate], seed=seed, grid={**GRID, "columns": 1, "rows": 1})[1]
+        scene = make_scene_and_rig(plates=[plate], seed=seed, grid={**GRID, "columns": 1, "rows": 1})[1]
         return complex(build_field(rig, scene, board, samples, rx=[0]).interpolate(offsets, offsets)[0, 0, 0])
 
-    smooth = amplitude(0.0, 1)
+    smooth = compute_amplitude(0.0, 1)
     for rough_mm in (0.15, 0.3):
-        coherent = np.mean([amplitude(rough_mm, seed) for seed in range(24)]) / smooth
+        coherent = np.mean([compute_amplitude(rough_mm, seed) for seed in range(24)]) / smooth
         expected = np.exp(-2 * (WAVE * rough_mm / 1e3 * cos) ** 2)
         assert coherent.real == pytest.approx(expected, abs=0.04)
         assert abs(coherent.imag) < 0.04

@@ -19,7 +19,7 @@ from polysight_simulators.scene.scene_file import (
 )
 
 
-def scene(**tables: Any) -> Scene:
+def make_scene(**tables: Any) -> Scene:
     return decode_scene({"name": "t", **tables}, "t.toml")
 
 
@@ -73,7 +73,7 @@ def test_a_wrong_key_or_value_is_refused_by_name(raw: dict[str, Any], named: str
 def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
     shaping = {"bend_us", "ripple_us"}
     assert set(SWITCHED_OFF) | shaping == set(Disturbances.__struct_fields__)
-    ideal = msgspec.to_builtins(scene(disturbances={"ideal": True}).disturbances)
+    ideal = msgspec.to_builtins(make_scene(disturbances={"ideal": True}).disturbances)
     expected = msgspec.to_builtins(msgspec.convert(SWITCHED_OFF, Disturbances))
     assert ideal == expected
 
@@ -81,7 +81,7 @@ def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
 @pytest.mark.parametrize("key", sorted(SWITCHED_OFF))
 @pytest.mark.parametrize("word", ["off", False])
 def test_each_disturbance_can_be_switched_off_alone(key: str, word: object) -> None:
-    disturbances = msgspec.to_builtins(scene(disturbances={key: word}).disturbances)
+    disturbances = msgspec.to_builtins(make_scene(disturbances={key: word}).disturbances)
     expected = {
         **msgspec.to_builtins(Disturbances()),
         key: msgspec.to_builtins(msgspec.convert(SWITCHED_OFF, Disturbances))[key],
@@ -90,19 +90,19 @@ def test_each_disturbance_can_be_switched_off_alone(key: str, word: object) -> N
 
 
 def test_overrides_merge_with_the_rig_and_twice_is_once(rig: Instrument) -> None:
-    s = scene(object_distance_mm=450.0, grid={"columns": 11}, burst={"pulses": 4}, stage={"speed_mm_s": 10.0})
+    s = make_scene(object_distance_mm=450.0, grid={"columns": 11}, burst={"pulses": 4}, stage={"speed_mm_s": 10.0})
     once = apply_scene(rig, s)
     assert (once.grid.columns, once.grid.rows) == (11, rig.grid.rows)
     assert (once.burst.pulses, once.burst.period_us) == (4, rig.burst.period_us)
     assert (once.stage.speed_mm_s, once.geometry.object_distance_mm) == (10.0, 450.0)
     assert apply_scene(once, s) == once
-    assert apply_scene(rig, scene()) == rig
+    assert apply_scene(rig, make_scene()) == rig
 
 
 @pytest.mark.parametrize("grid", [{"columns": "many"}, {"columns": 9000}, {"step_x_mm": -1.0}])
 def test_an_invalid_override_is_refused(rig: Instrument, grid: dict[str, Any]) -> None:
     with pytest.raises(ConfigError) as caught:
-        apply_scene(rig, scene(grid=grid))
+        apply_scene(rig, make_scene(grid=grid))
     assert next(iter(grid)) in str(caught.value)
 
 

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.pipeline import Pipeline
 from polysight.store.scan_folder import ScanFolder
@@ -13,12 +13,12 @@ from polysight_shared.errors import ConfigError
 from polysight_simulators.scene import Scene, decode_scene, reference_cube, simulate, synced_cube
 from polysight_simulators.scene.shapes import ENTRY_POINT_GROUP
 
-RIG = published_rig()
+RIG = load_published_rig()
 GRID = {"columns": 9, "rows": 5, "step_x_mm": 6.0, "step_y_mm": 6.0}
 BALL = {"kind": "sphere", "centre_mm": [4.0, -6.0], "radius_mm": 110.0, "metal": True}
 
 
-def scene(**content: object) -> Scene:
+def make_scene(**content: object) -> Scene:
     return decode_scene({"name": "shapes", "grid": GRID, **content}, "test")
 
 
@@ -39,8 +39,8 @@ def worlds_entry_point(tmp_path, monkeypatch):
 )
 def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
     place = {"centre_mm": [10.0, -4.0], "size_mm": [60.0, 50.0], **medium}
-    of_shapes = reference_cube(RIG, scene(shapes=[{"kind": "plate", **place}]))
-    of_plates = reference_cube(RIG, scene(plates=[{"name": "plate", **place}]))
+    of_shapes = reference_cube(RIG, make_scene(shapes=[{"kind": "plate", **place}]))
+    of_plates = reference_cube(RIG, make_scene(plates=[{"name": "plate", **place}]))
     ratios = []
     for name in of_shapes:
         spectrum = of_shapes[name]
@@ -54,7 +54,7 @@ def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
 
 @pytest.mark.usefixtures("worlds_entry_point")
 def test_a_recorded_scan_of_a_sphere_is_processed_to_its_samples(tmp_path):
-    ball = scene(shapes=[BALL]).with_disturbances(direct_snr_db="off")
+    ball = make_scene(shapes=[BALL]).with_disturbances(direct_snr_db="off")
     folder = simulate(RIG, ball, tmp_path / "scan")
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     assert truth["shapes"][0]["radius_mm"] == 110
@@ -71,7 +71,7 @@ def test_a_recorded_scan_of_a_sphere_is_processed_to_its_samples(tmp_path):
 def test_a_scene_with_shapes_names_the_missing_package(monkeypatch):
     monkeypatch.setattr("polysight_simulators.scene.shapes.entry_points", lambda **_: [])
     with pytest.raises(ConfigError, match="worlds"):
-        reference_cube(RIG, scene(shapes=[BALL]))
+        reference_cube(RIG, make_scene(shapes=[BALL]))
 
 
 @pytest.mark.parametrize(
@@ -89,4 +89,4 @@ def test_a_scene_with_shapes_names_the_missing_package(monkeypatch):
 )
 def test_shapes_that_cannot_be_are_refused(wrong):
     with pytest.raises(ConfigError):
-        scene(shapes=[{**BALL, **wrong}])
+        make_scene(shapes=[{**BALL, **wrong}])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec import convert
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.messages import Capture, RowFinished, RunStarted, RunStopped, ScanId, unpack_event
@@ -17,7 +17,7 @@ from polysight_shared.raster import FIRST_PULSE_DELAY_S, plan_raster
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm, simulate
 from polysight_simulators.scene.layouts import make_scan_id
 
-RIG = published_rig()
+RIG = load_published_rig()
 RAW: dict[str, Any] = {
     "name": "two small plates",
     "seed": 9,

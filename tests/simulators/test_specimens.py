@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import Instrument
 from polysight_simulators.scene import Scene, SimulatedRig, apply_scene, decode_scene, draw_specimens, simulate, truth
 from polysight_simulators.scene.scene_file import facets
 
-RIG = published_rig()
+RIG = load_published_rig()
 PLATE = {"name": "a", "centre_mm": [30.0, -20.0], "size_mm": [45.0, 30.0], "permittivity": [4.0, 0.4]}
 SMALL = {"columns": 3, "rows": 2, "step_x_mm": 10.0, "step_y_mm": 10.0}
 
 
-def scene(**tables: Any) -> Scene:
+def make_scene(**tables: Any) -> Scene:
     return decode_scene({"name": "t", "grid": SMALL, "plates": [PLATE], **tables}, "t")
 
 
@@ -25,7 +25,7 @@ def scene(**tables: Any) -> Scene:
 
 
 def test_permittivities_have_the_given_spread() -> None:
-    many = draw_specimens(scene(plates=[PLATE] * 2000, specimen_spread=[0.03, 0.5]))
+    many = draw_specimens(make_scene(plates=[PLATE] * 2000, specimen_spread=[0.03, 0.5]))
     real, loss = np.array([p.permittivity for p in many.plates]).T
     assert real.mean() == pytest.approx(4.0, rel=0.005)
     assert real.std() / 4.0 == pytest.approx(0.03, rel=0.1)
@@ -35,13 +35,13 @@ def test_permittivities_have_the_given_spread() -> None:
 
 
 def test_draws_depend_on_seed_and_index_and_repeating_changes_nothing() -> None:
-    two = scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], plane_tilt_deg=[0.5, 0.2], plane_shift_mm=2.0)
+    two = make_scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], plane_tilt_deg=[0.5, 0.2], plane_shift_mm=2.0)
     drawn = draw_specimens(two)
     assert draw_specimens(drawn) == drawn == draw_specimens(two)
     assert drawn.plates[0].permittivity != drawn.plates[1].permittivity
-    other_seed = scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], seed=2)
+    other_seed = make_scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], seed=2)
     assert draw_specimens(other_seed).plates[0].permittivity != drawn.plates[0].permittivity
-    assert draw_specimens(scene()) == scene()
+    assert draw_specimens(make_scene()) == make_scene()
 
 
 def test_layers_vary_but_air_and_metal_do_not() -> None:
@@ -52,7 +52,7 @@ def test_layers_vary_but_air_and_metal_do_not() -> None:
     ]
     bare = {key: value for key, value in PLATE.items() if key != "permittivity"}
     plates = [{**bare, "layers": layers}, {**bare, "metal": True}]
-    stack, metal = draw_specimens(scene(plates=plates, specimen_spread=[0.05, 0.3])).plates
+    stack, metal = draw_specimens(make_scene(plates=plates, specimen_spread=[0.05, 0.3])).plates
     assert stack.layers[1].permittivity == (1.0, 0.0)
     assert stack.layers[0].permittivity != (5.5, 0.05)
     assert stack.layers[2].permittivity != (9.0, 18.0)
@@ -61,18 +61,18 @@ def test_layers_vary_but_air_and_metal_do_not() -> None:
 
 def test_shift_and_tilt_of_the_plane_apply_to_its_plates_and_points() -> None:
     point = {"position_mm": [100.0, 0.0], "height_mm": 1.0}
-    drawn = draw_specimens(scene(points=[point], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0))
+    drawn = draw_specimens(make_scene(points=[point], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0))
     x, y = np.tan(np.radians([1.0, -0.5]))
     assert drawn.plates[0].tilt_deg == pytest.approx((1.0, -0.5))
     assert drawn.plates[0].height_mm == pytest.approx(2.0 + 30.0 * x - 20.0 * y)
     assert drawn.points[0].height_mm == pytest.approx(3.0 + 100.0 * x)
     turned = {**PLATE, "tilt_deg": [-1.0, 0.5], "height_mm": -2.0}
-    flat = draw_specimens(scene(plates=[turned], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0)).plates[0]
+    flat = draw_specimens(make_scene(plates=[turned], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0)).plates[0]
     assert flat.tilt_deg == pytest.approx((0.0, 0.0))
 
 
 def test_facets_fill_the_plate_and_have_the_given_roughness() -> None:
-    plate = scene(plates=[{**PLATE, "rough_mm": 0.2, "rough_length_mm": 1.0}]).plates[0]
+    plate = make_scene(plates=[{**PLATE, "rough_mm": 0.2, "rough_length_mm": 1.0}]).plates[0]
     drawn = facets(plate, 0, 1)
     assert drawn.height_m.shape == (30, 45)
     assert drawn.height_m.std() == pytest.approx(0.2e-3, rel=0.05)
@@ -85,7 +85,7 @@ def test_facets_fill_the_plate_and_have_the_given_roughness() -> None:
 
 
 def test_truth_json_contains_the_drawn_values(tmp_path: Path) -> None:
-    real = scene(
+    real = make_scene(
         plates=[{**PLATE, "tilt_deg": [0.4, 0.0], "rough_mm": 0.1}],
         specimen_spread=[0.05, 0.5],
         plane_shift_mm=1.0,
@@ -104,23 +104,23 @@ def test_truth_json_contains_the_drawn_values(tmp_path: Path) -> None:
     assert content["scene"]["disturbances"]["leakage_h"] == [0.0, 0.07]
     assert content["scene"]["disturbances"]["direct_loss_db"] == "absent"
     assert content["scene"]["plane_shift_mm"] == 1.0
-    assert truth(RIG, scene(), 1)["plates"][0]["permittivity"] == [4.0, 0.4]
+    assert truth(RIG, make_scene(), 1)["plates"][0]["permittivity"] == [4.0, 0.4]
 
 
-def polarimetry(rig: Instrument = RIG, **disturbances: Any) -> tuple[Any, Any, Any]:
-    p = apply_scene(rig, scene(disturbances=disturbances)).polarimetry
+def read_polarimetry(rig: Instrument = RIG, **disturbances: Any) -> tuple[Any, Any, Any]:
+    p = apply_scene(rig, make_scene(disturbances=disturbances)).polarimetry
     return p.leakage_h, p.leakage_v, p.leakage_std
 
 
 def test_the_rig_contains_leakage_as_measured() -> None:
     was = (RIG.polarimetry.leakage_h, RIG.polarimetry.leakage_v, RIG.polarimetry.leakage_std)
-    assert polarimetry(leakage_h=[0.0, 0.08]) == was, "never measured: the rig file stays as it is"
-    assert polarimetry(ideal=True) == ((0.0, 0.0), (0.0, 0.0), 0.0), "an ideal rig is known"
-    h, v, std = polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.003)
+    assert read_polarimetry(leakage_h=[0.0, 0.08]) == was, "never measured: the rig file stays as it is"
+    assert read_polarimetry(ideal=True) == ((0.0, 0.0), (0.0, 0.0), 0.0), "an ideal rig is known"
+    h, v, std = read_polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.003)
     assert std == 0.003
     error = np.array([*h, *v]) - [0.0, 0.08, 0.03, 0.0]
     assert 0 < np.abs(error).max() < 5 * 0.003
-    assert polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.0)[:2] == (
+    assert read_polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.0)[:2] == (
         (0.0, 0.08),
         (0.03, 0.0),
     )
@@ -129,7 +129,7 @@ def test_the_rig_contains_leakage_as_measured() -> None:
 def test_measured_leakage_has_its_standard_error() -> None:
     errors = []
     for seed in range(200):
-        drawn_scene = scene(seed=seed, disturbances={"ideal": True, "leakage_measured": 0.01})
+        drawn_scene = make_scene(seed=seed, disturbances={"ideal": True, "leakage_measured": 0.01})
         p = apply_scene(RIG, drawn_scene).polarimetry
         assert apply_scene(apply_scene(RIG, drawn_scene), drawn_scene).polarimetry == p
         errors += [*p.leakage_h, *p.leakage_v]
@@ -140,6 +140,8 @@ def test_measured_leakage_has_its_standard_error() -> None:
 def test_the_direct_path_is_stronger_weaker_or_absent(loss_db: Any, gain: float) -> None:
     def direct(loss: Any) -> np.ndarray:
         disturbances = {"ideal": True, "direct_loss_db": loss}
-        return SimulatedRig(RIG, scene(plates=[], disturbances=disturbances)).signals("RH", np.zeros(1), np.zeros(1))
+        return SimulatedRig(RIG, make_scene(plates=[], disturbances=disturbances)).signals(
+            "RH", np.zeros(1), np.zeros(1)
+        )
 
     assert np.allclose(direct(loss_db), gain * direct(0.0), atol=1e-5)

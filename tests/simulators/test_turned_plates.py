@@ -13,7 +13,7 @@ from polysight_worlds.world import Plate as PlateOfWorlds, World
 THETA = np.radians(55.0)
 
 
-def plate(rise_deg, **material):
+def make_plate(rise_deg, **material):
     return Plate("a", (0.0, 0.0), (45.0, 45.0), tilt_deg=(0.0, rise_deg), **material)
 
 
@@ -27,7 +27,7 @@ def test_metal_receives_what_the_image_of_the_transmitter_sends(rise_deg):
     p_of_receiver = np.array([np.cos(THETA), 0.0, np.sin(THETA)])
     sent = s_axis + p_of_transmitter
     image = 2 * normal * (normal @ sent) - sent
-    h, v = turn_reflection(plate(rise_deg, metal=True), 78e9, np.array(THETA))
+    h, v = turn_reflection(make_plate(rise_deg, metal=True), 78e9, np.array(THETA))
     assert [complex(h).real, complex(v).real] == pytest.approx([image @ s_axis, image @ p_of_receiver], abs=4e-3)
 
 
@@ -47,7 +47,7 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
         images = simulate(world, pixels=30)
         middle = slice(8, 22)
         calls.append(images.v[middle, middle].sum() / images.h[middle, middle].sum())
-        h, v = turn_reflection(plate(rise_deg, **material), 78e9, np.array(THETA))
+        h, v = turn_reflection(make_plate(rise_deg, **material), 78e9, np.array(THETA))
         expected.append(complex(v) / complex(h))
     change = np.array(calls[1:]) / calls[0] - 1
     predicted = np.array(expected[1:]) / expected[0] - 1

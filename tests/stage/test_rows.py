@@ -7,7 +7,7 @@ import itertools
 import random
 
 import pytest
-from tests.support.stage.drivers import edges, motions
+from tests.support.stage.drivers import list_edges, list_motions
 
 from polysight_shared.stage_line import Command, Immediate
 
@@ -20,13 +20,13 @@ def check_row(wires, x0: int, pitch: int, points: int, y: int, width_us: int):
     """The laws that hold for every row, held or not, except the even spacing."""
     times = [w.t_ns for w in wires]
     assert times == sorted(times)
-    rising = [e for e in edges(wires) if e.value]
-    falling = [e for e in edges(wires) if not e.value]
+    rising = [e for e in list_edges(wires) if e.value]
+    falling = [e for e in list_edges(wires) if not e.value]
     assert len(rising) == len(falling) == points
     assert [f.t_ns - r.t_ns for r, f in zip(rising, falling, strict=True)] == [width_us * 1000] * points
     # The motion reported just before each rising edge, at the same time, is at the exact step count.
     for i, edge in enumerate(rising):
-        motion = [m for m in motions(wires[: wires.index(edge)]) if m.t_ns == edge.t_ns][-1]
+        motion = [m for m in list_motions(wires[: wires.index(edge)]) if m.t_ns == edge.t_ns][-1]
         assert (motion.x_um, motion.y_um) == ((x0 + i * pitch) * UM, y * UM)
     return rising
 
@@ -56,16 +56,16 @@ def test_random_rows(stage, seed: int):
         spacing_ns = abs(pitch) / rate * 1e9
         assert all(abs(e.t_ns - first - i * spacing_ns) <= 500 for i, e in enumerate(rising))
         # Constant speed from one pitch before the first point to one pitch after the last.
-        latest = {m.t_ns: m for m in motions(wires)}  # of several at one time, the last counts
+        latest = {m.t_ns: m for m in list_motions(wires)}  # of several at one time, the last counts
         cruise = [m for t, m in latest.items() if first - spacing_ns - 500 <= t <= rising[-1].t_ns]
         sign = 1 if pitch > 0 else -1
         assert all(m.vx_um_s == sign * rate * UM for m in cruise)
         assert cruise[0].x_um == (x0 - pitch) * UM
         # At rest the reported motion is where the stage says it is.
-        last = motions(wires)[-1]
+        last = list_motions(wires)[-1]
         assert (last.vx_um_s, last.x_um, last.y_um) == (0, done.integer("x") * UM, y * UM)
     done, wires = stage.motion("MOVE", 0, 0, 10_000)
-    assert (motions(wires)[-1].x_um, motions(wires)[-1].y_um) == (0, 0)
+    assert (list_motions(wires)[-1].x_um, list_motions(wires)[-1].y_um) == (0, 0)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -86,7 +86,7 @@ def test_hold_resumes_on_the_exact_grid(stage, seed: int):
         stage.rx(bytes([Immediate.HOLD]))
         stage.run_ms(600)
         hold_count += stage.status().fields["state"] == "hold"
-        assert motions(stage.wires)[-1].vx_um_s == 0
+        assert list_motions(stage.wires)[-1].vx_um_s == 0
         stage.rx(Immediate.RESUME.sent)
     stage.run_until_rest()
     (done,) = stage.replies()
@@ -102,7 +102,7 @@ def test_ramps_keep_to_the_acceleration(stage, accel: int):
     assert stage.command("SET", 0, accel).kind == "ok"
     stage.wires.clear()
     _, wires = stage.motion("MOVE", 60_000, 20_000, 6000)
-    speeds = {m.t_ns: m.vx_um_s / UM for m in motions(wires) if m.vx_um_s > 0}
+    speeds = {m.t_ns: m.vx_um_s / UM for m in list_motions(wires) if m.vx_um_s > 0}
     for (t0, v0), (t1, v1) in itertools.pairwise(speeds.items()):
         assert abs(v1 - v0) <= 1.1 * accel * (t1 - t0) * 1e-9 + 5
     assert max(speeds.values()) == 6000
@@ -116,21 +116,21 @@ def test_stop_ends_the_triggers_and_keeps_the_position(stage):
     stage.wires.clear()
     assert stage.command("ROW", 20_000, 400, 50, 0, 4000).kind == "ok"
     stage.run_ms(5_500)
-    rising_edges = len([e for e in edges(stage.wires) if e.value])
+    rising_edges = len([e for e in list_edges(stage.wires) if e.value])
     assert 0 < rising_edges < 50
     stage.rx(bytes([Immediate.STOP]))
     stage.run_until_rest()
     assert [r.kind for r in stage.replies()] == ["alarm"]
     status = stage.status()
-    rising = [e for e in edges(stage.wires) if e.value]
+    rising = [e for e in list_edges(stage.wires) if e.value]
     assert rising_edges <= len(rising) <= rising_edges + 1
     assert status.integer("points") == status.integer("pulses") == len(rising)
-    assert motions(stage.wires)[-1].x_um == status.integer("x") * UM
+    assert list_motions(stage.wires)[-1].x_um == status.integer("x") * UM
     stage.run_ms(5_000)
-    assert len([e for e in edges(stage.wires) if e.value]) == len(rising)
+    assert len([e for e in list_edges(stage.wires) if e.value]) == len(rising)
 
 
-def _act(rng: random.Random, sequence: int) -> tuple[str, object]:
+def _draw_action(rng: random.Random, sequence: int) -> tuple[str, object]:
     kind = rng.choices(["command", "byte", "run", "rest", "press", "slip", "reset"], [40, 15, 30, 10, 2, 2, 1])[0]
     if kind == "command":
         x = rng.randint(-500, 20_000)
@@ -175,7 +175,7 @@ def test_same_words_and_same_wires(both, seed: int):
     sequence = 2
     for _ in range(120):
         sequence += rng.random() < 0.9
-        script.append(_act(rng, sequence))
+        script.append(_draw_action(rng, sequence))
     for i, (name, argument) in enumerate(script):
         if isinstance(argument, tuple):
             arguments = argument

@@ -21,24 +21,24 @@ SKETCH = REPO / "arduino_stage"
 PAGE = (REPO / "docs" / "spec" / "stage-line.md").read_text(encoding="utf-8")
 
 
-def constants(name: str) -> dict[str, int]:
+def read_constants(name: str) -> dict[str, int]:
     """`constexpr` integers of a header."""
     text = (SKETCH / name).read_text(encoding="ascii")
     definitions = re.findall(r"\b([A-Z_][A-Z0-9_]+) = (-?\d+)", text)
     return {k: int(v) for k, v in definitions}
 
 
-def pins(text: str) -> dict[str, int]:
+def read_pins(text: str) -> dict[str, int]:
     return {k: int(v) for k, v in re.findall(r"\b(?:PIN_)?([A-Z_]+) = (\d+)", text)}
 
 
 def test_pinout():
     """Pins are those of the published rig and additional ones; the emulated board has the same."""
     published = {"TRIGGER": 2, "LEFT_PUL": 3, "LEFT_DIR": 8, "RIGHT_PUL": 4, "RIGHT_DIR": 9, "X_PUL": 5, "X_DIR": 10}
-    board = pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
+    board = read_pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
     assert published.items() <= board.items()
     assert len(set(board.values())) == len(board)
-    emulated = pins(
+    emulated = read_pins(
         re.findall(
             r"enum (\{ TRIGGER.*?\});", (REPO / "simulators/polysight_simulators/uno/rig.c").read_text(), re.DOTALL
         )[0]
@@ -56,8 +56,8 @@ def test_parameters_and_bytes():
 
 
 def test_limits():
-    protocol = constants("protocol.h")
-    board = constants("board.h")
+    protocol = read_constants("protocol.h")
+    board = read_constants("board.h")
     assert protocol["MAX_LINE_BYTES"] == stage_line.MAX_LINE_BYTES
     assert protocol["PROTOCOL_VERSION"] == stage_line.PROTOCOL_VERSION
     assert f'"{stage_python.FIRMWARE}"' in (SKETCH / "protocol.h").read_text(encoding="ascii")
@@ -78,7 +78,7 @@ def test_limits():
 
 
 def test_defaults_are_those_of_the_rig_file():
-    board = constants("board.h")
+    board = read_constants("board.h")
     stage = Stage(port="")
     k = stage.steps_per_mm
     assert board["STEPS_PER_MM"] == k

@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.tables import to_builtins
@@ -23,7 +23,7 @@ SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm =
 @pytest.mark.usefixtures("uno_programs")
 def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
     """Every row is committed, and the radars measured the plate from the planned positions, also between triggers."""
-    rig = published_rig()
+    rig = load_published_rig()
     replace = msgspec.structs.replace
     rig = replace(
         rig,

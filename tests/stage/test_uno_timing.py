@@ -25,19 +25,19 @@ MARGIN = 16
 IDE_COMPILERS = (".arduino15/packages/arduino/tools/avr-gcc/*/bin", "arduino-*/hardware/tools/avr/bin")
 
 
-def other_compilers() -> list[Path]:
+def list_other_compilers() -> list[Path]:
     """Folders with an avr-gcc of the Arduino IDE, and those that POLYSIGHT_AVR_GCC lists, separated by colons."""
     named = [Path(p) for p in os.environ.get("POLYSIGHT_AVR_GCC", "").split(":") if p]
     return named + [compiler for pattern in IDE_COMPILERS for compiler in sorted(Path.home().glob(pattern))]
 
 
-def documented_cycles() -> int:
+def read_documented_cycles() -> int:
     match = re.search(r"// Measured worst case: (\d+) cycles", (SKETCH / "hal_uno.cpp").read_text(encoding="ascii"))
     assert match is not None
     return int(match[1])
 
 
-def busiest_step(host: Host) -> int:
+def measure_busiest_step(host: Host) -> int:
     """The longest step interrupt of ramps, rows and slants at the highest rate, with bytes coming in; cycles."""
     host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
     host.set(Parameter.TRIGGER, 1)
@@ -68,17 +68,17 @@ def busiest_step(host: Host) -> int:
 
 def test_interrupt_cost(host):
     """The step interrupt fits between two steps at the highest rate and takes as long as its comment says."""
-    most = busiest_step(host)
-    assert documented_cycles() - 60 <= most <= documented_cycles() <= HZ // TOP_RATE - MARGIN
+    most = measure_busiest_step(host)
+    assert read_documented_cycles() - 60 <= most <= read_documented_cycles() <= HZ // TOP_RATE - MARGIN
 
 
-@pytest.mark.parametrize("folder", other_compilers() or [None])
+@pytest.mark.parametrize("folder", list_other_compilers() or [None])
 def test_interrupt_cost_with_another_compiler(make_uno, folder: Path | None):
     """The same for the image that another avr-gcc makes."""
     if folder is None:
         pytest.skip("no other avr-gcc: the Arduino IDE's is looked for in ~/.arduino15, others in POLYSIGHT_AVR_GCC")
     host = Host(make_uno(start=(300, 250), image=compile_firmware(folder))).ready()
-    assert busiest_step(host) <= HZ // TOP_RATE - MARGIN
+    assert measure_busiest_step(host) <= HZ // TOP_RATE - MARGIN
 
 
 def test_top_rate_is_kept(host):

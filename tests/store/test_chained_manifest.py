@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.store.facts import load_facts, parse_fact
-from tests.support.store.plain_scan import errors, write_scan
+from tests.support.store.plain_scan import list_errors, write_scan
 
 from polysight.store import manifest
 from polysight.store.manifest import ManifestWriter, encode_line, parse
@@ -16,7 +16,7 @@ from polysight.store.validation import to_text, validate
 SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
 
 
-def chain_lines(path: Path, facts=SOME) -> list[bytes]:
+def make_chain_lines(path: Path, facts=SOME) -> list[bytes]:
     """The lines that a writer makes of facts."""
     with ManifestWriter(path / MANIFEST, create=True) as writer:
         for fact in facts:
@@ -26,7 +26,7 @@ def chain_lines(path: Path, facts=SOME) -> list[bytes]:
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory) -> list[bytes]:
-    return chain_lines(tmp_path_factory.mktemp("chain"))
+    return make_chain_lines(tmp_path_factory.mktemp("chain"))
 
 
 @given(st.integers(0, len(SOME) - 2), st.integers(1, 3))
@@ -52,7 +52,7 @@ def test_repeated_lines_are_noticed(lines):
 
 @pytest.mark.parametrize("damage", [b"{}\n", b"\x00\xff\n", b""])
 def test_a_damaged_line_is_one_fault_and_the_chain_continues_after_it(tmp_path, damage):
-    lines = chain_lines(tmp_path)
+    lines = make_chain_lines(tmp_path)
     remaining = [*lines[:3], damage, *lines[4:]]
     (tmp_path / MANIFEST).write_bytes(b"".join(remaining))
     with ManifestWriter(tmp_path / MANIFEST, create=False) as writer:
@@ -92,7 +92,7 @@ def remove_line(folder: Path, *numbers: int) -> None:
 def test_a_missing_line_of_a_row_is_an_error_that_names_line_and_row(scan):
     assert validate(scan) == []
     remove_line(scan, 4)
-    error_text = "\n".join(errors(scan))
+    error_text = "\n".join(list_errors(scan))
     assert "manifest.jsonl line 4" in error_text
     assert "row 2 " in error_text
     error_text = ScanFolder.load(scan)
@@ -105,7 +105,7 @@ def test_a_missing_line_of_the_last_row_is_detected_by_the_end(scan):
     facts = [json.loads(line) for line in lines]
     plain = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
     (scan / MANIFEST).write_bytes(b"".join(encode_line(f) for f in plain if f.get("row") != 3))
-    error_text = "\n".join(errors(scan))
+    error_text = "\n".join(list_errors(scan))
     assert "scan_ended counts 4 rows" in error_text
     assert "row 3 " in error_text
 
@@ -117,7 +117,7 @@ def test_a_row_taken_again_makes_the_gap_a_note(scan):
         writer.append({"fact": "scan_resumed", "rows_missing": 1})
         writer.append({**lost_row, "take": 2})
         writer.append({"fact": "scan_ended", "exit_status": "success", "reason": "", "rows_committed": 4})
-    assert errors(scan) == []
+    assert list_errors(scan) == []
     assert "line 4" in "\n".join(map(to_text, validate(scan)))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import tomli_w
 from tests.support.page.live_view import add_fact, begin_history
-from tests.support.rigs import rig_table
+from tests.support.rigs import load_rig_table
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import resume_scan
@@ -26,12 +26,12 @@ from polysight_shared.tables import decode, to_builtins
 
 @pytest.fixture(scope="module")
 def begun() -> Instrument:
-    table = rig_table()
+    table = load_rig_table()
     table["radar"] |= {"servers": {b["name"]: f"192.168.33.1:{70 + k}" for k, b in enumerate(table["boards"])}}
     return decode(table, Instrument, "begun")
 
 
-def leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+def list_leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     if isinstance(node, dict):
         items = node.items()
     elif isinstance(node, list):
@@ -41,10 +41,10 @@ def leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[
     if items is None:
         yield path, node
     for key, value in items or ():
-        yield from leaves(value, (*path, key))
+        yield from list_leaves(value, (*path, key))
 
 
-def other(value: Any) -> Any:
+def make_other_value(value: Any) -> Any:
     if isinstance(value, bool):
         return not value
     return value + (1 if isinstance(value, int | float) else "1")
@@ -55,7 +55,7 @@ def may_change(path: tuple[str | int, ...]) -> bool:
     return board or path[0] in ("pi", "limits") or path[:2] == ("radar", "servers")
 
 
-def does_not_matter(path: tuple[str | int, ...]) -> bool:
+def is_without_effect(path: tuple[str | int, ...]) -> bool:
     """The scan continues with its own settings that the host does not use (the stage's port), or with a copy."""
     return path[0] == "calibration" or path in (("stage", "port"), ("stage", "baud"))
 
@@ -64,12 +64,12 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
     """Each number, text and switch of the rig file, changed alone."""
     taken = 0
     refused = 0
-    for path, value in leaves(to_builtins(begun)):
+    for path, value in list_leaves(to_builtins(begun)):
         table = copy.deepcopy(to_builtins(begun))
         node: Any = table
         for key in path[:-1]:
             node = node[key]
-        node[path[-1]] = other(value)
+        node[path[-1]] = make_other_value(value)
         try:
             given_rig = decode(table, Instrument, "given")
         except ConfigError:
@@ -79,14 +79,14 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
             check_same_scan(begun, given_rig, "mine.toml")
             assert with_connection(begun, extract_connection(given_rig)) == given_rig
             taken += 1
-        elif does_not_matter(path):
+        elif is_without_effect(path):
             check_same_scan(begun, given_rig, "mine.toml")
             assert with_connection(begun, extract_connection(given_rig)) == begun
         else:
             name = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
             with pytest.raises(ConfigError) as e:
                 check_same_scan(begun, given_rig, "mine.toml")
-            assert f"{name} is {value!r} in the scan and {other(value)!r} there" in e.value.what
+            assert f"{name} is {value!r} in the scan and {make_other_value(value)!r} there" in e.value.what
             refused += 1
     assert taken > 20
     assert refused > 40

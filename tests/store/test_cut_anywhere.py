@@ -34,15 +34,15 @@ def find_journal(scan: SmallScan) -> Path:
     return next(scan.journals.glob("*.journal"))
 
 
-def faults(scan: SmallScan, severity: str = "error") -> list[str]:
+def list_faults(scan: SmallScan, severity: str = "error") -> list[str]:
     return [to_text(f) for f in validate(scan.path) if f.level == severity]
 
 
 def resume(scan: SmallScan, undisturbed_scan, image: bool = False, damaged_lines: int = 0) -> set[int]:
     """Resume; check that the scan is like an undisturbed one. Returns the rows that were retaken."""
     assert scan.run().exit_status == "success"
-    notes = faults(scan, "note")
-    assert faults(scan) == []
+    notes = list_faults(scan, "note")
+    assert list_faults(scan) == []
     assert len(notes) == damaged_lines, notes
     assert scan.rows() == undisturbed_scan.digests
     if image:
@@ -69,8 +69,8 @@ def test_manifest(undisturbed_scan, tmp_path, sample, record, tail):
     for cut in sample(range(len(last)), 8):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(lines_before + last[:cut] + tail)
-        assert faults(scan) == []
-        torn = [n for n in faults(scan, "note") if "torn" in n]
+        assert list_faults(scan) == []
+        torn = [n for n in list_faults(scan, "note") if "torn" in n]
         assert len(torn) == bool(last[:cut] + tail)
         assert resume(scan, undisturbed_scan, image=not cut) == ({2} if record == -2 else set())
 
@@ -84,7 +84,7 @@ def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
         turn(scan.path / "manifest.jsonl", 8 * offset + bit)
         # The line end: this line and the next are one
         end = bit // 8 == len(whole_lines[record]) - 1
-        named = faults(scan) + [n for n in faults(scan, "note") if "torn" in n or "damaged" in n]
+        named = list_faults(scan) + [n for n in list_faults(scan, "note") if "torn" in n or "damaged" in n]
         assert len(named) == 1
         # The last line is cut off, others stay where they are
         is_kept = record == -1 or (record == -2 and end)
@@ -115,10 +115,10 @@ def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "events.msgpack").write_bytes(raw[:cut] + tail)
         if record == 1:
-            assert faults(scan) == []
+            assert list_faults(scan) == []
         else:
-            assert "resume fetches" in faults(scan)[0]
-        assert len([n for n in faults(scan, "note") if "torn" in n]) == (cut > start or bool(tail))
+            assert "resume fetches" in list_faults(scan)[0]
+        assert len([n for n in list_faults(scan, "note") if "torn" in n]) == (cut > start or bool(tail))
         assert resume(scan, undisturbed_scan) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
 
@@ -132,7 +132,7 @@ def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
         turn(scan.path / "events.msgpack", bit)
         turned = (scan.path / "events.msgpack").read_bytes()
         readable = not read_events(scan.path / "events.msgpack").damage
-        assert any("events.msgpack" in f for f in faults(scan)), bit
+        assert any("events.msgpack" in f for f in list_faults(scan)), bit
         if readable:
             continue
         assert resume(scan, undisturbed_scan) == set()
@@ -202,7 +202,7 @@ def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
     for cut in sample([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / name).write_bytes(raw[:cut])
-        assert [name in f for f in faults(scan)] == [True]
+        assert [name in f for f in list_faults(scan)] == [True]
         if suffix == ".bin":
             with refused(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
@@ -219,7 +219,7 @@ def test_bit_of_a_committed_row(undisturbed_scan, tmp_path, sample, suffix):
     for bit in sample(range(8 * (undisturbed_scan.path / name).stat().st_size), 4):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / name, bit)
-        assert [name in f for f in faults(scan)] == [True]
+        assert [name in f for f in list_faults(scan)] == [True]
         assert resume(scan, undisturbed_scan) == {2}
 
 
@@ -231,5 +231,5 @@ def test_row_that_is_not_committed_may_be_anything(undisturbed_scan, tmp_path, s
         scan = undisturbed_scan.copy(tmp_path / "s")
         (scan.path / "manifest.jsonl").write_bytes(b"".join(whole_lines[:-2]))
         (scan.path / f"raw/RV/0002{suffix}").write_bytes(raw[:cut])
-        assert faults(scan) == []
+        assert list_faults(scan) == []
         assert resume(scan, undisturbed_scan) == {2}

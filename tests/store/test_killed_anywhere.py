@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import FaultyDisk, Killed
-from tests.support.store.plain_scan import errors
+from tests.support.store.plain_scan import list_errors
 from tests.support.store.small_scan import Samples, SmallScan
 
 from polysight.store.scan_folder import ScanFolder
@@ -37,7 +37,7 @@ def run_until_fault(scan: SmallScan, disk: FaultyDisk) -> bool:
             scan.run()
     except Killed:
         if scan.begun:
-            assert errors(scan.path) == []
+            assert list_errors(scan.path) == []
             assert scan.acknowledged <= set(ScanFolder.load(scan.path).committed_rows())
         return True
     return False

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.jobs.process import process_rows
 from polysight.store.open import open_source
@@ -21,7 +21,7 @@ from polysight_simulators.scene import AuthorsLayout
 COLUMNS = 9
 ROWS = 4
 PULSES = 3
-BASE = published_rig()
+BASE = load_published_rig()
 RIG = msgspec.structs.replace(
     BASE,
     grid=Grid(columns=COLUMNS, rows=ROWS, step_x_mm=2.0, step_y_mm=2.0),
@@ -63,7 +63,7 @@ def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False)
     return layout.folder, sent
 
 
-def packets(*numbers):
+def list_byte_ranges(*numbers):
     return [(k * PACKET, (k + 1) * PACKET) for k in numbers]
 
 
@@ -89,7 +89,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             skipped[board, row.index] = set(missing_positions.tolist())
             remaining = (plan.columns - missing_positions.size) * BURST // PACKET
             numbers = np.flatnonzero(rng.random(remaining) < 0.03)
-            losses[board, row.index] = packets(*numbers.tolist())
+            losses[board, row.index] = list_byte_ranges(*numbers.tolist())
     folder, sent = record(tmp_path, skipped, losses, zero_filling, by_columns)
     scan = open_source(folder, BASE)
     assert list(scan.rows()) == list(range(plan.rows))
@@ -116,7 +116,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
 @pytest.mark.parametrize("lost", [{3}, {0}, {4, 5}, {75}], ids=str)
 def test_lost_packets_are_masked_whatever_the_first_number(tmp_path, zero_filling, first_sequence, lost):
     assert -(-COLUMNS * BURST // PACKET) == 76
-    folder, sent = record(tmp_path, lost={("RV", 2): packets(*lost)}, zero_filling=zero_filling)
+    folder, sent = record(tmp_path, lost={("RV", 2): list_byte_ranges(*lost)}, zero_filling=zero_filling)
     log = folder / "RV" / "0_2_log.csv"
     numbered = [line.partition(",") for line in log.read_text().splitlines()]
     log.write_text("".join(f"{int(number) - 1 + first_sequence},{rest}\n" for number, _, rest in numbered))
@@ -233,7 +233,7 @@ def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling, first_s
 
 
 def test_without_a_log_zeros_are_lost_packets_and_a_short_row_is_masked(tmp_path):
-    folder, sent = record(tmp_path, lost={("RV", 1): packets(3, 4, 10)})
+    folder, sent = record(tmp_path, lost={("RV", 1): list_byte_ranges(3, 4, 10)})
     for log in (folder / "RV").glob("*_log.csv"):
         log.unlink()
     short = folder / "RV" / "0_0.bin"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.cli.options import rig_file
 from polysight.store.open import open_source
@@ -22,10 +22,10 @@ SAMPLES = 256
 
 @pytest.fixture(scope="module")
 def base():
-    return published_rig()
+    return load_published_rig()
 
 
-def _settings(**changes):
+def _make_settings(**changes):
     chirp = {
         "f0": 76.01e9,
         "slope": 38.816929e12,
@@ -61,7 +61,7 @@ def write(tmp_path):
     def make(**changes):
         folder = tmp_path / "unsynced" / "scan1"
         folder.mkdir(parents=True)
-        (folder / "data_collection_cfg.json").write_text(json.dumps(_settings(**changes)))
+        (folder / "data_collection_cfg.json").write_text(json.dumps(_make_settings(**changes)))
         return folder
 
     return make
@@ -219,7 +219,7 @@ def test_the_packaged_rig_file_is_that_of_published_data_alone(write, tmp_path, 
 def test_synchronised_cubes_are_read(tmp_path, base):
     folder = tmp_path / "raw" / "scan1"
     folder.mkdir(parents=True)
-    (folder / "data_collection_cfg.json").write_text(json.dumps(_settings()))
+    (folder / "data_collection_cfg.json").write_text(json.dumps(_make_settings()))
     rng = np.random.default_rng(0)
     cube = (rng.standard_normal((4, ROWS, COLUMNS, SAMPLES)) * (1 + 1j)).astype(np.complex64)
     for board in ("RH", "RV"):

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from tests.support.paths import POLYSIGHT, RIG_FILE
 from tests.support.refusals import refused
-from tests.support.scenes import small_scene
+from tests.support.scenes import write_small_scene
 from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import FaultyDisk
-from tests.support.store.plain_scan import errors
+from tests.support.store.plain_scan import list_errors
 
 from polysight.cli.main import main
 from polysight.jobs.live_scan import resume
@@ -33,10 +33,10 @@ from polysight_shared.errors import ConfigError, DataError, ErrorCode, ScanError
 
 ROWS = 4
 BOARDS = 2
-SCENE = small_scene(8, ROWS, metal=False)
+SCENE = write_small_scene(8, ROWS, metal=False)
 
 
-def polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
+def run_polysight(*words: object, typed: str = "") -> subprocess.CompletedProcess[str]:
     command = [POLYSIGHT, *map(str, words)]
     return subprocess.run(command, input=typed, capture_output=True, text=True, check=False)
 
@@ -49,7 +49,7 @@ def processed_scan(tmp_path_factory) -> Path:
     simulate = [sys.executable, "-m", "polysight_simulators", "simulate", folder / "scene.toml"]
     config = ["--config", RIG_FILE, "--out", folder / "scan"]
     subprocess.run([*simulate, *config], check=True, capture_output=True)
-    assert polysight("image", folder / "scan", "--out", folder / "scan" / "products").returncode == 0
+    assert run_polysight("image", folder / "scan", "--out", folder / "scan" / "products").returncode == 0
     (folder / "scan" / "products" / REPORT).write_text("stands for the rest of the products")
     return folder / "scan"
 
@@ -60,43 +60,43 @@ def scan(processed_scan, tmp_path) -> Path:
     return Path(shutil.copytree(processed_scan, tmp_path / "scan"))
 
 
-def payloads(scan: Path) -> set[Path]:
+def list_payloads(scan: Path) -> set[Path]:
     return set(scan.glob("raw/*/*.bin"))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def read_contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
 
 
 def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     quality = scan / "products" / "quality.json"
     write_json(quality, {**json.loads(quality.read_text()), "key_of_a_later_release": 1})
-    products = contents(scan / "products")
+    products = read_contents(scan / "products")
     digests = find_processed_digests(scan / "products")
-    assert len(payloads(scan)) == ROWS * BOARDS
-    process = polysight("drop-raw", scan, typed="drop\n")
+    assert len(list_payloads(scan)) == ROWS * BOARDS
+    process = run_polysight("drop-raw", scan, typed="drop\n")
     assert process.returncode == 0, process.stderr
     for board in ("RH", "RV"):
         assert f"to be removed: raw/{board}: rows 0-{ROWS - 1} ({ROWS} files)\n" in process.stdout
-    assert not payloads(scan)
+    assert not list_payloads(scan)
     said = json.loads(products.pop("quality.json"))
-    products_before = contents(scan / "products")
+    products_before = read_contents(scan / "products")
     dropped = json.loads(products_before.pop("quality.json"))
     assert dropped.pop("raw_dropped")["scan_id"] == ScanFolder.load(scan).scan_id
     assert (products_before, dropped) == (products, said)
-    products = contents(scan / "products")
+    products = read_contents(scan / "products")
     # Arrivals and gaps stay, where there were any
     assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)
     facts = load_facts(scan, "raw_dropped")
     assert [f["row"] for f in facts] == list(range(ROWS))
     said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
     assert said == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
-    process = polysight("validate", scan)
+    process = run_polysight("validate", scan)
     assert (process.returncode, process.stdout.count("note: raw: ")) == (0, 1)
     assert f"the raw data of {ROWS} rows was dropped after processing into products" in process.stdout
     with refused(ErrorCode.NO_DATA, ROWS):
         resume(scan, DEFAULT, keep_incomplete=False, process=True)
-    assert contents(scan / "products") == products
+    assert read_contents(scan / "products") == products
     assert drop_raw(scan, None, yes=True) == 0
     assert "dropped already" in capsys.readouterr().out
     assert main(["process", str(scan), "--out", str(scan / "products")]) in (0, NoResult.exit_status)
@@ -114,7 +114,7 @@ def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
 
 @pytest.mark.parametrize("what", ["image only", "being made", "being processed", "sample", "no samples", "settings"])
 def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what):
-    state_before = payloads(scan)
+    state_before = list_payloads(scan)
     samples = scan / "samples"
     with ExitStack() as other_items:
         code = ErrorCode.BUSY
@@ -143,7 +143,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             named = "samples.json"
         with refused(code, named):
             drop_raw(scan, None, yes=True)
-    assert payloads(scan) == state_before
+    assert list_payloads(scan) == state_before
     assert not load_facts(scan, "raw_dropped")
 
 
@@ -159,22 +159,22 @@ def test_a_damaged_sample_of_a_dropped_row_is_named_and_costs_this_row(scan, tmp
     assert drop_raw(scan, None, yes=True) == 0
     assert main(["image", str(scan), "--out", str(whole_scan)]) == 0
     flip(scan / "samples" / "RH.npy", row=2)
-    assert errors(scan) == [e for e in errors(scan) if "samples/RH.npy" in e and "row 2" in e] != []
+    assert list_errors(scan) == [e for e in list_errors(scan) if "samples/RH.npy" in e and "row 2" in e] != []
     assert main(["image", str(scan), "--out", str(tmp_path / "less")]) == 0
     assert "rows 2 are left out" in caplog.text
     coverage = json.loads((tmp_path / "less" / "quality.json").read_text())["coverage"]
     assert coverage["rows_absent"] == [2]
-    state_before = contents(scan / "products")
+    state_before = read_contents(scan / "products")
     with refused(ErrorCode.NOT_ENOUGH_DATA, "products"):
         process(scan, scan / "products")
-    assert contents(scan / "products") == state_before
+    assert read_contents(scan / "products") == state_before
     (scan / "samples" / "rows.jsonl").unlink()
     with refused(ErrorCode.NO_DATA, ROWS):
         process(scan, scan / "products")
 
 
 def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
-    state_before = payloads(scan)
+    state_before = list_payloads(scan)
     for typed in ("", "yes\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(ConfigError):
@@ -196,7 +196,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     (scan / "products" / "image.npz").write_bytes(b"half of it")
     with refused(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
-    assert payloads(scan) == state_before
+    assert list_payloads(scan) == state_before
     assert not load_facts(scan, "raw_dropped")
 
 
@@ -205,11 +205,11 @@ def test_only_rows_in_the_products_are_dropped(scan):
     board = next(iter(digests))
     del digests[board][2]
     drop(ScanFolder.load(scan), digests, scan / "products")
-    assert payloads(scan) == {scan / "raw" / board / "0002.bin"}
-    assert errors(scan) == []
+    assert list_payloads(scan) == {scan / "raw" / board / "0002.bin"}
+    assert list_errors(scan) == []
     undropped_file = scan / "raw" / board / "0002.bin"
     undropped_file.write_bytes(b"damaged")
-    assert any("0002.bin" in e for e in errors(scan))
+    assert any("0002.bin" in e for e in list_errors(scan))
 
 
 def test_an_unfinished_scan_keeps_its_rows(scan):
@@ -225,7 +225,7 @@ def test_an_unfinished_scan_keeps_its_rows(scan):
 def test_a_scan_in_use_keeps_its_rows(scan):
     with ScanFolder.load(scan).writer(), refused(ErrorCode.BUSY):
         drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
-    assert len(payloads(scan)) == ROWS * BOARDS
+    assert len(list_payloads(scan)) == ROWS * BOARDS
 
 
 class PowerCut(BaseException):
@@ -255,14 +255,14 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
             drop(ScanFolder.load(scan), digests, scan / "products")
     remaining = ScanFolder.load(scan)
     missing_files = {str(b.file) for row in remaining.committed_rows().values() for b in row.boards.values()} - {
-        str(path.relative_to(scan)) for path in payloads(scan)
+        str(path.relative_to(scan)) for path in list_payloads(scan)
     }
     assert missing_files <= set(dropped_files(remaining))
-    assert errors(scan) == []
+    assert list_errors(scan) == []
     assert find_damaged_rows(remaining) == {}
     drop(ScanFolder.load(scan), digests, scan / "products")
-    assert not payloads(scan)
-    assert errors(scan) == []
+    assert not list_payloads(scan)
+    assert list_errors(scan) == []
     assert [f["row"] for f in load_facts(scan, "raw_dropped")] == list(range(ROWS))
 
 
@@ -297,8 +297,8 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
             (scan / "raw" / board / name).unlink()
     for length in range(0, len(line), 7):
         (scan / MANIFEST).write_bytes(raw[: len(raw) - len(line) + length])
-        assert errors(scan) == []
-    assert len(payloads(scan)) == BOARDS
+        assert list_errors(scan) == []
+    assert len(list_payloads(scan)) == BOARDS
 
 
 def test_a_row_taken_again_is_there_again(scan):
@@ -309,6 +309,6 @@ def test_a_row_taken_again_is_there_again(scan):
         writer.append({**committed, "take": 2})
     folder.reload()
     assert {Path(file).name for file in dropped_files(folder)} == {"0000.bin", "0002.bin", "0003.bin"}
-    assert sum("0001.bin" in e for e in errors(scan)) == BOARDS
+    assert sum("0001.bin" in e for e in list_errors(scan)) == BOARDS
     with refused(ErrorCode.NO_DATA, "3 rows"):
         require_raw(folder)

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.store.open import open_source
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 from polysight_simulators.scene import SimulatedRig, decode_scene, find_lost_bytes, simulate
 
-RIG = published_rig()
+RIG = load_published_rig()
 RAW = {
     "name": "plate",
     "grid": {"columns": 4, "rows": 3, "step_x_mm": 10.0, "step_y_mm": 6.0},

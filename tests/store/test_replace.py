@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from tests.support.capture.records import Record, make_log, make_mask
 from tests.support.refusals import refused
-from tests.support.rigs import rig_with
+from tests.support.rigs import make_rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
-from tests.support.store.plain_scan import errors
+from tests.support.store.plain_scan import list_errors
 
 from polysight.capture import PACKETS_SUFFIX, Evidence, place_record, read_packets, write_index, write_packets
 from polysight.capture.dca1000 import Counters
@@ -25,7 +25,7 @@ from polysight_shared.raster import plan_raster
 
 def scan_with(folder: Path, lost: int | Collection[int], wrong: bool = False) -> tuple[ScanFolder, bytes]:
     """One row of each board, with packets lost and a leftover; `wrong`: all masked, as by an earlier release."""
-    rig = rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
+    rig = make_rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
     size = rig.row_bytes
     frame = rig.frame_bytes
@@ -80,13 +80,13 @@ def test_rows_with_the_same_result_are_not_touched(tmp_path):
 
 def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     scan, data = scan_with(tmp_path / "scan", lost=9, wrong=True)
-    assert errors(scan.path) == []
+    assert list_errors(scan.path) == []
     assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 1
     assert "committed  differently" in capsys.readouterr().out
     assert replace_folder(scan.path, as_json=False) == 0
     assert f"{len(data)} bytes missing before, 1456 now" in capsys.readouterr().out
     scan.reload()
-    assert errors(scan.path) == []
+    assert list_errors(scan.path) == []
     holds(scan, data, [(9 * 1456, 10 * 1456)])
     board = scan.committed_rows()[0].boards["RH"]
     placed = -(-len(data) // 1456) - 1
@@ -123,7 +123,7 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
         with pytest.raises(Killed), FaultyDisk(folder, fault, position, seed=position)():
             replace_rows(scan)
         scan = ScanFolder.load(scan.path)
-        assert errors(scan.path) == [], counting.done[position - 1]
+        assert list_errors(scan.path) == [], counting.done[position - 1]
         replace_rows(scan)
         holds(scan, data, [(9 * 1456, 10 * 1456)])
     # Unclosed files must be reported in this test, not in the next one
@@ -180,4 +180,4 @@ def test_a_row_without_its_packets_is_left(tmp_path):
     (scan.path / f"raw/RH/0000{PACKETS_SUFFIX}").unlink()
     (scan.path / f"raw/RV/0000{PACKETS_SUFFIX}").write_bytes(b"no")
     assert [bool(r.why_unchanged) for r in replace_rows(scan)] == [True, True]
-    assert len(errors(scan.path)) == 2
+    assert len(list_errors(scan.path)) == 2

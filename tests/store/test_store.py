@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from tests.support.acquisition.fake_rig import small_instrument
+from tests.support.acquisition.fake_rig import make_small_instrument
 from tests.support.refusals import refused
 from tests.support.store.facts import load_facts, parse_fact
 from tests.support.store.plain_scan import write_scan
@@ -283,7 +283,7 @@ def test_what_is_cut_off_the_events_is_kept_once(tmp_path):
 
 
 def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
-    instrument = small_instrument()
+    instrument = make_small_instrument()
     for torn in (b"", b'{"fact":"scan_star'):
         (tmp_path / "manifest.jsonl").write_bytes(torn)
         assert ScanFolder.create(tmp_path, instrument, plan_raster(instrument.grid)).committed_rows() == {}

@@ -9,7 +9,7 @@ import pytest
 from tests.support.refusals import refused
 from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
-from tests.support.store.plain_scan import errors
+from tests.support.store.plain_scan import list_errors
 from tests.support.store.small_scan import Samples, SmallScan
 
 from polysight.store import manifest, validation
@@ -104,7 +104,7 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_
         committed = set(ScanFolder.load(scan.path).committed_rows()) if scan.begun else set()
         assert scan.acknowledged <= committed
         if scan.begun:
-            assert errors(scan.path) == []
+            assert list_errors(scan.path) == []
         state_before = scan.rows() if scan.begun else {}
         # There is space again
         assert scan.run().exit_status == "success"

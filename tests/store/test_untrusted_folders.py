@@ -98,7 +98,7 @@ def test_only_bytes_that_were_committed_are_dropped(scan):
     assert not (scan.path / row.boards[other_board].file).exists()
 
 
-def bomb(path: Path, size: int = 6 << 30) -> Path:
+def write_bomb(path: Path, size: int = 6 << 30) -> Path:
     """An archive of 64 KB with an array of 6 GB, by its directory and its header."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
@@ -112,31 +112,31 @@ def bomb(path: Path, size: int = 6 << 30) -> Path:
 @pytest.mark.parametrize("read", [read_image, read_patches, Library.load], ids=["image", "patches", "library"])
 def test_an_archive_that_claims_too_much_is_refused_by_its_size(read, tmp_path):
     with refused(ErrorCode.FILE_TOO_LARGE):
-        read(bomb(tmp_path / "big.npz"))
+        read(write_bomb(tmp_path / "big.npz"))
 
 
-def larger_row(head, runs):
+def enlarge_row(head, runs):
     head["evidence"]["expected"] = 1 << 45
     return runs
 
 
-def overflow(head, _runs):
+def claim_overflow(head, _runs):
     head["runs"] = 1 << 16
     # 2**63 bytes in all: 64 bits call that negative
-    return claims(1 << 16, 0xFFFFFFFF, 0x8000)
+    return claim_runs(1 << 16, 0xFFFFFFFF, 0x8000)
 
 
-def claims(runs: int, packets: int, size: int) -> np.ndarray:
+def claim_runs(runs: int, packets: int, size: int) -> np.ndarray:
     return np.array([(0, 0, packets, size, 0)] * runs, RUN)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        larger_row,
-        overflow,
-        lambda _, runs: claims(len(runs), 0xFFFFFFFF, 0),
-        lambda _, runs: claims(len(runs), 0xFFFFFFFF, 1456),
+        enlarge_row,
+        claim_overflow,
+        lambda _, runs: claim_runs(len(runs), 0xFFFFFFFF, 0),
+        lambda _, runs: claim_runs(len(runs), 0xFFFFFFFF, 1456),
     ],
     ids=["row", "overflow", "empty packets", "many packets"],
 )
@@ -284,7 +284,7 @@ def test_a_netcdf_file_that_claims_too_much_is_refused_by_its_size(tmp_path):
         read_netcdf(tmp_path / "big.nc")
 
 
-def external(f: h5py.File) -> None:
+def link_external(f: h5py.File) -> None:
     f.create_dataset("h", (4,), "u1", external=[("/etc/passwd", 0, 4)])
 
 
@@ -292,7 +292,7 @@ def link_folder(f: h5py.File) -> None:
     f["h"] = h5py.ExternalLink("/etc/other.h5", "/h")
 
 
-@pytest.mark.parametrize("make", [external, link_folder])
+@pytest.mark.parametrize("make", [link_external, link_folder])
 def test_a_netcdf_file_with_arrays_in_other_files_is_refused(make, tmp_path):
     with h5py.File(tmp_path / "a.nc", "w") as f:
         make(f)

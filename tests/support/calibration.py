@@ -12,7 +12,7 @@ from polysight_shared.config import Instrument
 SOURCES = [SourceScan("plate", "scans/plate", True, 7)]
 
 
-def board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardFilter:
+def read_board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardFilter:
     """One receiver's corners, measured with those of the published rig."""
     return BoardFilter(
         corners_khz=[first_khz, second_khz],
@@ -27,11 +27,11 @@ def board_filter(first_khz: float = 180.5, second_khz: float = 355.25) -> BoardF
 
 def filter_file(first_khz: float = 180.5, rv: BoardFilter | None = None) -> FilterFile:
     """Both receivers with the same corners, or the second one with its own."""
-    rh = board_filter(first_khz)
+    rh = read_board_filter(first_khz)
     return FilterFile(**make_header("hpf", SOURCES), boards={"RH": rh, "RV": rv or rh})
 
 
-def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
+def make_metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     """The images of a noisy plate, made with this rig."""
     rng = np.random.default_rng(seed)
     grid = image_grid(rig)
@@ -43,7 +43,7 @@ def metal_reference(rig: Instrument, seed: int = 0) -> PlaneReference:
     return replace(plate, made_with=ImagedWith.from_rig(rig, {}))
 
 
-def remaining(estimate: Leakage, truth: Leakage) -> tuple[float, float]:
+def compute_remaining(estimate: Leakage, truth: Leakage) -> tuple[float, float]:
     """Return the larger cross-polar amplitude and the co-polar ratio's deviation from 1, after correction."""
     residual = np.linalg.solve(estimate.matrix(), truth.matrix())
     crosstalk = max(abs(residual[0, 1] / residual[0, 0]), abs(residual[1, 0] / residual[1, 1]))

@@ -57,7 +57,7 @@ class Mangled:
         return replace(recorded, pieces=split_pieces(words.reshape(-1).view(np.uint8)))
 
 
-def distances(source: Any, findings: Findings) -> list[float]:
+def compute_distances(source: Any, findings: Findings) -> list[float]:
     """Squared distances of the true permittivities in the regions."""
     scene = decode_scene(SCENE, "test")
     plates = truth_plates(truth(source.instrument, scene, scene.seed))
@@ -75,7 +75,7 @@ def distances(source: Any, findings: Findings) -> list[float]:
 ProcessMangled = Callable[..., tuple[Pipeline, Images, Findings]]
 
 
-def processor(source: Source) -> ProcessMangled:
+def make_processor(source: Source) -> ProcessMangled:
     """`process(mangle)`: pipeline, images and findings of the scan with changed words; `of`: of another source."""
     done: dict[Any, tuple[Pipeline, Images, Findings]] = {}
 

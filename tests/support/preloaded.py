@@ -91,7 +91,7 @@ def program_name(words: list[str]) -> str:
     return ""
 
 
-def starts_others(words: list[str]) -> bool:
+def may_start_others(words: list[str]) -> bool:
     """True for a program that may start others of ours, and gets a server; a fork takes as long as a short command."""
     name = program_name(words)
     is_command = name == KILLED_AT or name == "polysight"
@@ -257,10 +257,10 @@ def serve(connection: socket.socket) -> list[str]:
         if os.fork():
             os._exit(0)
         request = Request(*pickle.loads(message))
-        spare = [moved_up(file) for file in files]
+        spare = [move_descriptor_up(file) for file in files]
         for end in (connection, near):
             end.close()
-        if starts_others(request.words):
+        if may_start_others(request.words):
             ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             server = os.fork()
             if not server:
@@ -269,13 +269,13 @@ def serve(connection: socket.socket) -> list[str]:
                 connection = theirs
                 continue
             theirs.close()
-            install(Server(socket.socket(fileno=moved_up(ours.detach())), server))
+            install(Server(socket.socket(fileno=move_descriptor_up(ours.detach())), server))
             atexit.register(Popen.server.close)
-        become(request, spare, moved_up(far.detach()))
+        become(request, spare, move_descriptor_up(far.detach()))
         return request.words
 
 
-def moved_up(file: int) -> int:
+def move_descriptor_up(file: int) -> int:
     """Return a copy of a descriptor that lies above the program's own."""
     return fcntl.fcntl(file, fcntl.F_DUPFD_CLOEXEC, FIRST_SPARE)
 

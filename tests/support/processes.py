@@ -16,13 +16,13 @@ from polysight.cli.main import main
 from tests.support.paths import BIN
 
 LIMIT_S = 60.0
-"""Seconds in which this machine may idle while a test waits for something: see :func:`idle_s`."""
+"""Seconds in which this machine may idle while a test waits for something: see :func:`read_idle_s`."""
 
 HANG_S = 900.0
 """Seconds by the clock after which a call that blocks (socket, queue, thread) hangs. No busy machine reaches it."""
 
 
-def idle_s() -> float:
+def read_idle_s() -> float:
     """Seconds that a core of this machine was idle so far, the mean of all.
 
     Waits are limited by these seconds, not by the clock: slowness of a busy machine does not count as a hang.
@@ -51,13 +51,13 @@ class Ended:
 
 def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
     """Return when the condition holds; fail when the machine has idled for `limit_s` meanwhile."""
-    deadline = idle_s() + limit_s
+    deadline = read_idle_s() + limit_s
     while not condition():
-        assert idle_s() < deadline, f"not within {limit_s} s: {what}"
+        assert read_idle_s() < deadline, f"not within {limit_s} s: {what}"
         time.sleep(0.005)
 
 
-def processes_naming(text: str) -> dict[int, str]:
+def list_processes_naming(text: str) -> dict[int, str]:
     """Command lines of living processes in which `text` occurs."""
     processes = {}
     for entry in Path("/proc").iterdir():
@@ -110,9 +110,9 @@ class Program:
 
     def wait(self, limit_s: float = LIMIT_S) -> Ended:
         """Wait for the end; fail when the machine has idled for `limit_s` since."""
-        deadline = idle_s() + limit_s
+        deadline = read_idle_s() + limit_s
         while (status := self.process.poll()) is None:
-            if idle_s() > deadline:
+            if read_idle_s() > deadline:
                 self.kill()
                 pytest.fail(f"{self.process.args} hangs; it said:\n{self.out}\n{self.err}")
             time.sleep(0.02)
@@ -182,7 +182,7 @@ class Bench:
 
     def processes(self) -> dict[int, str]:
         """Command lines of living processes that name this folder."""
-        return processes_naming(str(self.folder))
+        return list_processes_naming(str(self.folder))
 
     def close(self) -> None:
         """End everything, the last one first."""

@@ -42,7 +42,7 @@ PERMITTIVITY = {
 _OLD = ("covariance", "dominated_by", "shares", "do")
 
 
-def segments(level: str | None) -> list[dict[str, Any]]:
+def make_segments(level: str | None) -> list[dict[str, Any]]:
     """Three patches as materials.json has them with this verdict; None: as earlier releases wrote them."""
     metal = {**COMMON, "label": 1, "box_mm": [-50.0, -20.0, -20.0, 20.0], "metal_reference": True}
     pet = {
@@ -61,7 +61,7 @@ def segments(level: str | None) -> list[dict[str, Any]]:
     return [metal, pet, noise]
 
 
-def judged_products(folder: Path, level: str | None, careless: bool = False, seed: int = 2) -> Path:
+def write_judged_products(folder: Path, level: str | None, careless: bool = False, seed: int = 2) -> Path:
     """Write the files; the images are noise of this seed.
 
     With `careless`, names and permittivities are kept although the verdict withholds them.
@@ -71,7 +71,11 @@ def judged_products(folder: Path, level: str | None, careless: bool = False, see
     axes = (np.linspace(-0.06, 0.06, 30), np.linspace(-0.04, 0.04, 20))
     sigma = None if level is None else rng.uniform(0.1, 0.2, h.shape)
     write_image(folder / "image.npz", Images(h, v, *axes, np.ones(h.shape, bool), h / v, sigma))
-    content: dict[str, Any] = {"scan_id": "s", "simulated": True, "segments": segments("good" if careless else level)}
+    content: dict[str, Any] = {
+        "scan_id": "s",
+        "simulated": True,
+        "segments": make_segments("good" if careless else level),
+    }
     quality: dict[str, Any] = {}
     if level is not None:
         quality["verdict"] = {"level": level, "reasons": [] if level == "good" else [REASON]}
@@ -98,21 +102,21 @@ def make_result(images: Images, content: dict[str, Any] | None, quality: dict[st
     )
 
 
-def changed(scan: ProcessedScan, **content: Any) -> ProcessedScan:
+def replace_results(scan: ProcessedScan, **content: Any) -> ProcessedScan:
     """The same result with other contents."""
     results = {name: value for name, value in vars(scan).items() if name in ComputedContent.__annotations__}
     return ProcessedScan.from_results(scan.folder, **{**results, **content})
 
 
-def _chunk(kind: bytes, data: bytes) -> bytes:
+def _encode_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
 PIXEL = (
     b"\x89PNG\r\n\x1a\n"
-    + _chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
-    + _chunk(b"IDAT", zlib.compress(b"\0\0"))
-    + _chunk(b"IEND", b"")
+    + _encode_chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
+    + _encode_chunk(b"IDAT", zlib.compress(b"\0\0"))
+    + _encode_chunk(b"IEND", b"")
 )
 """A PNG of one pixel."""
 

@@ -14,34 +14,34 @@ MID_BAND_OFFSET_HZ = 790e3
 Change = Callable[[dict[str, Any]], None]
 
 
-def published_rig() -> Instrument:
+def load_published_rig() -> Instrument:
     """The rig of instrument.toml."""
     return load_instrument(RIG_FILE)
 
 
-def timed_by_the_program(rig: Instrument) -> Instrument:
+def time_by_the_program(rig: Instrument) -> Instrument:
     """The same without one-shot and return wire, as the published rig had it: the program makes the pulses."""
     pi = msgspec.structs.replace(rig.pi, one_shot=False, pulses_in=None)
     return msgspec.structs.replace(rig, pi=pi)
 
 
-def timed_by_spi(rig: Instrument) -> Instrument:
+def time_by_spi(rig: Instrument) -> Instrument:
     """The same with SYNC_IN on MOSI, and MISO as its return wire."""
     pi = msgspec.structs.replace(rig.pi, wiring="spi", sync_out=(10,), pulses_in=9, one_shot=False)
     return msgspec.structs.replace(rig, pi=pi)
 
 
-def rig_table() -> dict[str, Any]:
+def load_rig_table() -> dict[str, Any]:
     """The published rig as plain values, to be changed and written or decoded."""
-    return to_builtins(published_rig())
+    return to_builtins(load_published_rig())
 
 
-def rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Instrument:
+def make_rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Instrument:
     """The published rig with some keys of tables replaced, then changed by hand.
 
     `rig_with(grid={"columns": 3}, burst={"pulses": 2})`; `change` gets the whole rig as plain values.
     """
-    table = rig_table()
+    table = load_rig_table()
     for name, keys in tables.items():
         table[name] |= keys
     if change is not None:
@@ -49,16 +49,16 @@ def rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Instrume
     return decode(table, Instrument, "test")
 
 
-def at_stage_port(rig: Instrument, port: str) -> Instrument:
+def set_stage_port(rig: Instrument, port: str) -> Instrument:
     """The rig with its stage at another serial port."""
     return msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, port=port))
 
 
-def programmed_rig(offset_hz: float = MID_BAND_OFFSET_HZ, **tables: dict[str, Any]) -> Instrument:
-    """As :func:`rig_with`, with this start offset of every receiver; by default the direct path is mid-band."""
+def make_programmed_rig(offset_hz: float = MID_BAND_OFFSET_HZ, **tables: dict[str, Any]) -> Instrument:
+    """As :func:`make_rig_with`, with this start offset of every receiver; by default the direct path is mid-band."""
 
     def program(table: dict[str, Any]) -> None:
         for board in table["boards"]:
             board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else offset_hz
 
-    return rig_with(program, **tables)
+    return make_rig_with(program, **tables)

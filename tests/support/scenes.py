@@ -9,7 +9,7 @@ PET = {"name": "PET", "centre_mm": [36.0, 6.0], "size_mm": [50.0, 50.0], "permit
 EVERYWHERE = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [500.0, 400.0], "metal": True}
 
 
-def small_scene(
+def write_small_scene(
     columns: int,
     rows: int,
     step_mm: tuple[float, float] = (10.0, 10.0),

@@ -12,9 +12,9 @@ from polysight_shared.errors import PolysightError
 from polysight_shared.tables import decode, to_builtins
 from tests.support.paths import RIG_FILE
 from tests.support.processes import Bench, Program, wait_for
-from tests.support.scenes import small_scene
+from tests.support.scenes import write_small_scene
 
-SCENE = small_scene(12, 6, pulses=4, pixels=40, pixel_mm=4.0)
+SCENE = write_small_scene(12, 6, pulses=4, pixels=40, pixel_mm=4.0)
 
 
 class Rig(Bench):
@@ -92,7 +92,7 @@ class Rig(Bench):
 
 
 @contextmanager
-def running(
+def run_simulated_rig(
     folder: Path, time_scale: float = 40.0, env: dict[str, str] | None = None, scene: str = SCENE
 ) -> Iterator[Rig]:
     """Run a simulated rig in `folder`; all its processes are ended afterwards."""

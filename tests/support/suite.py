@@ -75,7 +75,7 @@ FIRST = (
 """Files and folders that take longest. They are begun first, so that no worker ends long after the others."""
 
 
-def worker_group(node_id: str) -> str:
+def find_worker_group(node_id: str) -> str:
     """Folder or file whose tests share a worker."""
     file = node_id.partition("::")[0]
     room = file.rpartition("/")[0]
@@ -85,14 +85,14 @@ def worker_group(node_id: str) -> str:
 def sort_longest_first(items: list[pytest.Item]) -> None:
     """Sort tests in place: those of the longest files first, the others in the old order."""
     place = {file: n for n, file in enumerate(FIRST)}
-    items.sort(key=lambda item: place.get(worker_group(item.nodeid), len(place)))
+    items.sort(key=lambda item: place.get(find_worker_group(item.nodeid), len(place)))
 
 
 class ByFile(LoadScopeScheduling):
     """Distributes whole files to workers, in the order of collection."""
 
     def _split_scope(self, nodeid: str) -> str:
-        return worker_group(nodeid)
+        return find_worker_group(nodeid)
 
     def schedule(self) -> None:
         """As the base class, without its sorting by number of tests."""

@@ -20,7 +20,7 @@ ROWS = 56
 See = Callable[..., SeenEchoes]
 
 
-def nominal_optics() -> Optics:
+def make_nominal_optics() -> Optics:
     """Return the places and polarisations of the published rig's antennas in the estimator's form."""
     boards = published_boards()
     middle = {name: np.mean([rx.position for rx in rxs], axis=0) for name, rxs in boards.receivers().items()}
@@ -51,7 +51,7 @@ def scan_on_grid(
 
 @pytest.fixture(scope="session")
 def optics() -> Optics:
-    return nominal_optics()
+    return make_nominal_optics()
 
 
 @pytest.fixture(scope="session")

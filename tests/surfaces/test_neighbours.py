@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.surfaces.test_paths import BEHIND, FRONT_M, empty_scan, with_echo
+from tests.surfaces.test_paths import BEHIND, FRONT_M, add_sphere_echo, make_empty_scan
 
 from polysight.surfaces import Samples
 from polysight.surfaces.paths import find_echoes, measure_echoes
@@ -18,7 +18,7 @@ GATE_M = (1.4, 2.2)
 def scan_two(apart_m: tuple[float, float, float], second: complex) -> tuple[Samples, list[np.ndarray]]:
     """Scan two spheres whose fronts are so far apart; the echo of one has amplitude 0.5."""
     fronts = [FRONT_M - np.array(apart_m) / 2, FRONT_M + np.array(apart_m) / 2]
-    scan = with_echo(with_echo(empty_scan(), fronts[0], RADIUS_M, 0.5), fronts[1], RADIUS_M, second)
+    scan = add_sphere_echo(add_sphere_echo(make_empty_scan(), fronts[0], RADIUS_M, 0.5), fronts[1], RADIUS_M, second)
     return scan, fronts
 
 

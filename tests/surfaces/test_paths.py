@@ -25,7 +25,7 @@ C = SPEED_OF_LIGHT_M_S
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 12)
 
 
-def empty_scan() -> Samples:
+def make_empty_scan() -> Samples:
     """A scan of one window and a half, without echoes."""
     boards = published_boards()
     offsets = scan_offsets(21, 21)
@@ -34,11 +34,11 @@ def empty_scan() -> Samples:
     return Samples(cube, np.ones((21, 21), bool), offsets, FREQUENCIES_HZ, boards.tx.position, rx_m)
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def _normalise(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def with_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: complex) -> Samples:
+def add_sphere_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: complex) -> Samples:
     """Add a metal sphere's specular path, found by minimising over its surface with Newton's method."""
     centre = point_m + np.array([0.0, 0.0, radius_m])
     tx = scan.tx_m + scan.offsets_m
@@ -46,8 +46,8 @@ def with_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: co
     normal = np.array([0.0, 0.0, -1.0])
     for _ in range(12):
         p = centre + radius_m * normal
-        way = _unit(tx - p) + _unit(rx - p)
-        normal = _unit(way)
+        way = _normalise(tx - p) + _normalise(rx - p)
+        normal = _normalise(way)
     p = centre + radius_m * normal
     paths = np.linalg.norm(p - tx, axis=-1) + np.linalg.norm(p - rx, axis=-1)
     excess = paths - scan.direct_m[:, None, None]
@@ -55,7 +55,7 @@ def with_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: co
     return replace(scan, cube=scan.cube + amplitude * np.exp(2j * np.pi * turns))
 
 
-def with_mirror(scan: Samples, z_m: float, amplitude: complex) -> Samples:
+def add_mirror_echo(scan: Samples, z_m: float, amplitude: complex) -> Samples:
     """Add the echo of a level mirror, the same for all stage positions."""
     image = scan.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
     excess = np.linalg.norm(scan.rx_m - image, axis=1) - scan.direct_m
@@ -68,7 +68,7 @@ FRONT_M = np.array([-0.01, 0.104, 0.5])
 
 
 def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
-    scan = with_echo(empty_scan(), FRONT_M, 0.12, 0.5 * np.exp(0.3j))
+    scan = add_sphere_echo(make_empty_scan(), FRONT_M, 0.12, 0.5 * np.exp(0.3j))
     echoes = find_echoes(scan, (1.4, 2.0))
     points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
     normals, _ = find_normals(points, echoes.at_m, scan.tx_m, scan.middle_m)
@@ -81,8 +81,8 @@ def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
 
 
 def test_a_weak_echo_is_found_near_a_strong_one():
-    strong = with_mirror(empty_scan(), 0.65, 1.0)
-    both_echoes = with_echo(strong, FRONT_M, 0.1, 0.16)
+    strong = add_mirror_echo(make_empty_scan(), 0.65, 1.0)
+    both_echoes = add_sphere_echo(strong, FRONT_M, 0.1, 0.16)
     echoes = find_echoes(both_echoes, (1.4, 2.1))
     points = locate(echoes.path_m, echoes.slope, echoes.at_m, both_echoes.tx_m, both_echoes.middle_m)
     from_weak = np.abs(np.linalg.norm(points - (FRONT_M + 0.1 * BEHIND), axis=1) - 0.1)
@@ -90,7 +90,7 @@ def test_a_weak_echo_is_found_near_a_strong_one():
 
 
 def test_the_path_of_a_point_gives_the_point_back():
-    scan = empty_scan()
+    scan = make_empty_scan()
     rng = np.random.default_rng(1)
     n = 200
     points = rng.uniform([-0.1, 0.0, 0.4], [0.1, 0.2, 0.6], (n, 3))
@@ -106,7 +106,7 @@ def test_the_path_of_a_point_gives_the_point_back():
 
 
 def test_a_mirror_spreads_as_its_path():
-    scan = empty_scan()
+    scan = make_empty_scan()
     at_m = np.zeros((1, 3))
     image = scan.tx_m * [1, 1, -1] + [0, 0, 1.0]
     share = (0.5 - scan.middle_m[2]) / (image[2] - scan.middle_m[2])
@@ -120,7 +120,7 @@ def test_a_mirror_spreads_as_its_path():
 
 def test_a_known_path_is_measured_without_the_gain_of_a_search():
     """Noise alone has the power of a mean over the samples; a maximum over paths would be several times as large."""
-    scan = empty_scan()
+    scan = make_empty_scan()
     rng = np.random.default_rng(7)
     noise = rng.normal(size=scan.cube.shape) + 1j * rng.normal(size=scan.cube.shape)
     noisy = replace(scan, cube=noise)
@@ -137,8 +137,8 @@ def test_a_known_path_is_measured_without_the_gain_of_a_search():
 
 def test_an_amplitude_is_that_of_the_place_asked_not_of_the_window():
     """Places between stage positions: |V| changes by a per cent a millimetre near Brewster's angle."""
-    level = 2 + 40 * empty_scan().offsets_m[..., 0] - 30 * empty_scan().offsets_m[..., 1]
-    mirror = with_mirror(empty_scan(), 0.5, 1.0)
+    level = 2 + 40 * make_empty_scan().offsets_m[..., 0] - 30 * make_empty_scan().offsets_m[..., 1]
+    mirror = add_mirror_echo(make_empty_scan(), 0.5, 1.0)
     scan = replace(mirror, cube=mirror.cube * level)
     at_m = np.array([[0.0, 0.0, 0.0], [0.0009, -0.0007, 0.0], [-0.0004, 0.0008, 0.0]])
     path = np.full(3, find_mirror_path(scan, 0.5))

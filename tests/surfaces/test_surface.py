@@ -34,14 +34,14 @@ EXACT = Uncertainty(leakage=1e-4, axis_rad=1e-4, place_m=1e-6)
 CENTRE_M = (-0.01, 0.104, 0.5)
 
 
-def sphere_scene(radius_m: float, stack: Stack) -> ShapeScene:
+def make_sphere_scene(radius_m: float, stack: Stack) -> ShapeScene:
     x, y, z = CENTRE_M
     return ShapeScene("sphere", (sphere("ball", stack, (x, y, z + radius_m), radius_m),), stack.below, radius_m)
 
 
 @pytest.fixture(scope="module")
 def glass_ball(see, gains, optics):
-    scene = sphere_scene(0.11, Stack(below=5.2 - 0.4j))
+    scene = make_sphere_scene(0.11, Stack(below=5.2 - 0.4j))
     surface = see(scene.shapes)
     return scene, surface, analyse_surface(surface, optics, gains, uncertainty=EXACT, scan_id="ball", simulated=True)
 
@@ -94,7 +94,7 @@ def test_metal_is_metal_and_has_no_permittivity(metal, gains, optics):
 
 def test_below_40_mm_the_shape_alone_is_given_and_why(see, gains, optics):
     surface = analyse_surface(
-        see(sphere_scene(0.03, Stack(below=4 - 0.4j)).shapes, 64, 44), optics, gains, uncertainty=EXACT
+        see(make_sphere_scene(0.03, Stack(below=4 - 0.4j)).shapes, 64, 44), optics, gains, uncertainty=EXACT
     )
     assert len(surface.points_m)
     assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)

@@ -33,7 +33,7 @@ def average_halves(aligned):
     return aligned.halves.sum(axis=1)
 
 
-def _errors(aligned, df, phase):
+def _compute_errors(aligned, df, phase):
     """Errors of frequency (cycles per sample) and phase of each chirp relative to its burst."""
     f = aligned.frequency - df
     turns = np.exp(1j * (aligned.phase - phase))
@@ -60,7 +60,7 @@ def test_offsets_are_at_the_cramer_rao_bound(burst, snr_db, echo):
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
     assert aligned.good.all()
     mean_factor = np.sqrt(CHIRPS / (CHIRPS - 1))  # the mean was taken out of the errors
-    for error, bound in zip(_errors(aligned, df, phase), _compute_bounds(signal, snr_db), strict=True):
+    for error, bound in zip(_compute_errors(aligned, df, phase), _compute_bounds(signal, snr_db), strict=True):
         assert error.std() * mean_factor < 1.1 * bound
         assert error.std() * mean_factor > 0.9 * bound
 
@@ -77,7 +77,7 @@ def _divide_by_first(words):
 @pytest.mark.parametrize("snr_db", [0, 5])
 def test_at_low_snr_there_are_no_gross_errors_and_half_the_error_of_division(burst, snr_db):
     frames, df, phase, signal = burst(30, snr_db)
-    f, _ = _errors(align_row(frames, np.ones(df.shape, bool), LINEAR), df, phase)
+    f, _ = _compute_errors(align_row(frames, np.ones(df.shape, bool), LINEAR), df, phase)
     bin_ = 1 / 192
     assert np.abs(f).max() < bin_ / 2
     assert np.abs(f).max() < 8 * _compute_bounds(signal, snr_db)[0]
@@ -118,7 +118,7 @@ def test_a_common_frequency_and_phase_of_all_chirps_has_no_other_effect(burst, c
 def test_the_residual_is_the_true_error(burst):
     frames, df, phase, _ = burst(60, 12)
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
-    for k, error in enumerate(_errors(aligned, df, phase)):
+    for k, error in enumerate(_compute_errors(aligned, df, phase)):
         assert aligned.error[:, k].std() == pytest.approx(error.std(), rel=0.15)
 
 

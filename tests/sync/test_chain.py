@@ -58,7 +58,7 @@ def setup(small):
     return BoardSetup.from_rig(small, small.receivers[1], compensate_filter=False)
 
 
-def _relative_error(row, ideal, inside=slice(None)):
+def _compute_relative_error(row, ideal, inside=slice(None)):
     scaled = row.samples / 800
     return np.sqrt((np.abs(scaled - ideal)[..., inside] ** 2).mean() / (np.abs(ideal)[..., inside] ** 2).mean())
 
@@ -69,7 +69,7 @@ def test_a_disturbed_row_is_restored_to_the_ideal(row, setup):
     assert synchronised.valid.all()
     assert (synchronised.chirps == PULSES).all()
     noise_floor = 10 ** (-12 / 20) / np.sqrt(PULSES) / np.sqrt(2)
-    assert _relative_error(synchronised, ideal) < 1.3 * noise_floor
+    assert _compute_relative_error(synchronised, ideal) < 1.3 * noise_floor
 
 
 def test_offsets_have_no_effect_beyond_noise(row, setup):
@@ -83,8 +83,10 @@ def test_the_high_pass_filter_is_compensated(row, small, setup):
     frames, valid, ideal = row(filtered=True, snr_db=30)
     undone = synchronise_row(frames, valid, BoardSetup.from_rig(small, small.receivers[1]))
     remainder = synchronise_row(frames, valid, setup)
-    assert _relative_error(undone, ideal, slice(3, None)) < 0.04
-    assert _relative_error(undone, ideal, slice(3, None)) < 0.4 * _relative_error(remainder, ideal, slice(3, None))
+    assert _compute_relative_error(undone, ideal, slice(3, None)) < 0.04
+    assert _compute_relative_error(undone, ideal, slice(3, None)) < 0.4 * _compute_relative_error(
+        remainder, ideal, slice(3, None)
+    )
 
 
 def test_errors_shrink_from_received_to_averaged(row, setup):
@@ -168,7 +170,7 @@ def test_bursts_of_one_chirp(row, setup):
     assert (synchronised.chirps == 1).all()
     assert "referenced" not in synchronised.stages
     assert synchronised.stages["received"][2] < 0.2  # amplitude: noise, and no more
-    assert _relative_error(synchronised, ideal) < 1.3 * 10 ** (-20 / 20)
+    assert _compute_relative_error(synchronised, ideal) < 1.3 * 10 ** (-20 / 20)
 
 
 def test_a_row_without_frames_is_invalid(setup):

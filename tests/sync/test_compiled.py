@@ -43,7 +43,7 @@ def loops(library_file, tmp_path_factory, request):
     return sync_loops.Library(library_file, request.param)
 
 
-def bursts(positions=5, chirps=6, samples=256, seed=4):
+def draw_bursts(positions=5, chirps=6, samples=256, seed=4):
     """Noisy tones with a frequency and phase per chirp: int16 [position, chirp, sample, 2, rx]."""
     rng = np.random.default_rng(seed)
     n = np.arange(samples)[:, None]
@@ -82,7 +82,7 @@ def make_equaliser(rig):
 
 @pytest.mark.parametrize("other", ["silent", "clipped"])
 def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, other):
-    burst = bursts(positions=3, chirps=1)
+    burst = draw_bursts(positions=3, chirps=1)
     for by in (loops.align, align_in_numpy):
         expected = align(by, burst, np.ones((3, 1), bool), (0, 192))
         for k in range(6):
@@ -95,7 +95,7 @@ def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, othe
 
 
 def test_a_row_in_pieces_is_the_same_row(loops):
-    words = bursts(7)
+    words = draw_bursts(7)
     valid = np.ones((7, 6), bool)
     valid[2:4, 1] = False
     memory = np.empty_like(words[:3])
@@ -116,13 +116,13 @@ def test_a_row_in_pieces_is_the_same_row(loops):
 def test_pieces_that_are_not_the_row_are_refused(loops, positions):
     for by in (loops.align, align_in_numpy):
         with pytest.raises(ValueError, match="position"):
-            align_pieces([bursts(1)] * positions, np.ones((5, 6), bool), (0, 192), by=by)
+            align_pieces([draw_bursts(1)] * positions, np.ones((5, 6), bool), (0, 192), by=by)
 
 
 @pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
 @pytest.mark.parametrize("filtered", [True, False])
 def test_any_linear_part(loops, rig, linear, filtered):
-    words = bursts()
+    words = draw_bursts()
     valid = np.ones((5, 6), bool)
     equaliser = make_equaliser(rig) if filtered else None
     assert_equal_rows(
@@ -133,7 +133,7 @@ def test_any_linear_part(loops, rig, linear, filtered):
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
 def test_any_number_of_samples(loops, rig, samples, linear):
     """The law holds also if samples do not fill whole vectors or blocks."""
-    words = bursts(samples=samples)
+    words = draw_bursts(samples=samples)
     valid = np.ones((5, 6), bool)
     equaliser = make_equaliser(rig)
     assert_equal_rows(
@@ -144,7 +144,7 @@ def test_any_number_of_samples(loops, rig, samples, linear):
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
 def test_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed together; a single one has no reference."""
-    words = bursts(positions=3, chirps=chirps)
+    words = draw_bursts(positions=3, chirps=chirps)
     valid = np.ones((3, chirps), bool)
     equaliser = make_equaliser(rig)
     assert_equal_rows(
@@ -154,7 +154,7 @@ def test_any_number_of_chirps(loops, rig, chirps):
 
 
 def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
-    words = bursts(positions=7, chirps=8)
+    words = draw_bursts(positions=7, chirps=8)
     valid = np.ones((7, 8), bool)
     valid[0, :3] = False
     valid[1] = False
@@ -177,7 +177,7 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
 
 @pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
 def test_any_filter(loops, mode):
-    words = bursts()
+    words = draw_bursts()
     valid = np.ones((5, 6), bool)
     for corners in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
         equaliser = Equaliser(HighPass(corners), 10e6, mode == "complex2x", 4, 3 / 192)
@@ -188,7 +188,7 @@ def test_any_filter(loops, mode):
 
 
 def test_words_in_another_order_in_memory(loops):
-    words = bursts()[:, :, :, ::-1]
+    words = draw_bursts()[:, :, :, ::-1]
     valid = np.ones((5, 6), bool)
     assert not words.flags.c_contiguous
     assert_equal_rows(align(loops.align, words, valid, (0, 192)), align(align_in_numpy, words, valid, (0, 192)))
@@ -196,7 +196,7 @@ def test_words_in_another_order_in_memory(loops):
 
 def test_any_number_of_positions_and_none(loops):
     for positions in (0, 1, 17):
-        words = bursts(positions=positions)
+        words = draw_bursts(positions=positions)
         valid = np.ones((positions, 6), bool)
         result = align(loops.align, words, valid, (0, 192))
         assert result.halves.shape == (positions, 2, 4, 48)
@@ -253,7 +253,7 @@ def test_peaks_and_medians_of_any_spectrum(loops, size):
 
 
 def test_three_receivers_are_aligned_in_numpy():
-    words = bursts()[..., :3]
+    words = draw_bursts()[..., :3]
     assert align_row(words, np.ones(words.shape[:2], bool), (0, 192)).good.all()
 
 
@@ -261,7 +261,7 @@ def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     library = sync_loops.Library(library_file)
     monkeypatch.setattr(sync_loops, "library", lambda: library)
     monkeypatch.setattr("polysight.sync.offsets.align_in_numpy", None)
-    assert align_row(bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
+    assert align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 
 
 @pytest.fixture
@@ -289,7 +289,7 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
     real = sync_loops.Library
     monkeypatch.setattr(sync_loops, "Library", lambda: real(file))
     with caplog.at_level(logging.WARNING), ThreadPoolExecutor(3) as pool:
-        for row in pool.map(lambda _: align_row(bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
+        for row in pool.map(lambda _: align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
             assert row.good.all()
     (record,) = caplog.records
     assert "python -m polysight.sync.build" in record.getMessage()

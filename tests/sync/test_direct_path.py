@@ -29,7 +29,9 @@ def board(request, rig):
 def run(rig, paths, noise, direct_paths, align_single):
     """`run(board, ...)`: reference positions with random offsets; result, frequency error (Hz), phase error (rad)."""
 
-    def go(board, echo=1.0, snr_db=None, positions=150, seed=0, direct=1.0, gain=0.0, drift_hz=0.0, **more):
+    def synchronise_drawn_row(
+        board, echo=1.0, snr_db=None, positions=150, seed=0, direct=1.0, gain=0.0, drift_hz=0.0, **more
+    ):
         rng = np.random.default_rng(seed)
         signal, length = paths(board, positions, echo, rng, **more)
         pure, _ = paths(board, positions, 0.0, rng)
@@ -50,7 +52,7 @@ def run(rig, paths, noise, direct_paths, align_single):
         turn = np.exp(1j * (np.angle(referenced.amplitude) - phase - 2 * np.pi * middle_hz * delay))
         return referenced, f_error * rate, np.angle(turn / turn.mean())
 
-    return go
+    return synchronise_drawn_row
 
 
 def test_without_an_object_it_is_exact(run, board):

@@ -45,7 +45,7 @@ def receive_bursts(paths, noise, rig):
     return make
 
 
-def cross(frames, chosen, level, rng, samples=40):
+def add_crossing_chirp(frames, chosen, level, rng, samples=40):
     """Add another radar's chirp, which crosses the band of the signal within some samples of the chosen chirps."""
     out = frames.copy()
     n = np.arange(samples) - samples / 2
@@ -70,7 +70,7 @@ def make_words(counts, frames):
 def test_bursts_with_disturbed_chirps_give_the_average_of_the_others(align, receive_bursts, counts, count, level):
     rng = np.random.default_rng(count)
     chosen = choose(count, rng)
-    words = make_words(counts, cross(receive_bursts(), chosen, level, rng))
+    words = make_words(counts, add_crossing_chirp(receive_bursts(), chosen, level, rng))
     aligned = align(words)
     expected = align(words, ~chosen)
     np.testing.assert_array_equal(aligned.good, ~chosen)
@@ -83,7 +83,7 @@ def test_what_is_not_found_changes_the_average_by_less_than_its_noise(align, rec
     rng = np.random.default_rng(9)
     chosen = choose(3, rng)
     quiet = receive_bursts()
-    aligned = align(make_words(counts, cross(quiet, chosen, level, rng)))
+    aligned = align(make_words(counts, add_crossing_chirp(quiet, chosen, level, rng)))
     clean = align(make_words(counts, quiet))
     deviation = np.abs(aligned.halves.sum(axis=1)) - np.abs(clean.halves.sum(axis=1))
     noise = COUNTS * 10 ** (-8 / 20) / np.sqrt(2 * CHIRPS * 4)
@@ -140,7 +140,9 @@ def test_both_forms_leave_out_the_same(receive_bursts, counts):
         pytest.skip("no compiled loops: python -m polysight.sync.build")
     rng = np.random.default_rng(1)
     for level in (0.5, 1.0, 2.0, 20.0):
-        words = make_words(counts, cross(receive_bursts(12.0), rng.random((POSITIONS, CHIRPS)) < 0.3, level, rng))
+        words = make_words(
+            counts, add_crossing_chirp(receive_bursts(12.0), rng.random((POSITIONS, CHIRPS)) < 0.3, level, rng)
+        )
         compiled = align_pieces([words], np.ones(words.shape[:2], bool), LINEAR, by=library.align)
         in_numpy = align_pieces([words], np.ones(words.shape[:2], bool), LINEAR, by=align_in_numpy)
         np.testing.assert_array_equal(compiled.good, in_numpy.good)
@@ -153,7 +155,7 @@ def test_chirps_left_out_are_counted(rig, receive_bursts, counts):
     rng = np.random.default_rng(4)
     chosen = choose(2, rng)
     chosen[:4] = False
-    words = make_words(counts, cross(receive_bursts(15.0), chosen, 8.0, rng))
+    words = make_words(counts, add_crossing_chirp(receive_bursts(15.0), chosen, 8.0, rng))
     words[0] = clip(4 * words[0], int(2.5 * COUNTS))
     words[1, :3] = 32767
     valid = np.ones(chosen.size, bool)
@@ -169,6 +171,6 @@ def test_chirps_left_out_are_counted(rig, receive_bursts, counts):
 def test_three_chirps_are_too_few_to_call_one_disturbed(align, receive_bursts, counts):
     frames = receive_bursts()[:, :3]
     rng = np.random.default_rng(5)
-    words = make_words(counts, cross(frames, np.arange(3) == np.full((POSITIONS, 1), 1), 2.0, rng))
+    words = make_words(counts, add_crossing_chirp(frames, np.arange(3) == np.full((POSITIONS, 1), 1), 2.0, rng))
     assert align(words).good.all()
     assert align_row(words, np.ones((POSITIONS, 3), bool), LINEAR).good.all()

@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.capture import view_row_words
 from polysight.sync import BoardSetup, synchronise_row
@@ -17,8 +17,8 @@ ONE = Burst(pulses=1, chirps=16, chirp_us=143.0, period_us=2800.0)
 SCENE = decode_scene({"name": "the direct path and its disturbances", "seed": 7}, "test")
 
 
-def rig_with_burst(burst: Burst, speed_mm_s: float):
-    rig = published_rig()
+def make_rig_with_burst(burst: Burst, speed_mm_s: float):
+    rig = load_published_rig()
     return msgspec.structs.replace(
         rig,
         burst=burst,
@@ -29,7 +29,7 @@ def rig_with_burst(burst: Burst, speed_mm_s: float):
 
 def synchronise_burst(burst: Burst, speed_mm_s: float):
     """A simulated row of the direct path alone, synchronised."""
-    rig = rig_with_burst(burst, speed_mm_s)
+    rig = make_rig_with_burst(burst, speed_mm_s)
     radar = SimulatedRig(rig, SCENE)
     row = plan_raster(rig.grid).row(0)
     x, y = row_offsets_mm(radar, row)
@@ -50,7 +50,7 @@ def test_chirps_of_one_frame_share_their_trigger_error():
     """Chirps of different frames differ by up to 5 ns per board."""
     spread = {}
     for name, burst in (("many", MANY), ("one", ONE)):
-        rig = rig_with_burst(burst, 20.0)
+        rig = make_rig_with_burst(burst, 20.0)
         scene = decode_scene({"name": "x", "seed": 7, "disturbances": {"direct_snr_db": 60.0}}, "test")
         radar = SimulatedRig(rig, scene)
         chirps = radar.signals("RH", np.zeros(16 * 4), np.zeros(16 * 4), 0)[:, 0]

@@ -32,7 +32,7 @@ SIOCSIFFLAGS = 0x8914
 IFF_UP = 1
 
 
-def loopback_up() -> None:
+def raise_loopback() -> None:
     """What `ip link set lo up` does."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
         fcntl.ioctl(s, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
@@ -123,7 +123,7 @@ def main() -> None:
     """Print the result."""
     config = Path(sys.argv[1])
     rig = load_instrument(config)
-    loopback_up()
+    raise_loopback()
     chip = SimChip(rig.pi.gpio_chip, LINES)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(str(WIRES))

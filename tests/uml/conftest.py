@@ -15,7 +15,7 @@ import msgspec
 import pytest
 import tomli_w
 from tests.support.paths import REPO
-from tests.support.rigs import published_rig, timed_by_the_program
+from tests.support.rigs import load_published_rig, time_by_the_program
 
 from polysight_shared.config import Instrument
 from polysight_shared.program import die_with_parent
@@ -48,7 +48,7 @@ def run_row(kernel: Path, tmp_path: Path) -> Callable[..., dict[str, Any]]:
 
     def run(points: int, *options: str, real_time: bool = False, speed_mm_s: float = 20.0) -> dict[str, Any]:
         config = tmp_path / "instrument.toml"
-        rig = _rig(points, one_shot=real_time, speed_mm_s=speed_mm_s)
+        rig = _make_rig(points, one_shot=real_time, speed_mm_s=speed_mm_s)
         config.write_bytes(tomli_w.dumps(to_builtins(rig)).encode())
         program = [
             f"PYTHON={sys.executable}",
@@ -86,12 +86,12 @@ def _prepare_guest(real_time: bool) -> None:
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
 
 
-def _rig(points: int, one_shot: bool, speed_mm_s: float) -> Instrument:
+def _make_rig(points: int, one_shot: bool, speed_mm_s: float) -> Instrument:
     """The published rig with one row, near the home corner.
 
     In real time a system call takes some 10 us in user-mode Linux: there pulses are not short enough without one shot.
     """
-    rig = timed_by_the_program(published_rig())
+    rig = time_by_the_program(load_published_rig())
     replace = msgspec.structs.replace
     width_mm = (points - 1) * rig.grid.step_x_mm
     return replace(

@@ -58,7 +58,7 @@ class SimChip:
     def changes(self) -> Iterator[Change]:
         """Every setting of a line since the last call, from the kernel's trace event gpio_value."""
         while page := self._page():
-            for t_ns, payload in _events(page):
+            for t_ns, payload in _parse_events(page):
                 number, get, value = struct.unpack_from("<Iii", payload, 8)
                 if not get:
                     yield Change(t_ns, number - self._base, value)
@@ -70,7 +70,7 @@ class SimChip:
             return b""
 
 
-def _events(page: bytes) -> Iterator[tuple[int, bytes]]:
+def _parse_events(page: bytes) -> Iterator[tuple[int, bytes]]:
     """Time and payload of the events of a page of the ring buffer (Linux, Documentation/trace/ring-buffer-design)."""
     t_ns, committed = struct.unpack_from("<QQ", page)
     position = 16

@@ -74,7 +74,7 @@ def complete(result: dict[str, Any], points: int) -> bool:
     return result["finished"] == [points, 0, ""] and pulses == [PULSES] * points
 
 
-def period_errors_ns(bursts: list[tuple[Capture, list[Pulse]]]) -> list[int]:
+def compute_period_errors_ns(bursts: list[tuple[Capture, list[Pulse]]]) -> list[int]:
     """Rising edge to rising edge within a burst, less the nominal period."""
     return [b.rise_ns - a.rise_ns - PERIOD_NS for _, burst in bursts for a, b in itertools.pairwise(burst)]
 
@@ -86,7 +86,7 @@ def print_figure(text: str) -> None:
 
 def print_figures(what: str, bursts: list[tuple[Capture, list[Pulse]]]) -> None:
     """The figures of docs/benchmarks.md."""
-    errors = [e / 1e3 for e in sorted(period_errors_ns(bursts))]
+    errors = [e / 1e3 for e in sorted(compute_period_errors_ns(bursts))]
     latency = [(burst[0].rise_ns - capture.edge_ns) / 1e3 for capture, burst in bursts]
     cuts = quantiles(latency, n=1000, method="inclusive")
     width = max(p.fall_ns - p.rise_ns for _, burst in bursts for p in burst) / 1e3
@@ -105,7 +105,7 @@ def test_a_published_row_in_virtual_time(run_row):
     bursts = read_bursts(result)
     print_figures("virtual time", bursts)
     assert sum(len(burst) for _, burst in bursts) == 5600
-    assert max(map(abs, period_errors_ns(bursts))) <= 2_000
+    assert max(map(abs, compute_period_errors_ns(bursts))) <= 2_000
     edges = [capture.edge_ns for capture, _ in bursts]
     assert all(abs(b - a - SPACING_NS) <= 500_000 for a, b in itertools.pairwise(edges))
 

@@ -133,41 +133,41 @@ def test_every_reason_has_its_cause_and_a_remedy():
         assert not any(text.endswith(".") for text in (r.what, r.do))
 
 
-def rows(recorded, masked=0.0):
+def judge_rows(recorded, masked=0.0):
     return rules.judge_recording(Coverage(1000, recorded, 1000, recorded), masked)
 
 
-def path(snr_db=5.5, phase_rad=0.004, share=1.0):
+def judge_path(snr_db=5.5, phase_rad=0.004, share=1.0):
     return rules.judge_direct_path("RH", snr_db, phase_rad, share)
 
 
-def plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
+def judge_plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
     return rules.judge_plane(True, offset_mm, tilt_deg, 0.1)
 
 
 @pytest.mark.parametrize(
     ("judge", "inside", "outside", "levels"),
     [
-        (rows, 1000, 999, ("good", "care")),
-        (rows, 500, 499, ("care", "none")),
-        (lambda masked: rows(1000, masked), 0.005, 0.0051, ("good", "care")),
-        (lambda masked: rows(1000, masked), 0.5, 0.501, ("care", "none")),
-        (path, 0.0, -0.01, ("good", "care")),
-        (path, -14.0, -14.01, ("care", "none")),
+        (judge_rows, 1000, 999, ("good", "care")),
+        (judge_rows, 500, 499, ("care", "none")),
+        (lambda masked: judge_rows(1000, masked), 0.005, 0.0051, ("good", "care")),
+        (lambda masked: judge_rows(1000, masked), 0.5, 0.501, ("care", "none")),
+        (judge_path, 0.0, -0.01, ("good", "care")),
+        (judge_path, -14.0, -14.01, ("care", "none")),
         (lambda clipped: rules.judge_left_out_chirps("RH", clipped, 0.0, 0.0), 0.05, 0.051, ("good", "care")),
         (lambda disturbed: rules.judge_left_out_chirps("RH", 0.0, disturbed, 0.0), 0.05, 0.051, ("good", "care")),
         (lambda positions: rules.judge_left_out_chirps("RH", 0.01, 0.0, positions), 0.005, 0.0051, ("good", "care")),
         (lambda db: rules.judge_dark_reference("the given box", 4, db), 5.9, 6.1, ("good", "care")),
-        (lambda phase: path(phase_rad=phase), 0.05, 0.0501, ("good", "care")),
-        (lambda share: path(share=share), 0.5, 0.499, ("good", "none")),
+        (lambda phase: judge_path(phase_rad=phase), 0.05, 0.0501, ("good", "care")),
+        (lambda share: judge_path(share=share), 0.5, 0.499, ("good", "none")),
         (lambda level: rules.judge_levels({"H": level}), 0.4, 0.399, ("good", "care")),
         (lambda level: rules.judge_levels({"H": level}), 3.0, 3.01, ("good", "care")),
-        (plane, 3.0, 3.01, ("good", "care")),
-        (plane, -3.0, -3.01, ("good", "care")),
-        (plane, 13.0, 13.01, ("care", "none")),
-        (plane, -13.0, -13.01, ("care", "none")),
-        (lambda tilt: plane(0.0, (0.0, tilt)), 0.5, 0.501, ("good", "care")),
-        (lambda tilt: plane(0.0, (tilt, 0.0)), -0.5, -0.501, ("good", "care")),
+        (judge_plane, 3.0, 3.01, ("good", "care")),
+        (judge_plane, -3.0, -3.01, ("good", "care")),
+        (judge_plane, 13.0, 13.01, ("care", "none")),
+        (judge_plane, -13.0, -13.01, ("care", "none")),
+        (lambda tilt: judge_plane(0.0, (0.0, tilt)), 0.5, 0.501, ("good", "care")),
+        (lambda tilt: judge_plane(0.0, (tilt, 0.0)), -0.5, -0.501, ("good", "care")),
         (lambda across: rules.judge_tilts({1: across}), 0.5, 0.501, ("good", "care")),
         (lambda ln: rules.judge_brightness({1: ln}), 0.2, 0.201, ("good", "care")),
         (lambda ln: rules.judge_brightness({1: ln}), -0.2, -0.201, ("good", "care")),
@@ -201,10 +201,10 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
             "weaker",
         ),
         (rules.judge_levels({"V": 0.1}), ("V: the direct path is strong", "-20 dB", "weaker than the"), "weakens"),
-        (plane(20.0), ("+20 mm",), "-20"),
-        (plane(-20.0), ("-20 mm",), "+20"),
-        (plane(-4.0), ("-4.0 mm",), "+4"),
-        (plane(0.0, (-0.9, 0.2)), ("0.9 degrees",), "0.2"),
+        (judge_plane(20.0), ("+20 mm",), "-20"),
+        (judge_plane(-20.0), ("-20 mm",), "+20"),
+        (judge_plane(-4.0), ("-4.0 mm",), "+4"),
+        (judge_plane(0.0, (-0.9, 0.2)), ("0.9 degrees",), "0.2"),
         (rules.judge_tilts({1: 0.6, 4: -2.0}), ("patch 4", "-2.0 degrees", "(2 patches in all)"), "patch 1"),
         (rules.judge_tilts({1: 0.6, 4: 0.1}), ("patch 1", "+0.6 degrees"), "in all"),
         (rules.judge_patches({1: "noise", 3: "noise"}, 3), ("patches 1, 3 not judged: noise",), "patch 1"),
@@ -215,9 +215,9 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
         ),
         (rules.judge_exchange([2, 5], 3), ("H and V may be exchanged: patches 2, 5",), "3"),
         (rules.judge_disturbed_plates({3: 0.2, 1: 0.1, 2: 0.01}), ("within patches 1, 3:", "up to 20 %"), "2,"),
-        (rows(1000, 0.25), ("25.0 % of the recorded",), "absent"),
-        (path(-3.0), ("RH: the direct path is weak, -3 dB",), "missing"),
-        (path(share=0.25), ("missing (25 % of the positions",), "weak"),
+        (judge_rows(1000, 0.25), ("25.0 % of the recorded",), "absent"),
+        (judge_path(-3.0), ("RH: the direct path is weak, -3 dB",), "missing"),
+        (judge_path(share=0.25), ("missing (25 % of the positions",), "weak"),
     ],
 )
 def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reasons, said, never):
@@ -259,26 +259,26 @@ def test_a_single_plate_or_half_of_them_do_not_show_that_h_and_v_are_exchanged(s
 def test_reasons_come_from_the_recording_to_the_names():
     """The cause of the others first: without a direct path all is meaningless, without metal every permittivity."""
     assert order(
-        path(-20.0),
+        judge_path(-20.0),
         rules.judge_patches({}, 0),
         rules.judge_metal("metal", False, False, False, True, False),
-        plane(20.0),
+        judge_plane(20.0),
     ) == ["direct path is missing", "no patch", "no metal", "off the rig"]
     reasons = (
         rules.judge_recording(Coverage(10, 10, 10, 10, ("a damaged line",))),
-        rows(900),
-        rows(1000, 0.2),
+        judge_rows(900),
+        judge_rows(1000, 0.2),
         rules.judge_levels({"H": 9.0}),
-        path(-3.0),
+        judge_path(-3.0),
         rules.judge_metal("metal", True, False, False, False, False),
-        path(phase_rad=0.1),
+        judge_path(phase_rad=0.1),
         rules.judge_passivity({1: GAINS}),
         rules.judge_patches({1: "noise"}, 2),
         rules.judge_incidence(57.0, 55.0),
         rules.judge_brightness({1: 0.4}),
-        plane(4.0),
+        judge_plane(4.0),
         rules.judge_leakage(False, False, 0.1),
-        plane(0.0, (1.0, 0.0)),
+        judge_plane(0.0, (1.0, 0.0)),
         rules.judge_tilts({1: 1.0}),
     )
     assert order(*reasons) == [

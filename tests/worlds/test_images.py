@@ -18,7 +18,7 @@ CENTRE_M = float(RIG.centre_m[0]), float(RIG.centre_m[1])
 DIELECTRIC = Stack(below=5 - 1j)
 
 
-def ratio(images: ImagePair, plate: Plate) -> complex:
+def compute_ratio(images: ImagePair, plate: Plate) -> complex:
     """H / V over the inner part of a plate."""
     x0, y0, x1, y1 = plate.box_m
     inside_x = (images.x_m > x0 + 0.015) & (images.x_m < x1 - 0.015)
@@ -55,7 +55,7 @@ def test_a_plate_stands_where_it_was_put(metal_images):
 def test_a_dielectric_relative_to_metal_has_the_ratio_of_fresnel(metal_images):
     plate = Plate("plate", CENTRE_M, (0.06, 0.06), DIELECTRIC)
     images = simulate(World((plate,)))
-    measured = ratio(images, plate) / ratio(metal_images, metal_images.world.plates[0])
+    measured = compute_ratio(images, plate) / compute_ratio(metal_images, metal_images.world.plates[0])
     assert measured == pytest.approx(images.plate_ratio(plate), rel=0.01)
 
 

@@ -12,13 +12,13 @@ cosines = st.floats(0.05, 1.0)
 permittivities = st.builds(lambda real, loss: real - 1j * loss, st.floats(1.01, 20), st.floats(0, 20))
 
 
-def fresnel(permittivity: complex, cosine: float) -> tuple[complex, complex]:
+def compute_fresnel(permittivity: complex, cosine: float) -> tuple[complex, complex]:
     """Fresnel's formulas; r_p is of the tangential electric field."""
     root = np.sqrt(permittivity - (1 - cosine**2))
     return (cosine - root) / (cosine + root), (root - permittivity * cosine) / (root + permittivity * cosine)
 
 
-def between(above: complex, below: complex, cosine: float) -> tuple[complex, complex]:
+def compute_fresnel_between(above: complex, below: complex, cosine: float) -> tuple[complex, complex]:
     """Fresnel's formulas at a boundary of two media; `cosine` of the angle in air."""
     sine_squared = 1 - cosine**2
     first = np.sqrt(above - sine_squared + 0j)
@@ -29,7 +29,9 @@ def between(above: complex, below: complex, cosine: float) -> tuple[complex, com
 
 @given(permittivities, cosines)
 def test_a_half_space_reflects_by_fresnel(permittivity, cosine):
-    assert reflect(Stack(below=permittivity), FREQUENCY_HZ, cosine) == pytest.approx(fresnel(permittivity, cosine))
+    assert reflect(Stack(below=permittivity), FREQUENCY_HZ, cosine) == pytest.approx(
+        compute_fresnel(permittivity, cosine)
+    )
 
 
 @given(permittivities, permittivities, st.floats(0.0, 0.006), cosines)
@@ -37,7 +39,7 @@ def test_a_layer_reflects_by_airy(layer, below, thickness_m, cosine):
     root = np.sqrt(layer - (1 - cosine**2))
     turn = np.exp(-4j * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S * root * thickness_m)
     stack = Stack(((layer, thickness_m),), below)
-    pairs = zip(between(1, layer, cosine), between(layer, below, cosine), strict=True)
+    pairs = zip(compute_fresnel_between(1, layer, cosine), compute_fresnel_between(layer, below, cosine), strict=True)
     expected = [(top + bottom * turn) / (1 + top * bottom * turn) for top, bottom in pairs]
     assert reflect(stack, FREQUENCY_HZ, cosine) == pytest.approx(expected, abs=1e-9)
 

@@ -16,12 +16,14 @@ S_AXIS = np.array([[0.0], [1.0], [0.0]])
 P_AXIS = np.array([[0.0], [0.0], [1.0]])
 
 
-def dipoles(tx_m: tuple[float, ...], rx_m: tuple[float, ...], sent: np.ndarray, received: np.ndarray) -> series.Pair:
+def make_dipoles(
+    tx_m: tuple[float, ...], rx_m: tuple[float, ...], sent: np.ndarray, received: np.ndarray
+) -> series.Pair:
     """One pair of dipoles about the origin."""
     return series.Pair(np.array(tx_m)[:, None], np.array(rx_m)[:, None], sent + 0j, received + 0j)
 
 
-def random_pair(seed: int) -> tuple[series.Pair, series.Pair]:
+def draw_pair(seed: int) -> tuple[series.Pair, series.Pair]:
     """Dipoles at drawn places, and the same with TX and RX exchanged."""
     rng = np.random.default_rng(seed)
     places = rng.normal(size=(2, 3, 1))
@@ -35,7 +37,7 @@ def test_a_large_metal_sphere_has_its_radar_cross_section():
     radius_m = 0.1
     distance_m = 60.0
     receiver_m = (0.0, 0.0, -distance_m)
-    echo = series.scatter_sphere(dipoles(receiver_m, receiver_m, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
+    echo = series.scatter_sphere(make_dipoles(receiver_m, receiver_m, S_AXIS, S_AXIS), radius_m, None, FREQUENCY_HZ)[0]
     # sigma = 4 pi |E_s|^2 R^4 for a unit wave at 1 m; geometrical optics: pi a^2.
     section = 4 * np.pi * abs(echo) ** 2 * distance_m**4
     assert section == pytest.approx(np.pi * radius_m**2, rel=0.02)
@@ -45,7 +47,7 @@ def test_a_tiny_sphere_is_rayleighs_dipole():
     radius_m = 1e-4
     distance_m = 10.0
     eps = 4.0
-    pair = dipoles((0, 0, -distance_m), (distance_m, 0, 0), S_AXIS, S_AXIS)
+    pair = make_dipoles((0, 0, -distance_m), (distance_m, 0, 0), S_AXIS, S_AXIS)
     echo = abs(series.scatter_sphere(pair, radius_m, eps - 1e-9j, FREQUENCY_HZ, with_inside=True)[0])
     expected = K**2 * radius_m**3 * (eps - 1) / (eps + 2) / distance_m**2
     assert echo == pytest.approx(expected, rel=1e-2)
@@ -68,7 +70,7 @@ def test_a_sphere_with_loss_takes_more_than_it_scatters():
 @pytest.mark.parametrize("permittivity", MEDIA)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_transmitter_and_receiver_may_be_exchanged(permittivity, seed):
-    forth, back = random_pair(seed)
+    forth, back = draw_pair(seed)
     exchanged = series.scatter_sphere(forth, 0.05, permittivity, FREQUENCY_HZ)
     assert series.scatter_sphere(back, 0.05, permittivity, FREQUENCY_HZ) == pytest.approx(exchanged, rel=1e-9)
     path_m = np.array([1.3])
@@ -86,7 +88,7 @@ def test_the_stationary_axial_wave_gives_the_whole_integral(permittivity, tolera
     k = 2 * np.pi * frequency_hz / LIGHT_M_PER_S
     # A turn of both dipoles, so that all parts of the sum are there.
     tx_m, rx_m = places
-    pair = dipoles(tx_m, rx_m, sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
+    pair = make_dipoles(tx_m, rx_m, sent + 0.3 * S_AXIS, received + 0.2 * P_AXIS)
     body = series.EndlessCylinder(radius_m, permittivity, False)
     round_x = cylinder("cylinder", METAL, (0.0, 0.0, 0.0), radius_m, 2.0, axis=(1.0, 0.0, 0.0))
     path = follow_path(round_x.evaluate(*find_specular(round_x, pair.tx_m, pair.rx_m)), pair.tx_m, pair.rx_m)

@@ -16,21 +16,21 @@ DIELECTRIC = worlds.Stack(below=4 - 0.4j)
 OFFSETS_M = np.array([[0.0, 0, 0], [0.05, 0.02, 0], [-0.1, 0.06, 0], [0.12, -0.05, 0]])
 
 
-def point_behind(depth_m: float) -> tuple[float, float, float]:
+def make_point_behind(depth_m: float) -> tuple[float, float, float]:
     x, y, z = CENTRE_M
     return x, y, z + depth_m
 
 
 SHAPES = [
-    worlds.sphere("sphere", worlds.METAL, point_behind(0.1), 0.1),
-    worlds.cylinder("cylinder", DIELECTRIC, point_behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
-    worlds.cylinder("cone", worlds.METAL, point_behind(0.09), 0.09, 0.6, slope=-0.15),
-    worlds.plate("saddle", worlds.METAL, point_behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
-    worlds.plate("tilted", DIELECTRIC, point_behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
+    worlds.sphere("sphere", worlds.METAL, make_point_behind(0.1), 0.1),
+    worlds.cylinder("cylinder", DIELECTRIC, make_point_behind(0.1), 0.1, 0.6, axis=(0.3, 1.0, 0.1)),
+    worlds.cylinder("cone", worlds.METAL, make_point_behind(0.09), 0.09, 0.6, slope=-0.15),
+    worlds.plate("saddle", worlds.METAL, make_point_behind(0.0), (0.3, 0.3), bends=(7.0, -6.0, 1.0)),
+    worlds.plate("tilted", DIELECTRIC, make_point_behind(0.0), (0.9, 0.9), tilt_deg=(4.0, -2.0), is_soft=True),
 ]
 
 
-def geometrical_optics(
+def compute_geometrical_optics(
     shape: worlds.Shape, tx: Antenna, rx: Antenna, offset_m: np.ndarray, frequency_hz: float
 ) -> complex:
     """Ray at the specular point: Fresnel's coefficients, spreading by the path's second derivatives."""
@@ -66,7 +66,7 @@ def geometrical_optics(
 def test_a_shape_reflects_by_geometrical_optics_but_for_a_few_per_cent(shape):
     cubes = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:1], OFFSETS_M)
     for channel, receivers in ONE_RX.receivers().items():
-        expected = np.array([geometrical_optics(shape, BOARDS.tx, receivers[0], u, 76.3e9) for u in OFFSETS_M])
+        expected = np.array([compute_geometrical_optics(shape, BOARDS.tx, receivers[0], u, 76.3e9) for u in OFFSETS_M])
         assert np.abs(cubes[channel][0, 0] - expected).max() < 0.04 * np.abs(expected).max()
 
 
@@ -110,7 +110,7 @@ def test_a_whole_scan_is_that_of_its_single_positions(shape):
 def test_a_large_flat_plate_is_the_same_in_facets_and_in_zones():
     # The mean over Fresnel zones of the edges: plates of growing size swing around the one without edges.
     widths_m = np.linspace(0.5, 0.56, 9)
-    sharp = [worlds.plate("sharp", DIELECTRIC, point_behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
+    sharp = [worlds.plate("sharp", DIELECTRIC, make_point_behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
     few = OFFSETS_M[:2]
     first = [worlds.record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
     second = worlds.record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], few)["h"]

@@ -20,7 +20,7 @@ class Load:
     stall_ms: float = 0.0
 
 
-def pulse_times(bursts: int, pulses: int = 16, period_us: float = 1500.0, between_ms: float = 100.0) -> np.ndarray:
+def draw_pulse_times(bursts: int, pulses: int = 16, period_us: float = 1500.0, between_ms: float = 100.0) -> np.ndarray:
     """Return times of SYNC_IN pulses, int64 [burst, pulse], ns; the first is at 1 s."""
     first = 1_000 * MS + np.arange(bursts) * round(between_ms * MS)
     return (first[:, None] + np.arange(pulses) * round(period_us * US)).astype(np.int64)

@@ -12,7 +12,7 @@ from polysight_shared.raster import Row
 from polysight_simulators.loopback import move_to_free_subnet
 from tests.support.acquisition.fake_cards import FakeCard
 from tests.support.processes import HANG_S
-from tests.support.rigs import rig_with
+from tests.support.rigs import make_rig_with
 
 # The Pi's clock less the host's.
 PI_AHEAD_NS = 77_000_000_000
@@ -276,7 +276,7 @@ class FakeRig:
             self.pi.close()
 
 
-def small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
+def make_small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
     """The published rig with a small grid and few pulses, on a loopback subnet that is free.
 
     Each of the three attempts of a command waits for its reply as long as `HANG_S`.
@@ -284,4 +284,4 @@ def small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits:
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 3 * HANG_S, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}
     grid = {"columns": columns, "rows": rows}
-    return move_to_free_subnet(rig_with(grid=grid, burst={"pulses": pulses}, limits=limits, card=card))
+    return move_to_free_subnet(make_rig_with(grid=grid, burst={"pulses": pulses}, limits=limits, card=card))

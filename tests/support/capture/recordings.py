@@ -10,7 +10,7 @@ CARD = b"\xc0\xa8\x21\xb4"
 OTHER = b"\xc0\xa8\x21\xb5"
 
 
-def row(
+def draw_row(
     lanes: int,
     q_first: bool,
     chirps: int = 32,
@@ -41,7 +41,7 @@ def row(
     return np.round(words).astype("<i2").reshape(-1)
 
 
-def udp_frame(source_port: int, payload: bytes, card: bytes = CARD) -> bytes:
+def encode_udp_frame(source_port: int, payload: bytes, card: bytes = CARD) -> bytes:
     """Return an Ethernet frame with an IPv4 UDP datagram from a card."""
     udp = struct.pack(">HHHH", source_port, 4098, 8 + len(payload), 0) + payload
     ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(udp), 0, 0x4000, 64, 17, 0, card, b"\xc0\xa8!\x1e")
@@ -54,6 +54,6 @@ def write_pcap(
     """Write a capture file of UDP payloads, which come from the cards in turn."""
     raw = struct.pack(order + "IHHiIII", magic, 2, 4, 0, 0, 65535, 1)
     for k, p in enumerate(payloads):
-        frame = udp_frame(1024, p, cards[k % len(cards)])
+        frame = encode_udp_frame(1024, p, cards[k % len(cards)])
         raw += struct.pack(order + "IIII", 100 + k, 5, len(frame), len(frame)) + frame
     path.write_bytes(raw)

@@ -92,7 +92,7 @@ def place(
     return place_record(make_log(size, packets, batch), frame, past)
 
 
-def next_start(placed: PlacedRecord) -> Counters | None:
+def find_next_start(placed: PlacedRecord) -> Counters | None:
     """Counters with which the card's next record starts; None if that is uncertain."""
     return placed.past.start
 

@@ -9,7 +9,7 @@ from polysight.calibration.direct_signal import find_direct
 from polysight.doctor.context import CheckContext, DoctorOptions, LoadResult, System
 from polysight.sync import BoardSetup
 from polysight_simulators.scene import SimulatedRig, decode_scene
-from tests.support.rigs import programmed_rig
+from tests.support.rigs import make_programmed_rig
 
 # A computer whose disk and receivers count as fast enough, without a measurement.
 QUICK = System(
@@ -18,7 +18,7 @@ QUICK = System(
 )
 # Frames of a board at rest.
 FRAMES = 32
-RIG = programmed_rig()
+RIG = make_programmed_rig()
 SMALL = {
     "name": "s",
     "grid": {"columns": 4, "rows": 2},
@@ -36,7 +36,7 @@ def simulate_frames(board, rig=RIG, **disturbances):
 setup_of = functools.cache(lambda board: BoardSetup.from_rig(RIG, RIG.by_name(board)))  # no start frequency changes it
 
 
-def direct_signal(board, rig=RIG, **disturbances):
+def make_direct_signal(board, rig=RIG, **disturbances):
     """The doctor's finding on the direct path in simulated frames of a board."""
     words = simulate_frames(board, rig, **disturbances)
     return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))

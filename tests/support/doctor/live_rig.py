@@ -22,8 +22,8 @@ from polysight_shared.config import Instrument, load_instrument
 from polysight_shared.findings import Finding
 from polysight_shared.tables import to_builtins
 from tests.support.doctor.case import QUICK
-from tests.support.processes import HANG_S, processes_naming, wait_for
-from tests.support.rigs import programmed_rig
+from tests.support.processes import HANG_S, list_processes_naming, wait_for
+from tests.support.rigs import make_programmed_rig
 
 SCENE = """name = "doctor"
 seed = 3
@@ -40,9 +40,9 @@ if_offset_hz = 0.0
 """
 
 
-def impatient_rig() -> Instrument:
+def make_impatient_rig() -> Instrument:
     """A rig with the direct path mid-band and short timeouts."""
-    return programmed_rig(limits={"command_timeout_s": 6.0, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
+    return make_programmed_rig(limits={"command_timeout_s": 6.0, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
 
 
 @dataclass
@@ -116,7 +116,7 @@ class LiveRig:
             wait_for(lambda: pi.status().state == "homed", "homed")
 
     def _pid(self, word: str) -> int:
-        lines = processes_naming(str(self.folder))
+        lines = list_processes_naming(str(self.folder))
         pids = [pid for pid, line in lines.items() if word in line and "polysight_simulators.rig" not in line]
         assert len(pids) == 1, (word, pids)
         return pids[0]

@@ -40,7 +40,7 @@ def post(view: Any, path: str, body: Any = None, token: str = TOKEN, **headers: 
     return status, json.loads(raw)
 
 
-def raw(view: Any, data: bytes, limit_s: float = HANG_S) -> bytes:
+def send_raw(view: Any, data: bytes, limit_s: float = HANG_S) -> bytes:
     """Send bytes; return everything received until the server closes the connection."""
     with socket.create_connection(("127.0.0.1", view.port), limit_s) as s:
         s.sendall(data)

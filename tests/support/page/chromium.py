@@ -21,7 +21,7 @@ from urllib.request import urlopen
 from websockets.sync.client import connect
 
 from tests.support.paths import REPO
-from tests.support.processes import HANG_S, LIMIT_S, idle_s, wait_for
+from tests.support.processes import HANG_S, LIMIT_S, read_idle_s, wait_for
 
 # Sizes of a window: width, height, and whether it is a phone.
 DESK = (1400, 900, False)
@@ -210,9 +210,9 @@ class Browser:
 
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until an expression is true in the page."""
-        deadline = idle_s() + limit_s
+        deadline = read_idle_s() + limit_s
         while not self._true(expression):
-            assert idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
+            assert read_idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
             time.sleep(0.05)
 
     def _true(self, expression: str) -> bool:

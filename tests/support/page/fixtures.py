@@ -14,7 +14,7 @@ from polysight_simulators.scene import decode_scene, simulate
 from tests.support.page.live_view import GrowingScan
 from tests.support.processes import wait_for
 from tests.support.products import skip_rendering
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, PET, make_scene
 from tests.support.store.small_scan import Samples, SmallScan
 from tests.support.suite import make_once
@@ -67,7 +67,7 @@ def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def make(root: Path) -> None:
         for name, seed in (("one", 3), ("two", 7)):
-            folder = simulate(published_rig(), scene, root / name, seed=seed)
+            folder = simulate(load_published_rig(), scene, root / name, seed=seed)
             with skip_rendering():
                 assert process(folder, folder / "products", threads=1) == 0
 

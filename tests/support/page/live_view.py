@@ -111,7 +111,7 @@ class Served:
 
 
 @contextmanager
-def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0) -> Iterator[Served]:
+def serve_view(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0) -> Iterator[Served]:
     """A server of one live view for the block."""
     access = Access(token, loopback=host == "127.0.0.1", control=bool(token))
     scans = Scans(watch.folder.parent, watch.folder.name)
@@ -123,7 +123,7 @@ def served(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0
 
 
 @contextmanager
-def served_folder(
+def serve_folder(
     root: Path,
     token: str = "",
     access: Access | None = None,

@@ -17,7 +17,7 @@ from polysight_shared import messages as m
 from polysight_shared.config import Instrument
 from polysight_shared.raster import plan_raster
 from polysight_shared.sockets import create_requester, create_subscriber
-from tests.support.processes import LIMIT_S, idle_s, wait_for
+from tests.support.processes import LIMIT_S, read_idle_s, wait_for
 
 POLL_MS = 100
 # Step of the ticking clock.
@@ -133,8 +133,8 @@ class HostSide:
     def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None) -> Any:
         """The next event of a kind."""
         limit_s = self.limit_s if limit_s is None else limit_s
-        deadline = idle_s() + limit_s
-        while idle_s() < deadline:
+        deadline = read_idle_s() + limit_s
+        while read_idle_s() < deadline:
             if self.subscriber.poll(POLL_MS):
                 event = m.unpack_event(self.subscriber.recv_multipart()[-1])
                 self.events.append(event)

@@ -62,7 +62,7 @@ def require_stand_in_chip() -> None:
         pytest.skip(f"no stand-in chip without {' '.join(lacking)}: {gpio.ENABLING_COMMAND}", allow_module_level=True)
 
 
-def resident_bytes(pid: int | str = "self") -> int:
+def read_resident_bytes(pid: int | str = "self") -> int:
     """Memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 

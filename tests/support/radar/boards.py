@@ -6,7 +6,7 @@ import msgspec
 
 from polysight_shared.config import Instrument, NativeRadar, Radar
 from polysight_simulators.radars import FUNCTIONAL_LEVELS, RadarBoard
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 
 class VirtualClock:
@@ -69,14 +69,14 @@ class Restarts(BoardWords):
                 self.board.switch_power(True)
 
 
-def native_rig() -> Instrument:
+def make_native_rig() -> Instrument:
     """The published rig under native control, each receiver's direct path in the middle of its IF window."""
-    rig = published_rig()
+    rig = load_published_rig()
     boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
     radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=f"FT{b.name}") for b in boards})
     return msgspec.structs.replace(rig, boards=boards, radar=radar)
 
 
-def with_radar(rig: Instrument, **values: object) -> Instrument:
+def change_radar_table(rig: Instrument, **values: object) -> Instrument:
     """The rig with other values in its table [radar]."""
     return msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, **values))

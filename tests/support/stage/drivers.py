@@ -15,18 +15,18 @@ from polysight_shared.stage_line import Command, Immediate, Parameter, Reply
 from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
 from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight_simulators.uno import HZ, EmulatedUno, PinEdge
-from tests.support.processes import HANG_S, LIMIT_S, idle_s
+from tests.support.processes import HANG_S, LIMIT_S, read_idle_s
 
 # Longest time until a stage comes to rest: 10 minutes.
 LIMIT_TICKS = 600 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
 
 
-def edges(wires: list[WireMessage]) -> list[WireEdge]:
+def list_edges(wires: list[WireMessage]) -> list[WireEdge]:
     return [w for w in wires if isinstance(w, WireEdge)]
 
 
-def motions(wires: list[WireMessage]) -> list[WireMotion]:
+def list_motions(wires: list[WireMessage]) -> list[WireMotion]:
     return [w for w in wires if isinstance(w, WireMotion)]
 
 
@@ -302,9 +302,9 @@ class PortDriver(Driver):
         self.received = self.received[self.received.index(b"polysight-stage") :]
 
     def until(self, there: Callable[[], bool]) -> None:
-        limit = idle_s() + LIMIT_S
+        limit = read_idle_s() + LIMIT_S
         while not there():
-            if idle_s() > limit:
+            if read_idle_s() > limit:
                 raise ProtocolError(f"not within {LIMIT_S:g} s; received {self.received!r}")
             self._listen()
 
@@ -325,8 +325,8 @@ class PortDriver(Driver):
 
     def run_until_rest(self, limit_ticks: int = LIMIT_TICKS) -> None:
         """Request the status until the stage rests; these answers are not kept."""
-        limit = idle_s() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
-        while idle_s() < limit:
+        limit = read_idle_s() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
+        while read_idle_s() < limit:
             if self.status().fields["state"] in ("idle", "alarm", "hold"):
                 return
             self._listen(0.1 / self._speed)

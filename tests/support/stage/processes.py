@@ -11,7 +11,7 @@ from pathlib import Path
 
 from polysight_shared.wires import WireEdge, WireMessage, WireMotion, parse
 from tests.support.paths import REPO, RIG_FILE
-from tests.support.processes import HANG_S, LIMIT_S, idle_s
+from tests.support.processes import HANG_S, LIMIT_S, read_idle_s
 
 # The commands of a stage: the sketch for this machine, its Python stand-in, machine code on an emulated UNO.
 COMMANDS = {"pc": ("stage",), "python": ("stage", "--python"), "uno": ("uno",)}
@@ -91,9 +91,9 @@ def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "")
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         parent.kill()
-    limit = idle_s() + LIMIT_S
+    limit = read_idle_s() + LIMIT_S
     while runs(child):
-        if idle_s() > limit:
+        if read_idle_s() > limit:
             return True
         time.sleep(0.02)
     return False

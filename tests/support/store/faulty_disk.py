@@ -168,19 +168,19 @@ class FaultyDisk:
         return fd
 
     def _pwrite(self, fd: int, data: Any, offset: int) -> int:
-        path = _descriptor_path(fd)
+        path = _read_descriptor_path(fd)
         self._touch(path)
         self._hit("pwrite", path, lambda: REAL.pwrite(fd, bytes(data)[: len(data) // 2], offset))
         return REAL.pwrite(fd, data, offset)
 
     def _on_file(self, name: str, fd: int, *more: Any) -> Any:
-        self._touch(_descriptor_path(fd))
-        self._hit(name, _descriptor_path(fd))
+        self._touch(_read_descriptor_path(fd))
+        self._hit(name, _read_descriptor_path(fd))
         return getattr(REAL, name)(fd, *more)
 
     def _fsync(self, fd: int) -> None:
-        self._hit("fsync", _descriptor_path(fd))
-        self._sync(_descriptor_path(fd))  # not the real sync, which would only cost time
+        self._hit("fsync", _read_descriptor_path(fd))
+        self._sync(_read_descriptor_path(fd))  # not the real sync, which would only cost time
 
     def _mkdir(self, path: Any, *more: Any, **named: Any) -> None:
         self._hit("mkdir", Path(path))
@@ -238,6 +238,6 @@ class _SeenFile(io.FileIO):
         return super().truncate(size)
 
 
-def _descriptor_path(fd: int) -> Path:
+def _read_descriptor_path(fd: int) -> Path:
     """The path of an open descriptor."""
     return Path(f"/proc/self/fd/{fd}").readlink()

@@ -11,14 +11,14 @@ from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import to_text, validate
 from polysight_shared.messages import Fault, RunStarted
 from polysight_shared.raster import plan_raster
-from tests.support.acquisition.fake_rig import small_instrument
+from tests.support.acquisition.fake_rig import make_small_instrument
 
 Gaps = dict[tuple[str, int], list[tuple[int, int]]]
 
 
 def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
     """Four committed rows, all bytes of row k being k + 1; `gaps` are missing byte ranges by board and row."""
-    instrument = small_instrument()
+    instrument = make_small_instrument()
     scan = ScanFolder.create(folder, instrument, plan_raster(instrument.grid), simulated=True)
     frames = instrument.grid.columns * instrument.burst.pulses
     events = EventWriter(scan.path / "events.msgpack")
@@ -48,6 +48,6 @@ def write_scan(folder: Path, gaps: Gaps | None = None) -> Path:
     return scan.path
 
 
-def errors(folder: Path) -> list[str]:
+def list_errors(folder: Path) -> list[str]:
     """Errors of a scan folder, without notes."""
     return [to_text(f) for f in validate(folder) if f.level == "error"]

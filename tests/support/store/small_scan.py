@@ -32,10 +32,10 @@ from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.scene import SimulatedRig, load_scene, row_offsets_mm
 from tests.support.capture.records import encode_packets
 from tests.support.pipelines import make_pipeline
-from tests.support.rigs import published_rig
-from tests.support.scenes import small_scene
+from tests.support.rigs import load_published_rig
+from tests.support.scenes import write_small_scene
 
-SCENE = small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
+SCENE = write_small_scene(3, 3, step_mm=(20.0, 20.0), pixels=12)
 
 
 class Samples:
@@ -43,7 +43,7 @@ class Samples:
 
     def __init__(self, folder: Path) -> None:
         (folder / "scene.toml").write_text(SCENE)
-        radar = SimulatedRig(published_rig(), load_scene(folder / "scene.toml"))
+        radar = SimulatedRig(load_published_rig(), load_scene(folder / "scene.toml"))
         table = to_builtins(radar.rig)
         table["limits"] |= {"free_disk_bytes": 0}
         self.instrument = decode(table, Instrument, "small scan")

@@ -59,7 +59,7 @@ def test_texts_of_a_file_are_lines_without_control_characters(tmp_path):
     """They are printed, and ESC would control the terminal."""
     path = tmp_path / "PET_55.pkl"
     names = {"name": "PET\x1b[31m\n3 mm\n", "collection_name": "scan\t1\x00", "ref_name": "\u202ecopper"}
-    path.write_bytes(pickle.dumps(content(4) | names))
+    path.write_bytes(pickle.dumps(make_content(4) | names))
     entry = read_material(path)
     assert (entry.name, entry.scan, entry.reference) == ("PET?[31m 3 mm", "scan 1?", "?copper")
 

@@ -66,13 +66,13 @@ def test_a_run_that_is_interrupted_has_a_page_and_a_second_one_names_what_is_not
     def interrupt(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "MAKERS", {"fig3": lambda _: item(), "fig20": interrupt})
+    monkeypatch.setattr(report, "MAKERS", {"fig3": lambda _: make_item(), "fig20": interrupt})
     assert main(["reproduce", "--out", str(tmp_path)]) == 130
     page = (tmp_path / "reproduce.html").read_text(encoding="utf-8")
     assert 'id="fig3"' in page
     assert "Not made in this run: fig20" in page
 
-    monkeypatch.setattr(report, "MAKERS", {"fig21": lambda _: item("fig21")})
+    monkeypatch.setattr(report, "MAKERS", {"fig21": lambda _: make_item("fig21")})
     capsys.readouterr()
     assert main(["reproduce", "--out", str(tmp_path)]) == 0
     out = capsys.readouterr().out

@@ -371,7 +371,7 @@ def source(instrument):
 
 
 @pytest.fixture
-def list_rises(hub, instrument):
+def rises(hub, instrument):
     """Wire times of the next rising edges, each followed by its falling one."""
     with closing(WireClient(hub, listen=instrument.pi.sync_out)) as radar:
 

@@ -9,7 +9,7 @@ import pytest
 from tests.support.pi.fakes import FakeLines
 from tests.support.pi.program import Process
 from tests.support.refusals import refused
-from tests.support.rigs import at_stage_port, published_rig
+from tests.support.rigs import load_published_rig, set_stage_port
 
 from polysight_pi import PROGRAM
 from polysight_pi.cli import main
@@ -85,7 +85,7 @@ def test_check_names_every_hop(command, config, hub, stage):
 
 
 def test_commands_without_the_service(command, instrument, write_config, hub, stage):
-    config = write_config(at_stage_port(move_to_free_subnet(instrument), stage.port))
+    config = write_config(set_stage_port(move_to_free_subnet(instrument), stage.port))
     options = ("--config", config, "--wires", hub, "--count", 3, "--json")
     status, out, _ = command("pulse", *options)
     assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
@@ -157,7 +157,7 @@ def test_advice_for_another_users_file_is_the_whole_command(command, config, mon
         raise PermissionError(errno.EACCES, "Permission denied", "take-over-key")
 
     monkeypatch.setattr("pathlib.Path.read_text", refuse)
-    monkeypatch.setattr("polysight_shared.config.load_instrument", lambda _: published_rig())
+    monkeypatch.setattr("polysight_shared.config.load_instrument", lambda _: load_published_rig())
     status, _, err = command("take-over", "abort", "--config", config)
     assert status == 5
     assert f"sudo -u polysight {PROGRAM} take-over abort --config {config}`" in err

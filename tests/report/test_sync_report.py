@@ -11,7 +11,7 @@ from polysight.sync import PUBLISHED_STD, STAGES, SyncedRow
 SCALES = {"received": (8e4, 1.8, 0.1), "aligned": (80.0, 0.013, 0.01), "averaged": (20.0, 0.003, 0.003)}
 
 
-def row(snr_db=7.2, n=4000, seed=0):
+def draw_row(snr_db=7.2, n=4000, seed=0):
     """A row of errors of known size, without echoes."""
     rng = np.random.default_rng(seed)
     errors = {name: rng.standard_normal((3, n)) * np.array(scale)[:, None] for name, scale in SCALES.items()}
@@ -39,7 +39,7 @@ def make_report(*rows, rx=4):
 
 
 def test_spreads_are_those_of_the_errors():
-    summary = make_report(row(seed=1), row(seed=2)).summary()
+    summary = make_report(draw_row(seed=1), draw_row(seed=2)).summary()
     assert summary["chirps"] == 2 * 4000 * 16
     for name, scale in SCALES.items():
         stage = summary["stages"][name]
@@ -51,15 +51,15 @@ def test_spreads_are_those_of_the_errors():
 
 def test_the_papers_figures_are_the_bound_of_one_tone_at_7_2_db():
     # Four times that of the average of 16 chirps.
-    f, phase, _ = 4 * np.array(make_report(row(7.2), rx=1).bounds()["averaged"])
+    f, phase, _ = 4 * np.array(make_report(draw_row(7.2), rx=1).bounds()["averaged"])
     assert f == pytest.approx(PUBLISHED_STD["frequency_hz"], rel=0.01)
     assert phase == pytest.approx(PUBLISHED_STD["phase_rad"], rel=0.02)
 
 
 def test_four_receivers_and_16_chirps_are_worth_64_times_the_power():
-    bounds = make_report(row(7.2)).bounds()
-    alone = make_report(row(7.2), rx=1).bounds()["aligned"]
-    burst_alone = make_report(row(7.2), rx=1).bounds()["averaged"]
+    bounds = make_report(draw_row(7.2)).bounds()
+    alone = make_report(draw_row(7.2), rx=1).bounds()["aligned"]
+    burst_alone = make_report(draw_row(7.2), rx=1).bounds()["averaged"]
     assert bounds["averaged"] == pytest.approx(np.array(burst_alone) / 2)
     assert np.array(alone) == pytest.approx(4 * np.sqrt(15 / 16) * np.array(burst_alone))
     assert bounds["aligned"] == pytest.approx(np.array(alone) / 2)
@@ -68,7 +68,7 @@ def test_four_receivers_and_16_chirps_are_worth_64_times_the_power():
 @pytest.mark.parametrize("chirps", [2, 3, 16])
 def test_the_bound_of_an_aligned_chirp_is_that_of_its_deviation_from_the_burst(chirps):
     """The mean of a burst is taken out of its chirps' errors: with two chirps half of the variance is left."""
-    noisy = row(7.2)
+    noisy = draw_row(7.2)
     noisy.chirps[:] = chirps
     report = make_report(noisy)
     one_chirp = np.sqrt(chirps) * np.array(report.bounds()["averaged"])
@@ -79,7 +79,7 @@ def test_the_bound_of_an_aligned_chirp_is_that_of_its_deviation_from_the_burst(c
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_files_and_words(tmp_path, simulated):
-    text = write_sync_report(tmp_path, {"RH": make_report(row())}, "scan one", simulated)
+    text = write_sync_report(tmp_path, {"RH": make_report(draw_row())}, "scan one", simulated)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["sync-RH.png", "sync.json", "sync.txt"]
     assert (tmp_path / "sync-RH.png").read_bytes().startswith(b"\x89PNG")
     facts = json.loads((tmp_path / "sync.json").read_text())

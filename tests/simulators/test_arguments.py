@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from tests.support.paths import RIG_FILE
 from tests.support.refusals import refused
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import NativeRadar
 from polysight_shared.errors import ErrorCode
@@ -52,7 +52,7 @@ def test_a_time_scale_that_is_none_is_refused_before_a_process_starts(tmp_path, 
 
 def move_native(boards):
     """Rig with native control of these boards, one a board of the published rig, on a subnet."""
-    rig = published_rig()
+    rig = load_published_rig()
     native = {board.name: identity for board, identity in zip(rig.boards, boards, strict=True)}
     radar = msgspec.structs.replace(rig.radar, control="native", native=native)
     return move_to_subnet(msgspec.structs.replace(rig, radar=radar), "127.3.4")

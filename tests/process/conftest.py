@@ -42,7 +42,7 @@ def six_plates(tmp_path_factory: pytest.TempPathFactory) -> ScanFolder:
 
 @pytest.fixture(scope="session")
 def process_six_plates(six_plates: ScanFolder) -> mangled_scans.ProcessMangled:
-    return mangled_scans.processor(six_plates)
+    return mangled_scans.make_processor(six_plates)
 
 
 @pytest.fixture(scope="session")

@@ -43,13 +43,13 @@ def kill(
     def mangle(name: str, row: int, words: np.ndarray) -> None:
         if name == board and row in rows:
             for k in rx:
-                part = words[_chirps_of(positions, words)]
+                part = words[_select_chirps(positions, words)]
                 part[..., k - 1] = draw_noise(100 * row + k, part, rms) if value is None else value
 
     return mangle
 
 
-def _chirps_of(positions: slice, words: np.ndarray) -> slice:
+def _select_chirps(positions: slice, words: np.ndarray) -> slice:
     """The chirps of some positions; a row of a cube has one for each."""
     chirps = len(words) // SCENE["grid"]["columns"]
     return slice(*(None if end is None else end * chirps for end in (positions.start, positions.stop)))
@@ -69,11 +69,11 @@ def form_images(source: ScanFolder, mangle: Mangle) -> Images:
     return make_pipeline(Mangled(source, mangle)).form_images()  # type: ignore[arg-type]
 
 
-def about_rx(findings: Findings) -> list[str]:
+def list_reasons_about_rx(findings: Findings) -> list[str]:
     return [r.what for r in findings.verdict.reasons if "RX" in r.what]
 
 
-def other_reasons(findings: Findings) -> set[str]:
+def list_other_reasons(findings: Findings) -> set[str]:
     """All reasons except those about an RX, without their numbers."""
     return {"".join(c for c in r.what if not c.isdigit()) for r in findings.verdict.reasons if "RX" not in r.what}
 
@@ -83,9 +83,9 @@ def test_noise_instead_of_an_rx_is_reported_and_changes_nothing_else(source, pro
     _, healthy_images, healthy = process()
     pipeline, images, findings = process(kill(board, rx))
     assert findings.verdict.level == "care"
-    (told,) = about_rx(findings)
+    (told,) = list_reasons_about_rx(findings)
     assert f"RX{rx} of {board}" in told
-    assert other_reasons(findings) <= other_reasons(healthy)
+    assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(distances(source, findings)) == len(PLATES)
     assert max(distances(source, findings)) < 9
     assert pipeline.quality.result().boards[board].dead_rx == {rx: list(range(ROWS))}
@@ -136,11 +136,11 @@ def test_the_images_are_those_of_a_rig_without_the_rx(source):
 @pytest.mark.parametrize("rows", [range(16, ROWS), range(16, 17)])
 def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
     pipeline, _, findings = process(kill("RV", 4, rows=rows))
-    (told,) = about_rx(findings)
+    (told,) = list_reasons_about_rx(findings)
     assert "RX4 of RV" in told
     assert "first in row 16" in told
     assert pipeline.quality.result().boards["RV"].dead_rx == {4: list(rows)}
-    assert other_reasons(findings) <= other_reasons(process()[2])
+    assert list_other_reasons(findings) <= list_other_reasons(process()[2])
     assert max(distances(source, findings)) < 9
 
 
@@ -159,14 +159,14 @@ def test_a_weak_rx_stays(process):
             words[..., 1] = np.rint(words[..., 1] * 10 ** (-10 / 20))
 
     pipeline, _, findings = process(weaken)
-    assert about_rx(findings) == []
+    assert list_reasons_about_rx(findings) == []
     assert pipeline.quality.result().boards["RV"].dead_rx == {}
 
 
 def test_two_dead_rx_leave_an_image(source, process):
     _, _, findings = process(kill("RH", 2, 3))
-    assert len(about_rx(findings)) == 1
-    assert other_reasons(findings) <= other_reasons(process()[2])
+    assert len(list_reasons_about_rx(findings)) == 1
+    assert list_other_reasons(findings) <= list_other_reasons(process()[2])
     assert max(distances(source, findings)) < 9
 
 
@@ -174,7 +174,7 @@ def test_a_board_without_any_rx_is_refused(process):
     _, _, findings = process(kill("RV", 1, 2, 3, 4))
     assert findings.verdict.level == "none"
     assert any("RV: the direct path is missing" in r.what for r in findings.verdict.reasons)
-    assert about_rx(findings) == []
+    assert list_reasons_about_rx(findings) == []
 
 
 def test_the_operator_hears_of_it_with_the_first_row(source, monkeypatch, caplog):
@@ -205,8 +205,8 @@ def test_a_cube_with_a_dead_rx_is_read_like_rows(process, rms):
     level = float(np.sqrt(np.mean(np.abs(cubes.read_row("RV", 15).cube) ** 2)))
     _, _, healthy = process(None, cubes)
     _, _, findings = process(kill("RV", 4, rms=rms * level), cubes)
-    (told,) = about_rx(findings)
+    (told,) = list_reasons_about_rx(findings)
     assert "RX4 of RV" in told
-    assert other_reasons(findings) <= other_reasons(healthy)
+    assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(distances(cubes, findings)) == len(PLATES)
     assert max(distances(cubes, findings)) < 9

@@ -8,7 +8,7 @@ import pytest
 from tests.support import mangled_scans
 from tests.support.paths import EXAMPLES
 from tests.support.pipelines import make_pipeline
-from tests.support.rigs import published_rig, rig_with
+from tests.support.rigs import load_published_rig, rig_with
 from tests.support.scenes import COPPER, PET, make_scene
 from tests.support.suite import make_once
 
@@ -36,7 +36,9 @@ Make = Callable[..., Imaged]
 def six_plates(tmp_path_factory: pytest.TempPathFactory) -> ScanFolder:
     """Raw data of the scene of `mangled_scans`."""
     scene = decode_scene(mangled_scans.SCENE, "test")
-    folder = make_once(tmp_path_factory, "six-plates", lambda folder: simulate(published_rig(), scene, folder / "scan"))
+    folder = make_once(
+        tmp_path_factory, "six-plates", lambda folder: simulate(load_published_rig(), scene, folder / "scan")
+    )
     return ScanFolder.load(folder / "scan")
 
 
@@ -71,7 +73,7 @@ def make_scan() -> Callable[..., Path]:
     """`make_scan(folder, scene, rig)`: a simulated scan, in a scan folder."""
 
     def make(folder: Path, scene: dict[str, Any], rig: Instrument | None = None, **more: Any) -> Path:
-        return simulate(rig or published_rig(), decode_scene(scene, "test"), folder, **more)
+        return simulate(rig or load_published_rig(), decode_scene(scene, "test"), folder, **more)
 
     return make
 

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.coverage import Cubes
 from tests.support.mangled_scans import PLATES, ROWS, SCENE, Mangle, Mangled, ProcessMangled, distances
 from tests.support.pipelines import make_pipeline
-from tests.support.rigs import published_rig
+from tests.support.rigs import load_published_rig
 
 from polysight.imaging import Images
 from polysight.jobs.process import LiveProcessing
@@ -201,7 +201,7 @@ def test_kept_samples_and_live_images_know_it(source):
 
 @pytest.mark.parametrize("rms", [0.0, 0.03])
 def test_a_cube_with_a_dead_rx_is_read_like_rows(process, rms):
-    cubes = Cubes(published_rig(), decode_scene(SCENE, "test"))
+    cubes = Cubes(load_published_rig(), decode_scene(SCENE, "test"))
     level = float(np.sqrt(np.mean(np.abs(cubes.read_row("RV", 15).cube) ** 2)))
     _, _, healthy = process(None, cubes)
     _, _, findings = process(kill("RV", 4, rms=rms * level), cubes)

@@ -8,7 +8,7 @@ import pytest
 from tests.support import mangled_scans
 from tests.support.paths import EXAMPLES
 from tests.support.pipelines import make_pipeline
-from tests.support.rigs import load_published_rig, rig_with
+from tests.support.rigs import load_published_rig, make_rig_with
 from tests.support.scenes import COPPER, PET, make_scene
 from tests.support.suite import make_once
 
@@ -37,7 +37,7 @@ def six_plates(tmp_path_factory: pytest.TempPathFactory) -> ScanFolder:
     """Raw data of the scene of `mangled_scans`."""
     scene = decode_scene(mangled_scans.SCENE, "test")
     folder = make_once(
-        tmp_path_factory, "six-plates", lambda folder: simulate(load_published_rig(), scene, folder / "scan")
+        tmp_path_factory, "six-plates", lambda path: simulate(load_published_rig(), scene, path / "scan")
     )
     return ScanFolder.load(folder / "scan")
 
@@ -53,7 +53,7 @@ def image_scene(tmp_path_factory: pytest.TempPathFactory) -> Make:
 
     Four pulses per position instead of sixteen: a scan takes a third of the time.
     """
-    rig = rig_with(burst={"pulses": 4})
+    rig = make_rig_with(burst={"pulses": 4})
     fields = tmp_path_factory.mktemp("fields")  # shared by scans of a scene with different disturbances
     done: dict[str, Imaged] = {}
 

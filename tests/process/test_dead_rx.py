@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
-from tests.support.mangled_scans import PLATES, ROWS, SCENE, Mangle, Mangled, ProcessMangled, distances
+from tests.support.mangled_scans import PLATES, ROWS, SCENE, Mangle, Mangled, ProcessMangled, compute_distances
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import load_published_rig
 
@@ -86,8 +86,8 @@ def test_noise_instead_of_an_rx_is_reported_and_changes_nothing_else(source, pro
     (told,) = list_reasons_about_rx(findings)
     assert f"RX{rx} of {board}" in told
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
-    assert len(distances(source, findings)) == len(PLATES)
-    assert max(distances(source, findings)) < 9
+    assert len(compute_distances(source, findings)) == len(PLATES)
+    assert max(compute_distances(source, findings)) < 9
     assert pipeline.quality.result().boards[board].dead_rx == {rx: list(range(ROWS))}
     both = images.valid & healthy_images.valid
     for one, other in ((images.h, healthy_images.h), (images.v, healthy_images.v)):
@@ -141,7 +141,7 @@ def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
     assert "first in row 16" in told
     assert pipeline.quality.result().boards["RV"].dead_rx == {4: list(rows)}
     assert list_other_reasons(findings) <= list_other_reasons(process()[2])
-    assert max(distances(source, findings)) < 9
+    assert max(compute_distances(source, findings)) < 9
 
 
 @pytest.mark.parametrize("positions", [slice(38, None), slice(21, 27), slice(0, 5), slice(24, None)], ids=str)
@@ -167,7 +167,7 @@ def test_two_dead_rx_leave_an_image(source, process):
     _, _, findings = process(kill("RH", 2, 3))
     assert len(list_reasons_about_rx(findings)) == 1
     assert list_other_reasons(findings) <= list_other_reasons(process()[2])
-    assert max(distances(source, findings)) < 9
+    assert max(compute_distances(source, findings)) < 9
 
 
 def test_a_board_without_any_rx_is_refused(process):
@@ -208,5 +208,5 @@ def test_a_cube_with_a_dead_rx_is_read_like_rows(process, rms):
     (told,) = list_reasons_about_rx(findings)
     assert "RX4 of RV" in told
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
-    assert len(distances(cubes, findings)) == len(PLATES)
-    assert max(distances(cubes, findings)) < 9
+    assert len(compute_distances(cubes, findings)) == len(PLATES)
+    assert max(compute_distances(cubes, findings)) < 9

@@ -49,7 +49,7 @@ class Burst(Section, frozen=True):
     by hand.
     """
 
-    pulses: Count
+    pulses: Annotated[int, msgspec.Meta(ge=1, le=65_536)]
     period_us: Positive
     width_us: Positive = 1.0
     chirps: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1

@@ -121,6 +121,7 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
         ("grid", "columns", 9000, ErrorCode.VALUE_INVALID, ["stage.centre_x_mm"]),
         ("grid", "rows", 0, ErrorCode.VALUE_INVALID, ["grid.rows"]),
         ("stage", "accel_mm_s2", -1.0, ErrorCode.VALUE_INVALID, ["accel_mm_s2", -1.0]),
+        ("burst", "pulses", 1_000_000_000, ErrorCode.VALUE_INVALID, ["burst.pulses", 65536]),
         ("limits", "command_timeout_s", 1e12, ErrorCode.VALUE_INVALID, ["limits.command_timeout_s", 86400]),
         ("limits", "end_of_record_s", 1e12, ErrorCode.VALUE_INVALID, ["limits.end_of_record_s", 86400]),
         ("stage", "speed_mm_s", 900.0, ErrorCode.VALUE_INVALID, ["grid.columns", "stage.speed_mm_s"]),

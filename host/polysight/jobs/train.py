@@ -99,11 +99,11 @@ def check_labelled(data: Path) -> None:
         raise DataError(f"{data}: no such folder", "the path is wrong", "give scan folders, or folders of products")
     saved_labels = find_labels(data)
     if is_given_images(data):
-        out = quote(f"out/{data.resolve().name}")
+        out = Path("out") / data.resolve().name
         raise DataError(
             f"{data}: images of another program, not a scan",
             "a library is made from recorded scans and from products",
-            f"polysight process {quote(data)} --out {out}; polysight label {out}; then train on {out}."
+            f"polysight process {quote(data)} --out {quote(out)}; polysight label {quote(out)}; then train on it."
             " The whole published data: polysight train --authors DIR",
             code=ErrorCode.FILE_FOREIGN,
         )

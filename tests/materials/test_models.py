@@ -45,8 +45,10 @@ def draw_samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=
 def shuffle_names(data, seed=0):
     """The same pixels with the names shuffled among the patches."""
     first = np.unique(data.patches, return_index=True)[1]
-    dealt = np.random.default_rng(seed).permutation(data.names[first])
-    return Samples(data.x, dealt[np.searchsorted(data.patches[first], data.patches)], data.groups, data.patches)
+    shuffled_names = np.random.default_rng(seed).permutation(data.names[first])
+    return Samples(
+        data.x, shuffled_names[np.searchsorted(data.patches[first], data.patches)], data.groups, data.patches
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -171,9 +173,11 @@ def test_a_second_angle_helps():
 
 def test_joining_angles_pairs_whole_patches():
     first_angle = draw_samples(groups=3, pixels=5)
-    two = draw_samples(groups=3, pixels=4, seed=2)
-    renamed = Samples(two.x, two.names, np.char.add("at 55 ", two.groups), two.patches + 1000)
-    for second_angle in (two, renamed):
+    other_samples = draw_samples(groups=3, pixels=4, seed=2)
+    renamed = Samples(
+        other_samples.x, other_samples.names, np.char.add("at 55 ", other_samples.groups), other_samples.patches + 1000
+    )
+    for second_angle in (other_samples, renamed):
         both_angles = first_angle.join(second_angle)
         # The fewer pixels of each patch
         assert both_angles.names.size == 3 * 6 * 4
@@ -185,7 +189,9 @@ def test_joining_angles_pairs_whole_patches():
             assert np.unique(second_angle.patches[partner]).size == 1
             assert set(second_angle.names[partner]) == set(both_angles.names[of_patch])
     with refused(ErrorCode.MISMATCH):
-        first_angle.join(Samples(two.x, np.char.add("x", two.names), two.groups, two.patches))
+        first_angle.join(
+            Samples(other_samples.x, np.char.add("x", other_samples.names), other_samples.groups, other_samples.patches)
+        )
 
 
 def test_channels_alone_know_less():

@@ -75,12 +75,12 @@ def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, sav
     assert {s.box for s in by_folder.segments} == set(BOXES)
     assert len(by_file.segments) == len(by_folder.segments)
     upside_down = {(x, -y): e for (x, y), e in list_permittivities(by_file).items()}
-    for place, e in list_permittivities(by_folder).items():
-        near = min(upside_down, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
-        assert np.hypot(near[0] - place[0], near[1] - place[1]) < 5
-        assert (e is None) == (upside_down[near] is None)
-        if e is not None:
-            assert e.real == pytest.approx(upside_down[near].real, rel=0.05)
+    for place, permittivity in list_permittivities(by_folder).items():
+        nearest_place = min(upside_down, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
+        assert np.hypot(nearest_place[0] - place[0], nearest_place[1] - place[1]) < 5
+        assert (permittivity is None) == (upside_down[nearest_place] is None)
+        if permittivity is not None:
+            assert permittivity.real == pytest.approx(upside_down[nearest_place].real, rel=0.05)
 
 
 def test_a_labels_folder_may_be_renamed(labels_folder, tmp_path, rig):
@@ -131,9 +131,9 @@ def test_the_angle_in_the_description_of_a_labels_folder_comes_before_the_rigs(l
     file = folder / "plates.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"description": text}))
     scan = analyse_file(folder, rig)
-    is_told = any("the incidence angle is not known" in reason.what for reason in scan.verdict.reasons)
+    is_reported = any("the incidence angle is not known" in reason.what for reason in scan.verdict.reasons)
     assert scan.quality.given_images.incidence_from == ("file" if "60" in text else "rig file")
-    assert is_told == ("60" not in text)
+    assert is_reported == ("60" not in text)
 
 
 def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(save_images, rig):
@@ -295,8 +295,8 @@ def test_a_library_is_trained_on_labelled_products_of_given_images(labels_folder
         folder = Path(shutil.copytree(labels_folder, tmp_path / name))
         (folder / "plates.json").rename(folder / f"{name}.json")
         assert main(["process", str(folder), "--out", str(tmp_path / "out" / name), "--model", "none"]) == 0
-        named = [f"{number}={box}" for number, box in enumerate(BOXES, 1)]
-        words = [word for pair in named for word in ("--rename", pair)]
+        name_options = [f"{number}={box}" for number, box in enumerate(BOXES, 1)]
+        words = [word for pair in name_options for word in ("--rename", pair)]
         assert main(["label", str(tmp_path / "out" / name), "--from-patches", "--metal", "1", *words]) == 0
     products = [str(tmp_path / "out" / name) for name in ("first", "second")]
     assert main(["train", *products, "--out", str(tmp_path / "library.npz")]) == 0

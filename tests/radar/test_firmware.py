@@ -91,12 +91,12 @@ class PowerCut(BoardWords):
 
     def __init__(self, board, clock, after: int) -> None:
         super().__init__(board, clock)
-        self.left = after
+        self.messages_left = after
 
     def write(self, words):
         if words[0] == 0x1234:
-            self.left -= 1
-            if self.left == 0:
+            self.messages_left -= 1
+            if self.messages_left == 0:
                 self.board.switch_power(False)
         super().write(words)
 
@@ -225,10 +225,12 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
 @pytest.mark.parametrize("flash", [b"", DATA], ids=["from RAM", "from flash"])
 def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     board = Simulated(lambda: clock.time, flash=flash)
-    effect = board.cores._apply_setting_or_query
-    old = bytes((2, 1, 20, 1, 1, 0))
+    execute = board.cores._apply_setting_or_query
+    old_version = bytes((2, 1, 20, 1, 1, 0))
     monkeypatch.setattr(
-        board.cores, "_apply_setting_or_query", lambda n, d: effect(n, d)[:10] + old if n == 0x0220 else effect(n, d)
+        board.cores,
+        "_apply_setting_or_query",
+        lambda n, d: execute(n, d)[:10] + old_version if n == 0x0220 else execute(n, d),
     )
     radar = make_board(board, clock, IMAGE)
     radar.configure()
@@ -271,12 +273,12 @@ def test_a_restart_during_a_download_ends_it_immediately(clock, part):
 
 
 def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
-    obey = new.cores._download
+    download = new.cores._download
     calls = []
 
     def refuse_seventh(data, remaining):
         calls.append(remaining)
-        return (7, b"", 0.0) if len(calls) == 7 else obey(data, remaining)
+        return (7, b"", 0.0) if len(calls) == 7 else download(data, remaining)
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
     with refused(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):
@@ -284,10 +286,10 @@ def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
 
 
 def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
-    obey = new.cores._download
+    download = new.cores._download
 
     def forget(data, remaining):
-        result = obey(data, remaining)
+        result = download(data, remaining)
         new.cores.flash = new.cores.flash[:-1] + b"\xff"
         return result
 
@@ -299,10 +301,10 @@ def test_a_flash_that_loses_data_is_an_error(new, clock, monkeypatch):
 @pytest.mark.parametrize(("reported", "warned"), [((2, 9, 20, 1, 1, 0x30), True), ((0,) * 6, False)])
 def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, reported, warned):
     """Another patch than that of the file is a warning; the old patch, or none, is an error."""
-    effect = new.cores._apply_setting_or_query
+    execute = new.cores._apply_setting_or_query
 
     def answer(number, data):
-        result = effect(number, data)
+        result = execute(number, data)
         if number == 0x40E0 and any(result[10:]):
             return result[:10] + bytes(reported)
         return result

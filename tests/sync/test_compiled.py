@@ -57,23 +57,23 @@ def align(by, words, valid, linear, equaliser=None):
     return align_pieces([words], valid, linear, equaliser, by=by)
 
 
-def assert_equal_rows(one: AlignedRow, other: AlignedRow):
+def assert_equal_rows(result: AlignedRow, expected: AlignedRow):
     """Equal within float32 rounding; phases may wrap."""
-    np.testing.assert_array_equal(one.good, other.good)
-    np.testing.assert_array_equal(one.clipped, other.clipped)
-    has_signal = other.good.any(axis=1)  # silent chirps have no band
-    np.testing.assert_allclose(one.centre[has_signal], other.centre[has_signal], rtol=0, atol=1e-6)
-    usable = (other.coherence > 0.1) & has_signal[:, None]  # the tone of a chirp without match is arbitrary
-    assert one.halves.dtype == other.halves.dtype
+    np.testing.assert_array_equal(result.good, expected.good)
+    np.testing.assert_array_equal(result.clipped, expected.clipped)
+    has_signal = expected.good.any(axis=1)  # silent chirps have no band
+    np.testing.assert_allclose(result.centre[has_signal], expected.centre[has_signal], rtol=0, atol=1e-6)
+    usable = (expected.coherence > 0.1) & has_signal[:, None]  # the tone of a chirp without match is arbitrary
+    assert result.halves.dtype == expected.halves.dtype
     np.testing.assert_allclose(
-        one.halves, other.halves, rtol=0, atol=3e-6 * max(1.0, float(np.abs(other.halves).max()))
+        result.halves, expected.halves, rtol=0, atol=3e-6 * max(1.0, float(np.abs(expected.halves).max()))
     )
-    np.testing.assert_allclose(one.frequency[usable], other.frequency[usable], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(result.frequency[usable], expected.frequency[usable], rtol=0, atol=1e-8)
     for name in ("amplitude", "gain", "coherence"):
-        np.testing.assert_allclose(getattr(one, name)[usable], getattr(other, name)[usable], rtol=0, atol=1e-5)
-    turn = np.exp(1j * one.phase) - np.exp(1j * other.phase.astype(np.float64))
-    np.testing.assert_allclose(turn[usable], 0, atol=1e-5)
-    np.testing.assert_allclose(one.error, other.error, rtol=0, atol=2e-5)
+        np.testing.assert_allclose(getattr(result, name)[usable], getattr(expected, name)[usable], rtol=0, atol=1e-5)
+    phase_error = np.exp(1j * result.phase) - np.exp(1j * expected.phase.astype(np.float64))
+    np.testing.assert_allclose(phase_error[usable], 0, atol=1e-5)
+    np.testing.assert_allclose(result.error, expected.error, rtol=0, atol=2e-5)
 
 
 def make_equaliser(rig):
@@ -286,8 +286,8 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
         shutil.copyfile(_ctypes.__file__, file)
     elif broken == "a pipe":
         os.mkfifo(file)
-    real = sync_loops.Library
-    monkeypatch.setattr(sync_loops, "Library", lambda: real(file))
+    library_class = sync_loops.Library
+    monkeypatch.setattr(sync_loops, "Library", lambda: library_class(file))
     with caplog.at_level(logging.WARNING), ThreadPoolExecutor(3) as pool:
         for row in pool.map(lambda _: align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
             assert row.good.all()

@@ -59,7 +59,7 @@ class ProcessingQueue:
         return len(self._of_this_run)
 
     @property
-    def left(self) -> int:
+    def rows_left(self) -> int:
         """Number of unprocessed rows, of this run and of earlier ones."""
         return sum(not f.done() for f in self._futures)
 

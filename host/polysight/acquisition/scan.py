@@ -391,8 +391,8 @@ class RunningScan:
             )
         )
         waiting = ""
-        if self._queue.left:
-            waiting = f"; {self._queue.left} rows wait to be processed"
+        if self._queue.rows_left:
+            waiting = f"; {self._queue.rows_left} rows wait to be processed"
         self._notify("end", reason + waiting)
         if not begun:
             return

@@ -237,27 +237,27 @@ def analyse(
     labels = [p.label for p in judged]
     inversion = relative.solution.inversion
     calibrated = remove_leakage(relative.raw, inversion.choose_leakage_to_remove(relative.prior))
-    sh = smooth_inside(calibrated.h, segmentation, optics.smooth_px)
-    sv = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
-    sp = ratio(sh, sv)
+    smoothed_h = smooth_inside(calibrated.h, segmentation, optics.smooth_px)
+    smoothed_v = smooth_inside(calibrated.v, segmentation, optics.smooth_px)
+    smoothed_p = ratio(smoothed_h, smoothed_v)
     estimates = dict(zip(labels, inversion.patches, strict=True))
     # ln of |H| over that of a half space of the same ratio; NaN where |H| was not used.
     brightness_off = dict(zip(labels, inversion.brightness_off.tolist(), strict=True))
-    patches = {
-        p.label: permittivity_of_patch(sh[p.interior], sv[p.interior], _mean_angle(theta, p), estimates.get(p.label))
-        for p in segmentation.patches
-    }
+    patches = {}
+    for p in segmentation.patches:
+        pixels = (smoothed_h[p.interior], smoothed_v[p.interior])
+        patches[p.label] = permittivity_of_patch(*pixels, _mean_angle(theta, p), estimates.get(p.label))
     refused = relative.refused | refuse_impossible(patches, estimates, kinds)
-    named = _name_patches(classifier, (sh, sv, sp), inversion, judged)
+    named = _name_patches(classifier, (smoothed_h, smoothed_v, smoothed_p), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
     results = tuple(
         PatchResult(p, patches[p.label], named.get(p.label), truth.get(p.label), refused.get(p.label))
         for p in segmentation.patches
     )
     return MaterialsResult(
-        calibrated=calibrated, h=sh, v=sv, p=sp, metal=relative.metal, segmentation=segmentation, patches=results,
-        theta_rad=theta, inversion=inversion, prior=relative.prior, tilts=tilts,
-        boxes=dict(known_scene.names), library=() if classifier is None else classifier.names,
+        calibrated=calibrated, h=smoothed_h, v=smoothed_v, p=smoothed_p, metal=relative.metal,
+        segmentation=segmentation, patches=results, theta_rad=theta, inversion=inversion, prior=relative.prior,
+        tilts=tilts, boxes=dict(known_scene.names), library=() if classifier is None else classifier.names,
         brightness_off={label: ln for label, ln in brightness_off.items() if np.isfinite(ln)},
         evidence={label: e.evidence for label, e in estimates.items() if e.evidence is not None},
         apart_mm=apart_mm, drift=relative.scatter.change, halo=relative.scatter.halo.level,
@@ -313,8 +313,8 @@ class SceneScatter:
     metal
         Scatter of the metal reference; None if it was scanned separately, or has too few pixels.
     change
-        Drift of ln(V / H) over the scan at the plates of `scatter`, in their order, and at the metal; None if `metal`
-        is.
+        Drift of ln(V / H) over the scan at the plates of `scatter`, in their order, and at the metal; None without the
+        scatter of the metal.
     metal_spread
         Relative spread of the pixels of metal that was scanned separately; None: it is in the scene.
     border
@@ -443,9 +443,10 @@ class SceneScatter:
         patch_measurement = replace(ratio_measurement, dispersion=dispersion)
         if not patch_measurement.brightness:
             return patch_measurement
-        halo = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
-        background = abs(patch_measurement.inverse_ratio) * self.background_in(patch_measurement)
-        return replace(patch_measurement, std=float(np.sqrt(patch_measurement.std**2 + halo**2 + background**2)))
+        halo_std = HALO_OF_PATCH * self.halo.around.get(patch.label, 0.0) / patch_measurement.brightness
+        background_std = abs(patch_measurement.inverse_ratio) * self.background_in(patch_measurement)
+        std = float(np.sqrt(patch_measurement.std**2 + halo_std**2 + background_std**2))
+        return replace(patch_measurement, std=std)
 
     def background_in(self, measurement: PatchMeasurement) -> float:
         """Return the standard deviation of each part of a patch's ln(V / H) by what lies behind it."""
@@ -465,7 +466,7 @@ class SceneScatter:
 
 @dataclass(frozen=True)
 class RelativeScene:
-    """A scene relative to a metal reference, which has the evidence of the other patches if it is in the scene.
+    """A scene relative to a metal reference. A reference within the scene holds the evidence that it is metal.
 
     Attributes
     ----------
@@ -509,20 +510,20 @@ class _Scene:
         theta = np.asarray(self.optics.theta_rad, np.float64)
         raw = divide_by_reference(images, reference, self.plane)
         # H and V relative to metal, smoothed.
-        rh = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
-        rv = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
+        relative_h = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
+        relative_v = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
         background_rms = background(raw.h, raw.v, segmentation, images.usable)
-        refused = check_patches(segmentation, rh, rv, background_rms, reference.mask)
+        refused = check_patches(segmentation, relative_h, relative_v, background_rms, reference.mask)
         refused |= self.tilts.refusals()
         judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
         scatter = SceneScatter.collect(
-            channels=(rh, rv), raw=raw, judged=judged, segmentation=segmentation, reference=reference,
+            channels=(relative_h, relative_v), raw=raw, judged=judged, segmentation=segmentation, reference=reference,
             plane=self.plane, images=images, tilts=self.tilts,
         )  # fmt: skip
         prior = scatter.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
         dispersions = measure_dispersions(images, segmentation, judged, reference.mask, self.plane)
         measured = [
-            scatter.measure(p, (rh, rv), _mean_angle(theta, p), d).widen_by_jump(self.optics.jump_rad)
+            scatter.measure(p, (relative_h, relative_v), _mean_angle(theta, p), d).widen_by_jump(self.optics.jump_rad)
             for p, d in zip(judged, dispersions, strict=True)
         ]
         solution = _solve(measured, prior, self.kinds, self.optics.other_sign)
@@ -542,13 +543,13 @@ def find_most_like_metal(relatives: Sequence[RelativeScene]) -> RelativeScene:
     the first is taken.
     """
 
-    def bare(relative: RelativeScene) -> float:
+    def score_as_bare_metal(relative: RelativeScene) -> float:
         evidence = relative.metal.evidence
         if evidence is None or evidence.against or relative.metal.label in relative.refused:
             return -np.inf
         return evidence.bare
 
-    return max(relatives, key=bare)
+    return max(relatives, key=score_as_bare_metal)
 
 
 def _list_kinds(classifier: Classifier | None, theta_rad: float) -> Kinds:
@@ -637,24 +638,23 @@ def _weigh_metal(
 def _select_patches(images: Images, known_scene: KnownScene) -> Segmentation:
     """Return the known patches, cut to the valid pixels, or else find them."""
     if known_scene.segmentation is not None:
-        cut = tuple(replace(p, interior=p.interior & images.valid) for p in known_scene.segmentation.patches)
-        return replace(known_scene.segmentation, patches=cut)
+        valid_patches = tuple(replace(p, interior=p.interior & images.valid) for p in known_scene.segmentation.patches)
+        return replace(known_scene.segmentation, patches=valid_patches)
     if not images.usable.any():
         # A scan without a direct path in any position has no signal: there is nothing to search, the verdict says why.
         return Segmentation(np.zeros(images.h.shape, np.int32), ())
-    even = images if known_scene.plane is None else known_scene.plane.apply(images)
-    segmentation = segment(even.h, even.v, images.x_m, images.y_m, images.valid)
-    filled = known_scene.plane is not None and float(np.median(np.abs(even.h[images.valid]))) > FILLED_LEVEL
-    if not segmentation.patches and filled:
+    relative_images = images if known_scene.plane is None else known_scene.plane.apply(images)
+    segmentation = segment(relative_images.h, relative_images.v, images.x_m, images.y_m, images.valid)
+    is_filled = (
+        known_scene.plane is not None and float(np.median(np.abs(relative_images.h[images.valid]))) > FILLED_LEVEL
+    )
+    if not segmentation.patches and is_filled:
         return whole_plane(images.valid, images.x_m, images.y_m, SegmentSettings().margin_mm)
     return segmentation
 
 
 def _list_references(images: Images, known_scene: KnownScene, segmentation: Segmentation) -> tuple[MetalReference, ...]:
-    """Return the given metal reference, or else those that :func:`find_metals` finds.
-
-    Without patches it is that of :func:`make_missing_reference`.
-    """
+    """Return the given metal reference, or those of :func:`find_metals`, or that of :func:`make_missing_reference`."""
     if isinstance(known_scene.metal, PlaneReference):
         return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
     if isinstance(known_scene.metal, int):
@@ -689,8 +689,10 @@ def permittivity_change(result: MaterialsResult, angles: IncidenceChoice) -> dic
         pixels = patch_result.patch.interior
         if patch_result.permittivity.value is not None and pixels.any():
             mean_angles_rad = np.array([np.mean(angles.used_rad[pixels]), np.mean(angles.other_rad[pixels])])
-            eps = permittivity_from_ratio(patch_result.permittivity.ratio, mean_angles_rad)
-            changes.append((float(abs(eps[1] / eps[0] - 1)), patch_result.patch.label))
+            permittivity_by_angle = permittivity_from_ratio(patch_result.permittivity.ratio, mean_angles_rad)
+            changes.append(
+                (float(abs(permittivity_by_angle[1] / permittivity_by_angle[0] - 1)), patch_result.patch.label)
+            )
     if not changes:
         return {}
     largest, label = max(changes)

@@ -206,20 +206,20 @@ class _DielectricReference(SceneLikelihood):
         The measured ratio is t of the patch over t0 of the reference. The first element also holds the likelihood of
         the reference's V / H relative to the direct path, if that is known.
         """
-        parts = super()._log_likelihoods(z, half_spaces)
+        base_logs = super()._log_likelihoods(z, half_spaces)
         reference = self.reference_ratio(z)
-        size = np.abs(reference)
+        reference_amplitude = np.abs(reference)
         measured = half_spaces.t / reference
         # The measured ratio is t / t0, so its density is |t0|^2 that of t. A plate may also be of the material of the
         # reference, with the same prior probability as a second metal patch: its ratio is then 1, with this variance
         # of real and imaginary part each.
         variance = METAL_SPREAD**2 + self.own_variance
         log_same_material = -0.5 * np.abs(measured - 1) ** 2 / variance - np.log(2 * np.pi * variance)
-        log_some_kind = parts[..., 1:] + 2 * np.log(size)
+        log_some_kind = base_logs[..., 1:] + 2 * np.log(reference_amplitude)
         patch_logs = np.logaddexp(np.log1p(-METAL_SHARE) + log_some_kind, np.log(METAL_SHARE) + log_same_material)
-        brightness_log = parts[..., :1]
+        brightness_log = base_logs[..., :1]
         if self.channel_ratio_db is not None:
-            too_dark_db = 20 * np.log10(size) - self.channel_ratio_db
+            too_dark_db = 20 * np.log10(reference_amplitude) - self.channel_ratio_db
             brightness_log = brightness_log - 0.5 * (too_dark_db / CHANNEL_RATIO_STD_DB) ** 2
         return np.concatenate([brightness_log, patch_logs], axis=-1)
 

@@ -76,11 +76,11 @@ def make_log(size: int, packets: list[bytes], batch: int = 7, t_ns: int = 1) -> 
     """Return the packets of a row as a receiver logs them, `batch` at a time, the k-th at `t_ns` + k nanoseconds."""
     log = PacketLog(size)
     for i in range(0, len(packets), batch):
-        some = packets[i : i + batch]
-        block = np.zeros((len(some), max(10, *map(len, some))), dtype=np.uint8)
-        for k, p in enumerate(some):
+        batch_of_packets = packets[i : i + batch]
+        block = np.zeros((len(batch_of_packets), max(10, *map(len, batch_of_packets))), dtype=np.uint8)
+        for k, p in enumerate(batch_of_packets):
             block[k, : len(p)] = np.frombuffer(p, dtype=np.uint8)
-        log.add(block, np.array([len(p) for p in some]), t_ns + i)
+        log.add(block, np.array([len(p) for p in batch_of_packets]), t_ns + i)
     return log
 
 
@@ -88,8 +88,8 @@ def place(
     size: int, packets: list[bytes], start: Counters | EarlierRecords, frame: int = 1, batch: int = 7
 ) -> tuple[PlacedRecord, np.ndarray]:
     """Place a row that starts at these counters, or after the known earlier records."""
-    past = EarlierRecords(start) if isinstance(start, Counters) else start
-    return place_record(make_log(size, packets, batch), frame, past)
+    earlier_records = EarlierRecords(start) if isinstance(start, Counters) else start
+    return place_record(make_log(size, packets, batch), frame, earlier_records)
 
 
 def find_next_start(placed: PlacedRecord) -> Counters | None:
@@ -100,8 +100,8 @@ def find_next_start(placed: PlacedRecord) -> Counters | None:
 def make_mask(size: int, gaps: list[tuple[int, int]]) -> np.ndarray:
     """Return bool [size], true in the gaps (start, stop)."""
     mask = np.zeros(size, dtype=bool)
-    for a, b in gaps:
-        mask[a:b] = True
+    for start, stop in gaps:
+        mask[start:stop] = True
     return mask
 
 
@@ -115,9 +115,11 @@ def log_packets(sent: SentRecord, expected: int, batch: int) -> PacketLog:
     """The arrivals as a receiver logs them, some at a time, each with the time of its arrival."""
     log = PacketLog(expected)
     for k in range(0, len(sent.arrivals), batch):
-        some = sent.arrivals[k : k + batch]
-        block = np.zeros((len(some), max(10, *(len(a.packet) for a in some))), dtype=np.uint8)
-        for row, a in zip(block, some, strict=True):
+        batch_of_arrivals = sent.arrivals[k : k + batch]
+        block = np.zeros((len(batch_of_arrivals), max(10, *(len(a.packet) for a in batch_of_arrivals))), dtype=np.uint8)
+        for row, a in zip(block, batch_of_arrivals, strict=True):
             row[: len(a.packet)] = np.frombuffer(a.packet, dtype=np.uint8)
-        log.add(block, np.array([len(a.packet) for a in some]), np.array([a.t_ns for a in some]))
+        log.add(
+            block, np.array([len(a.packet) for a in batch_of_arrivals]), np.array([a.t_ns for a in batch_of_arrivals])
+        )
     return log

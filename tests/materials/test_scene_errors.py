@@ -1,6 +1,6 @@
 """Errors that a scene shows: displaced images, a drift, a halo of an overdriven receiver."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -293,3 +293,20 @@ def test_the_error_of_a_common_change_is_the_standard_deviation_of_a_single_case
     error = _explain_cases(-0.3, (0.004,)).error(np.ones(1))
 
     assert error == pytest.approx(0.004, rel=1e-3)
+
+
+def test_fringes_that_weak_plates_alone_show_are_none():
+    """Bright edge strips disturb V of plates that reflect little of it; they were called a second path."""
+    places = np.array(PLACES_M)
+    wave_vector = 2 * np.pi / 0.25 * np.array([0.6, 0.8])
+    fringes = 0.15 * np.exp(1j * places @ wave_vector)
+    slopes = dict(zip(PLACES_M, 1j * fringes[:, None] * wave_vector, strict=True))
+    strong_places = {PLACES_M[0], PLACES_M[4], PLACES_M[8]}
+    scatters = make_scatter(lambda x, y: (0j, 0j) if (x, y) in strong_places else slopes[x, y])
+    levels = [0.9 if place in strong_places else 0.1 for place in PLACES_M]
+    by_weak_plates = [replace(s, level=level) for s, level in zip(scatters, levels, strict=True)]
+    change = estimate_common_change(scatters, ORIGIN_M)
+    assert change.fringes > 0.5
+    weak = estimate_common_change(by_weak_plates, ORIGIN_M)
+    assert weak.fringes < 0.5
+    np.testing.assert_array_equal(weak.std, change.std)

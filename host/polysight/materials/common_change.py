@@ -63,6 +63,10 @@ its plates' intervals are 30 instead of 19 %."""
 ALIKE_BOTH_WAYS = 0.7
 """Prior probability that the plates' own slopes have the same standard deviation along x and y; chosen. Bent plates
 have slopes along y alone, the direction in which H and V see different places."""
+LIKELY_FRINGES = 0.5
+WEAK_LEVEL = 0.2
+"""Probability of fringes from which they have to be likely without the plates of weaker |V / H| relative to metal; the
+level is chosen. Light from bright edges, or from a table behind, is as strong as V of such plates."""
 BORDER_SLOPE_STD = 100.0
 """Standard deviation of the slope of a plate at the border of the image, per metre: so large that it is not used."""
 LEAST_SLOPE_STD = 1e-3
@@ -104,7 +108,8 @@ class CommonChange:
     ripple
         float64 [plate]: standard deviation of either part of the plate's ln(V / H) by its own slopes.
     fringes
-        Probability that there are fringes by a second path beside the direct path.
+        Probability that there are fringes by a second path beside the direct path; if weak plates alone show them, it
+        is that by the other plates.
     drifts
         Probability that the gains drift by more than those of a stable rig.
     """
@@ -150,28 +155,42 @@ def estimate_common_change(
     border = np.array(at_border, bool) if at_border else np.zeros(len(plates), bool)
     places_m = np.array([plate.centre_m for plate in plates], np.float64).reshape(-1, 2)
     smooth_fields = _Fields.collect(places_m, np.array(origin_m, np.float64))
-    parts = []
-    noises = []
-    for part in (np.real, np.imag):
-        slopes = np.array([part(plate.slope) for plate in plates], np.float64).reshape(-1, 2).T
-        noise = np.array([part(plate.slope_std) for plate in plates], np.float64).reshape(-1, 2).T
-        noises.append(np.maximum(noise, LEAST_SLOPE_STD))
-        parts.append(smooth_fields.explain(slopes, noises[-1] + BORDER_SLOPE_STD * border))
-    # The cases of `shared` apply to amplitude and phase together, so both evidences count.
-    log_weight = parts[0].log_evidence + parts[1].log_evidence + smooth_fields.log_prior
-    weight = np.exp(log_weight - log_weight.max())
-    weight /= weight.sum()
+    parts, noises = _explain_parts(smooth_fields, plates, border)
+    weight = smooth_fields.weigh(parts)
     real = parts[0].average(weight)
     imag = parts[1].average(weight)
+    fringes = smooth_fields.sum_over_fringes(weight)
+    weak = np.array([plate.level < WEAK_LEVEL for plate in plates], bool) & ~border
+    if fringes > LIKELY_FRINGES and weak.any():
+        # A second path changes the gain for strong and weak plates alike, light from edges only the ratio of weak ones.
+        strong_parts, _ = _explain_parts(smooth_fields, plates, border | weak)
+        fringes = min(fringes, smooth_fields.sum_over_fringes(smooth_fields.weigh(strong_parts)))
     return CommonChange(
         value=(real.mean + 1j * imag.mean)[0],
         std=SHARE_OF_CHANGE * (parts[0].error(weight) + 1j * parts[1].error(weight)),
         drift=(real.drift + 1j * imag.drift)[0],
         drift_std=(real.drift_std + 1j * imag.drift_std)[0],
         ripple=RIPPLE_M * _estimate_own_slopes((real.remaining[0], imag.remaining[0]), noises, border),
-        fringes=float(sum(w for w, (fringe, _, _, _) in zip(weight, smooth_fields.shared, strict=True) if fringe > 0)),
+        fringes=fringes,
         drifts=float(sum(w for w, (_, _, _, stable) in zip(weight, smooth_fields.shared, strict=True) if not stable)),
     )
+
+
+def _explain_parts(
+    smooth_fields: _Fields, plates: Sequence[Scatter], ignored: npt.NDArray[np.bool_]
+) -> tuple[list[_ExpectedFromSlopes], list[Real]]:
+    """Explain the slopes of real and imaginary part, but for those of plates that are `ignored`; return noises, too.
+
+    The noises are standard deviations of the slopes, [2, plate] of each part.
+    """
+    parts = []
+    noises = []
+    for part in (np.real, np.imag):
+        slopes = np.array([part(plate.slope) for plate in plates], np.float64).reshape(-1, 2).T
+        noise = np.array([part(plate.slope_std) for plate in plates], np.float64).reshape(-1, 2).T
+        noises.append(np.maximum(noise, LEAST_SLOPE_STD))
+        parts.append(smooth_fields.explain(slopes, noises[-1] + BORDER_SLOPE_STD * ignored))
+    return parts, noises
 
 
 def _estimate_own_slopes(remaining: Sequence[Real], noises: Sequence[Real], border: npt.NDArray[np.bool_]) -> Real:
@@ -289,6 +308,17 @@ class _Fields:
             shared=shared,
             log_prior=np.log(prior),
         )
+
+    def weigh(self, parts: Sequence[_ExpectedFromSlopes]) -> Real:
+        """Return the probability of each case of `shared`, given both parts of ln(V / H)."""
+        # The cases apply to amplitude and phase together, so both evidences count.
+        log_weight = parts[0].log_evidence + parts[1].log_evidence + self.log_prior
+        weight = np.exp(log_weight - log_weight.max())
+        return weight / weight.sum()
+
+    def sum_over_fringes(self, weight: Real) -> float:
+        """Return the probability of fringes, by the probability of each case of `shared`."""
+        return float(sum(w for w, (fringe, _, _, _) in zip(weight, self.shared, strict=True) if fringe > 0))
 
     def explain(self, slopes: Real, noise: Real) -> _ExpectedFromSlopes:
         """Explain the slopes [2, plate] of one part of ln(V / H), once for each case of `shared`.

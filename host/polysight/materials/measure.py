@@ -260,6 +260,8 @@ class Scatter:
         Centre of the pixels, x and y.
     relief_rad
         Standard deviation of the phase of H about a plane: the plate's surface is rough, wavy or bent.
+    level
+        Median |V / H|, relative to metal if the images are.
     """
 
     amplitude: float
@@ -269,6 +271,7 @@ class Scatter:
     slope_std: npt.NDArray[np.complex128]
     centre_m: tuple[float, float]
     relief_rad: float = 0.0
+    level: float = 1.0
 
 
 def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Scatter | None:
@@ -309,6 +312,7 @@ def measure_scatter(mask: Mask, h: Image, v: Image, x_m: Real, y_m: Real) -> Sca
         slope_std=unit * rest_std,
         centre_m=(x, y),
         relief_rad=_measure_relief(h[pixels], centred),
+        level=abs(middle),
     )
 
 

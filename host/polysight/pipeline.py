@@ -69,7 +69,7 @@ class Pipeline:
                 images = self.builder.current()
             else:
                 self.quality.remove_phase_jumps((self.samples.filled, *self.sub_bands.builders))
-                images = self.samples.filled.finish()
+                images = self.quality.remove_phase_drift(self.samples.filled, self.sub_bands.builders)
         self.quality.add_entries(**self.synchroniser.recording_facts())
         return images.transpose() if self.source.mirrored else images
 
@@ -93,7 +93,8 @@ class Pipeline:
             axes = images.x_m, images.y_m
             incidence = polarimetry.incidence_choice(rig, *axes, self.settings.incidence, images.raised_m)
             optics = materials.Optics.from_rig(self.rig, incidence, angle_std, self.synchroniser.direct_path_known)
-            result = materials.analyse(images, replace(optics, jump_rad=self.quality.jump_rad), known_scene, classifier)
+            optics = replace(optics, phase_left_rad=self.quality.phase_left_rad)
+            result = materials.analyse(images, optics, known_scene, classifier)
             metal_plane = None if known_scene is None else known_scene.plane  # of a plate scanned separately
             self.quality.add_materials(result, incidence, images.valid, metal_plane)
         with self.quality.measure_time("sub-bands"):

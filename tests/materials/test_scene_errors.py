@@ -295,7 +295,7 @@ def test_the_error_of_a_common_change_is_the_standard_deviation_of_a_single_case
     assert error == pytest.approx(0.004, rel=1e-3)
 
 
-def test_fringes_that_weak_plates_alone_show_are_none():
+def test_fringes_that_only_weak_plates_show_are_not_reported():
     """Bright edge strips disturb V of plates that reflect little of it; they were called a second path."""
     places = np.array(PLACES_M)
     wave_vector = 2 * np.pi / 0.25 * np.array([0.6, 0.8])

@@ -15,7 +15,7 @@ from tests.support.pipelines import make_pipeline
 from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 
-from polysight.process.quality import PhaseJump, find_phase_jumps
+from polysight.process.row_phases import PhaseJump, find_phase_jumps
 from polysight_simulators.scene import decode_scene
 from polysight_worlds import METAL, Plate, Stack, World, published_rig as independent_rig, record
 from polysight_worlds.world import nine_places

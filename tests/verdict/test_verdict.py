@@ -7,7 +7,7 @@ import re
 import pytest
 
 from polysight.materials import SMEAR
-from polysight.results import rules
+from polysight.results import row_rules, rules
 from polysight.results.verdict import Coverage, NoResult, Verdict, join_reasons, percent, read_verdict, reason
 from polysight_shared.findings import Finding
 
@@ -126,8 +126,11 @@ def test_every_reason_has_its_cause_and_a_remedy():
         *rules.judge_fringes(0.9),
         *rules.judge_disturbed_plates({2: 0.2}),
         *rules.judge_moved_boards(1.0),
+        *row_rules.judge_phase_jumps({"RH": [(9, 0.4), (20, 0.3)], "RV": [(9, 0.5)]}),
+        *row_rules.judge_displaced_rows(0.4),
+        *row_rules.judge_phase_drift(1.0, 0.1),
     ]
-    assert len(reasons) >= 24
+    assert len(reasons) >= 28
     for r in reasons:
         assert all((r.what, r.why, r.do))
         assert not any(text.endswith(".") for text in (r.what, r.do))
@@ -334,6 +337,8 @@ def test_no_verdict_shows_a_number_that_is_none(x):
         *rules.judge_fringes(number),
         *rules.judge_disturbed_plates({1: number, 2: 0.3}),
         *rules.judge_moved_boards(number),
+        *row_rules.judge_displaced_rows(number),
+        *row_rules.judge_phase_drift(number, number),
         *rules.judge_incidence(number, 55.0),
         *rules.judge_incidence(55.0, x),
         *rules.judge_reconstruction([("RH", 0.3, x)]),
@@ -413,3 +418,17 @@ def test_fringes_are_ascribed_to_the_background_where_it_disturbs_the_plates():
     (behind,) = rules.judge_background(0.15)
     assert "behind the plates" in fringes.why
     assert fringes.weight < behind.weight
+
+
+def test_a_jump_of_both_boards_alike_is_reported_once_and_blames_no_cable():
+    both = row_rules.judge_phase_jumps({"RH": [(26, 0.41)], "RV": [(26, 0.38)]})
+    assert [r.what for r in both] == ["the phase of the echo jumps by +23 degrees before row 26 in both boards alike"]
+    assert "no cable of one board" in both[0].why
+    apart = row_rules.judge_phase_jumps({"RH": [(26, 0.41)], "RV": [(26, -0.38), (40, 0.3)]})
+    assert [r.what.split(":")[0] for r in apart] == ["RH", "RV"]
+
+
+def test_images_apart_after_a_drift_of_the_phase_blame_no_board():
+    (found,) = rules.judge_image_shift((0.1, 1.5), has_drift=True)
+    assert "boards are out of place" not in found.why
+    assert "drift" in found.why

@@ -36,6 +36,10 @@ from polysight.materials.classify import (
     Classifier as Classifier,
     classifier_sentence as classifier_sentence,
 )
+from polysight.materials.common_change import (
+    PhaseAlongPlate as PhaseAlongPlate,
+    measure_along_plates as measure_along_plates,
+)
 from polysight.materials.copies import find_copies as find_copies
 from polysight.materials.discriminant import REJECTED_SHARE as REJECTED_SHARE, ErrorDiscriminant as ErrorDiscriminant
 from polysight.materials.kinds import find_permittivity_slope as find_permittivity_slope

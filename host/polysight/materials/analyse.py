@@ -102,15 +102,16 @@ class Optics:
         inside each patch.
     other_sign
         Probability a priori that all phases of the images have the other sign: 0 for scans of this program.
-    jump_rad
-        Jump of a board's phase between two rows of the scan, which the images are without, radians; 0: none.
+    phase_left_rad
+        Standard deviation of a plate's phase by what may be left of jumps and drifts of a board's phase that were
+        removed from the images, radians.
     """
 
     theta_rad: npt.ArrayLike
     prior: RigPrior = MEASURED_RIG
     smooth_px: float = 2.0
     other_sign: float = 0.0
-    jump_rad: float = 0.0
+    phase_left_rad: float = 0.0
 
     @classmethod
     def from_rig(
@@ -523,7 +524,9 @@ class _Scene:
         prior = scatter.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
         dispersions = measure_dispersions(images, segmentation, judged, reference.mask, self.plane)
         measured = [
-            scatter.measure(p, (relative_h, relative_v), _mean_angle(theta, p), d).widen_by_jump(self.optics.jump_rad)
+            scatter.measure(p, (relative_h, relative_v), _mean_angle(theta, p), d).widen_phase(
+                self.optics.phase_left_rad
+            )
             for p, d in zip(judged, dispersions, strict=True)
         ]
         solution = _solve(measured, prior, self.kinds, self.optics.other_sign)

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from polysight.imaging import Images, Mask
 from polysight.materials.measure import Scatter
 
 Real = npt.NDArray[np.float64]
@@ -69,6 +70,13 @@ WEAK_LEVEL = 0.2
 level is chosen. Light from bright edges, or from a table behind, is as strong as V of such plates."""
 BORDER_SLOPE_STD = 100.0
 """Standard deviation of the slope of a plate at the border of the image, per metre: so large that it is not used."""
+LEAST_ROW_PIXELS = 4
+LEAST_PLATE_ROWS = 5
+"""Pixels that a row of a plate's interior has to have, and rows that a plate has to have, so that the phase along it is
+measured; chosen."""
+RIM_ROWS = 3
+"""Rows at either end of a plate's interior that are not used for it: a drift of the phase moves the image of V against
+that of H, and the edges of plates reach farther in; chosen."""
 LEAST_SLOPE_STD = 1e-3
 """Smallest standard deviation of a measured slope, per metre."""
 RIPPLE_M = 0.015
@@ -486,3 +494,44 @@ class _ExpectedFromSlopes:
 def _list_arrays(explained: _ExpectedFromSlopes) -> tuple[Real, ...]:
     """Return the values of the fields, in the order in which the class declares them."""
     return tuple(getattr(explained, field.name) for field in fields(explained))
+
+
+@dataclass(frozen=True)
+class PhaseAlongPlate:
+    """Phase of V / H along the inside of a plate.
+
+    Attributes
+    ----------
+    y_m, phase_rad
+        float64 [row]: y of each row of pixels, and the phase of V / H there.
+    level
+        Mean |V / H|.
+    step_h_rad, step_v_rad
+        Mean step of the phase of H, and of V, from row to row.
+    """
+
+    y_m: Real
+    phase_rad: Real
+    level: float
+    step_h_rad: float
+    step_v_rad: float
+
+
+def measure_along_plates(images: Images, interiors: Sequence[Mask]) -> list[PhaseAlongPlate]:
+    """Return the phase of V / H along y of each plate with enough rows; `interiors`: bool [ny, nx] each."""
+    plates = []
+    for interior in interiors:
+        inside = interior & images.usable
+        h = np.where(inside, images.h, 0)
+        v = np.where(inside, images.v, 0)
+        sums = np.asarray((v * np.conj(h)).sum(axis=1), np.complex128)
+        rows = np.flatnonzero((np.count_nonzero(inside, axis=1) >= LEAST_ROW_PIXELS) & (sums != 0))[RIM_ROWS:-RIM_ROWS]
+        if rows.size < LEAST_PLATE_ROWS:
+            continue
+        steps_rad = [float(np.angle(np.vdot(image[rows[:-1]], image[rows[1:]]))) for image in (h, v)]
+        power_of_h = float(np.sum(np.abs(h[rows]) ** 2))
+        plates.append(PhaseAlongPlate(
+            y_m=np.asarray(images.y_m, np.float64)[rows], phase_rad=np.unwrap(np.angle(sums[rows])),
+            level=float(np.abs(sums[rows]).sum()) / power_of_h, step_h_rad=steps_rad[0], step_v_rad=steps_rad[1],
+        ))  # fmt: skip
+    return plates

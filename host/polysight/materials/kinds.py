@@ -134,11 +134,6 @@ class PatchDispersion:
     band_hz: tuple[float, float]
 
 
-JUMP_LEFT = 0.2
-"""Standard deviation of a plate's phase by a jump of a board's phase that was removed, relative to the jump. Most jumps
-of 30 degrees are measured within 4 degrees, those at the rim of weak plates within 8 (simulated)."""
-
-
 @dataclass(frozen=True)
 class PatchMeasurement:
     """Measurement of one patch, relative to metal; leakage is not removed.
@@ -175,10 +170,10 @@ class PatchMeasurement:
         std = max(self.std, LEAST_RATIO_STD)
         return std**2 * np.eye(2) + turn_covariance(self.inverse_ratio, np.diag(np.square(self.relative_std)))
 
-    def widen_by_jump(self, jump_rad: float) -> PatchMeasurement:
-        """Return the measurement with the error that a jump of a board's phase, radians, leaves after its removal."""
+    def widen_phase(self, std_rad: float) -> PatchMeasurement:
+        """Return the measurement with another standard deviation of the phase of V / H, radians, added."""
         amplitude, phase = self.relative_std
-        return replace(self, relative_std=(amplitude, float(np.hypot(phase, JUMP_LEFT * jump_rad))))
+        return replace(self, relative_std=(amplitude, float(np.hypot(phase, std_rad))))
 
 
 @dataclass(frozen=True)

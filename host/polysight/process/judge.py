@@ -21,6 +21,7 @@ from polysight.results import (
     check_plate,
     check_reasons,
     join_reasons,
+    row_rules,
     rules,
 )
 from polysight_shared.config import CheckPlate
@@ -34,7 +35,15 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     boards_in_order = [board for board in quality.boards.values() if not board.rx_order]
     positions = sum(b.positions for b in boards_in_order)
     masked = sum(b.positions_masked for b in boards_in_order)
-    missing: list[Finding] = []
+    missing = row_rules.judge_displaced_rows(quality.find_displaced_rows().rms_mm)
+    if quality.drift is not None:
+        missing += row_rules.judge_phase_drift(quality.drift.range_rad, quality.drift.left_rad)
+    jumps = {
+        name: [(jump.row, jump.angle_rad) for jump in of_board]
+        for name, of_board in quality.find_phase_jumps().items()
+        if not quality.boards[name].rx_order
+    }
+    missing += row_rules.judge_phase_jumps(jumps)
     for name, board in quality.boards.items():
         if board.rx_order:
             missing += rules.judge_rx_order(name, board.rx_order)
@@ -46,21 +55,10 @@ def recording_verdict(quality: Quality) -> list[Finding]:
         missing += rules.judge_direct_path(name, board.direct_snr_db, board.residual("averaged"), share_of_received)
         missing += _report_disturbances(name, list(board.figures.values()))
         missing += rules.judge_dead_rx(name, board.dead_rx, len(board.rows))
-        missing += rules.judge_phase_jumps(name, [(jump.row, jump.angle_rad) for jump in board.find_phase_jumps()])
     share_masked = _divide(masked, positions, default=0.0 if len(boards_in_order) < len(quality.boards) else 1.0)
     recorded = rules.judge_recording(coverage, share_masked, is_filled=bool(quality.filled))
     filled = [(board, e.missing_share, e.image_error) for board, e in quality.filled.items()]
     return recorded + missing + rules.judge_reconstruction(filled)
-
-
-def _lacks_positions(quality: Quality) -> bool:
-    """Return true if more positions than a few of some board have no data, and were not reconstructed."""
-    if quality.filled:
-        return False
-    coverage = quality.coverage()
-    shares = [_divide(board.positions_masked, board.positions, default=1.0) for board in quality.boards.values()]
-    rows_absent = 1 - _divide(coverage.rows_recorded, coverage.rows_planned, default=0.0)
-    return max([rows_absent, *shares]) > rules.SOME_POSITIONS
 
 
 def _divide(part: float, whole: float, default: float) -> float:
@@ -114,7 +112,9 @@ def judge(
     tilt_deg = (0.0, 0.0)
     if "metal_reference" in quality.notes:
         tilt_deg = quality.notes["metal_reference"].tilt_deg
-    reasons += scene_reasons(result, plane, classifier, tilt_deg, has_gaps=_lacks_positions(quality))
+    reasons += scene_reasons(
+        result, plane, classifier, tilt_deg, has_gaps=quality.lacks_positions, has_drift=quality.drift is not None
+    )
     if check.name:
         reasons += check_reasons(check_plate(check, result.rows()))
     return join_reasons(reasons)
@@ -126,11 +126,12 @@ def scene_reasons(
     classifier: Classifier | None,
     reference_tilt_deg: tuple[float, float] = (0.0, 0.0),
     has_gaps: bool = False,
+    has_drift: bool = False,
 ) -> list[Finding]:
     """Return reasons from the scene and its images; parameters are those of :func:`judge`.
 
     `reference_tilt_deg` is the tilt of a metal plate that was scanned separately. `has_gaps`: positions have no data,
-    and were not reconstructed.
+    and were not reconstructed. `has_drift`: a drift of the phase was removed.
     """
     reasons: list[Finding] = []
     refused = {r.patch.label: r.refused.what for r in result.patches if r.refused is not None}
@@ -148,7 +149,7 @@ def scene_reasons(
     copies = find_copies(objects, result.calibrated.h, result.calibrated.v, pixel_mm)
     if copies is not None:
         reasons += rules.judge_copies(copies.labels, copies.shift_mm, copies.level_db, has_gaps)
-    reasons += rules.judge_image_shift(result.apart_mm)
+    reasons += rules.judge_image_shift(result.apart_mm, has_drift)
     if result.drift is not None:
         reasons += rules.judge_drift(*result.drift.largest_drift(), result.drift.drifts)
         reasons += rules.judge_fringes(result.drift.fringes, has_gaps, result.behind)

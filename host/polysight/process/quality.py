@@ -1,16 +1,7 @@
 """Quality of a processed scan: the figures of quality.json, by row, board and scan; `judge.py` has the verdict on them.
 
 `Quality` collects frames received, positions masked, synchronisation residuals and run time, and what only all rows of
-a board show together: the order of its RX, and jumps of its phase.
-
-A jump of the phase between two rows comes, for example, from a cable that was touched. Referencing to the direct path
-leaves it if only the echo has it. Echoes of neighbouring positions are alike: a linear predictor from the two rows on
-either side, fitted to the rows around, explains an echo but for 15 to 30 % of its amplitude where plates reflect (rows
-6 mm apart). If the phase jumps by phi between two rows, the parts of the prediction from the other side of the jump
-have to be turned by phi; least squares gives it.
-
-A jump where nothing reflects (gaps between plates, rows at the ends of the scan) is not seen, and one between the last
-row of one plate and the first of the next looks like a difference of the plates.
+a board show together: the order of its RX, and jumps of its phase (`row_phases.py`).
 """
 
 from __future__ import annotations
@@ -20,8 +11,8 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Annotated, Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -29,8 +20,22 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from polysight.imaging import ImageBuilder, Images, describe_imaging
-from polysight.materials import MaterialsResult, permittivity_change
+from polysight.materials import MaterialsResult, find_interiors, measure_along_plates, permittivity_change
 from polysight.polarimetry import IncidenceChoice, PlaneReference
+from polysight.process.row_phases import (
+    DRIFT_DONE_RAD,
+    JUMP_LEFT,
+    LEAST_PLATES,
+    MOST_DRIFT_ROUNDS,
+    NOT_DISPLACED,
+    DisplacedRows,
+    PhaseDrift,
+    PhaseJump,
+    estimate_phase_drift,
+    find_displaced_rows,
+    find_phase_jumps,
+    keep_jumps_without_shifts,
+)
 from polysight.results import (
     Backlash,
     BoardQuality,
@@ -41,6 +46,7 @@ from polysight.results import (
     Residual,
     ScanQuality,
     Verdict,
+    rules,
 )
 from polysight.store import CubeRow, RowData, Source
 from polysight.sync import (
@@ -53,6 +59,7 @@ from polysight.sync import (
     sample_frequencies_hz,
 )
 from polysight_shared.config import Board, Instrument
+from polysight_shared.geometry import specular_midpoint_m
 from polysight_shared.raster import plan_raster
 
 # Nothing is calibrated.
@@ -60,31 +67,6 @@ NO_FILES: Mapping[str, CalibrationSource] = {}
 # Least share of a board's rows that tell another order of the RX; chosen.
 OTHER_ORDER_SHARE = 0.1
 Count = Annotated[int, msgspec.Meta(ge=0)]
-
-# Rows on either side that an echo is predicted from, and positions on either side in each of them; chosen.
-_PREDICTOR_ROWS = (-2, -1, 1, 2)
-_PREDICTOR_POSITIONS = 1
-# Rows on either side of a jump that the predictor is fitted to, and regularisation relative to its mean power; chosen.
-_FIT_ROWS = 6
-_RIDGE = 1e-3
-# Least jump that is told; chosen.
-_LEAST_RAD = np.radians(9)
-# Least clearness of a jump: its ratio to the error of the prediction, times how far that ratio stands out from the
-# third largest one (a jump's neighbours have a share of it). Of 136 boards in drawn scenes without a jump, two thirds
-# of them with rows 6 mm apart, which are predicted badly from their neighbours, the clearest reached 1.5. Of jumps of
-# 60 degrees 82 % reach 2, of 30 degrees 65 % (all simulated); with rows 2 mm apart those of 15 degrees reach 11.
-_LEAST_CLEAR = 2.0
-# The error of the prediction relative to the part that turns, above which a row tells nothing; chosen.
-_MAX_ERROR = 1.0
-# Least number of rows that tell something: the clearest is compared with the third. Scenes with rows 12 mm apart, where
-# a row is not predicted from its neighbours, have 3 to 5, and jumps of their own; others 8 and more.
-_LEAST_ROWS = 10
-# Times that a jump is measured again with what was found turned back: until then the predictor was fitted across it.
-_REPEATS = 2
-# Most jumps of a board that are looked for, one after another (a loose cable makes several); chosen.
-_MOST_JUMPS = 4
-# Rows at either end of a scan, where the predictor is not fitted to both sides; chosen.
-_END_ROWS = 3
 
 
 class RowFigures(msgspec.Struct, frozen=True, kw_only=True):
@@ -251,18 +233,25 @@ class BoardRows:
             return []
         return list(order)
 
-    def find_phase_jumps(self) -> tuple[PhaseJump, ...]:
-        """Find the clear jumps of the echo's phase between two rows, in the order of rows."""
+    def list_echoes(self) -> dict[int, NDArray[np.complexfloating]]:
+        """Return the echoes of all rows, complex [rx, position], positions from the smallest x."""
+        plan = plan_raster(self.rig.grid)
         # A copy: threads may add rows meanwhile.
         rows = dict(self.rows)
-        is_searched = rows.keys() == self._searched_rows.keys() and all(
-            quality is self._searched_rows[row] for row, quality in rows.items()
-        )
-        if not is_searched:
-            plan = plan_raster(self.rig.grid)
-            self._jumps = find_phase_jumps({row: r.echo[:, :: plan.row(row).direction] for row, r in rows.items()})
+        return {row: quality.echo[:, :: plan.row(row).direction] for row, quality in rows.items()}
+
+    def find_phase_jumps(self, shifts: NDArray[np.float64] | None = None) -> tuple[PhaseJump, ...]:
+        """Find the clear jumps of the echo's phase between two rows, in the order of rows.
+
+        `shifts` [round, row] are those of displaced rows (:class:`DisplacedRows`); None without any.
+        """
+        rows = dict(self.rows)
+        if not _hold_same_rows(rows, self._searched_rows):
+            self._jumps = find_phase_jumps(self.list_echoes())
             self._searched_rows = rows
-        return self._jumps
+        if shifts is None or not self._jumps:
+            return self._jumps
+        return keep_jumps_without_shifts(self._jumps, self.list_echoes(), shifts)
 
     @property
     def direct_snr_db(self) -> float | None:
@@ -325,6 +314,11 @@ class BoardRows:
         return Backlash(shift=round(estimate.shift, 4), std=round(estimate.std, 4))
 
 
+def _hold_same_rows(rows: Mapping[int, RowQuality], others: Mapping[int, RowQuality]) -> bool:
+    """Return true if both hold the same rows, none of them added again."""
+    return rows.keys() == others.keys() and all(quality is others[row] for row, quality in rows.items())
+
+
 def _find_frequency_range(direct_hz: NDArray[np.float64]) -> FrequencyRange | UnsetType:
     """Return median, least and largest IF, Hz; unset without any."""
     if direct_hz.size == 0:
@@ -370,110 +364,6 @@ def find_masked_runs(masked: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
-class PhaseJump(NamedTuple):
-    """A jump of the phase of a board's echo: the row that it comes before, and its size in radians."""
-
-    row: int
-    angle_rad: float
-
-
-def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[PhaseJump, ...]:
-    """Find the clear jumps of the phase from row to row, at most `_MOST_JUMPS`, in the order of rows.
-
-    `rows`: number to echoes, complex [rx, position], positions from the smallest x. Numbers that are missing count as
-    rows without echo. What was found is turned back before the next jump is looked for.
-    """
-    if len(rows) < 2 * _END_ROWS:
-        return ()
-    first = min(rows)
-    shape = next(iter(rows.values())).shape
-    echoes = np.zeros((max(rows) - first + 1, *shape), complex)
-    for number, echo in rows.items():
-        echoes[number - first] = echo
-    jumps: list[PhaseJump] = []
-    while len(jumps) < _MOST_JUMPS:
-        jump = _find_clearest_jump(echoes)
-        # What is left of a jump is no jump of its own.
-        if jump is None or any(abs(jump.row - other.row) <= 1 for other in jumps):
-            break
-        echoes[jump.row :] *= np.exp(-1j * jump.angle_rad)
-        jumps.append(jump)
-    return tuple(PhaseJump(first + jump.row, jump.angle_rad) for jump in sorted(jumps))
-
-
-def _find_clearest_jump(echoes: NDArray[np.complex128]) -> PhaseJump | None:
-    """Find the clearest jump of echoes [row, rx, position]; None if no jump is clear."""
-    angles, errors = _measure_jumps(echoes)
-    is_sound = errors < _MAX_ERROR
-    ratio = np.zeros(len(angles))
-    ratio[is_sound] = np.abs(angles[is_sound]) / errors[is_sound]
-    if np.count_nonzero(is_sound) < _LEAST_ROWS:
-        return None
-    row = int(np.argmax(ratio))
-    third = float(np.sort(ratio[is_sound])[-3])
-    is_clear = ratio[row] ** 2 > _LEAST_CLEAR * third
-    angle = float(angles[row])
-    if not is_clear or abs(angle) < _LEAST_RAD:
-        return None
-    for _ in range(_REPEATS):
-        turned = echoes.copy()
-        turned[row:] *= np.exp(-1j * angle)
-        angle += float(_measure_jumps(turned)[0][row])
-    return PhaseJump(row, angle)
-
-
-def _measure_jumps(echoes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the jump before each row, radians, and the error of its prediction, [row]; the error is inf if unknown."""
-    count, rx, positions = echoes.shape
-    padded = np.pad(echoes, ((0, 0), (0, 0), (_PREDICTOR_POSITIONS, _PREDICTOR_POSITIONS)))
-    taps = 2 * _PREDICTOR_POSITIONS + 1
-    # [row, rx, position, tap]
-    shifted = np.stack([padded[:, :, k : k + positions] for k in range(taps)], axis=-1)
-    angles = np.zeros(count)
-    errors = np.full(count, np.inf)
-    targets = range(-_PREDICTOR_ROWS[0], count - _PREDICTOR_ROWS[-1])
-    # Neighbours [rx * position, tap] of each target by row, and the sums of least squares over each target's row.
-    neighbours = {k: [shifted[k + d].reshape(rx * positions, taps) for d in _PREDICTOR_ROWS] for k in targets}
-    products = {}
-    for k in targets:
-        together = np.concatenate(neighbours[k], axis=1)
-        products[k] = together.conj().T @ together, together.conj().T @ echoes[k].ravel()
-    for jump in range(_END_ROWS, count - _PREDICTOR_ROWS[-1]):
-        fitted = [k for k in range(jump - _FIT_ROWS, jump + _FIT_ROWS) if k in products]
-        normal = np.sum([products[k][0] for k in fitted], axis=0)
-        power = float(np.trace(normal).real) / len(normal)
-        if power == 0:
-            continue
-        right = np.sum([products[k][1] for k in fitted], axis=0)
-        predictor = np.linalg.solve(normal + _RIDGE * power * np.eye(len(normal)), right).reshape(
-            len(_PREDICTOR_ROWS), taps
-        )
-        turn = 0j
-        turned_power = 0.0
-        residual = 0.0
-        for k in range(jump + _PREDICTOR_ROWS[0], jump + _PREDICTOR_ROWS[-1]):
-            if k not in products:
-                continue
-            beyond = np.zeros(rx * positions, complex)
-            unpredicted = echoes[k].ravel().copy()
-            for d, values, weights in zip(_PREDICTOR_ROWS, neighbours[k], predictor, strict=True):
-                is_beyond = (k + d >= jump) != (k >= jump)
-                if is_beyond:
-                    beyond += values @ weights
-                else:
-                    unpredicted -= values @ weights
-            # Rows before the jump see it turned one way, rows behind it the other way.
-            product = np.vdot(beyond, unpredicted)
-            turn += product.conjugate() if k < jump else product
-            turned_power += float(np.vdot(beyond, beyond).real)
-            residual += float(np.vdot(unpredicted - beyond, unpredicted - beyond).real)
-        if turned_power > 0:
-            angles[jump] = float(np.angle(turn))
-            left = max(residual - 2 * (abs(turn) - turn.real), 0.0)
-            errors[jump] = max(float(np.sqrt(left / turned_power)), 1e-6)
-    return angles, errors
-
-
 class Quality:
     """Collects the quality figures of a scan during processing.
 
@@ -491,6 +381,8 @@ class Quality:
         Entries of quality.json that others add, by their name.
     filled
         Reconstructed positions of each board that has any.
+    drift
+        Drift of one board's phase that was removed from the images; None: none.
     """
 
     def __init__(
@@ -503,6 +395,10 @@ class Quality:
         if calibration:
             self.notes["calibration"] = dict(calibration)
         self.filled: Mapping[str, ReconstructedPositions] = {}
+        self.drift: PhaseDrift | None = None
+        self._displaced = NOT_DISPLACED
+        # The rows of each board in which displaced rows were looked for.
+        self._searched: list[dict[int, RowQuality]] = []
         # Rows are processed in several threads, which all add to `seconds`.
         self._lock = threading.Lock()
 
@@ -511,13 +407,30 @@ class Quality:
         """Boards with rows of which no position has a direct path."""
         return [name for name, b in self.boards.items() if b.positions and b.positions_masked == b.positions]
 
+    def find_displaced_rows(self) -> DisplacedRows:
+        """Find rows that are not where the stage was commanded: both boards show it."""
+        rows = [dict(board.rows) for board in self.boards.values()]
+        is_searched = len(rows) == len(self._searched) and all(map(_hold_same_rows, rows, self._searched))
+        if not is_searched:
+            echoes = [board.list_echoes() for board in self.boards.values()]
+            self._displaced = find_displaced_rows(echoes, self.source.plan.step_y_mm)
+            self._searched = rows
+        return self._displaced
+
+    def find_phase_jumps(self) -> dict[str, tuple[PhaseJump, ...]]:
+        """Find the clear jumps of the phase of each board's echo, by its name."""
+        displaced = self.find_displaced_rows()
+        if displaced.rms_mm > 0:
+            return {name: board.find_phase_jumps(displaced.shifts) for name, board in self.boards.items()}
+        return {name: board.find_phase_jumps() for name, board in self.boards.items()}
+
     def remove_phase_jumps(self, builders: Iterable[ImageBuilder]) -> None:
         """Turn rows back by each board's phase jumps, in all images that the builders form.
 
         The longest section without a jump keeps its phase.
         """
-        for name, board in self.boards.items():
-            jumps = board.find_phase_jumps()
+        self.drift = None
+        for name, jumps in self.find_phase_jumps().items():
             angles_rad = np.zeros(self.source.plan.rows)
             for jump in jumps:
                 angles_rad[jump.row :] -= jump.angle_rad
@@ -527,17 +440,73 @@ class Quality:
             for builder in builders:
                 builder.boards[name].turn_rows(angles_rad)
 
+    def remove_phase_drift(self, builder: ImageBuilder, others: Iterable[ImageBuilder]) -> Images:
+        """Return the builder's images without a drift of one board's phase over the rows, if that is clear.
+
+        The rows are turned back in all images that this builder and the `others` form. Nothing is done where positions
+        are missing or the phase jumps: what is left of those looks like a drift.
+        """
+        images = builder.finish()
+        if self.lacks_positions or any(self.find_phase_jumps().values()):
+            return images
+        plates = measure_along_plates(images, find_interiors(images))
+        if len(plates) < LEAST_PLATES:
+            return images
+        drift = estimate_phase_drift(plates)
+        if not drift.clear:
+            return images
+        builders = (builder, *others)
+        h, v = self.boards
+        name, sign = (v, 1) if drift.of_v else (h, -1)
+        rig = self.boards[name].rig
+        middle_m = specular_midpoint_m(rig, self.boards[name].board)[1]
+        y_m = middle_m + np.array([row.y_mm for row in plan_raster(rig.grid)]) / 1e3
+        removed_rad = drift.at(y_m)
+        for _ in range(MOST_DRIFT_ROUNDS):
+            for each in builders:
+                each.boards[name].turn_rows(sign * removed_rad)
+            images = builder.finish()
+            plates = measure_along_plates(images, find_interiors(images))
+            if len(plates) < LEAST_PLATES:
+                break
+            again = estimate_phase_drift(plates, (y_m, removed_rad))
+            # Which board drifts shows only before anything is removed.
+            drift = replace(again, of_v=drift.of_v)
+            change_rad = drift.at(y_m) - removed_rad
+            if float(np.std(change_rad)) < DRIFT_DONE_RAD:
+                break
+            # Half of the change: with all of it the estimates swing about the drift.
+            removed_rad = removed_rad + change_rad / 2
+        self.drift = drift
+        return images
+
     @property
-    def jump_rad(self) -> float:
-        """Largest jump of a board's phase between two rows of the scan, radians; 0 if none was found."""
-        jumps = [jump for board in self.boards.values() for jump in board.find_phase_jumps()]
-        return max((abs(jump.angle_rad) for jump in jumps), default=0.0)
+    def lacks_positions(self) -> bool:
+        """True if more positions than a few of some board have no data, and were not reconstructed."""
+        if self.filled:
+            return False
+        rows_absent = len(self._list_absent_rows()) / max(1, self.source.plan.rows)
+        # A board without any position lacks all of them.
+        masked = [b.positions_masked / b.positions if b.positions else 1.0 for b in self.boards.values()]
+        return max(rows_absent, *masked) > rules.SOME_POSITIONS
+
+    def _list_absent_rows(self) -> list[int]:
+        """Return the rows of the plan that some board lacks."""
+        boards = list(self.boards.values())
+        return [row for row in range(self.source.plan.rows) if any(row not in board.rows for board in boards)]
+
+    @property
+    def phase_left_rad(self) -> float:
+        """Standard deviation of a plate's phase by what may be left of removed jumps and drifts, radians."""
+        jumps = [abs(jump.angle_rad) for of_board in self.find_phase_jumps().values() for jump in of_board]
+        left_of_drift = 0.0 if self.drift is None else self.drift.left_rad
+        return float(np.hypot(JUMP_LEFT * max(jumps, default=0.0), left_of_drift))
 
     def coverage(self) -> Coverage:
         """Compare rows, positions and frames with the plan; missing rows count as not received."""
         plan = self.source.plan
         boards = list(self.boards.values())
-        absent = [row for row in range(plan.rows) if any(row not in board.rows for board in boards)]
+        absent = self._list_absent_rows()
         frames_a_position = self.source.instrument.burst.chirps_a_position
         # A cube that another program synchronised holds the average of each position.
         if self.source.synchronised:

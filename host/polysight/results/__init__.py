@@ -3,11 +3,11 @@
 `ScanMaterials`, `ScanQuality` and `ScanFacts` are the content of materials.json, quality.json and scan.json; their
 `read` takes files of any release. `PatchFigures` declares each figure of a patch once, with name, unit and title
 (`Column`); `list_declared_figures` lists them for tables, exports and datasets. With the verdict "no result" a
-`ScanMaterials` cannot hold names or permittivities. `rules` holds the rules of the verdict, `join_reasons`
-joins what they find. `to_plain` converts all of it to JSON types.
+`ScanMaterials` cannot hold names or permittivities. `rules` and `row_rules` hold the rules of the verdict,
+`join_reasons` joins what they find. `to_plain` converts all of it to JSON types.
 """
 
-from polysight.results import rules as rules
+from polysight.results import row_rules as row_rules, rules as rules
 from polysight.results.check_plate import (
     ACTION_SIGMAS as ACTION_SIGMAS,
     WARNING_SIGMAS as WARNING_SIGMAS,

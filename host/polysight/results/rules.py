@@ -194,19 +194,6 @@ def judge_rx_order(board: str, order: Sequence[int]) -> list[Finding]:
     )]  # fmt: skip
 
 
-def judge_phase_jumps(board: str, jumps: Sequence[tuple[int, float]]) -> list[Finding]:
-    """Judge jumps of the phase of a board's echo: (the row before which it jumps, angle in radians) of each."""
-    if not jumps:
-        return []
-    places = ", ".join(f"by {np.degrees(angle_rad):+z.0f} degrees before row {row}" for row, angle_rad in jumps)
-    return [reason(
-        "care", f"{board}: the phase of the echo jumps {places}",
-        "a cable or connector is loose or was touched, or the board was knocked; the direct path does not show it; it"
-        " was removed from the images as measured between the rows, and the errors contain what may be left",
-        "fix cables and boards, and scan again", 4.7,
-    )]  # fmt: skip
-
-
 def judge_direct_path(board: str, snr_db: float | None, phase_rad: float | None, found_share: float) -> list[Finding]:
     """Judge one board's direct path: its level over noise, the residual phase, and the share of positions with one."""
     if 1 - found_share > FEW_POSITIONS or (is_known(snr_db) and snr_db < DIRECT_SNR_NONE_DB):
@@ -455,16 +442,20 @@ def judge_copies(
     )]  # fmt: skip
 
 
-def judge_image_shift(apart_mm: tuple[float, float]) -> list[Finding]:
-    """Judge where the image of V lay relative to that of H (x, y)."""
+def judge_image_shift(apart_mm: tuple[float, float], has_drift: bool = False) -> list[Finding]:
+    """Judge where the image of V lay relative to that of H (x, y); `has_drift`: a drift of the phase was removed."""
     distance = float(np.hypot(*apart_mm))
     if not is_known(distance) or distance <= IMAGE_SHIFT_MM:
         return []
+    cause = "boards are out of place by a few millimetres, or all plates lie high; the images were laid on each other"
+    do = "measure where the antennas are (`polysight calibrate direct-path`) and correct the rig file"
+    if has_drift:
+        cause = "the drift of a phase moves an image, and some of it is left; the images were laid on each other"
+        do = "see the drift of the phase; if it is gone and this stays, measure where the antennas are"
     return [reason(
         "care",
         f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+z.1f}, y {apart_mm[1]:+z.1f} mm)",
-        "boards are out of place by a few millimetres, or all plates lie high; the images were laid on each other",
-        "measure where the antennas are (`polysight calibrate direct-path`) and correct the rig file", 1.9,
+        cause, do, 1.9,
     )]  # fmt: skip
 
 

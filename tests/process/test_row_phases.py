@@ -1,0 +1,122 @@
+"""Displaced rows and a drifting phase are reported by their own names, and jumps that are no jumps are left alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from benchmarks.coverage import Cubes
+from tests.support.mangled_scans import PLATES, SCENE, compute_distances
+from tests.support.pipelines import make_pipeline
+from tests.support.rigs import load_published_rig
+
+from polysight.process.row_phases import find_displaced_rows, find_phase_jumps, keep_jumps_without_shifts
+from polysight_simulators.scene import decode_scene
+from polysight_worlds import METAL, Plate, Stack, World, published_rig as independent_rig, record
+from polysight_worlds.world import nine_places
+
+EMPTY: dict[str, Any] = SCENE | {"plates": []}
+STEP_MM = 4.0
+Echoes = dict[int, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def fine_rows() -> list[np.ndarray]:
+    """Echoes of nine plates in both boards, [row, position] with rows 2 mm apart, of an independent world."""
+    rig = independent_rig()
+    stacks = [METAL, *(Stack(below=complex(e, -0.4)) for e in (2.2, 3.0, 3.6, 4.2, 5.0, 6.0, 7.0, 2.6))]
+    places = nine_places((rig.centre_m[0], rig.centre_m[1]))
+    plates = [Plate(str(i), place, (0.046, 0.046), s) for i, (place, s) in enumerate(zip(places, stacks, strict=True))]
+    boards = []
+    for antenna in (rig.h, rig.v):
+        echoes = record(rig, antenna, World(tuple(plates)))
+        direct_m = np.linalg.norm(antenna.position - rig.tx.position)
+        # The range cell of the plates.
+        turn = np.exp(2j * np.pi * rig.frequencies_hz * (direct_m + 0.308) / 299792458.0)
+        boards.append(np.tensordot(turn, echoes, 1))
+    return boards
+
+
+def displace(fine: np.ndarray, shifts_mm: np.ndarray) -> Echoes:
+    """Every second of the fine rows, each from where it is displaced to: by the spectrum along y."""
+    frequencies = np.fft.fftfreq(len(fine), 2.0)
+    spectrum = np.fft.fft(fine, axis=0)
+    rows = {}
+    for number in range(len(fine) // 2):
+        y_mm = STEP_MM * number + shifts_mm[number]
+        rows[number] = (np.exp(2j * np.pi * frequencies * y_mm) @ spectrum / len(fine))[None]
+    return rows
+
+
+def draw_shifts_mm(seed: int, rms_mm: float) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    slow = np.sin(2 * np.pi * np.arange(100) / rng.uniform(10, 60))
+    return rms_mm * (rng.standard_normal(100) + 1.5 * slow)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_rows_that_both_boards_see_displaced_are_found_and_no_jump_is(fine_rows, seed):
+    """Of rows 0.4 mm off, one was called a jump of V's phase and turned (found from outside)."""
+    boards = [displace(fine, draw_shifts_mm(seed, 0.4)) for fine in fine_rows]
+    displaced = find_displaced_rows(boards, STEP_MM)
+    assert displaced.rms_mm == pytest.approx(0.4, rel=0.5)
+    assert any(find_phase_jumps(rows) for rows in boards)
+    assert not any(keep_jumps_without_shifts(find_phase_jumps(rows), rows, displaced.shifts) for rows in boards)
+
+
+def test_rows_in_their_places_are_not_displaced(fine_rows):
+    boards = [displace(fine, np.zeros(100)) for fine in fine_rows]
+    assert find_displaced_rows(boards, STEP_MM).rms_mm == 0.0
+
+
+@pytest.mark.parametrize("of_both", [False, True])
+def test_a_jump_is_no_displacement(fine_rows, of_both):
+    boards = [displace(fine, np.zeros(100)) for fine in fine_rows]
+    for rows in boards if of_both else boards[1:]:
+        for number in range(48, 100):
+            rows[number] = rows[number] * np.exp(0.6j)
+    assert find_displaced_rows(boards, STEP_MM).rms_mm == 0.0
+
+
+def test_a_jump_among_displaced_rows_is_found_at_its_row(fine_rows):
+    rows = displace(fine_rows[1], draw_shifts_mm(1, 0.4))
+    other = displace(fine_rows[0], draw_shifts_mm(1, 0.4))
+    for number in range(48, 100):
+        rows[number] = rows[number] * np.exp(1.2j)
+    shifts = find_displaced_rows([other, rows], STEP_MM).shifts
+    assert [jump.row for jump in keep_jumps_without_shifts(find_phase_jumps(rows), rows, shifts)] == [48]
+
+
+def make_drifting_cubes(board: str, phase_rad: np.ndarray) -> Cubes:
+    """Cubes of the six plates whose echo in one board is turned by a phase of each row; the direct path is not."""
+    cubes = Cubes(load_published_rig(), decode_scene(SCENE, "test"))
+    direct = Cubes(load_published_rig(), decode_scene(EMPTY, "test"))._cubes[board].mean(axis=(1, 2, 3), keepdims=True)
+    echoes = cubes._cubes[board] - direct
+    cubes._cubes[board] = direct + echoes * np.exp(1j * phase_rad).astype(np.complex64)[None, :, None, None]
+    return cubes
+
+
+@pytest.mark.parametrize(("board", "size_rad"), [("RV", 0.8), ("RH", -1.0)])
+def test_a_drift_of_one_boards_phase_is_the_first_reason_removed_and_counted(board, size_rad):
+    """It was called a second path, an overdriven receiver, and boards out of place (found from outside)."""
+    rows = SCENE["grid"]["rows"]
+    phase_rad = size_rad * np.sin(2 * np.pi * np.arange(rows) / rows)
+    cubes = make_drifting_cubes(board, phase_rad)
+    pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
+    findings = pipeline.examine(pipeline.form_images())
+    drift = pipeline.quality.drift
+    assert drift is not None
+    assert drift.of_v is (board == "RV")
+    assert "the phase of V / H drifts over the rows" in findings.verdict.reasons[0].what
+    assert not any("second path" in r.why or "out of place" in r.why for r in findings.verdict.reasons)
+    inside = compute_distances(cubes, findings)
+    assert len(inside) == len(PLATES)
+    assert max(inside) < 9
+
+
+def test_a_phase_that_hardly_drifts_is_left_alone():
+    cubes = make_drifting_cubes("RV", 0.02 * np.sin(2 * np.pi * np.arange(SCENE["grid"]["rows"]) / 41))
+    pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
+    pipeline.form_images()
+    assert pipeline.quality.drift is None

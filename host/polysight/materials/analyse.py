@@ -103,8 +103,7 @@ class Optics:
     other_sign
         Probability a priori that all phases of the images have the other sign: 0 for scans of this program.
     phase_left_rad
-        Standard deviation of a plate's phase by what may be left of jumps and drifts of a board's phase that were
-        removed from the images, radians.
+        Standard deviation of a plate's phase by what may be left of removed jumps and drifts of a board's, radians.
     """
 
     theta_rad: npt.ArrayLike
@@ -523,10 +522,9 @@ class _Scene:
         )  # fmt: skip
         prior = scatter.prior(self.optics.prior, float(np.hypot(*self.apart_mm)))
         dispersions = measure_dispersions(images, segmentation, judged, reference.mask, self.plane)
+        left_rad = self.optics.phase_left_rad
         measured = [
-            scatter.measure(p, (relative_h, relative_v), _mean_angle(theta, p), d).widen_phase(
-                self.optics.phase_left_rad
-            )
+            scatter.measure(p, (relative_h, relative_v), _mean_angle(theta, p), d).widen_phase(left_rad)
             for p, d in zip(judged, dispersions, strict=True)
         ]
         solution = _solve(measured, prior, self.kinds, self.optics.other_sign)

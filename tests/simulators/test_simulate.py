@@ -100,7 +100,7 @@ def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path)
     ("plate", "run", "named"),
     [
         ({"centre_mm": [2000.0, 2000.0]}, {}, "extend over"),
-        ({}, {"burst": {"pulses": 400_000, "period_us": 1500.0}, "stage": {"speed_mm_s": 0.001}}, "MB a board"),
+        ({}, {"burst": {"pulses": 65_536, "period_us": 1500.0}, "stage": {"speed_mm_s": 0.001}}, "MB a board"),
     ],
 )
 def test_what_exceeds_the_memory_is_refused(

@@ -168,6 +168,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the pages")
     parser.add_argument("--quick", action="store_true", help="without results of notebooks, without the gallery")
     args = parser.parse_args(argv)
+    if args.out.exists() and not args.out.is_dir():
+        parser.error(f"--out {args.out}: not a folder")
     names = list(dict.fromkeys(name for package in PACKAGES for name in list_modules(package)))
     build(names, args.out)
     pages = build_site(args.out, run=not args.quick)

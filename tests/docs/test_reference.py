@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from docs.reference import ROOMS, build, link_faults, list_modules
+from docs.reference import ROOMS, build, link_faults, list_modules, main
 from docs.site import build_site, draw_pictures
 
 import polysight
@@ -86,3 +86,13 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path, link):
 def test_a_package_without_public_names_has_a_page_for_each_module():
     modules = list(list_modules("polysight_shared"))
     assert {"polysight_shared", "polysight_shared.errors", "polysight_shared.config"} <= set(modules)
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path, capsys):
+    file = tmp_path / "pages"
+    file.write_text("mine", encoding="utf-8")
+    with pytest.raises(SystemExit) as exit_info:
+        main(["--out", str(file)])
+    assert exit_info.value.code == 2
+    assert f"{file}: not a folder" in capsys.readouterr().err
+    assert file.read_text(encoding="utf-8") == "mine"

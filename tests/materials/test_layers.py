@@ -119,15 +119,19 @@ def test_what_the_wave_does_not_reach_has_a_large_error_bar():
 
 
 def test_a_layer_before_which_nothing_lies_is_not_called_hidden_for_a_large_error_of_its_loss():
-    fit = LayerFit(6.08 - 0.53j, None, 0.47, 0.49, 0.0, 0.0, 0)
+    fit = LayerFit(
+        6.08 - 0.53j, thickness_m=None, std_real=0.47, std_loss=0.49, std_thickness_m=0.0, chi2=0.0, freedom=0
+    )
     assert fit.warnings() == ["the data hardly tell the loss of this layer: it is known to +- 0.49"]
     assert replace(fit, std_loss=0.15).warnings() == []
     assert replace(fit, std_real=2.0).warnings() == ["the data hardly depend on this layer: its error bar is large"]
 
 
 def test_as_many_unknowns_as_numbers_are_reported_with_the_missing_measurements():
-    rival = LayerFit(6.11 - 1.58j, 0.96e-3, 0.1, 0.1, 1e-5, 0.02, 0)
-    fit = LayerFit(6.28 - 1.22j, 1.74e-3, 0.1, 0.1, 1e-5, 0.01, 0, rivals=(rival,))
+    rival = LayerFit(
+        6.11 - 1.58j, thickness_m=0.96e-3, std_real=0.1, std_loss=0.1, std_thickness_m=1e-5, chi2=0.02, freedom=0
+    )
+    fit = replace(rival, permittivity=6.28 - 1.22j, thickness_m=1.74e-3, chi2=0.01, rivals=(rival,))
     told = fit.warnings()
     assert any("--bands 4" in words for words in told)
     assert not any("degrees of freedom" in words for words in told)

@@ -154,7 +154,8 @@ def test_the_figures_are_compared_with_the_published_values(out):
 def test_sugar_is_judged_at_the_angle_with_the_most_solutions_whatever_else_was_scanned_at_another(tmp_path):
     def make_entry(name, percent, angle_deg):
         ratio = np.full(4, np.tan(np.radians(40 + percent / 10)), np.complex64)
-        return Entry(name, "1", np.abs(ratio), np.ones(4, np.float32), ratio, angle_deg, True)
+        v = np.ones(4, np.float32)
+        return Entry(name, scan="1", h=np.abs(ratio), v=v, p=ratio, incidence_deg=angle_deg, simulated=True)
 
     solutions = [make_entry(f"sugar ({percent}%)", percent, 60.0) for percent in (2, 4, 6, 8)]
     others = [make_entry(f"solid {k}", 0, 55.0) for k in range(9)]

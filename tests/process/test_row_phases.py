@@ -1,4 +1,4 @@
-"""Displaced rows and a drifting phase are reported by their own names, and jumps that are no jumps are left alone."""
+"""Displaced rows and a drifting phase are reported by their own names; what only looks like a jump is left alone."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_rows_in_their_places_are_not_displaced(fine_rows):
 
 
 @pytest.mark.parametrize("of_both", [False, True])
-def test_a_jump_is_no_displacement(fine_rows, of_both):
+def test_a_jump_is_not_taken_for_a_displacement(fine_rows, of_both):
     boards = [displace(fine, np.zeros(100)) for fine in fine_rows]
     for rows in boards if of_both else boards[1:]:
         for number in range(48, 100):

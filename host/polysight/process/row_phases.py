@@ -45,9 +45,9 @@ _LEAST_RAD = np.radians(9)
 # of them with rows 6 mm apart, which are predicted badly from their neighbours, the clearest reached 1.5. Of jumps of
 # 60 degrees 82 % reach 2, of 30 degrees 65 % (all simulated); with rows 2 mm apart those of 15 degrees reach 11.
 _LEAST_CLEAR = 2.0
-# The error of the prediction relative to the part that turns, above which a row tells nothing; chosen.
+# The error of the prediction relative to the part that turns, above which a row is not used; chosen.
 _MAX_ERROR = 1.0
-# Least number of rows that tell something: the clearest is compared with the third. Scenes with rows 12 mm apart, where
+# Least number of rows that are used: the clearest is compared with the third. Scenes with rows 12 mm apart, where
 # a row is not predicted from its neighbours, have 3 to 5, and jumps of their own; others 8 and more.
 _LEAST_ROWS = 10
 # Times that a jump is measured again with what was found turned back: until then the predictor was fitted across it.
@@ -122,14 +122,11 @@ def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[P
     if len(rows) < 2 * _END_ROWS:
         return ()
     first = min(rows)
-    shape = next(iter(rows.values())).shape
-    echoes = np.zeros((max(rows) - first + 1, *shape), complex)
-    for number, echo in rows.items():
-        echoes[number - first] = echo
+    echoes = _stack_rows({number - first: echo for number, echo in rows.items()}, max(rows) - first + 1)
     jumps: list[PhaseJump] = []
     while len(jumps) < _MOST_JUMPS:
         jump = _find_clearest_jump(echoes)
-        # What is left of a jump is no jump of its own.
+        # What is left of a jump is not counted as another one.
         if jump is None or any(abs(jump.row - other.row) <= 1 for other in jumps):
             break
         echoes[jump.row :] *= np.exp(-1j * jump.angle_rad)

@@ -68,8 +68,7 @@ class Pipeline:
             if from_sums:
                 images = self.builder.current()
             else:
-                self.quality.remove_phase_jumps((self.samples.filled, *self.sub_bands.builders))
-                images = self.quality.remove_phase_drift(self.samples.filled, self.sub_bands.builders)
+                images = self.quality.form_images(self.samples.filled, self.sub_bands.builders)
         self.quality.add_entries(**self.synchroniser.recording_facts())
         return images.transpose() if self.source.mirrored else images
 

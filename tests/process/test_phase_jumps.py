@@ -15,7 +15,8 @@ from tests.support.pipelines import make_pipeline
 from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 
-from polysight.process.row_phases import PhaseJump, find_phase_jumps
+from polysight.process.row_phases import find_phase_jumps
+from polysight.results import PhaseJump
 from polysight_simulators.scene import decode_scene
 from polysight_worlds import METAL, Plate, Stack, World, published_rig as independent_rig, record
 from polysight_worlds.world import nine_places
@@ -40,6 +41,7 @@ def test_a_jump_within_the_scan_is_the_first_reason_and_counted(board, row, degr
     (jump,) = pipeline.quality.boards[board].find_phase_jumps()
     assert abs(jump.row - row) <= 1
     assert np.degrees(jump.angle_rad) == pytest.approx(degrees, abs=6)
+    assert pipeline.quality.result().boards[board].phase_jumps == [jump]
     assert findings.verdict.level == "care"
     assert f"{board}: the phase of the echo jumps" in findings.verdict.reasons[0].what
     inside = compute_distances(cubes, findings)
@@ -138,6 +140,6 @@ def test_rows_are_turned_back_by_all_jumps_and_the_longest_section_keeps_its_pha
     builder = SimpleNamespace(
         boards={name: SimpleNamespace(turn_rows=partial(turned.__setitem__, name)) for name in ("RH", "RV")}
     )
-    pipeline.quality.remove_phase_jumps([builder])  # type: ignore[list-item]
+    pipeline.quality._remove_phase_jumps([builder])  # type: ignore[list-item]
     assert not turned["RH"].any()
     np.testing.assert_allclose(turned["RV"][[0, 3, 4, 24, 25, -1]], [0.5, 0.5, 0.0, 0.0, 0.2, 0.2])

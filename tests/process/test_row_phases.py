@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from benchmarks.coverage import Cubes
+from msgspec import UNSET
 from tests.support.mangled_scans import PLATES, SCENE, compute_distances
 from tests.support.pipelines import make_pipeline
 from tests.support.rigs import load_published_rig
 
-from polysight.process.row_phases import find_displaced_rows, find_phase_jumps, keep_jumps_without_shifts
+from polysight.process.row_phases import DisplacedRows, find_displaced_rows, find_phase_jumps, keep_jumps_without_shifts
 from polysight_simulators.scene import decode_scene
 from polysight_worlds import METAL, Plate, Stack, World, published_rig as independent_rig, record
 from polysight_worlds.world import nine_places
@@ -70,6 +71,16 @@ def test_rows_in_their_places_are_not_displaced(fine_rows):
     assert find_displaced_rows(boards, STEP_MM).rms_mm == 0.0
 
 
+def test_quality_json_has_the_size_of_displaced_rows_and_no_entry_without_them(monkeypatch):
+    pipeline = make_pipeline(Cubes(load_published_rig(), decode_scene(EMPTY, "test")))  # type: ignore[arg-type]
+    assert pipeline.quality.result().rows_displaced_mm is UNSET
+    monkeypatch.setattr(
+        "polysight.process.quality.find_displaced_rows", lambda *_: DisplacedRows(np.zeros((1, 41)), 0.4)
+    )
+    pipeline.quality.find_displaced_rows()
+    assert pipeline.quality.result().rows_displaced_mm == 0.4
+
+
 @pytest.mark.parametrize("of_both", [False, True])
 def test_a_jump_is_not_taken_for_a_displacement(fine_rows, of_both):
     boards = [displace(fine, np.zeros(100)) for fine in fine_rows]
@@ -105,9 +116,12 @@ def test_a_drift_of_one_boards_phase_is_the_first_reason_removed_and_counted(boa
     cubes = make_drifting_cubes(board, phase_rad)
     pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
     findings = pipeline.examine(pipeline.form_images())
-    drift = pipeline.quality.drift
-    assert drift is not None
-    assert drift.of_v is (board == "RV")
+    drift = pipeline.quality.result().phase_drift
+    assert drift
+    assert drift.board == board
+    # The plates do not reach the drift's extremes.
+    assert abs(size_rad) < drift.range_rad < 2.2 * abs(size_rad)
+    assert drift.left_rad < drift.rms_rad / 2
     assert "the phase of V / H drifts over the rows" in findings.verdict.reasons[0].what
     assert not any("second path" in r.why or "out of place" in r.why for r in findings.verdict.reasons)
     inside = compute_distances(cubes, findings)
@@ -119,4 +133,4 @@ def test_a_phase_that_hardly_drifts_is_left_alone():
     cubes = make_drifting_cubes("RV", 0.02 * np.sin(2 * np.pi * np.arange(SCENE["grid"]["rows"]) / 41))
     pipeline = make_pipeline(cubes)  # type: ignore[arg-type]
     pipeline.form_images()
-    assert pipeline.quality.drift is None
+    assert pipeline.quality.result().phase_drift is UNSET

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from polysight.materials import SMEAR
-from polysight.results import row_rules, rules
+from polysight.results import PhaseJump, row_rules, rules
 from polysight.results.verdict import Coverage, NoResult, Verdict, join_reasons, percent, read_verdict, reason
 from polysight_shared.findings import Finding
 
@@ -126,7 +126,7 @@ def test_every_reason_has_its_cause_and_a_remedy():
         *rules.judge_fringes(0.9),
         *rules.judge_disturbed_plates({2: 0.2}),
         *rules.judge_moved_boards(1.0),
-        *row_rules.judge_phase_jumps({"RH": [(9, 0.4), (20, 0.3)], "RV": [(9, 0.5)]}),
+        *row_rules.judge_phase_jumps({"RH": [PhaseJump(9, 0.4), PhaseJump(20, 0.3)], "RV": [PhaseJump(9, 0.5)]}),
         *row_rules.judge_displaced_rows(0.4),
         *row_rules.judge_phase_drift(1.0, 0.1),
     ]
@@ -421,10 +421,10 @@ def test_fringes_are_ascribed_to_the_background_where_it_disturbs_the_plates():
 
 
 def test_a_jump_of_both_boards_alike_is_reported_once_and_blames_no_cable():
-    both = row_rules.judge_phase_jumps({"RH": [(26, 0.41)], "RV": [(26, 0.38)]})
+    both = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, 0.38)]})
     assert [r.what for r in both] == ["the phase of the echo jumps by +23 degrees before row 26 in both boards alike"]
     assert "no cable of one board" in both[0].why
-    apart = row_rules.judge_phase_jumps({"RH": [(26, 0.41)], "RV": [(26, -0.38), (40, 0.3)]})
+    apart = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, -0.38), PhaseJump(40, 0.3)]})
     assert [r.what.split(":")[0] for r in apart] == ["RH", "RV"]
 
 

@@ -39,9 +39,7 @@ def recording_verdict(quality: Quality) -> list[Finding]:
     if quality.drift is not None:
         missing += row_rules.judge_phase_drift(quality.drift.range_rad, quality.drift.left_rad)
     jumps = {
-        name: [(jump.row, jump.angle_rad) for jump in of_board]
-        for name, of_board in quality.find_phase_jumps().items()
-        if not quality.boards[name].rx_order
+        name: of_board for name, of_board in quality.find_phase_jumps().items() if not quality.boards[name].rx_order
     }
     missing += row_rules.judge_phase_jumps(jumps)
     for name, board in quality.boards.items():

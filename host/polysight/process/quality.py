@@ -9,9 +9,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import msgspec
@@ -29,8 +29,6 @@ from polysight.process.row_phases import (
     MOST_DRIFT_ROUNDS,
     NOT_DISPLACED,
     DisplacedRows,
-    PhaseDrift,
-    PhaseJump,
     estimate_phase_drift,
     find_displaced_rows,
     find_phase_jumps,
@@ -42,7 +40,9 @@ from polysight.results import (
     CalibrationSource,
     Coverage,
     FrequencyRange,
+    PhaseJump,
     ReconstructedPositions,
+    RemovedDrift,
     Residual,
     ScanQuality,
     Verdict,
@@ -272,10 +272,11 @@ class BoardRows:
             return float(np.median(phases))
         return None
 
-    def summary(self, backlash: bool = True) -> BoardQuality:
+    def summary(self, backlash: bool = True, removed_jumps: Sequence[PhaseJump] = ()) -> BoardQuality:
         """Return the board's entry of quality.json. Residuals are RMS over rows, weighted by valid positions.
 
-        `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row.
+        `backlash=False` skips the estimate of the stage's backlash, which takes 2 ms per row. `removed_jumps` are the
+        jumps of the phase that were removed from the images.
         """
         figures = self.figures
         direct = _collect_finite_values([self.rows[row].direct_hz for row in figures])
@@ -297,6 +298,7 @@ class BoardRows:
             positions_clipped=sum(r.positions_clipped for r in figures.values()),
             dead_rx=self.dead_rx,
             rx_order=self.rx_order,
+            phase_jumps=list(removed_jumps),
             direct_path_hz=_find_frequency_range(direct),
             direct_path_snr_db=snr,
             stage_backlash_mm=shift,
@@ -395,7 +397,9 @@ class Quality:
         if calibration:
             self.notes["calibration"] = dict(calibration)
         self.filled: Mapping[str, ReconstructedPositions] = {}
-        self.drift: PhaseDrift | None = None
+        self.drift: RemovedDrift | None = None
+        # Jumps that were removed from the images, of each board that has any.
+        self._removed_jumps: dict[str, tuple[PhaseJump, ...]] = {}
         self._displaced = NOT_DISPLACED
         # The rows of each board in which displaced rows were looked for.
         self._searched: list[dict[int, RowQuality]] = []
@@ -424,13 +428,20 @@ class Quality:
             return {name: board.find_phase_jumps(displaced.shifts) for name, board in self.boards.items()}
         return {name: board.find_phase_jumps() for name, board in self.boards.items()}
 
-    def remove_phase_jumps(self, builders: Iterable[ImageBuilder]) -> None:
-        """Turn rows back by each board's phase jumps, in all images that the builders form.
+    def form_images(self, builder: ImageBuilder, others: Iterable[ImageBuilder]) -> Images:
+        """Return the builder's images without jumps of a board's phase and without its drift over the rows.
 
-        The longest section without a jump keeps its phase.
+        The rows are turned back in all images that this builder and the `others` form.
         """
+        builders = (builder, *others)
         self.drift = None
-        for name, jumps in self.find_phase_jumps().items():
+        self._remove_phase_jumps(builders)
+        return self._remove_phase_drift(builders)
+
+    def _remove_phase_jumps(self, builders: Iterable[ImageBuilder]) -> None:
+        """Turn rows back by each board's phase jumps; the longest section without a jump keeps its phase."""
+        self._removed_jumps = self.find_phase_jumps()
+        for name, jumps in self._removed_jumps.items():
             angles_rad = np.zeros(self.source.plan.rows)
             for jump in jumps:
                 angles_rad[jump.row :] -= jump.angle_rad
@@ -440,13 +451,12 @@ class Quality:
             for builder in builders:
                 builder.boards[name].turn_rows(angles_rad)
 
-    def remove_phase_drift(self, builder: ImageBuilder, others: Iterable[ImageBuilder]) -> Images:
-        """Return the builder's images without a drift of one board's phase over the rows, if that is clear.
+    def _remove_phase_drift(self, builders: Sequence[ImageBuilder]) -> Images:
+        """Return the first builder's images without a drift of one board's phase over the rows, if that is clear.
 
-        The rows are turned back in all images that this builder and the `others` form. Nothing is done where positions
-        are missing or the phase jumps: what is left of those looks like a drift.
+        Nothing is done where positions are missing or the phase jumps: what is left of those looks like a drift.
         """
-        images = builder.finish()
+        images = builders[0].finish()
         if self.lacks_positions or any(self.find_phase_jumps().values()):
             return images
         plates = measure_along_plates(images, find_interiors(images))
@@ -455,29 +465,34 @@ class Quality:
         drift = estimate_phase_drift(plates)
         if not drift.clear:
             return images
-        builders = (builder, *others)
         h, v = self.boards
         name, sign = (v, 1) if drift.of_v else (h, -1)
         rig = self.boards[name].rig
         middle_m = specular_midpoint_m(rig, self.boards[name].board)[1]
         y_m = middle_m + np.array([row.y_mm for row in plan_raster(rig.grid)]) / 1e3
         removed_rad = drift.at(y_m)
+        # Unless the images show how much it is.
+        not_removed_rad = drift.rms_rad
         for _ in range(MOST_DRIFT_ROUNDS):
-            for each in builders:
-                each.boards[name].turn_rows(sign * removed_rad)
-            images = builder.finish()
+            for builder in builders:
+                builder.boards[name].turn_rows(sign * removed_rad)
+            images = builders[0].finish()
             plates = measure_along_plates(images, find_interiors(images))
             if len(plates) < LEAST_PLATES:
                 break
-            again = estimate_phase_drift(plates, (y_m, removed_rad))
-            # Which board drifts shows only before anything is removed.
-            drift = replace(again, of_v=drift.of_v)
+            drift = estimate_phase_drift(plates, (y_m, removed_rad))
             change_rad = drift.at(y_m) - removed_rad
-            if float(np.std(change_rad)) < DRIFT_DONE_RAD:
+            not_removed_rad = float(np.std(change_rad))
+            if not_removed_rad < DRIFT_DONE_RAD:
                 break
             # Half of the change: with all of it the estimates swing about the drift.
             removed_rad = removed_rad + change_rad / 2
-        self.drift = drift
+        self.drift = RemovedDrift(
+            board=name,
+            range_rad=drift.range_rad,
+            rms_rad=drift.rms_rad,
+            left_rad=float(np.hypot(drift.left_rad, not_removed_rad)),
+        )
         return images
 
     @property
@@ -568,8 +583,12 @@ class Quality:
         """Return the content of quality.json; `backlash=False` leaves the estimate of the stage's backlash out."""
         return ScanQuality(
             **self.notes,
-            boards={name: board.summary(backlash) for name, board in self.boards.items()},
+            boards={
+                name: board.summary(backlash, self._removed_jumps.get(name, ())) for name, board in self.boards.items()
+            },
             coverage=self.coverage(),
+            rows_displaced_mm=self._displaced.rms_mm or UNSET,
+            phase_drift=self.drift or UNSET,
             seconds_per_stage=self.seconds_per_stage,
             verdict=verdict or UNSET,
             pixel_accuracy=pixel_accuracy,

@@ -24,13 +24,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from polysight.materials import PhaseAlongPlate
+from polysight.results import PhaseJump
 
 # Rows on either side that an echo is predicted from, and positions on either side in each of them; chosen.
 _PREDICTOR_ROWS = (-2, -1, 1, 2)
@@ -104,13 +104,6 @@ MOST_DRIFT_ROUNDS = 6
 """Times that a drift is measured, each time in images from which the last estimate was removed."""
 DRIFT_DONE_RAD = 0.03
 """Change of the estimated drift (rms over the plates) below which no more images are formed; chosen."""
-
-
-class PhaseJump(NamedTuple):
-    """A jump of the phase of a board's echo: the row that it comes before, and its size in radians."""
-
-    row: int
-    angle_rad: float
 
 
 def find_phase_jumps(rows: Mapping[int, NDArray[np.complexfloating]]) -> tuple[PhaseJump, ...]:

@@ -25,6 +25,32 @@ class Backlash(msgspec.Struct, frozen=True):
     std: float
 
 
+class PhaseJump(msgspec.Struct, frozen=True, order=True):
+    """A jump of the phase of a board's echo: the row that it comes before, and its size in radians."""
+
+    row: int
+    angle_rad: float
+
+
+class RemovedDrift(msgspec.Struct, frozen=True, kw_only=True):
+    """A drift of the phase of one board over the rows that was removed from the images.
+
+    Attributes
+    ----------
+    board
+        The board that drifts.
+    range_rad, rms_rad
+        Largest difference of the drift between two plates, and its root mean square over the plates.
+    left_rad
+        Standard deviation of what is left at a plate against another one.
+    """
+
+    board: str
+    range_rad: float
+    rms_rad: float
+    left_rad: float
+
+
 class FrequencyRange(msgspec.Struct, frozen=True):
     """Intermediate frequency of the direct path over all positions, Hz."""
 
@@ -56,6 +82,8 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
         RX that gave no signal, counted from 1, to the rows; they were left out of the images there.
     rx_order
         Places in the rig file of the recorded RX, counted from 1, if they were recorded in another order; else empty.
+    phase_jumps
+        Jumps of the phase of the echo that were removed from the images, in the order of rows.
     masked_columns
         Row to half-open ranges [start, stop) of masked columns.
     rows_recorded
@@ -79,6 +107,7 @@ class BoardQuality(msgspec.Struct, frozen=True, kw_only=True):
     positions_clipped: int = 0
     dead_rx: dict[int, list[int]] = {}
     rx_order: list[int] = []
+    phase_jumps: list[PhaseJump] = []
     direct_path_hz: FrequencyRange | UnsetType = UNSET
     # In one sample of one chirp; None where the noise is unknown.
     direct_path_snr_db: float | None = None
@@ -229,6 +258,9 @@ class ScanQuality(msgspec.Struct, frozen=True, kw_only=True):
     rows_retaken: int | UnsetType = UNSET
     rows_incomplete: list[int] | UnsetType = UNSET
     imaging: dict[str, BoardImaging | list[str]] | UnsetType = UNSET
+    # Root mean square of the distances of rows from where they were commanded, if the rows are displaced.
+    rows_displaced_mm: float | UnsetType = UNSET
+    phase_drift: RemovedDrift | UnsetType = UNSET
     # Reconstructed positions by board.
     sparse: dict[str, ReconstructedPositions] | UnsetType = UNSET
     incidence: IncidenceAngles | UnsetType = UNSET

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from polysight.results.quality import PhaseJump
 from polysight.results.verdict import is_known, reason
 from polysight_shared.findings import Finding
 
@@ -13,8 +14,8 @@ ALIKE_RAD = 0.2
 """Difference of the jumps of both boards between the same rows, up to which they are one jump; chosen."""
 
 
-def judge_phase_jumps(jumps: Mapping[str, Sequence[tuple[int, float]]]) -> list[Finding]:
-    """Judge jumps of the phase of echoes: board to (the row before which it jumps, angle in radians) of each."""
+def judge_phase_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[Finding]:
+    """Judge jumps of the phase of the echoes of each board."""
     shared = _find_shared_jumps(jumps)
     reasons = []
     if shared:
@@ -25,7 +26,8 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[tuple[int, float]]]) -> list[
             "fix the stage and the object, and scan again", 4.7,
         ))  # fmt: skip
     for board, found in jumps.items():
-        own = [jump for jump in found if all(jump[0] != row for row, _ in shared)]
+        shared_rows = {jump.row for jump in shared}
+        own = [jump for jump in found if jump.row not in shared_rows]
         if not own:
             continue
         reasons.append(reason(
@@ -37,25 +39,27 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[tuple[int, float]]]) -> list[
     return reasons
 
 
-def _find_shared_jumps(jumps: Mapping[str, Sequence[tuple[int, float]]]) -> list[tuple[int, float]]:
-    """Return the jumps that all boards have before the same row, alike within `ALIKE_RAD`: row and mean angle."""
+def _find_shared_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[PhaseJump]:
+    """Return the jumps that all boards have before the same row, alike within `ALIKE_RAD`, with their mean angle."""
     if len(jumps) < 2:
         return []
     first, *others = jumps.values()
     shared = []
-    for row, angle_rad in first:
-        alike_rad = [
-            [other_rad for other_row, other_rad in found if other_row == row and abs(other_rad - angle_rad) < ALIKE_RAD]
-            for found in others
-        ]
-        if all(alike_rad):
-            shared.append((row, float(np.mean([angle_rad, *(of_board[0] for of_board in alike_rad)]))))
+    for jump in first:
+        alike = [other for of_board in others for other in of_board if _is_alike(jump, other)]
+        if len(alike) == len(others):
+            shared.append(PhaseJump(jump.row, float(np.mean([jump.angle_rad, *(other.angle_rad for other in alike)]))))
     return shared
 
 
-def _list_jumps(jumps: Sequence[tuple[int, float]]) -> str:
+def _is_alike(jump: PhaseJump, other: PhaseJump) -> bool:
+    """Return true if another board's jump comes before the same row, and their angles agree within `ALIKE_RAD`."""
+    return other.row == jump.row and abs(other.angle_rad - jump.angle_rad) < ALIKE_RAD
+
+
+def _list_jumps(jumps: Sequence[PhaseJump]) -> str:
     """Return sizes and rows of jumps as text."""
-    return ", ".join(f"by {np.degrees(angle_rad):+z.0f} degrees before row {row}" for row, angle_rad in jumps)
+    return ", ".join(f"by {np.degrees(jump.angle_rad):+z.0f} degrees before row {jump.row}" for jump in jumps)
 
 
 def judge_displaced_rows(rms_mm: float) -> list[Finding]:

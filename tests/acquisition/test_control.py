@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from tests.support.page.live_view import open_control
 from tests.support.processes import wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 from tests.support.store.small_scan import SmallScan
 
@@ -97,7 +97,7 @@ def test_the_status_of_a_scan_names_its_host_and_requests_and_ends_with_it(tmp_p
         assert (read_life(tmp_path).asked, read_life(tmp_path).asker) == ("stop", "the page at 192.168.1.7")
         control.end_rows()
         wait_for(lambda: read_life(tmp_path).doing == "materials", "that rows have ended")
-        with refused(ErrorCode.NO_ANSWER, "materials"):
+        with expect_refusal(ErrorCode.NO_ANSWER, "materials"):
             send_command(tmp_path, ScanCommand.ABORT)
         assert not stop.now
     assert not (tmp_path / CONTROL_FOLDER).exists()
@@ -164,13 +164,13 @@ def test_control_folder_that_was_not_opened_touches_nothing(tmp_path):
 
 
 def test_command_without_a_running_scan_is_refused(tmp_path):
-    with refused(ErrorCode.NO_ANSWER, "pause", tmp_path):
+    with expect_refusal(ErrorCode.NO_ANSWER, "pause", tmp_path):
         send_command(tmp_path, ScanCommand.PAUSE)
 
 
 def test_command_that_is_not_accepted_is_withdrawn(tmp_path):
     (tmp_path / CONTROL_FOLDER).mkdir()
-    with refused(ErrorCode.NO_ANSWER, "abort"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "abort"):
         send_command(tmp_path, ScanCommand.ABORT, limit_s=0.2)
     assert list((tmp_path / CONTROL_FOLDER).iterdir()) == []
 
@@ -178,7 +178,7 @@ def test_command_that_is_not_accepted_is_withdrawn(tmp_path):
 def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
     with ControlFolder(tmp_path / "not" / "there", StopRequest()) as control:
         control.open()
-        with refused(ErrorCode.NO_ANSWER):
+        with expect_refusal(ErrorCode.NO_ANSWER):
             send_command(tmp_path / "not" / "there", ScanCommand.PAUSE)
 
 

@@ -9,7 +9,7 @@ import sys
 import msgspec
 import pytest
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import run_scan
@@ -166,7 +166,7 @@ def change_radar_settings(instrument: Instrument, **radar) -> dict:
     ],
 )
 def test_wrong_radar_tables_are_refused(make_instrument, radar, rule):
-    with refused(ErrorCode.VALUE_INVALID, rule):
+    with expect_refusal(ErrorCode.VALUE_INVALID, rule):
         decode(change_radar_settings(make_instrument(), **radar), Instrument, "test")
 
 
@@ -278,7 +278,7 @@ def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
 def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_path):
     rig.cards["RH"].silent_data = True
     radar = Radar("line_server", dict.fromkeys((b.name for b in rig.instrument.boards), server.address))
-    with refused(ErrorCode.ROW_INCOMPLETE, "RH", server.address):
+    with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RH", server.address):
         run_scan(msgspec.structs.replace(rig.instrument, radar=radar), tmp_path / "s")
     lines = [server.accept().recv(1000) for _ in rig.instrument.boards]
     assert lines == [RETRIGGER_LINE * 3] * 3

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition import ready
@@ -58,7 +58,7 @@ class HomingPi:
 def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeypatch, limit_s, reason):
     pi: Any = HomingPi(limit_s)
     monkeypatch.setattr(ready, "time", pi)
-    with refused(ErrorCode.STAGE_NOT_READY, reason):
+    with expect_refusal(ErrorCode.STAGE_NOT_READY, reason):
         make_ready(pi, StopRequest(), lambda *_: None)
 
 
@@ -89,7 +89,7 @@ def test_disk_space_checked_is_that_of_the_rows(make_instrument, tmp_path, monke
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 1000))
     check_disk(tmp_path, rig, rows)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 999))
-    with refused(ErrorCode.DISK_FULL, rows):
+    with expect_refusal(ErrorCode.DISK_FULL, rows):
         check_disk(tmp_path, rig, rows)
 
 
@@ -104,7 +104,7 @@ def test_plan_and_doctor_show_the_size_of_a_scan(make_instrument):
 def test_a_pi_that_places_rows_elsewhere_is_refused_before_a_folder_is_made(rig, tmp_path, key):
     own_value = rig.instrument.stage.placement_settings[key]
     rig.pi.stage = {**rig.pi.stage, key: own_value + 0.5}
-    with refused(ErrorCode.STAGE_DIFFERS, key, f"{own_value:g}", f"{own_value + 0.5:g}"):
+    with expect_refusal(ErrorCode.STAGE_DIFFERS, key, f"{own_value:g}", f"{own_value + 0.5:g}"):
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
     assert rig.pi.commands[-1:] == rig.pi.commands[:1], "nothing but Hello was asked"
@@ -120,7 +120,7 @@ def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_ol
     facts = len(load_facts(scan))
     assert not scan.complete
     rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
-    with refused(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
+    with expect_refusal(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
         resume_scan(tmp_path / "s")
     scan.reload()
     assert (list(scan.rows()), len(load_facts(scan))) == (rows, facts), "nothing was written"

@@ -4,7 +4,7 @@ import re
 
 import pytest
 from tests.support.paths import REPO
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.acquisition.row import TRANSITIONS, RowState, RowTransaction
 from polysight.capture import receiver as receiver_words
@@ -77,5 +77,5 @@ def test_only_the_transitions_of_the_table_are_made(state):
             transaction.change_state(then)
             assert answer == [RowState.WAITING, then]
         else:
-            with refused(ErrorCode.OTHER, state, then):
+            with expect_refusal(ErrorCode.OTHER, state, then):
                 transaction.change_state(then)

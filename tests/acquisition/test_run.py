@@ -13,7 +13,7 @@ import pytest
 from tests.support.acquisition.fake_cards import FULL, FakeCard, make_payload
 from tests.support.acquisition.fake_rig import FakeRig
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 from tests.support.store.plain_scan import list_errors
 
@@ -100,7 +100,7 @@ def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, droppe
 def test_retakes_are_bounded_and_the_error_names_the_board(rig, tmp_path):
     for take in (1, 2, 3):
         rig.cards["RV"].drop[1, take] = {3}
-    with refused(ErrorCode.ROW_INCOMPLETE, "RV", "3 takes"):
+    with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RV", "3 takes"):
         run_scan(rig.instrument, tmp_path / "s")
     scan = ScanFolder.load(tmp_path / "s")
     assert list(scan.committed_rows()) == [0]
@@ -199,21 +199,21 @@ def test_processing_error_does_not_stop_the_scan(rig, tmp_path):
 
 def test_no_pi(make_instrument, tmp_path):
     instrument = make_instrument(command_timeout_s=0.3)
-    with refused(ErrorCode.NO_ANSWER, 5601, "polysight-pi run"):
+    with expect_refusal(ErrorCode.NO_ANSWER, 5601, "polysight-pi run"):
         run_scan(instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
 
 
 def test_mute_card_is_named(rig, tmp_path):
     rig.cards["RV"].mute = True
-    with refused(ErrorCode.NO_ANSWER, "RV", rig.instrument.by_name("RV").card_address):
+    with expect_refusal(ErrorCode.NO_ANSWER, "RV", rig.instrument.by_name("RV").card_address):
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
 
 
 def test_radar_without_data_is_not_a_mute_card(rig, tmp_path):
     rig.cards["RH"].silent_data = True
-    with refused(ErrorCode.ROW_INCOMPLETE, "RH", "SYNC_IN", "armed"):
+    with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RH", "SYNC_IN", "armed"):
         run_scan(rig.instrument, tmp_path / "s")
 
 
@@ -221,13 +221,13 @@ def test_port_in_use_is_named(rig, tmp_path):
     board = rig.instrument.by_name("RV")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other_socket:
         other_socket.bind((board.host_address, board.data_port))
-        with refused(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}", "ss -ulnp"):
+        with expect_refusal(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}", "ss -ulnp"):
             run_scan(rig.instrument, tmp_path / "s")
 
 
 def test_a_receive_buffer_below_two_bursts_ends_the_scan_before_it_begins(rig, tmp_path):
     card = msgspec.structs.replace(rig.instrument.card, receive_buffer_bytes=4096)
-    with refused(ErrorCode.VALUE_INVALID, "sysctl -w net.core.rmem_max="):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "sysctl -w net.core.rmem_max="):
         run_scan(msgspec.structs.replace(rig.instrument, card=card), tmp_path / "s")
     assert not (tmp_path / "s").exists()
 
@@ -235,7 +235,7 @@ def test_a_receive_buffer_below_two_bursts_ends_the_scan_before_it_begins(rig, t
 def test_frames_below_a_packet_end_the_scan_before_it_begins(rig, tmp_path):
     """Of several frames in a packet, the times of all but one are unknown."""
     chirp = msgspec.structs.replace(rig.instrument.chirp, samples=64, linear_samples=(0, 64))
-    with refused(ErrorCode.VALUE_INVALID, "1024 bytes", "more samples"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "1024 bytes", "more samples"):
         run_scan(msgspec.structs.replace(rig.instrument, chirp=chirp), tmp_path / "s")
     assert not (tmp_path / "s").exists()
 
@@ -243,7 +243,7 @@ def test_frames_below_a_packet_end_the_scan_before_it_begins(rig, tmp_path):
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
     state_before = compute_digests(ScanFolder.load(tmp_path / "s"))
-    with refused(ErrorCode.FILE_EXISTS, "manifest"):
+    with expect_refusal(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
     assert compute_digests(ScanFolder.load(tmp_path / "s")) == state_before
 
@@ -345,7 +345,7 @@ def test_a_scan_is_not_resumed_with_the_cards_of_two_boards_exchanged(rig, tmp_p
     }
     addresses = list(macs)
     macs.update(zip(addresses, [macs[address] for address in reversed(addresses)], strict=True))
-    with refused(ErrorCode.MISMATCH, "RH", "RV", "12:34:56:78:90:RV"):
+    with expect_refusal(ErrorCode.MISMATCH, "RH", "RV", "12:34:56:78:90:RV"):
         resume_scan(tmp_path / "s")
     macs.update(zip(addresses, ["12:34:56:78:90:RH", "12:34:56:78:90:new"], strict=True))
     assert resume_scan(tmp_path / "s").exit_status == "success"

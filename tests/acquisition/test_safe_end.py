@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition import pi_client, scan as running
@@ -89,7 +89,7 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     rig.pi.fail_rows[1, 1] = fault
     rig.pi.latched = "stage alarm 14: the emergency stop is pressed"
     phases = []
-    with refused(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
+    with expect_refusal(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=lambda p: phases.append(p.phase))
     assert "retake" not in phases
     assert rig.pi.latched in e.value.what
@@ -109,7 +109,7 @@ def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp
     if homes:
         assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     else:
-        with refused(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
+        with expect_refusal(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
             run_scan(rig.instrument, tmp_path / "s")
         assert "polysight-pi home" in e.value.remedy
     assert list_motion_commands(rig.pi).count(m.Home) == homes, "at the start, and after the last row"
@@ -131,7 +131,7 @@ def test_pi_that_restarted_between_rows_ends_the_scan_immediately(rig, tmp_path)
             rig.pi.homed = False
             rig.pi.state = "idle"
 
-    with refused(ErrorCode.STAGE_NOT_READY) as e:
+    with expect_refusal(ErrorCode.STAGE_NOT_READY) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert "2 of 4 rows are safe" in e.value.remedy
     assert list_motion_commands(rig.pi).count(m.Home) == 1
@@ -144,7 +144,7 @@ def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
         if p.phase == "committed" and p.row == 1:
             rig.pi.run = msgspec.structs.replace(rig.pi.run, scan_id="another")
 
-    with refused(ErrorCode.STAGE_NOT_READY, "another"):
+    with expect_refusal(ErrorCode.STAGE_NOT_READY, "another"):
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert m.Abort not in list_motion_commands(rig.pi)
 
@@ -156,7 +156,7 @@ def test_stage_that_is_not_ready_between_rows_is_not_homed(rig, tmp_path, state)
             rig.pi.homed = state == "homed"
             rig.pi.state = state
 
-    with refused(ErrorCode.STAGE_NOT_READY, repr(state)) as e:
+    with expect_refusal(ErrorCode.STAGE_NOT_READY, repr(state)) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert "polysight-pi home" in e.value.remedy
     assert list_motion_commands(rig.pi).count(m.Home) == 1
@@ -193,7 +193,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, rece
             said_at_end.append((release.is_set(), p.message))
             release.set()
 
-    with refused(ErrorCode.NO_ANSWER, board) as e:
+    with expect_refusal(ErrorCode.NO_ANSWER, board) as e:
         run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: release.wait(HANG_S) and None, progress=progress)
     assert "1 of 4 rows are safe" in e.value.remedy
     assert list_motion_commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
@@ -220,7 +220,7 @@ def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
         if p.phase == "committed" and p.row == 1:
             rig.pi.lose_replies = 10_000
 
-    with refused(ErrorCode.NO_ANSWER) as e:
+    with expect_refusal(ErrorCode.NO_ANSWER) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert f"2 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
 

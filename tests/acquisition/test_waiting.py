@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import zmq
 from tests.support.processes import HANG_S
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition import ready, row, scan as running
@@ -113,7 +113,7 @@ def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path,
         return real(path)._replace(free=rig.instrument.row_bytes if len(rig.pi.rows_run) >= 2 else 1 << 40)
 
     monkeypatch.setattr(ready.shutil, "disk_usage", filling)
-    with refused(ErrorCode.DISK_FULL):
+    with expect_refusal(ErrorCode.DISK_FULL):
         run_scan(rig.instrument, tmp_path / "s")
     assert rig.pi.rows_run == [(0, 1), (1, 1)]
     ended = load_facts(tmp_path / "s", "scan_ended")[0]
@@ -130,7 +130,7 @@ def test_disk_that_cannot_hold_the_row_is_an_error_before_its_first_pulse(rig, r
             for pid in receivers.values():
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (1000, 1000))
 
-    with refused(ErrorCode.DISK_FULL, "resume"):
+    with expect_refusal(ErrorCode.DISK_FULL, "resume"):
         run_scan(rig.instrument, tmp_path / "s", progress=progress)
     assert rig.pi.rows_run == [(0, 1), (1, 1)]
     assert not list((tmp_path / "s").rglob("*.part"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 from tests.support.products import name_check_plate
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 import polysight
 from polysight.cli.main import main
@@ -103,7 +103,7 @@ def test_the_command_prints_and_draws_the_check(products_copy, tmp_path, capsys,
 
 
 def test_a_check_without_scans_is_refused():
-    with refused(ErrorCode.OTHER):
+    with expect_refusal(ErrorCode.OTHER):
         polysight.check()
 
 

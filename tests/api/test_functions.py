@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 import polysight
 from polysight import compare, fresnel, multilayer, open_scan, permittivity_from_ratio
@@ -69,9 +69,9 @@ def test_an_array_with_labels_is_one_medium(which):
 @pytest.mark.parametrize("theta", [55.0, np.array([0.9, 55.0]), xarray.DataArray([55.0], dims="angle")])
 def test_degrees_are_not_taken_as_radians(theta):
     for call in (lambda: fresnel(3.8 - 0.7j, theta), lambda: permittivity_from_ratio(2.0, theta_rad=theta)):
-        with refused(ErrorCode.VALUE_INVALID, 55):
+        with expect_refusal(ErrorCode.VALUE_INVALID, 55):
             call()
-    with refused(ErrorCode.VALUE_INVALID, 55):
+    with expect_refusal(ErrorCode.VALUE_INVALID, 55):
         multilayer(2.9 - 0.03j, 1e-3, 78e9, theta)
     assert np.isnan(fresnel(3.8 - 0.7j, np.nan)[0])
 
@@ -132,7 +132,7 @@ def test_labelled_scans_make_a_library_that_names_them(products, tmp_path):
 def test_a_value_that_is_not_a_box_is_refused_by_name(products, tmp_path, box):
     place = shutil.copytree(products, tmp_path / "one")
     (place / "labels.json").unlink(missing_ok=True)
-    with refused(ErrorCode.VALUE_INVALID, "oak"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "oak"):
         open_scan(place).label({"oak": box})
     assert not (place / "labels.json").exists()
 
@@ -163,7 +163,7 @@ def test_an_unknown_change_of_a_plan_is_refused_with_those_that_are_known():
 
 @pytest.mark.parametrize("changes", [{"width_mm": "wide"}, {"columns": None}, {"pulses": [7]}])
 def test_a_changed_plan_value_that_is_not_a_number_is_refused_by_name(changes):
-    with refused(ErrorCode.VALUE_INVALID, next(iter(changes)), "not a number"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, next(iter(changes)), "not a number"):
         polysight.plan(**changes)
 
 
@@ -178,7 +178,7 @@ def test_a_scene_can_be_written_in_python(tmp_path):
         simulated_scan = polysight.simulate(scene, tmp_path / "scan", seed=5)
     assert simulated_scan.simulated is True
     assert simulated_scan.rows.planned == 9
-    with pytest.warns(UserWarning, match="grid"), refused(ErrorCode.OTHER):
+    with pytest.warns(UserWarning, match="grid"), expect_refusal(ErrorCode.OTHER):
         polysight.simulate({"name": "wrong", "plates": [{"nme": "x"}]}, tmp_path / "other")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 import polysight
 from polysight import fresnel, open_scan, permittivity_from_ratio
@@ -162,5 +162,5 @@ def test_a_place_has_the_figures_of_map_and_patch(scan):
 
 @pytest.mark.parametrize("place", [(900.0, 0.0), (0.0, -900.0)])
 def test_a_place_outside_the_image_is_not_a_border_pixel(scan, place):
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         scan.probe(*place)

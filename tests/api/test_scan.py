@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray
 from msgspec.structs import replace
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 import polysight
@@ -146,7 +146,7 @@ def test_the_unreferenced_image_is_what_image_writes(scan, folder, tmp_path):
     saved = open_scan(tmp_path / "out")
     xarray.testing.assert_allclose(saved.image(metal_referenced=False), scan.image(metal_referenced=False))
     for call in (saved.image, saved.patches, saved.plot):
-        with refused(ErrorCode.MISMATCH):
+        with expect_refusal(ErrorCode.MISMATCH):
             call()
 
 
@@ -333,7 +333,7 @@ def test_a_scan_without_a_whole_row_says_so(folder, tmp_path):
     scan = open_scan(copy_without_rows(folder, tmp_path / "scan", *range(27)))
     assert scan.rows.committed == ()
     for call in (scan.image, scan.patches, scan.plot, lambda: scan.image(metal_referenced=False)):
-        with refused(ErrorCode.NO_DATA):
+        with expect_refusal(ErrorCode.NO_DATA):
             call()
 
 
@@ -366,11 +366,11 @@ def test_a_given_rig_is_reported_as_ignored_if_the_scan_folder_has_one(folder):
 
 
 def test_products_cannot_be_processed_again(products):
-    with refused(ErrorCode.VALUES_CONFLICT, products):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, products):
         open_scan(products, bands=3)
-    with refused(ErrorCode.VALUES_CONFLICT, products):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, products):
         open_scan(products, rig=REPO / "instrument.toml")
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         open_scan(products).image(metal_referenced=False)
 
 
@@ -385,7 +385,7 @@ def test_products_without_facts_of_the_scan_can_be_opened(products, tmp_path):
     # as in materials.json
     assert scan.simulated is True
     for name in ("rig", "rows"):
-        with refused(ErrorCode.KEY_MISSING, name):
+        with expect_refusal(ErrorCode.KEY_MISSING, name):
             getattr(scan, name)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.support.calibration import SOURCES, filter_file, make_metal_reference
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.calibration.files import (
@@ -57,7 +57,7 @@ def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refuse
     for i, (file, khz, value) in enumerate([(filter_path, 350.0, "[175.0, 350.0] kHz"), (partial, 175.0, "RV")]):
         path = write_calibration(file, tmp_path / str(i))
         rig = make_rig(chirp={"hpf1_khz": khz}, calibration={"hpf": str(path)}, grid={"columns": 2, "rows": 2})
-        with refused(ErrorCode.MISMATCH, path, value):
+        with expect_refusal(ErrorCode.MISMATCH, path, value):
             copy_into_scan(rig, tmp_path / "scan", True)
 
 
@@ -71,11 +71,11 @@ def test_files_survive_writing_and_never_overwrite(tmp_path):
 
 
 def test_a_file_of_another_kind_format_or_content_is_refused(hpf):
-    with refused(ErrorCode.FILE_FOREIGN, hpf, "hpf", "direct_path"):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, hpf, "hpf", "direct_path"):
         read_calibration(hpf, PlacesFile, "direct_path")
     text = hpf.read_text()
     hpf.write_text(text.replace("format = 1", "format = 2"))
-    with refused(ErrorCode.VERSION_UNSUPPORTED, hpf, 2):
+    with expect_refusal(ErrorCode.VERSION_UNSUPPORTED, hpf, 2):
         read_calibration(hpf, FilterFile, "hpf")
     hpf.write_text(text.replace("chirps = 640", 'chirps = "many"'))
     with pytest.raises(ConfigError) as caught:
@@ -127,7 +127,7 @@ def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_
 
 def test_metal_of_other_pixels_is_refused_before_the_scan(tmp_path, make_rig, rig_naming):
     metal = write_metal(make_metal_reference(make_rig(image={"pixel_mm": 2.5})), SOURCES, tmp_path / "c")
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         create(tmp_path / "s", rig_naming(metal=metal))
 
 
@@ -135,10 +135,10 @@ def test_a_changed_or_missing_copy_is_refused(tmp_path, rig_naming, hpf):
     scan = create(tmp_path / "scan", rig_naming(hpf=hpf))
     copy = next((scan.path / "calibration").iterdir())
     copy.write_text(copy.read_text().replace("180.5", "190.5"))
-    with refused(ErrorCode.FILE_DAMAGED, copy, hpf):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, copy, hpf):
         load_scan_calibration(scan)
     copy.unlink()
-    with refused(ErrorCode.FILE_DAMAGED, copy, hpf):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, copy, hpf):
         load_scan_calibration(scan)
 
 
@@ -170,12 +170,12 @@ def test_images_of_another_metal_reference_are_refused(tmp_path, make_rig):
     path = write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "one")
     other_reference = write_metal(make_metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
     path.with_suffix(".npz").write_bytes(other_reference.with_suffix(".npz").read_bytes())
-    with refused(ErrorCode.FILE_DAMAGED, path.with_suffix(".npz")):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, path.with_suffix(".npz")):
         load_calibration({"metal": path}).reference()
 
 
 def test_simulated_calibration_is_refused_for_a_measured_scan(tmp_path, rig_naming, hpf):
-    with refused(ErrorCode.MISMATCH, hpf):
+    with expect_refusal(ErrorCode.MISMATCH, hpf):
         copy_into_scan(rig_naming(hpf=hpf), tmp_path / "scan", False)
     measured = msgspec.structs.replace(filter_file(), sources=[SourceScan("sweep", "scans/sweep", False, 7)])
     rig = rig_naming(hpf=write_calibration(measured, hpf.parent))

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.support.calibration import SOURCES, filter_file, make_metal_reference
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.calibration.files import load_calibration, load_checked_calibration, write_calibration, write_metal
 from polysight.cli.main import main
@@ -76,7 +76,7 @@ def metal(make_rig, tmp_path):
 
 @pytest.mark.parametrize(("change", "values"), MATTERS.values(), ids=MATTERS)
 def test_a_metal_reference_of_another_rig_is_refused_with_the_difference(metal, make_rig, change, values):
-    with refused(ErrorCode.MISMATCH, metal, *values):
+    with expect_refusal(ErrorCode.MISMATCH, metal, *values):
         load_checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True)
 
 
@@ -91,7 +91,7 @@ def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_r
         return make_rig(calibration={"metal": str(metal), "hpf": str(file)})
 
     assert load_checked_calibration(rig(179.0), True)
-    with refused(ErrorCode.MISMATCH, "RV", 200):
+    with expect_refusal(ErrorCode.MISMATCH, "RV", 200):
         load_checked_calibration(rig(200.0), True)
 
 
@@ -99,7 +99,7 @@ def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
     text_before, _, text_after = metal.read_text().partition("[imaged_with]")
     assert text_after
     metal.write_text(text_before)
-    with refused(ErrorCode.KEY_MISSING, metal):
+    with expect_refusal(ErrorCode.KEY_MISSING, metal):
         load_checked_calibration(make_rig(calibration={"metal": str(metal)}), True)
 
 
@@ -159,7 +159,7 @@ def test_a_scan_without_metal_is_refused(tmp_path, make_rig, make_scan):
 def test_a_plastic_sheet_is_not_a_metal_plate(tmp_path, make_rig, make_scan):
     sheet = {k: v for k, v in PLATE.items() if k != "metal"} | {"name": "acrylic", "permittivity": [4.0, 0.4]}
     folder = make_scan(tmp_path / "sheet", make_rig(**SMALL), plates=[sheet])
-    with refused(ErrorCode.NO_DATA, "no metal"):
+    with expect_refusal(ErrorCode.NO_DATA, "no metal"):
         load_reference(folder)
 
 
@@ -169,7 +169,7 @@ def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
     rig = make_rig(**SMALL)
     reference.check_rig(ImagedWith.from_rig(rig, {}))
     deeper = msgspec.structs.replace(rig.geometry, object_distance_mm=rig.geometry.object_distance_mm + 0.2)
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         reference.check_rig(ImagedWith.from_rig(msgspec.structs.replace(rig, geometry=deeper), {}))
 
 
@@ -184,7 +184,7 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
 def test_processing_refuses_the_calibration_of_another_rig(full_metal, taken_with):
     assert load_metal_plane(Pipeline(taken_with(full_metal))) is not None
     moved = Pipeline(taken_with(full_metal, MATTERS["V moved"][0]))
-    with refused(ErrorCode.MISMATCH, "RV"):
+    with expect_refusal(ErrorCode.MISMATCH, "RV"):
         load_metal_plane(moved)
     # Metal in the scene has the scene's rig
     assert load_metal_plane(moved, in_scene=True) is None
@@ -205,7 +205,7 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
     pipeline = Pipeline(taken_with(banded_metal))
     assert len(load_metal_plane(pipeline, BANDS).bands) == BANDS
     assert load_metal_plane(pipeline) is not None
-    with refused(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
+    with expect_refusal(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
         load_metal_plane(pipeline, 3)
 
 

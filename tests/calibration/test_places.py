@@ -8,7 +8,7 @@ import pytest
 import tomli_w
 from tests.support.kept import assert_kept
 from tests.support.processes import read_output
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.calibration.files import Calibration, PlacesFile, load_calibration, open_raw, read_calibration
 from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
@@ -112,7 +112,7 @@ def test_an_active_calibration_corrects_every_antenna(case, file):
 
 
 def test_it_is_refused_after_a_change_of_mounts_in_the_rig_file(case, file):
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         Calibration(places=file).rig(case[3])
 
 
@@ -143,14 +143,14 @@ def test_an_undetermined_unknown_stays_near_the_rig_file(case, few_echoes):
 
 def test_another_target_is_refused(case, few_echoes):
     wrong = [TargetPoint((20.0 * k, 31.0 * (k % 2))) for k in range(-1, 2)]
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         places_file(case[2], fit_places(few_echoes, case[2], wrong), 3, [])
 
 
 def test_a_target_needs_three_points(tmp_path):
     path = tmp_path / "target.toml"
     path.write_text("[[points]]\nposition_mm = [0.0, 1.0]\n")
-    with refused(ErrorCode.NOT_ENOUGH_DATA, path, 1):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, path, 1):
         read_target(path)
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.calibration import files
 from polysight.calibration.direct_signal import choose_start_offset, fit_start, predict_by_geometry, unwrap_if
@@ -92,7 +92,7 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
 def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, make_scan, tmp_path):
     rig = make_rig(set_offset(790e3), **TABLES)
     folder = make_scan(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
-    with refused(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
+    with expect_refusal(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
         fit_start(open_raw(folder), "RH")
 
 

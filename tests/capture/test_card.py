@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tests.support.capture.cards import reply
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.capture import card, dca1000
 from polysight.capture.card import CardClient, EepromSettings, program_eeprom, survey_cards
@@ -105,7 +105,7 @@ def test_a_flood_of_replies_of_another_code_ends_a_command_with_an_error(scripte
     monkeypatch.setattr(client, "_socket", flood)
     monkeypatch.setattr(card.select, "select", lambda readable, *_: (readable, [], []))
     monkeypatch.setattr(card, "time", SimpleNamespace(monotonic=itertools.count(0.0, 1e3).__next__))
-    with refused(ErrorCode.NO_ANSWER, "ALIVE"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "ALIVE"):
         client.check_alive()
     assert client.take_status() == Status(0)
 
@@ -119,20 +119,20 @@ def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
 def test_refusal_is_an_error_but_not_for_stop(scripted_card):
     client, _ = scripted_card(lambda code, _: [reply(code, 1)])
     client.record_stop()
-    with refused(ErrorCode.REFUSED_BY_PEER, "CONFIGURE_FPGA"):
+    with expect_refusal(ErrorCode.REFUSED_BY_PEER, "CONFIGURE_FPGA"):
         client.configure(Card())
 
 
 def test_silent_card_is_named(scripted_card):
     client, card = scripted_card(lambda *_: [], unanswered=[(Code.ALIVE, n) for n in (1, 2, 3)])
-    with refused(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
         client.check_alive()
     wait_for(lambda: len(card.seen) == 3, "three requests")
 
 
 def test_command_port_in_use(scripted_card):
     client, _ = scripted_card(lambda *_: [])
-    with refused(ErrorCode.BUSY, 4202, "ss -ulnp"):
+    with expect_refusal(ErrorCode.BUSY, 4202, "ss -ulnp"):
         CardClient(client.board, 1.0)
 
 
@@ -208,7 +208,7 @@ def test_the_card_decodes_the_settings_sent(net, ends, mac, ports):
 def test_a_card_that_could_not_be_reached_is_refused(given):
     good = {"host_address": "192.168.33.30", "card_address": "192.168.33.180"}
     EepromSettings(**good)
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         EepromSettings(**(good | given))
 
 
@@ -237,7 +237,7 @@ def test_written_once_confirmed(scripted_card):
 @pytest.mark.parametrize("confirmed", ["", "yes", "192.168.33.180"])
 def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
     client, card = scripted_card(make_answers())
-    with refused(ErrorCode.VALUE_INVALID, client.board.card_address):
+    with expect_refusal(ErrorCode.VALUE_INVALID, client.board.card_address):
         program_eeprom(client, read_settings(client), confirmed)
     assert card.seen == []
 
@@ -253,7 +253,7 @@ def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
 def test_a_card_that_could_not_write_it(scripted_card, status, answer, unanswered, code):
     client, card = scripted_card(make_answers(status, answer), unanswered=unanswered)
     settings = read_settings(client)
-    with refused(code):
+    with expect_refusal(code):
         program_eeprom(client, settings, settings.confirmation)
     wait_for(lambda: card.seen[1:], "the command")
     assert [code for code, _ in card.seen] == [Code.ALIVE, Code.CONFIGURE_EEPROM]
@@ -272,7 +272,7 @@ def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, 
         client.require_alone()
     else:
         monkeypatch.setattr(card, "_TWIN_S", HANG_S)
-        with refused(ErrorCode.VALUES_CONFLICT, f"{answers} answers"):
+        with expect_refusal(ErrorCode.VALUES_CONFLICT, f"{answers} answers"):
             client.require_alone()
 
 
@@ -283,7 +283,10 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
     with CardClient(rig.boards[1], HANG_S) as client:
         client.require_alone()
     monkeypatch.setattr(card, "_TWIN_S", HANG_S)
-    with CardClient(rig.boards[2], HANG_S) as client, refused(ErrorCode.VALUES_CONFLICT, "2 answers to one request"):
+    with (
+        CardClient(rig.boards[2], HANG_S) as client,
+        expect_refusal(ErrorCode.VALUES_CONFLICT, "2 answers to one request"),
+    ):
         client.require_alone()
 
 
@@ -298,7 +301,7 @@ def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_
         known["mac"] = forgotten
         client.record_start()
     known["mac"] = "12:34:56:78:90:13"
-    with refused(ErrorCode.VALUES_CONFLICT, "12:34:56:78:90:12 and 12:34:56:78:90:13"):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, "12:34:56:78:90:12 and 12:34:56:78:90:13"):
         client.record_start()
 
 

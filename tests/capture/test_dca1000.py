@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.capture import dca1000 as d
 from polysight.capture.dca1000 import decode_row, decode_two_lane
@@ -105,7 +105,7 @@ def test_frames_with_a_missing_byte_are_invalid_and_zero(cuts):
 
 
 def test_short_data_is_refused():
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         decode_row(bytes(100), (), 2, 4)
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         decode_two_lane(bytes(1000), 1, 3)

@@ -14,7 +14,7 @@ from tests.support.capture.recordings import CARD, OTHER, draw_row, write_pcap
 from tests.support.capture.records import encode_packets
 from tests.support.paths import REAL_CAPTURES, RIG_FILE
 from tests.support.processes import Bench
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.scenes import write_small_scene
 
 from polysight.capture import recognise_format
@@ -44,7 +44,7 @@ def test_a_recording_in_its_layout_has_a_peak_and_no_remarks(tmp_path, layout):
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "x.bin"
     path.write_bytes(b"\x89PNG\r\n" * 1000 if content == "PNG" else content.encode())
-    with refused(ErrorCode.FILE_FOREIGN, str(path)):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, str(path)):
         inspect_bin(path)
 
 
@@ -53,7 +53,7 @@ def test_other_files_are_refused(tmp_path, content):
 def test_random_bytes_are_not_a_recording(tmp_path, size, layout):
     path = tmp_path / "x.bin"
     path.write_bytes(np.random.default_rng(size).bytes(size))
-    with refused(ErrorCode.FILE_FOREIGN, str(path)):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, str(path)):
         inspect_bin(path, layout)
 
 
@@ -131,9 +131,9 @@ def test_a_packet_capture_is_known_by_its_first_bytes_whatever_its_name(tmp_path
 
 def test_too_small_or_absent(tmp_path):
     (tmp_path / "x.bin").write_bytes(b"")
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         inspect_bin(tmp_path / "x.bin")
-    with refused(ErrorCode.FILE_UNREADABLE):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE):
         inspect_bin(tmp_path / "absent.bin")
 
 

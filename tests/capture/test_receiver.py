@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from tests.support.capture.records import FULL, encode_packets
 from tests.support.processes import wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.acquisition.capture_rig import has_record_ended
 from polysight.acquisition.control import read_start_ticks
@@ -170,15 +170,15 @@ def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
 
 def test_errors_come_back_to_the_host(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver:
-        with refused(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}"):
+        with expect_refusal(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}"):
             ReceiverProcess(board, 1 << 20)
         (tmp_path / "file").write_text("")
-        with refused(ErrorCode.FILE_UNWRITABLE):
+        with expect_refusal(ErrorCode.FILE_UNWRITABLE):
             receiver.begin_row(0, 1, 4096, 4096, tmp_path / "file" / "a.part")
         with pytest.raises(DeviceError):
             receiver.end_row()
         os.kill(receiver._process.pid, signal.SIGKILL)
-        with refused(ErrorCode.NO_ANSWER):
+        with expect_refusal(ErrorCode.NO_ANSWER):
             receiver.report()
         with pytest.raises(DeviceError):
             receiver.report()
@@ -332,7 +332,7 @@ def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, ca
 
 
 def test_address_of_another_machine():
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         bind_udp("192.0.2.1", 4098, "RH data")
 
 

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 from tests.support.paths import REPO
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.capture.network import check_receive_buffer, usable_packets
 from polysight.capture.receiver import Core, ReceiverProcess, receiver_cores, take_core, take_priority
@@ -83,11 +83,11 @@ def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):
     assert "212992 bytes granted" in warning
     assert "net.core.rmem_max is 212992" in warning
     assert "`sysctl -w net.core.rmem_max=8388608`" in warning
-    with refused(ErrorCode.VALUE_INVALID, "`sysctl -w net.core.rmem_max=8388608`"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "`sysctl -w net.core.rmem_max=8388608`"):
         check_receive_buffer("RH", 100_000, 8 << 20, burst, limit)
-    with refused(ErrorCode.VALUE_INVALID, "`sysctl -w net.core.rmem_max=", "net.core.rmem_max limits it"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "`sysctl -w net.core.rmem_max=", "net.core.rmem_max limits it"):
         check_receive_buffer("RH", 8192, 1 << 20, burst, tmp_path / "absent")
-    with refused(ErrorCode.VALUE_INVALID, "card.receive_buffer_bytes"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "card.receive_buffer_bytes"):
         check_receive_buffer("RH", 8192, 8192, burst, tmp_path / "absent")
 
 

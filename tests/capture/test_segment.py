@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.capture.dca1000 import PacketLog
 from polysight.capture.row_files import Segment, read_index
@@ -44,7 +44,7 @@ def test_a_segment_holds_the_bytes_given(tmp_path):
 
 
 def test_no_room_on_the_disk(tmp_path):
-    with refused(ErrorCode.DISK_FULL):
+    with expect_refusal(ErrorCode.DISK_FULL):
         Segment(tmp_path / "huge.part", 1 << 60)
 
 

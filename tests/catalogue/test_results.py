@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.scenes import COPPER, PET
 
 from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, read_result, thumbnail
@@ -52,7 +52,7 @@ def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
         (middle_x, low - inside_mm),
         (middle_x, high + inside_mm),
     ):
-        with refused(ErrorCode.VALUE_INVALID, "outside the image"):
+        with expect_refusal(ErrorCode.VALUE_INVALID, "outside the image"):
             pixels.nearest(*place)
 
 
@@ -72,7 +72,7 @@ def test_metal_has_no_permittivity_and_the_reason_is_given(processed):
 
 def test_places_outside_the_image_are_refused(processed):
     for place in ((1000.0, 0.0), (0.0, -500.0), (float("nan"), 0.0)):
-        with refused(ErrorCode.VALUE_INVALID):
+        with expect_refusal(ErrorCode.VALUE_INVALID):
             probe(processed / "one", *place)
 
 
@@ -144,7 +144,7 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
 
 def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):
     write_judged_products(tmp_path / "none", "none")
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         compare(processed / "one", tmp_path / "none")
 
 
@@ -205,5 +205,5 @@ def test_a_pipe_in_place_of_the_image_blocks_no_reader(tmp_path):
     (folder / "image.npz").unlink()
     os.mkfifo(folder / "image.npz")
     for look in (lambda: probe(folder, 0.0, 0.0), lambda: thumbnail(Pixels(folder))):
-        with refused(ErrorCode.FILE_FOREIGN):
+        with expect_refusal(ErrorCode.FILE_FOREIGN):
             look()

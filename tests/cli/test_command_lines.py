@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import build_parser, main
 from polysight.cli.options import join_negative_values
@@ -55,7 +55,7 @@ def scan(tmp_path) -> Path:
 )
 def test_options_that_would_do_nothing_are_refused(words, options):
     args = build_parser().parse_args(words)
-    with refused(ErrorCode.VALUES_CONFLICT, *options):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, *options):
         args.run(args)
 
 
@@ -107,7 +107,7 @@ def test_an_object_distance_is_one_in_the_lab(text):
 @pytest.mark.parametrize("words", ["--columns 1", "--rows 1", "--width-mm 0.5", "--height-mm 0.9", "--step-x-mm 5000"])
 def test_a_plan_without_an_aperture_is_refused(words):
     args = build_parser().parse_args(["plan", "--config", str(RIG_FILE), *words.split()])
-    with refused(ErrorCode.VALUE_INVALID, "positions"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "positions"):
         args.run(args)
 
 

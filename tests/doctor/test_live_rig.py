@@ -12,7 +12,7 @@ from tests.support.calibration import filter_file, read_board_filter
 from tests.support.doctor.case import QUICK
 from tests.support.doctor.live_rig import answering
 from tests.support.processes import wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.scan import run_scan
@@ -114,7 +114,7 @@ def test_a_scan_in_progress_is_not_disturbed(live):
     with live.pi() as pi:
         pi.begin_run(run)
         findings = live.doctor(pulse=True, move=True)
-        with refused(ErrorCode.REFUSED_BY_PEER, "another"):
+        with expect_refusal(ErrorCode.REFUSED_BY_PEER, "another"):
             pi.pulse(16, 1500, 1)
         pi.end_run("another", "abort", "test")
     assert_failed(findings, "rig is free")

@@ -4,7 +4,7 @@ import importlib
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import backproject, project
 from polysight.imaging.direct import DirectImager
@@ -89,5 +89,5 @@ def test_backproject_and_project_run_on_the_library_of_their_samples(library):
 def test_without_array_api_compat_other_libraries_are_refused(monkeypatch, aperture):
     strict = importlib.import_module("array_api_strict")
     monkeypatch.setitem(importlib.import_module("sys").modules, "array_api_compat", None)
-    with refused(ErrorCode.PACKAGE_MISSING, "array-api-compat"):
+    with expect_refusal(ErrorCode.PACKAGE_MISSING, "array-api-compat"):
         DirectImager(aperture).image(strict.asarray(np.zeros(aperture.shape, np.complex64)))

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 import scipy.signal
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import (
     UNKNOWN_PLANE,
@@ -161,11 +161,11 @@ def test_without_rows_the_image_is_empty(make_rig):
 def test_rows_of_another_plan_are_refused(make_rig, synced_row):
     builder = ImageBuilder(make_rig(7, 5))
     row = synced_row(np.zeros((4, 7, 256)))
-    with refused(ErrorCode.MISMATCH, "LS"):
+    with expect_refusal(ErrorCode.MISMATCH, "LS"):
         builder.add_row("LS", 0, row)
-    with refused(ErrorCode.MISMATCH, 5, "RH"):
+    with expect_refusal(ErrorCode.MISMATCH, 5, "RH"):
         builder.add_row("RH", 5, row)
-    with refused(ErrorCode.MISMATCH, 6, 7):
+    with expect_refusal(ErrorCode.MISMATCH, 6, 7):
         builder.add_row("RH", 0, synced_row(np.zeros((4, 6, 256))))
 
 

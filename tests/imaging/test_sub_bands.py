@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.imaging.images import MIN_SAMPLES, sub_bands
@@ -42,5 +42,5 @@ def test_the_model_of_a_layer_averages_over_the_same_frequencies(count):
 
 @pytest.mark.parametrize("count", [0, -1, 16, 1000])
 def test_too_many_are_refused(count):
-    with refused(ErrorCode.VALUE_INVALID, count):
+    with expect_refusal(ErrorCode.VALUE_INVALID, count):
         sub_bands(CHIRP, count)

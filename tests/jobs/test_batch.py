@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 from tests.support.scenes import make_scene
 from tests.support.store.plain_scan import write_scan
@@ -209,7 +209,7 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
     assert batch.find_scans([tmp_path / "nowhere"]) == [tmp_path / "nowhere"]
     products = write_judged_products(tmp_path / "products", "good")
     assert batch.find_scans([products]) == [products]
-    with refused(ErrorCode.NAME_TAKEN, "s1"):
+    with expect_refusal(ErrorCode.NAME_TAKEN, "s1"):
         batch.make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
 
 
@@ -272,7 +272,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
         outcomes = batch.process_many(todo, tmp_path / "out", 1, dask=cluster.scheduler_address)
     assert [o.status for o in outcomes] == ["done", "failed", "done"]
     assert all(batch.is_finished(j) == (j.name != "bad") for j in todo)
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         list(many.run_on_dask(todo, "tcp://127.0.0.1:9", timeout="1s"))
 
 

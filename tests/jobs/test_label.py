@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import build_parser, main
 from polysight.jobs.label import Edits, apply_edits, label
@@ -105,13 +105,13 @@ def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
 )
 def test_labels_that_cannot_be_used_are_refused_and_nothing_is_written(products, words, code, value):
     args = build_parser().parse_args(["label", str(products), *words])
-    with refused(code, value):
+    with expect_refusal(code, value):
         args.run(args)
     assert not (products / "labels.json").exists()
 
 
 def test_a_folder_without_an_image_is_to_be_processed_first(tmp_path):
-    with refused(ErrorCode.FILE_MISSING, tmp_path):
+    with expect_refusal(ErrorCode.FILE_MISSING, tmp_path):
         label(tmp_path, Edits(), list_only=True)
 
 
@@ -127,7 +127,7 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert load_boxes(products).metal == "glass"
     state_before = (products / "labels.json").read_bytes()
     for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
-        with refused(code):
+        with expect_refusal(code):
             label(products, Edits(), ask=script_answers(*answers)[0])
     assert (products / "labels.json").read_bytes() == state_before
 
@@ -176,7 +176,7 @@ def test_boxes_that_another_command_saved_meanwhile_are_not_overwritten(products
         return apply_edits(*args)
 
     monkeypatch.setattr("polysight.jobs.label.apply_edits", edit_during_another_command)
-    with refused(ErrorCode.MISMATCH, products):
+    with expect_refusal(ErrorCode.MISMATCH, products):
         label(products, Edits(boxes=[("glass", (-40.0, 0.0, -20.0, 20.0))]))
     assert list(load_boxes(products).boxes) == ["oak"]
     label(products, Edits(boxes=[("glass", (-40.0, 0.0, -20.0, 20.0))]))

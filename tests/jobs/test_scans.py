@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 from tests.support.page.live_view import open_control
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 from tests.support.scenes import COPPER, make_scene
 
@@ -99,7 +99,7 @@ def test_results_at_a_place_and_of_two_scans_are_printed(root, capsys, tmp_path)
 def test_folders_and_places_that_are_not_there_are_refused(root, monkeypatch, command, code):
     monkeypatch.chdir(root)
     args = build_parser().parse_args(command.split())
-    with refused(code):
+    with expect_refusal(code):
         args.run(args)
 
 
@@ -122,7 +122,7 @@ def test_notes_are_of_a_scan(root, folder):
     """A mistyped folder gets no notes that no list would ever show."""
     (root / "empty").mkdir()
     args = build_parser().parse_args(["note", str(root / folder), "--text", "oak"])
-    with refused(ErrorCode.FILE_MISSING, root / folder):
+    with expect_refusal(ErrorCode.FILE_MISSING, root / folder):
         args.run(args)
     assert not (root / folder / NOTES_FILE).exists()
 
@@ -180,6 +180,6 @@ def test_products_of_a_running_scan_are_left_to_it(root, monkeypatch, command):
     args = build_parser().parse_args(command.split())
     with (root / "one" / MANIFEST).open("rb") as recorded:
         manifest.lock_file(recorded)
-        with refused(ErrorCode.BUSY, "polysight preview one"):
+        with expect_refusal(ErrorCode.BUSY, "polysight preview one"):
             args.run(args)
     assert not (root / "one" / "products").exists()

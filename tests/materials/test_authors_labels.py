@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from tests.support.drawn_files import Errors, Material, write_labels
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.materials import train
 from polysight.polarimetry import ratio_from_permittivity
@@ -58,19 +58,19 @@ def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
     text = json.loads((folder / "scan_7.json").read_text())
     del text["labels"]["Copper plate"]
     (folder / "scan_7.json").write_text(json.dumps(text))
-    with refused(ErrorCode.NO_DATA, "scan_7"):
+    with expect_refusal(ErrorCode.NO_DATA, "scan_7"):
         train.entries_of_boxes(train.read_labelled_scan(folder), 60.0)
     np.save(folder / "sar_h.npy", np.ones(3))
-    with refused(ErrorCode.TYPE_WRONG, "sar_h.npy", "float64"):
+    with expect_refusal(ErrorCode.TYPE_WRONG, "sar_h.npy", "float64"):
         train.read_labelled_scan(folder)
     np.save(folder / "sar_h.npy", np.ones((3, 3), complex))
-    with refused(ErrorCode.MISMATCH, (3, 3)):
+    with expect_refusal(ErrorCode.MISMATCH, (3, 3)):
         train.read_labelled_scan(folder)
     np.save(folder / "sar_h.npy", np.array([{}], dtype=object), allow_pickle=True)
-    with refused(ErrorCode.FILE_UNREADABLE, "sar_h.npy"):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, "sar_h.npy"):
         train.read_labelled_scan(folder)
     (folder / "scan_7.json").unlink()
-    with refused(ErrorCode.FILE_MISSING):
+    with expect_refusal(ErrorCode.FILE_MISSING):
         train.read_labelled_scan(folder)
 
 
@@ -81,7 +81,7 @@ def test_a_box_of_no_finite_numbers_is_refused_without_advice_for_boxes_drawn_he
     for corner in ("NaN", "Infinity", "1e400"):
         content["labels"]["ceramic"] = [100, 90, 130, "corner"]
         file.write_text(json.dumps(content).replace('"corner"', corner))
-        with refused(ErrorCode.VALUE_INVALID, "labels.ceramic", "finite", "fetch it again") as refusal:
+        with expect_refusal(ErrorCode.VALUE_INVALID, "labels.ceramic", "finite", "fetch it again") as refusal:
             train.read_labelled_scan(folder)
         assert "polysight label" not in refusal.value.remedy
 
@@ -98,7 +98,7 @@ def test_the_orientation_does_not_depend_on_the_unit_of_the_images(tmp_path, fac
 def test_a_missing_image_is_reported_in_words(tmp_path):
     folder = write_scan(tmp_path)
     (folder / "sar_v.npy").unlink()
-    with refused(ErrorCode.FILE_UNREADABLE, "sar_v.npy: not an image: No such file or directory"):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, "sar_v.npy: not an image: No such file or directory"):
         train.read_labelled_scan(folder)
 
 

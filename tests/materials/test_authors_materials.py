@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.materials.train import read_material, read_materials, read_pickle
 from polysight_shared.errors import DataError, ErrorCode
@@ -68,7 +68,7 @@ def test_texts_of_a_file_are_lines_without_control_characters(tmp_path):
 def test_an_angle_that_is_none_is_refused(tmp_path, angle):
     path = tmp_path / "PET_55.pkl"
     path.write_bytes(pickle.dumps(make_content(4) | {"incident_angle": angle}))
-    with refused(ErrorCode.FILE_FOREIGN, "incident_angle"):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, "incident_angle"):
         read_material(path)
 
 
@@ -91,7 +91,7 @@ def test_older_names_of_numpy_are_read(tmp_path):
 def test_a_pickle_of_something_else_is_not_a_material_file(tmp_path, thing):
     path = tmp_path / "PET_55.pkl"
     path.write_bytes(pickle.dumps(thing))
-    with refused(ErrorCode.FILE_FOREIGN, path):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, path):
         read_material(path)
 
 
@@ -107,7 +107,7 @@ def test_a_hostile_file_is_refused_and_does_nothing(tmp_path):
     target = tmp_path / "ran"
     path = tmp_path / "evil_55.pkl"
     path.write_bytes(pickle.dumps(make_content() | {"name": Hostile(target)}))
-    with refused(ErrorCode.FILE_FOREIGN, "system"):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, "system"):
         read_material(path)
     assert not target.exists()
 
@@ -118,7 +118,7 @@ def test_a_hostile_file_is_refused_and_does_nothing(tmp_path):
 def test_no_other_name_is_admitted(tmp_path, module, name):
     path = tmp_path / "x.pkl"
     path.write_bytes(f"c{module}\n{name}\n(S'1'\ntR.".encode())
-    with refused(ErrorCode.FILE_FOREIGN, name):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, name):
         read_pickle(path)
 
 
@@ -140,5 +140,5 @@ def test_other_forms_are_errors(tmp_path, broken):
 
 
 def test_a_folder_without_material_files_is_refused(tmp_path):
-    with refused(ErrorCode.FILE_MISSING, tmp_path):
+    with expect_refusal(ErrorCode.FILE_MISSING, tmp_path):
         read_materials(tmp_path)

@@ -4,7 +4,7 @@ import math
 from collections import Counter
 
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight import materials
 from polysight.cli.main import main
@@ -124,17 +124,17 @@ def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
 
 def test_a_bad_file_is_refused(tmp_path):
     path = tmp_path / "catalogue.toml"
-    with refused(ErrorCode.FILE_MISSING, path):
+    with expect_refusal(ErrorCode.FILE_MISSING, path):
         materials.read_catalogue(path)
     path.write_text("materials = [")
-    with refused(ErrorCode.FILE_DAMAGED, path):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, path):
         materials.read_catalogue(path)
     line = '{ name = "a", real = 2.0, loss = 0.1, ghz = 77, source = ["Nobody"], kind = "felt" }'
     path.write_text(f"materials = [{line}]\n[sources]\n[kinds]\n")
-    with refused(ErrorCode.KEY_MISSING, path, "felt"):
+    with expect_refusal(ErrorCode.KEY_MISSING, path, "felt"):
         materials.read_catalogue(path)
     path.write_text(f"materials = [{line}]\n[sources]\n[kinds]\nfelt = {{ generic = [], spread = [0.1, 0.5] }}\n")
-    with refused(ErrorCode.KEY_MISSING, path, "Nobody"):
+    with expect_refusal(ErrorCode.KEY_MISSING, path, "Nobody"):
         materials.read_catalogue(path)
 
 

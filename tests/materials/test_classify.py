@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import main
 from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, fit_library
@@ -96,14 +96,14 @@ def test_another_model_can_be_chosen_and_the_report_names_it(powders):
     assert classifier_sentence(knn).startswith(PAPER_MODEL)
     earlier = Classifier(powders, model="linear discriminant", angles_deg=[60.0])
     assert earlier.model == DISCRIMINANT_MODEL
-    with refused(ErrorCode.VALUE_INVALID, "guess"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "guess"):
         Classifier(powders, model="guess", angles_deg=[60.0])
 
 
 def test_an_angle_the_library_does_not_hold_is_refused(powders):
-    with refused(ErrorCode.MISMATCH, "50.0"):
+    with expect_refusal(ErrorCode.MISMATCH, "50.0"):
         Classifier(powders, angles_deg=[50.0])
-    with refused(ErrorCode.KEY_MISSING, "55, 60"):
+    with expect_refusal(ErrorCode.KEY_MISSING, "55, 60"):
         Classifier(powders)
 
 

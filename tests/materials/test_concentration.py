@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import main
 from polysight.materials import Entry, Library
@@ -90,14 +90,14 @@ def test_concentrations_are_read_from_names_unless_they_are_given():
 
 
 def test_what_cannot_be_fitted_is_refused():
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         fit_concentration(
             Library(tuple(e for e in make_library_of_sugar().entries if e.name in ("sugar (1.3%)", "sugar (3.8%)")))
         )
     mixed = [*make_library_of_sugar().entries, make_entry("sugar (9.9%)", 1.1, incidence_deg=60.0)]
-    with refused(ErrorCode.MISMATCH, "60.0"):
+    with expect_refusal(ErrorCode.MISMATCH, "60.0"):
         fit_concentration(Library(tuple(mixed)))
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         Line.through([1.0, 1.0, 1.0], [0.0, 1.0, 2.0])
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
 from polysight.materials.result import pixel_features
@@ -32,5 +32,5 @@ def test_an_unknown_patch_has_no_likelier_name(library, ratio, gain):
 
 
 def test_one_angle_given_twice_is_refused(library):
-    with refused(ErrorCode.VALUES_CONFLICT):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT):
         Classifier(library, angles_deg=[ANGLE_DEG, ANGLE_DEG])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.materials.classify import DISCRIMINANT_MODEL, PAPER_MODEL, fit_weights
 from polysight.materials.discriminant import REJECTED_SHARE, ErrorDiscriminant
@@ -207,5 +207,5 @@ def test_a_material_of_two_scans_among_many_is_judged():
 def test_scans_without_a_common_material_are_refused():
     samples = draw_pixels(14, scans=5)
     disjoint = samples.take(np.char.lstrip(samples.names, "m") == np.char.lstrip(samples.groups, "s"))
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         score(disjoint, DISCRIMINANT_MODEL)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight import materials
 from polysight.process import Inputs, convert_boxes_to_patches
@@ -50,7 +50,7 @@ CONFLICT = ErrorCode.VALUES_CONFLICT
     ],
 )
 def test_boxes_and_names_that_cannot_be_used_for_training_are_refused(boxes, more, code, values):
-    with refused(code, *values) as e:
+    with expect_refusal(code, *values) as e:
         check_boxes(boxes, **more)
     assert e.value.why
     assert e.value.remedy
@@ -67,7 +67,7 @@ def test_boxes_may_touch_and_reach_the_edge_of_the_image():
 def test_a_box_where_nothing_was_scanned_is_refused():
     valid = np.ones((50, 50), bool)
     valid[:, 25:] = False
-    with refused(ErrorCode.NO_DATA, "oak"):
+    with expect_refusal(ErrorCode.NO_DATA, "oak"):
         materials.check_labels(materials.Labels({"copper": COPPER, "oak": OAK}, "mm"), X_M, Y_M, valid)
 
 
@@ -95,7 +95,7 @@ def test_names_of_any_script_are_kept_in_one_form(text, name):
 
 @pytest.mark.parametrize("mark", ["\u200b", "\u00ad", "\u2060", "\ufeff"])
 def test_invisible_characters_are_not_part_of_a_name(mark):
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         materials.clean_name(f"rubber{mark}")
 
 
@@ -121,13 +121,13 @@ def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
 def test_keys_of_another_form_are_refused(tmp_path, more):
     path = tmp_path / "labels.json"
     path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}, **more}))
-    with refused(ErrorCode.VALUE_INVALID, path, next(iter(more))):
+    with expect_refusal(ErrorCode.VALUE_INVALID, path, next(iter(more))):
         materials.read_labels(path)
 
 
 def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
     overlapping = materials.Labels({"copper": COPPER, "oak": (-15.0, -10.0, 40.0, 10.0)}, "mm", by_hand=True)
-    with refused(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
         convert_boxes_to_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
     labels = materials.Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
     drawn = convert_boxes_to_patches(DEFAULT, Inputs(labels), X_M, Y_M)
@@ -152,5 +152,5 @@ def test_boxes_next_to_or_above_each_other_do_not_overlap(other):
     copper = (-20.0, -20.0, 0.0, 0.0)
     assert set(check_boxes({"copper": copper, "oak": other}).boxes) == {"copper", "oak"}
     reaching = (min(other[0], -0.5), min(other[1], -0.5), *other[2:])
-    with refused(CONFLICT, "overlap"):
+    with expect_refusal(CONFLICT, "overlap"):
         check_boxes({"copper": copper, "oak": reaching})

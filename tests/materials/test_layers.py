@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.materials.layers import Bands, Layer, LayerFit, Spectrum, check_range, check_stack, fit_layer, predict
@@ -154,14 +154,14 @@ def test_a_stack_that_is_not_the_one_measured_is_noticed():
     ],
 )
 def test_stacks_that_cannot_be_fitted_are_refused(stack, code):
-    with refused(code) as caught:
+    with expect_refusal(code) as caught:
         fit_layer(measure_bands([GLASS]), stack, THETA)
     assert isinstance(caught.value, ConfigError)
 
 
 def test_fewer_data_than_unknowns_are_refused():
     bands = measure_bands([Layer("sheet", 3.0, 1e-3)], spectrum=Spectrum.from_chirp(CHIRP, 1))
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         fit_layer(bands, [Layer("sheet", None, 1e-3)], THETA, (0.5e-3, 2e-3))
 
 
@@ -193,11 +193,11 @@ def test_a_misfit_of_one_scan_in_a_thousand_is_reported_and_its_rivals_are_kept(
 
 @pytest.mark.parametrize("eps", [0.5 + 0j, 4 + 0.5j, 1e9 + 0j, 4 - 1e9j])
 def test_a_known_layer_that_no_passive_material_is(eps):
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         check_stack([Layer("a", eps, 1e-3), Layer("b")])
 
 
 def test_a_range_of_thickness_too_wide_to_distinguish_solutions_is_refused():
     check_range((0.5e-3, 20e-3))
-    with refused(ErrorCode.VALUE_INVALID, "1000 mm"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "1000 mm"):
         check_range((0.5e-3, 1.0))

@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import main
 from polysight.jobs.materials import report
@@ -13,7 +13,7 @@ from polysight_shared.errors import ErrorCode
 
 def test_a_report_of_images_alone_lists_the_missing_results(tmp_path):
     (tmp_path / "image.npz").touch()
-    with refused(ErrorCode.FILE_MISSING, "report.html"):
+    with expect_refusal(ErrorCode.FILE_MISSING, "report.html"):
         report(tmp_path)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight import materials
 from polysight.materials.analyse import Optics
@@ -83,7 +83,7 @@ def test_pickles_and_damaged_files_are_refused(tmp_path, library):
         tmp_path / "absent.npz": ErrorCode.FILE_MISSING,
     }
     for path, code in codes.items():
-        with refused(code, path):
+        with expect_refusal(code, path):
             materials.Library.load(path)
 
 
@@ -121,11 +121,11 @@ def test_polarimetry_beats_one_channel(library):
 
 
 def test_unusable_libraries_are_refused(library):
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         materials.Classifier(materials.Library(()))
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         materials.Classifier(materials.Library(library.entries, {"weights": {"h": 1}}))
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         materials.make_library([])
 
 

@@ -7,7 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.materials.classify import (
     DISCRIMINANT_MODEL,
@@ -120,7 +120,7 @@ def test_a_split_by_pixel_needs_two_pixels_of_a_material():
     pixels = Samples(np.eye(3, 4), names, two, two)
     judged = np.concatenate([test for _, test in splits(pixels, by_pixel=True)])
     assert sorted(judged) == [0, 1, 2]
-    with refused(ErrorCode.NOT_ENOUGH_DATA, "two pixels"):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "two pixels"):
         list(splits(pixels.take(np.array([False, True, True])), by_pixel=True))
 
 
@@ -188,7 +188,7 @@ def test_joining_angles_pairs_whole_patches():
             partner = [np.flatnonzero((second_angle.x == row).all(axis=1))[0] for row in both_angles.x[of_patch, 4:]]
             assert np.unique(second_angle.patches[partner]).size == 1
             assert set(second_angle.names[partner]) == set(both_angles.names[of_patch])
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         first_angle.join(
             Samples(other_samples.x, np.char.add("x", other_samples.names), other_samples.groups, other_samples.patches)
         )
@@ -204,7 +204,7 @@ def test_channels_alone_know_less():
 
 
 def test_one_scan_is_refused():
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         score(draw_samples(groups=1), PAPER_MODEL)
 
 

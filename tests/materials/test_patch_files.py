@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import Images
 from polysight.materials import UNKNOWN, Classifier, match_patches, pack_patches, read_patches
@@ -81,5 +81,5 @@ def test_a_budget_of_other_patches_is_refused(synthetic, analyse_placement, tmp_
     out = io.BytesIO()
     np.savez(out, **{**arrays, "evidence_ratio": arrays["evidence_ratio"][:-1]})
     path.write_bytes(out.getvalue())
-    with refused(ErrorCode.FILE_UNREADABLE, path):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
         read_patches(path)

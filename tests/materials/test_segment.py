@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from benchmarks.touching import judge_gap
 from scipy.ndimage import gaussian_filter
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
 from polysight.materials.labels import patches_from_labels
@@ -88,13 +88,13 @@ def test_invalid_part_is_left_out(synthetic):
     segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m, valid)
     assert segmentation.patches
     assert not segmentation.labels[:, :75].any()
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         segment(scene.h, scene.v, scene.x_m, scene.y_m, np.zeros_like(valid))
     longer_m = np.append(scene.x_m, 2 * scene.x_m[-1] - scene.x_m[-2])
     for axes in ((scene.x_m[:-1], scene.y_m), (longer_m, scene.y_m), (scene.x_m, scene.y_m[1:])):
-        with refused(ErrorCode.MISMATCH):
+        with expect_refusal(ErrorCode.MISMATCH):
             segment(scene.h, scene.v, *axes)
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         segment(scene.h, scene.v[1:], scene.x_m, scene.y_m)
 
 
@@ -122,9 +122,9 @@ def test_metal_by_box_and_label(synthetic):
     by_box = metal_in_box(copper.box_mm, segmentation, scene.x_m, scene.y_m)
     assert by_box.label is not None
     assert (by_box.mask == metal_by_label(by_box.label, segmentation).mask).all()
-    with refused(ErrorCode.NO_DATA, "--metal-box x0,y0,x1,y1"):
+    with expect_refusal(ErrorCode.NO_DATA, "--metal-box x0,y0,x1,y1"):
         metal_in_box((1e3, 1e3, 2e3, 2e3), segmentation, scene.x_m, scene.y_m)
-    with refused(ErrorCode.NO_DATA, 99):
+    with expect_refusal(ErrorCode.NO_DATA, 99):
         metal_by_label(99, segmentation)
 
 
@@ -138,7 +138,7 @@ def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
     assert segmentation.patches[0].pixels == 20 * 15
     assert segmentation.labels[20, 10] == 1
     assert segmentation.labels[35, 10] == 0
-    with refused(ErrorCode.NO_DATA, "far"):
+    with expect_refusal(ErrorCode.NO_DATA, "far"):
         patches_from_labels({"far": (500.0, 0.0, 600.0, 10.0)}, scene.x_m, scene.y_m)
 
 
@@ -155,7 +155,7 @@ def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
 def test_bad_label_files_are_refused(tmp_path, text, code):
     path = tmp_path / "bad.json"
     path.write_text(text)
-    with refused(code, path):
+    with expect_refusal(code, path):
         read_labels(path)
 
 

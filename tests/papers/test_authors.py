@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.support.drawn_files import Errors, Material, write_labels, write_material
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import main
 from polysight.materials import Library, classify
@@ -185,7 +185,7 @@ def test_the_meaning_of_a_name_can_be_given(dataset, tmp_path):
     data = read_authors(dataset, RIG_FILE, names=names)
     assert ROWS[20].name in data.sources[MATERIALS].names
     names.write_text('{"unobtainium": 99}')
-    with refused(ErrorCode.VALUE_INVALID, 99):
+    with expect_refusal(ErrorCode.VALUE_INVALID, 99):
         read_names(names)
 
 
@@ -256,7 +256,7 @@ def test_pairs_of_scans_share_no_scan_and_both_angles_are_seen(dataset):
 
 def test_nothing_to_classify_is_refused(dataset):
     data = read_authors(dataset, RIG_FILE)
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         authors_fig20(Judgements(replace(data, sources={})))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.polarimetry import specular_incidence_rad
@@ -67,7 +67,7 @@ def test_a_simulated_scan_is_made_and_removed():
 
 def test_a_scene_that_cannot_be_simulated_is_named():
     with (
-        refused(ErrorCode.VALUE_INVALID, "broken"),
+        expect_refusal(ErrorCode.VALUE_INVALID, "broken"),
         simulate_scan("broken", [plate("x", 0.5 + 0j, 0, 0)], RIG_FILE, seed=1),
     ):
         pass

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tests.support.pi.fakes import FakeLines, gone
 from tests.support.processes import HANG_S
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig, time_by_spi
 
 from polysight_pi import lines as pi_lines, trigger
@@ -247,7 +247,7 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
 def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
     needed_bytes = len(trigger.make_spi_burst(trigger.BurstSpec(*burst), LARGE_BUFFER).data)
     if needed_bytes > bufsiz:
-        with refused(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
+        with expect_refusal(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
             trigger.make_spi_burst(trigger.BurstSpec(*burst), bufsiz)
         advised_bytes = int(e.value.remedy.partition("bufsiz=")[2].partition("`")[0])
         assert needed_bytes <= advised_bytes
@@ -258,7 +258,7 @@ def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
 
 @pytest.mark.parametrize("width_ns", [MIN_WIDTH_NS, 499, 2001, MAX_WIDTH_NS])
 def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
-    with refused(ErrorCode.VALUES_CONFLICT, "0.5..2 us"):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, "0.5..2 us"):
         trigger.make_spi_burst(trigger.BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
 
 

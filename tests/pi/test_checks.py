@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 from tests.support.pi.program import run
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_pi import checks, lines as pi_lines
 from polysight_pi.checks import check_lines, judge_widths, measure_clock, run_check
@@ -220,7 +220,7 @@ def test_wirings_of_the_past_are_read_and_never_opened(gpio_rig, hub, wiring, sy
     rig = msgspec.structs.replace(gpio_rig, pi=msgspec.structs.replace(gpio_rig.pi, **old))
     assert decode(to_builtins(rig), Instrument, "manifest") == rig
     for wires in (None, hub):
-        with refused(ErrorCode.VALUE_INVALID, wiring, "fanout"):
+        with expect_refusal(ErrorCode.VALUE_INVALID, wiring, "fanout"):
             open_lines(rig, wires)
 
 
@@ -235,5 +235,5 @@ def test_spi_drives_its_mosi():
 def test_a_missing_chip_is_reported_with_those_that_exist(tmp_path):
     assert find_chip("/dev/gpiochip7") == "/dev/gpiochip7"
     (tmp_path / "gpiochip0").write_text("")
-    with refused(ErrorCode.FILE_MISSING, "pinctrl-bcm2835", "gpiochip0"):
+    with expect_refusal(ErrorCode.FILE_MISSING, "pinctrl-bcm2835", "gpiochip0"):
         find_chip("pinctrl-bcm2835", tmp_path)

@@ -8,7 +8,7 @@ import shlex
 import pytest
 from tests.support.pi.fakes import FakeLines
 from tests.support.pi.program import Process
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig, set_stage_port
 
 from polysight_pi import PROGRAM
@@ -194,7 +194,7 @@ def test_keys_are_advised_as_a_command_that_works(command, tmp_path):
     assert command("keys", "--dir", folder, "--list")[1] == "no client is allowed\n"
 
     (folder / "pi.key_secret").write_text("public-key = 'short'\nsecret-key = 'short'\n")
-    with make_server_context() as context, refused(ErrorCode.FILE_MISSING, "CURVE") as error:
+    with make_server_context() as context, expect_refusal(ErrorCode.FILE_MISSING, "CURVE") as error:
         create_replier(context, "tcp://0.0.0.0:*", folder).close()
     assert command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == 0
 

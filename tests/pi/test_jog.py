@@ -9,7 +9,7 @@ import msgspec
 import pytest
 import zmq
 from tests.support.processes import wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.acquisition import PiClient
 from polysight.cli.main import main
@@ -61,7 +61,7 @@ def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):
 
     person = threading.Thread(target=abort_later)
     person.start()
-    with refused(ErrorCode.STAGE_NOT_READY, "aborted"):
+    with expect_refusal(ErrorCode.STAGE_NOT_READY, "aborted"):
         client.jog("x", 10.0, 20.0)
     person.join()
     assert pi.host.wait(m.Jogged).status == "aborted"

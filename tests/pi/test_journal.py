@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import pytest
 from hypothesis import given, settings, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_pi import journal as journal_module
 from polysight_pi.client import replay_events
@@ -112,7 +112,7 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
         return n
 
     monkeypatch.setattr(journal_module.os, "pwrite", full)
-    with refused(ErrorCode.DISK_FULL, j.path, "No space left"):
+    with expect_refusal(ErrorCode.DISK_FULL, j.path, "No space left"):
         j.write([b"lost 1", b"lost 2"])
     assert (j.last_seq, j.read(1, 9)) == (1, [b"kept"])
     monkeypatch.undo()
@@ -125,19 +125,19 @@ def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
 def test_a_file_of_another_program_is_refused_and_kept(tmp_path):
     path = tmp_path / "a.journal"
     path.write_bytes(b"somebody's notes")
-    with refused(ErrorCode.FILE_FOREIGN, path):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, path):
         JournalFile(path)
     assert path.read_bytes() == b"somebody's notes"
 
 
 def test_one_process_a_folder(tmp_path):
     folder = Journal(tmp_path / "j")
-    with refused(ErrorCode.BUSY, tmp_path / "j"):
+    with expect_refusal(ErrorCode.BUSY, tmp_path / "j"):
         Journal(tmp_path / "j")
     folder.close()
     Journal(tmp_path / "j").close()
     (tmp_path / "file").write_text("")
-    with refused(ErrorCode.FILE_UNREADABLE, tmp_path / "file" / "j"):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, tmp_path / "file" / "j"):
         Journal(tmp_path / "file" / "j")
 
 
@@ -225,13 +225,13 @@ def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     folder.check_room("scan", 70_000)
-    with refused(ErrorCode.DISK_FULL, "26.6 MB free", "26.6 MB needed", 70_001):
+    with expect_refusal(ErrorCode.DISK_FULL, "26.6 MB free", "26.6 MB needed", 70_001):
         folder.check_room("scan", 70_001)
     folder.journal_path("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
     free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
     # Only the rest needs space
     folder.check_room("there", 70_000)
-    with refused(ErrorCode.DISK_FULL):
+    with expect_refusal(ErrorCode.DISK_FULL):
         folder.check_room("another", 70_000)
     folder.close()
 

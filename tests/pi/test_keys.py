@@ -9,7 +9,7 @@ import pytest
 import zmq
 from tests.support.paths import REPO, RIG_FILE
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused as expect_refused
+from tests.support.refusals import expect_refusal as expect_refused
 from tests.support.rigs import load_published_rig
 from zmq.auth import load_certificate
 

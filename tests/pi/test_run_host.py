@@ -18,7 +18,7 @@ from hypothesis import given, settings, strategies as st
 from tests.support.pi.fakes import FakeDriver, FakeLines
 from tests.support.pi.host_side import Running
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import set_stage_port
 
 from polysight_pi import executor as executors, system
@@ -324,7 +324,7 @@ def test_the_commands_on_the_pi_wait_for_a_service_that_answers_late(rig):
         pi = msgspec.structs.replace(rig.pi, command_address=f"tcp://127.0.0.1:{port}")
         thread = threading.Thread(target=answer)
         thread.start()
-        with refused(ErrorCode.REFUSED_BY_PEER, "the host is alive"):
+        with expect_refusal(ErrorCode.REFUSED_BY_PEER, "the host is alive"):
             home_by_service(msgspec.structs.replace(rig, pi=pi))
         thread.join()
 

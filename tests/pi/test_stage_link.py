@@ -12,7 +12,7 @@ import msgspec
 import pytest
 from tests.support.pi.fakes import FakeStage
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig, set_stage_port
 from tests.support.stage.processes import StageProcess
 
@@ -156,16 +156,16 @@ def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
 
 
 def test_no_port_and_another_protocol(tmp_path, monkeypatch, connect):
-    with refused(ErrorCode.FILE_UNREADABLE, tmp_path / "none"):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, tmp_path / "none"):
         StageLink(str(tmp_path / "none"), 115200, lambda _: None)
     monkeypatch.setattr("polysight_pi.stage.PROTOCOL_VERSION", 9)
-    with refused(ErrorCode.VERSION_UNSUPPORTED, "protocol 2", 9):
+    with expect_refusal(ErrorCode.VERSION_UNSUPPORTED, "protocol 2", 9):
         connect()
 
 
 def test_other_steps_per_mm_are_refused_before_a_motion(dry_stage, instrument):
     dry_stage.steps = "160"
-    with refused(ErrorCode.MISMATCH, 160, 200), BenchStage(set_stage_port(instrument, dry_stage.port).stage):
+    with expect_refusal(ErrorCode.MISMATCH, 160, 200), BenchStage(set_stage_port(instrument, dry_stage.port).stage):
         pass
     assert [c.verb for c in dry_stage.seen] == ["HELLO"]
 

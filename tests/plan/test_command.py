@@ -7,7 +7,7 @@ import tomllib
 import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_rig_table, make_rig_with
 from tests.support.scenes import EVERYWHERE, make_scene
 from tests.support.store.facts import load_facts
@@ -194,7 +194,7 @@ def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, read_plan):
 def test_a_scan_without_rows_has_no_noise(scan, tmp_path):
     empty_scan = ScanFolder.load(scan)
     empty = ScanFolder.create(tmp_path / "empty", empty_scan.instrument, empty_scan.plan, simulated=True)
-    with refused(ErrorCode.NOT_ENOUGH_DATA):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
         measure_noise(empty)
 
 

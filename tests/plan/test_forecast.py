@@ -5,7 +5,7 @@ import re
 import msgspec
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import ImageBuilder, PhaseSlope, backproject, compute_field_limits
 from polysight.imaging.geometry import Antennas
@@ -37,7 +37,9 @@ def test_a_new_step_keeps_the_aperture(rig):
     "changes", [PlanChanges(width_mm=900.0), PlanChanges(speed_mm_s=100.0, pulses=2, width_mm=760.0)]
 )
 def test_a_plan_whose_rows_exceed_the_travel_is_refused_by_the_rig_file_s_rule(rig, changes):
-    with refused(ErrorCode.VALUE_INVALID, "grid.columns", "stage.travel_x_mm", "polysight plan --help") as refusal:
+    with expect_refusal(
+        ErrorCode.VALUE_INVALID, "grid.columns", "stage.travel_x_mm", "polysight plan --help"
+    ) as refusal:
         changes.apply(rig)
     # No file holds these numbers.
     assert "correct" not in refusal.value.remedy

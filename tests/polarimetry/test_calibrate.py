@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight import polarimetry
@@ -114,9 +114,9 @@ def test_reference_over_the_whole_plane_removes_uneven_illumination():
 def test_dark_or_empty_metal_regions_are_refused():
     h, v = make_channels(4.0)
     for mask in (np.zeros(SHAPE, bool), ~(METAL | PLATE)):
-        with refused(ErrorCode.NO_DATA):
+        with expect_refusal(ErrorCode.NO_DATA):
             polarimetry.calibrate(make_images(h, v), mask)
-    with refused(ErrorCode.MISMATCH, (2, 2)):
+    with expect_refusal(ErrorCode.MISMATCH, (2, 2)):
         polarimetry.calibrate(make_images(h, v), np.ones((2, 2), bool))
 
 

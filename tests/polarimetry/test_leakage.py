@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.calibration import compute_remaining
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.polarimetry import Leakage, leakage_from_images
 from polysight.polarimetry.calibrate import (
@@ -108,7 +108,7 @@ def test_strips_reflect_the_field_along_them():
     # Strips along the transmitter's field on the plane reflect all of it.
     along = np.arctan(1 / np.cos(THETA))
     assert strips_wave(along, THETA) == pytest.approx((-1, -1))
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         strips_wave(-along, THETA)
 
 
@@ -123,9 +123,9 @@ def test_insufficient_standards_are_refused():
     rng = np.random.default_rng(1)
     plate = measure_metal_standard(truth, PLATE, rng)
     upright = measure_metal_standard(truth, strips_wave(UPRIGHT, THETA), rng)
-    with refused(ErrorCode.NOT_ENOUGH_DATA, 2):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, 2):
         estimate_leakage([plate, upright])
-    with refused(ErrorCode.VALUES_CONFLICT):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT):
         estimate_leakage([plate, plate, upright])
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         common_direction(np.zeros(5, complex), np.zeros(5, complex))

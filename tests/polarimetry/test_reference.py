@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import Images
 from polysight.polarimetry import fresnel, plane_reference
@@ -77,13 +77,13 @@ def test_facts_of_a_reference_hold_the_variation_of_the_gains_over_the_plane():
 
 def test_images_without_a_metal_plate_are_refused():
     dark = np.zeros((Y.size, X.size), complex)
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         plane_reference(make_images(dark, dark))
     spots = dark.copy()
     spots[::10, ::10] = 1.0
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         plane_reference(make_images(spots, spots), smooth_mm=2.0)
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         plane_reference(make_images(dark + 1, dark + 1)).check_axes(X + 1e-3, Y)
 
 
@@ -94,7 +94,7 @@ def test_a_scene_with_other_plates_than_the_metal_is_refused(permittivity):
     is_metal = (X < 0.07)[None, :]
     h = np.where(is_metal, 1.0, r[0]) * np.ones((Y.size, 1), complex)
     v = np.where(is_metal, 1.0, r[1]) * np.ones((Y.size, 1), complex)
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         plane_reference(make_images(h, v))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.support.pipelines import make_pipeline
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.cli.main import main
@@ -107,7 +107,7 @@ def test_an_empty_cube_is_an_error(tmp_path):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
     source = open_source(folder, SMALL)
     assert isinstance(source, PublishedCubes)
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         detect_form([0 * source.read_row("RH", 0).cube], source.instrument, source.instrument.receivers[0])
 
 

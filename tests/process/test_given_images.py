@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec import UNSET
 from tests.support.drawn_files import Errors, Material, write_labels
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight import open_scan
 from polysight.cli.main import main
@@ -195,7 +195,7 @@ WRONG = {
 @pytest.mark.parametrize(("changed", "code", "named"), WRONG.values(), ids=WRONG.keys())
 def test_wrong_files_are_refused_by_name(save_images, rig, changed, code, named):
     path = save_images(**changed)
-    with refused(code, path, named) as caught:
+    with expect_refusal(code, path, named) as caught:
         read_given_images(path, rig)
     assert caught.value.why
     assert caught.value.remedy
@@ -213,19 +213,19 @@ def test_images_without_a_phase_between_the_channels_are_refused(save_images, pa
     """Without it every loss would be found to be zero, with a small error."""
     h, v = lose(pair["h"], pair["v"])
     path = save_images(h=h, v=v)
-    with refused(ErrorCode.VALUE_INVALID, path, "no phase between h and v"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, path, "no phase between h and v"):
         analyse_file(path, rig)
 
 
 def test_files_that_are_not_an_archive_are_refused(tmp_path, rig):
     path = tmp_path / "other.npz"
-    with refused(ErrorCode.FILE_MISSING, path):
+    with expect_refusal(ErrorCode.FILE_MISSING, path):
         read_given_images(path, rig)
     path.write_bytes(b"PK no archive")
-    with refused(ErrorCode.FILE_UNREADABLE, path):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
         read_given_images(path, rig)
     np.savez(path, h=np.array([{}], dtype=object), v=np.ones((9, 9), complex))
-    with refused(ErrorCode.FILE_UNREADABLE, path):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
         read_given_images(path, rig)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import read_output
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight.cli.main import main
@@ -87,7 +87,7 @@ def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monke
     out = tmp_path / "out"
     publish_images(pipeline, out)
     monkeypatch.setattr(Pipeline, "examine", fails)
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         make_products(pipeline, out, ())
     assert read_products(out).valid.any()
 
@@ -138,7 +138,7 @@ def test_products_without_the_rows_that_were_recorded_meanwhile_replace_none(
         (resumed / MANIFEST).write_bytes(whole)
 
     monkeypatch.setattr(process, "add_rows", add_rows_and_resume)
-    with refused(ErrorCode.BUSY, f"polysight process {resumed} --out {resumed / 'products'}"):
+    with expect_refusal(ErrorCode.BUSY, f"polysight process {resumed} --out {resumed / 'products'}"):
         process.process(resumed, resumed / "products")
     assert not (resumed / "products").exists()
     # Elsewhere they are what was asked for.
@@ -159,7 +159,7 @@ def test_products_are_left_to_a_scan_that_was_resumed_meanwhile(
             running.enter_context(ManifestWriter(resumed / MANIFEST, create=False))
 
         monkeypatch.setattr(process, "add_rows", add_rows_and_resume)
-        with refused(ErrorCode.BUSY, "polysight preview"):
+        with expect_refusal(ErrorCode.BUSY, "polysight preview"):
             process.process(resumed, resumed / "products")
     assert not (resumed / "products").exists()
 

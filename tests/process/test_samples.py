@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from tests.support.pipelines import make_pipeline
 from tests.support.processes import HANG_S
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import PLANE_REACH_M, Images
 from polysight.jobs.process import image, process
@@ -106,7 +106,7 @@ def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> N
         raise DataError(f"row {row}", code=ErrorCode.NO_DATA)
 
     monkeypatch.setattr(ThreadPoolExecutor, "shutdown", stop)
-    with refused(ErrorCode.NO_DATA, "row 0"):
+    with expect_refusal(ErrorCode.NO_DATA, "row 0"):
         list(map_rows(add, range(1000), threads=2))
     assert len(begun) <= 3
 
@@ -292,7 +292,7 @@ def test_an_image_without_a_valid_pixel_is_an_error_that_names_the_board(
         words *= board not in dead
 
     damage_raw(monkeypatch, silent)
-    with refused(ErrorCode.NO_DATA, " and ".join(dead)):
+    with expect_refusal(ErrorCode.NO_DATA, " and ".join(dead)):
         if command == "image":
             image(scan, tmp_path / "out")
         else:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
@@ -71,5 +71,5 @@ def test_exports_are_written_to_the_folder_of_their_products_by_default(tmp_path
     assert create_export_folder(tmp_path / "products", tmp_path / "other") == tmp_path / "other"
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "linked-export").symlink_to(tmp_path / "elsewhere")
-    with refused(ErrorCode.PATH_OUTSIDE, "linked-export"):
+    with expect_refusal(ErrorCode.PATH_OUTSIDE, "linked-export"):
         create_export_folder(tmp_path / "linked", None)

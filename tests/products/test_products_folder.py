@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.products import folder as products_folder, write_json
 from polysight.products.folder import check_products_folder, replace_products
@@ -113,7 +113,7 @@ def test_hidden_files_of_other_programs_are_kept(out):
 def test_a_second_program_is_refused(out):
     with replace_products(out, "s") as new:
         write(new, NEW)
-        with refused(ErrorCode.BUSY, out):
+        with expect_refusal(ErrorCode.BUSY, out):
             replace(out)
     assert read(out) == NEW
 
@@ -128,24 +128,24 @@ def test_a_link_stays_a_link(out):
 
 def test_a_folder_that_must_not_be_replaced_is_refused(out, monkeypatch):
     write(out.parent / "thesis", {"thesis.tex": b"precious"})
-    with refused(ErrorCode.FILE_EXISTS, "thesis.tex"):
+    with expect_refusal(ErrorCode.FILE_EXISTS, "thesis.tex"):
         check_products_folder(out.parent / "thesis", "s")
     for path in (out / "image.npz", out / "image.npz" / "deeper"):
-        with refused(ErrorCode.FILE_UNREADABLE, path):
+        with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
             check_products_folder(path, "s")
     with monkeypatch.context() as mounted:
         mounted.setattr(Path, "is_mount", lambda path: path == out)
-        with refused(ErrorCode.VALUE_INVALID, out):
+        with expect_refusal(ErrorCode.VALUE_INVALID, out):
             check_products_folder(out, "s")
     monkeypatch.chdir(out)
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         check_products_folder(Path(), "s")
 
 
 def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
     write_json(out / "quality.json", {"raw_dropped": {"scan_id": "first", "dropped_utc": "2026-01-02T03:04:05"}})
     state_before = read(out)
-    with refused(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), replace_products(out, "second"):
+    with expect_refusal(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), replace_products(out, "second"):
         pytest.fail("it began")
     assert read(out) == state_before
     with replace_products(out, "first") as new:  # from a copy that has its raw rows

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.cli.main import main
@@ -110,7 +110,7 @@ def test_damaged_products_are_named(folder, capsys, name, content):
 
 
 def test_missing_products_are_named(tmp_path):
-    with refused(ErrorCode.FILE_MISSING, tmp_path, MATERIALS):
+    with expect_refusal(ErrorCode.FILE_MISSING, tmp_path, MATERIALS):
         read_products(tmp_path, MATERIALS)
     assert ProcessedScan(tmp_path).materials is None
     assert ProcessedScan(tmp_path).rig is None

@@ -9,7 +9,7 @@ import pytest
 import scipy.io
 import xarray
 from tests.support.products import NAMES, write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight import open_scan
 from polysight.cli.main import main
@@ -106,7 +106,7 @@ def test_p_sigma_has_the_shape_of_the_image(tmp_path):
     image = np.ones((2, 2), np.complex64)
     axis = np.array([0.0, 0.1])
     valid = np.ones((2, 2), bool)
-    with refused(ErrorCode.MISMATCH, "p_sigma"):
+    with expect_refusal(ErrorCode.MISMATCH, "p_sigma"):
         write_image(
             tmp_path / "i.npz",
             Images(h=image, v=image, x_m=axis, y_m=axis, valid=valid, p=image, p_sigma=np.ones((3, 2))),

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 from tests.support.radar.boards import Restarts
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import (
@@ -88,7 +88,7 @@ def test_only_the_transmitter_transmits(rig):
 def test_a_board_is_armed_only_after_the_radar_reported_it(radar, monkeypatch):
     radar.configure()
     monkeypatch.setattr(cores, "READY_S", 1e9)
-    with refused(ErrorCode.NO_ANSWER, "0x100B"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "0x100B"):
         radar.arm(FRAMES)
     assert radar.state is State.FAULT
     assert "0x100B" in radar.reason
@@ -186,7 +186,7 @@ def test_an_unplugged_board_is_a_fault_and_recovers_when_plugged_in(radar, board
     board.plugged = False
     assert radar.poll() is State.FAULT
     assert "unplugged" in radar.reason
-    with refused(ErrorCode.NO_ANSWER, "unplugged"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "unplugged"):
         radar.arm(FRAMES)
     board.plugged = True
     radar.arm(FRAMES)
@@ -260,7 +260,7 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
         words = Restarts(board, clock, state_after)
         radar = RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE)
         began = clock.time
-        with refused(ErrorCode.RADAR_RESTARTED, "RH"):
+        with expect_refusal(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
         assert clock.time - began < 8.0, state_after
         assert radar.state is State.FAULT
@@ -282,7 +282,7 @@ def test_a_refusal_just_after_a_restart_is_reported_as_a_restart(radar, board, m
         return execute(number, data, remaining)
 
     monkeypatch.setattr(board.cores, "execute", restarting)
-    with refused(ErrorCode.RADAR_RESTARTED, "LS"):
+    with expect_refusal(ErrorCode.RADAR_RESTARTED, "LS"):
         radar.configure()
 
 
@@ -295,7 +295,7 @@ def test_frames_that_end_right_after_arming_are_an_error(radar, board, monkeypat
             event(0x100F, b"", delay_s)
 
     monkeypatch.setattr(board.cores, "event", both)
-    with refused(ErrorCode.OTHER, "LS"):
+    with expect_refusal(ErrorCode.OTHER, "LS"):
         radar.arm(FRAMES)
 
 
@@ -305,7 +305,7 @@ def test_a_cable_unplugged_before_the_power_up_event_is_not_reported_as_wrong_ju
         board.plugged = False
 
     monkeypatch.setattr(words, "reset", pull)
-    with refused(ErrorCode.NO_ANSWER, "unplugged") as caught:
+    with expect_refusal(ErrorCode.NO_ANSWER, "unplugged") as caught:
         radar.configure()
     assert "jumpers" not in caught.value.why
 
@@ -316,7 +316,7 @@ def test_a_cable_unplugged_before_the_power_up_event_is_not_reported_as_wrong_ju
 )
 def test_an_ignored_fault_is_named_after_the_cause_of_a_failure(radar, board, faults, code):
     board.inject(*faults)
-    with refused(code) as caught:
+    with expect_refusal(code) as caught:
         radar.configure()
     assert caught.value.why.index("main core fault: register read-back error") > 20
 

@@ -4,7 +4,7 @@ import json
 import struct
 
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.calibration_data import (
@@ -70,7 +70,7 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     if name == "RH" and bit in OF_TX:
         radar.configure()
         return
-    with refused(ErrorCode.RADAR_FAULT, text):
+    with expect_refusal(ErrorCode.RADAR_FAULT, text):
         radar.configure()
     assert not (tmp_path / "kept").exists()
     assert 0x0100 not in board.executed
@@ -78,7 +78,7 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
 
 def test_a_calibration_folder_that_cannot_be_written_is_named(make_board, tmp_path):
     (tmp_path / "kept").write_text("a file in place of the folder")
-    with refused(ErrorCode.FILE_UNWRITABLE, tmp_path / "kept", "calibration_dir"):
+    with expect_refusal(ErrorCode.FILE_UNWRITABLE, tmp_path / "kept", "calibration_dir"):
         make_board(CalibrationFiles(tmp_path / "kept", b"settings")).configure()
 
 
@@ -99,6 +99,6 @@ def test_a_damaged_calibration_is_not_sent_to_a_board(make_board, board, tmp_pat
     (file,) = tmp_path.iterdir()
     file.write_text(spoil(file.read_text()))
     board.executed.clear()
-    with refused(ErrorCode.FILE_DAMAGED, file):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, file):
         make_board(files).configure()
     assert RestoreCalibration.ID not in board.executed

@@ -5,7 +5,7 @@ import zlib
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.radar.boards import BoardWords, Restarts, VirtualClock, make_native_rig
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.board import RadarBoard, State
 from polysight.radar.commands import make_program
@@ -43,7 +43,7 @@ def append_crc(data: bytes) -> bytes:
     ],
 )
 def test_a_file_that_is_not_an_image_is_refused_with_the_reason(data, why):
-    with refused(ErrorCode.FILE_FOREIGN, "image.bin", why):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, "image.bin", why):
         check_image(data, "image.bin")
 
 
@@ -131,7 +131,7 @@ def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
 
 def test_without_an_image_a_new_board_is_refused(new, clock):
     radar = make_board(new, clock)
-    with refused(ErrorCode.RADAR_NO_FIRMWARE) as caught:
+    with expect_refusal(ErrorCode.RADAR_NO_FIRMWARE) as caught:
         radar.configure()
     assert "image header" in caught.value.why  # from its boot status
 
@@ -180,7 +180,7 @@ def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     radar = RadarBoard(
         "LS", BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0"
     )
-    with refused(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
+    with expect_refusal(ErrorCode.MISMATCH, "5eed0001", "5eed0002"):
         use(radar)
     assert 0x0080 not in board.executed
 
@@ -201,7 +201,7 @@ def test_an_image_for_another_rom_is_not_sent(clock, rom, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     board.cores.main_rom = rom
     for use in (lambda r: r.write_flash(IMAGE, ignore), lambda r: r.configure()):
-        with refused(ErrorCode.MISMATCH, ".".join(map(str, rom))):
+        with expect_refusal(ErrorCode.MISMATCH, ".".join(map(str, rom))):
             use(make_board(board, clock, IMAGE))
     assert 0x4080 not in board.executed
     assert board.cores.flash == flash
@@ -217,7 +217,7 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
     """The same codes would mean other frequencies on such a device."""
     board = Simulated(lambda: clock.time, flash=DATA)
     setattr(board.cores, core, rom)
-    with refused(ErrorCode.MISMATCH, text):
+    with expect_refusal(ErrorCode.MISMATCH, text):
         make_board(board, clock, image).configure()
     assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
 
@@ -266,7 +266,7 @@ def test_a_restart_during_a_download_ends_it_immediately(clock, part):
     """The restarted ROM would take the next part as the first of another file."""
     board = Simulated(lambda: clock.time, flash=DATA, erase_s=0.1)
     words = Restarts(board, clock, part + 1)
-    with refused(ErrorCode.RADAR_RESTARTED, f"part {part} of 35"):
+    with expect_refusal(ErrorCode.RADAR_RESTARTED, f"part {part} of 35"):
         make_board(board, clock, words=words).write_flash(IMAGE, ignore)
     assert words.later == 0
     assert clock.time < 5.0
@@ -281,7 +281,7 @@ def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
         return (7, b"", 0.0) if len(calls) == 7 else download(data, remaining)
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
-    with refused(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):
+    with expect_refusal(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):
         make_board(new, clock).write_flash(IMAGE, ignore)
 
 
@@ -315,9 +315,9 @@ def test_the_reported_patch_is_compared_with_the_image(new, clock, monkeypatch, 
         radar.configure()
         assert any("reports patch 2.9.3.0 after the download" in line for line in radar.warnings)
         return
-    with refused(ErrorCode.RADAR_NO_FIRMWARE):
+    with expect_refusal(ErrorCode.RADAR_NO_FIRMWARE):
         radar.configure()
-    with refused(ErrorCode.MISMATCH, "0.0.0.0"):
+    with expect_refusal(ErrorCode.MISMATCH, "0.0.0.0"):
         radar.write_flash(IMAGE, ignore)
 
 

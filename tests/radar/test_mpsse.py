@@ -2,7 +2,7 @@
 
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.usb import UsbWords, encode_reads, encode_spi_setup, encode_writes
 from polysight_shared.errors import ErrorCode
@@ -69,7 +69,7 @@ def test_the_reset_is_released_in_functional_mode_only(board, chip):
 
 def test_a_short_read_is_an_error(chip, usb, monkeypatch):
     monkeypatch.setattr(chip, "give", lambda name, size: b"\0" * (size - 1))  # noqa: ARG005
-    with refused(ErrorCode.NO_ANSWER, "3 of 4 bytes"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "3 of 4 bytes"):
         usb.read(2)
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         usb.interrupt()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.radar.boards import BoardWords, change_radar_table
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar import board as boards
 from polysight.radar.commands import GET_DIE_ID
@@ -120,7 +120,7 @@ def test_a_board_that_missed_a_pulse_is_not_done(radars, usb):
 
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
     usb.boards["FTRV"].cores.die_number = 2
-    with refused(ErrorCode.VALUES_CONFLICT, "RH and RV"):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, "RH and RV"):
         NativeRadars(rig, usb.open, clock)
 
 
@@ -180,15 +180,15 @@ def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock)
         raise AssertionError(f"{serial} was opened")
 
     wrong = change_radar_table(rig, rx_gain_db=31)
-    with refused(ErrorCode.VALUE_INVALID, "RX gain step"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "RX gain step"):
         NativeRadars(wrong, never, clock)
-    with NativeRadars(rig, usb.open, clock) as native_radars, refused(ErrorCode.VALUE_INVALID, "frames"):
+    with NativeRadars(rig, usb.open, clock) as native_radars, expect_refusal(ErrorCode.VALUE_INVALID, "frames"):
         native_radars.arm(65536)
 
 
 def test_a_board_that_fails_at_the_start_closes_the_others(rig, usb, clock):
     usb.boards["FTRV"].cores.flash = b""
-    with refused(ErrorCode.RADAR_NO_FIRMWARE, "RV"):
+    with expect_refusal(ErrorCode.RADAR_NO_FIRMWARE, "RV"):
         NativeRadars(rig, usb.open, clock)
     assert all(link.closed for links in usb.links.values() for link in links)
 
@@ -196,7 +196,7 @@ def test_a_board_that_fails_at_the_start_closes_the_others(rig, usb, clock):
 def test_the_rig_file_must_have_every_board_and_each_serial_once(rig):
     table = to_builtins(rig)
     del table["radar"]["native"]["RV"]
-    with refused(ErrorCode.VALUE_INVALID, "radar.native"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "radar.native"):
         decode(table, Instrument, "rig.toml")
     twice = {n: NativeRadar("FT1") for n in ("LS", "RH", "RV")}
     with pytest.raises(ValueError, match="usb_serial"):

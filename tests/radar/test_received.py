@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import pytest
 from tests.support.radar.boards import VirtualClock
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar import messages as m
 from polysight.radar.commands import DEVICE_CONFIGURATION, GET_MAIN_VERSION, LOW_POWER_OFF, RF_POWER_UP
@@ -123,7 +123,7 @@ def test_a_refusal_without_a_body_ends_a_command_of_any_sequence_number_immediat
     """The known answer has number 0; it is not known if such a device repeats the command's number."""
     line, sent_words = connect(AWR1243_ERROR)
     line.sequence = sequence
-    with refused(ErrorCode.REFUSED_BY_PEER, "LowPower"):
+    with expect_refusal(ErrorCode.REFUSED_BY_PEER, "LowPower"):
         line.call(LOW_POWER_OFF)
     assert len([w for w in sent_words.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
@@ -131,7 +131,7 @@ def test_a_refusal_without_a_body_ends_a_command_of_any_sequence_number_immediat
 def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
     line, sent_words = connect(AWR2243_ERROR)
     line.sequence = 10
-    with refused(ErrorCode.REFUSED_BY_PEER, "LowPower", "error 62", "0x0105"):
+    with expect_refusal(ErrorCode.REFUSED_BY_PEER, "LowPower", "error 62", "0x0105"):
         line.call(LOW_POWER_OFF)
     assert len([w for w in sent_words.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
@@ -141,7 +141,7 @@ def test_a_response_of_another_core_is_not_an_answer(direction, kind):
     line, _ = connect(
         *[encode_message(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)] * 3
     )
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         line.call(DEVICE_CONFIGURATION)
 
 
@@ -152,7 +152,7 @@ def test_an_acknowledgement_with_a_16_bit_crc_is_accepted():
 
 def test_a_refusal_of_another_sequence_is_late():
     line, _ = connect(AWR2243_ERROR)
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         line.call(DEVICE_CONFIGURATION)
     assert "late" in line.warnings[0]
 
@@ -186,7 +186,7 @@ def test_an_answer_in_chunks_is_joined():
 @pytest.mark.parametrize("chunks", [[(1, 0x40E0)], [(2, 0x40E0), (0, 0x40E2)]], ids=["last", "middle"])
 def test_an_answer_with_a_missing_chunk_is_not_an_answer(chunks):
     line, _ = connect(*[encode_chunk(*fields, bytes(16)) for fields in chunks])
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         line.call(GET_MAIN_VERSION)
 
 

@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.radar.boards import BoardWords, VirtualClock, make_native_rig
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.board import RadarBoard
 from polysight.radar.commands import (
@@ -103,7 +103,7 @@ def test_events_come_in_order_and_once(link, board):
 
 def test_a_refusal_is_an_error_without_a_retry(link, board, sent):
     board.inject(Fault.REFUSE)
-    with refused(ErrorCode.REFUSED_BY_PEER, "RH", "LowPower", "error 6"):
+    with expect_refusal(ErrorCode.REFUSED_BY_PEER, "RH", "LowPower", "error 6"):
         link.call(LOW_POWER_OFF)
     assert len(decode_commands(sent)) == 1
 
@@ -111,7 +111,7 @@ def test_a_refusal_is_an_error_without_a_retry(link, board, sent):
 def test_retries_are_limited(link, board, sent, clock):
     board.inject(*[Fault.NO_ANSWER] * ATTEMPTS)
     began = clock.time
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         link.call(LOW_POWER_OFF)
     assert [m.retry for m in decode_commands(sent)] == [False, True, True]
     assert clock.time - began == pytest.approx(ATTEMPTS * 1.0, rel=0.05)
@@ -126,7 +126,7 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     words.reset(held=False)
     link.wait_for((MAIN_POWER_UP,), 1.0, ignore)
     board.inject(fault)
-    with refused(ErrorCode.NO_ANSWER):
+    with expect_refusal(ErrorCode.NO_ANSWER):
         link.call(RF_POWER_UP)
     assert len(decode_commands(sent)) == 1
 
@@ -154,14 +154,14 @@ def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(wo
 
 def test_an_unplugged_link_is_an_error_immediately(link, board):
     board.plugged = False
-    with refused(ErrorCode.NO_ANSWER, "unplugged"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "unplugged"):
         link.call(LOW_POWER_OFF)
-    with refused(ErrorCode.NO_ANSWER, "unplugged"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "unplugged"):
         link.poll()
 
 
 def test_an_event_that_does_not_come_is_a_timeout_with_its_number(link):
-    with refused(ErrorCode.NO_ANSWER, "0x100B", "2 s"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "0x100B", "2 s"):
         link.wait_for((0x100B,), 2.0, ignore)
 
 

@@ -7,7 +7,7 @@ import pytest
 from pyftdi.ftdi import Ftdi
 from pyftdi.usbtools import UsbTools
 from tests.support.radar import usb_bus
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.control import NativeRadars, RadarState
 from polysight.radar.usb import open_usb
@@ -85,14 +85,14 @@ def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
     assert plugged_chip.chip.words_written == [0x1234]
     assert all(other.chip.words_written == [] and other.modes == {} for other in other_chips)
 
-    with refused(ErrorCode.NO_ANSWER, "usb:1-7", "1-4.1, 1-4.2"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "usb:1-7", "1-4.1, 1-4.2"):
         open_usb("usb:1-7")
 
 
 def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, plugged_chip):
     second_chip = make_chip(RadarBoard(lambda: 0.0), "FT1234", (4, 3))
     bus.plug(second_chip)
-    with refused(ErrorCode.VALUES_CONFLICT, "1-4.2, 1-4.3") as caught:
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, "1-4.2, 1-4.3") as caught:
         open_usb("FT1234")
     assert "usb_path" in caught.value.remedy
     assert plugged_chip.modes == second_chip.modes == {}
@@ -105,13 +105,13 @@ def test_a_serial_number_of_two_chips_opens_neither_and_lists_their_paths(bus, p
 @pytest.mark.usefixtures("plugged_chip")
 def test_a_chip_that_cannot_be_claimed_is_an_error_with_the_cause(bus, number, code, cause):
     bus.refuses = number
-    with refused(code, "FT1234", cause):
+    with expect_refusal(code, "FT1234", cause):
         open_usb("FT1234")
 
 
 @pytest.mark.usefixtures("plugged_chip")
 def test_a_missing_chip_is_an_error_with_its_serial_number():
-    with refused(ErrorCode.NO_ANSWER, "FT9"):
+    with expect_refusal(ErrorCode.NO_ANSWER, "FT9"):
         open_usb("FT9")
 
 
@@ -130,7 +130,7 @@ def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged_chip, clo
         words.close()
     bus.pull(plugged_chip)
     if closed == "after":
-        with refused(ErrorCode.NO_ANSWER, "FT1234", "No such device"):
+        with expect_refusal(ErrorCode.NO_ANSWER, "FT1234", "No such device"):
             words.write([1])
         words.close()
     assert UsbTools.Devices == {}
@@ -151,7 +151,7 @@ def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
         bus.plug(plugged_chip)
         plugged_chip.transfers = 0
         plugged_chip.pull_at = position
-        with refused(ErrorCode.NO_ANSWER, "FT1234"):
+        with expect_refusal(ErrorCode.NO_ANSWER, "FT1234"):
             open_usb("FT1234")
         assert UsbTools.Devices == {}
     bus.plug(plugged_chip)
@@ -185,6 +185,6 @@ def test_a_scan_survives_a_replug_of_one_board(bus, rig, clock):
 def test_missing_pyftdi_is_an_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyftdi", None)
     monkeypatch.setitem(sys.modules, "pyftdi.ftdi", None)
-    with refused(ErrorCode.PACKAGE_MISSING, "pyftdi") as caught:
+    with expect_refusal(ErrorCode.PACKAGE_MISSING, "pyftdi") as caught:
         open_usb("FT1")
     assert "pip install pyftdi" in str(caught.value)

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from hypothesis import example, given, settings, strategies as st
 from tests.support.radar.boards import change_radar_table, make_native_rig
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.radar.commands import check_constraints, direct_if_hz, list_constraints, make_program
 from polysight_shared.config import Instrument, NativeRadar
@@ -188,7 +188,7 @@ def test_ldo_bypass_needs_this_boards_serial(rig):
         == {"LDO bypass of RH"}
     )
     assert list_broken_constraints(acknowledge_bypass("FTRH")) == set()
-    with refused(ErrorCode.VALUE_INVALID, "LDO bypass"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "LDO bypass"):
         check_constraints(acknowledge_bypass("yes"), FRAMES)
 
 

@@ -18,7 +18,7 @@ from tests.support.page.asking import TOKEN, ask, compute_digest, get, post, sen
 from tests.support.page.live_view import serve_folder
 from tests.support.processes import HANG_S
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.serve import ServerAddress, guard, server
 from polysight.serve.front import ConnectionLimit, CountedConnection
@@ -357,7 +357,7 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans
 
 @pytest.mark.parametrize("given", ["certificate", "key"])
 def test_a_certificate_without_its_key_is_refused_before_the_files_are_read(tmp_path, given):
-    with refused(ErrorCode.OTHER, "--certificate and --key"):
+    with expect_refusal(ErrorCode.OTHER, "--certificate and --key"):
         ServerAddress(**{given: tmp_path / "missing.pem"}).check()
 
 
@@ -371,7 +371,7 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     subprocess.run([str(w) for w in command], check=True, capture_output=True)
     # Two equal processes that are independent of each other
     for wrong in ("key.pem", "certificate.pem"):
-        with refused(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
+        with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
             ServerAddress("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
     place = ServerAddress("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
     with serve_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:

@@ -16,7 +16,7 @@ from tests.support.page.asking import ask, get, post
 from tests.support.page.live_view import open_control
 from tests.support.processes import HANG_S, wait_for
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.serve import server
 from polysight.serve.door import MOST_SILENT, is_command
@@ -238,11 +238,11 @@ def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_p
         assert cookie.partition("=")[2] == headers["set-cookie"].partition("=")[2]
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     path.chmod(0o644)
-    with refused(ErrorCode.VALUE_INVALID, path):
+    with expect_refusal(ErrorCode.VALUE_INVALID, path):
         load_token()
     path.chmod(0o600)
     path.write_text(token[: TOKEN_BYTES - 1])
-    with refused(ErrorCode.VALUE_INVALID, path):
+    with expect_refusal(ErrorCode.VALUE_INVALID, path):
         load_token()
     path.write_text(token[:TOKEN_BYTES])
     assert load_token() == token[:TOKEN_BYTES]
@@ -266,11 +266,11 @@ def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
         assert get(server, "/api/scans")["scans"] == []
     assert (tmp_path / "scans").is_dir()
     for folder, control in ((tmp_path / "drive" / "scans", True), (Path("only-shown"), False)):
-        with refused(ErrorCode.FILE_MISSING, folder, "mkdir -p"):
+        with expect_refusal(ErrorCode.FILE_MISSING, folder, "mkdir -p"):
             serve(folder, ServerAddress(), None, control)
         assert not folder.exists()
     (tmp_path / "scene.toml").touch()
-    with refused(ErrorCode.FILE_FOREIGN, tmp_path / "scene.toml", "is not a folder"):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path / "scene.toml", "is not a folder"):
         serve(tmp_path / "scene.toml", ServerAddress(), None, True)
 
 
@@ -278,7 +278,7 @@ def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
 def test_a_folder_of_something_else_than_a_scan_has_no_live_view(scans, folder):
     (scans.parent / "pictures").mkdir()
     (scans.parent / "pictures" / "one.jpg").touch()
-    with refused(ErrorCode.FILE_FOREIGN, scans.parent / folder) as caught:
+    with expect_refusal(ErrorCode.FILE_FOREIGN, scans.parent / folder) as caught:
         preview(scans.parent / folder, ServerAddress(port=0), control=False)
     assert (f"polysight preview {scans / 'one'}" in str(caught.value)) == (folder == "scans")
 

@@ -14,7 +14,7 @@ import zmq
 from tests.support.page.asking import TOKEN, get, post
 from tests.support.page.live_view import serve_folder
 from tests.support.processes import HANG_S, wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.catalogue import PROGRAM_FOLDER, find_program
@@ -75,7 +75,7 @@ def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
 
 
 def test_one_program_of_a_kind_runs_in_a_folder(programs, sleeping):
-    with refused(ErrorCode.BUSY):
+    with expect_refusal(ErrorCode.BUSY):
         programs.start(sleeping, "scan", ["--version"])
 
 

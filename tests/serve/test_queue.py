@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from tests.support.processes import wait_for
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.serve import programs
 from polysight.serve.programs import Queue
@@ -57,7 +57,7 @@ def queue(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 def test_scans_start_in_order_when_the_rig_is_free(queue, rig):
     assert queue.waiting().names == ["first", "second", "third"]
-    with refused(ErrorCode.NAME_TAKEN):
+    with expect_refusal(ErrorCode.NAME_TAKEN):
         queue.add("second", b'{"name": "second"}')
     queue.remove("second")
     for count, name in enumerate(("first", "third"), 1):

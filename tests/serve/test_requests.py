@@ -9,7 +9,7 @@ from tests.support.page.asking import TOKEN, post
 from tests.support.page.live_view import serve_folder
 from tests.support.paths import RIG_FILE
 from tests.support.products import write_judged_products
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import build_parser
 from polysight.cli.options import join_negative_values
@@ -60,7 +60,7 @@ BOX = (0.0, 0.0, 10.0, 10.0)
 )  # fmt: skip
 def test_a_limit_holds_just_inside_and_not_just_outside(kind, inside, outside):
     decode(inside, kind, "the request")
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         decode(outside, kind, "the request")
 
 
@@ -70,7 +70,7 @@ def test_a_plan_of_the_page_has_at_most_so_many_positions_after_its_steps():
     assert within.grid.columns == 1995
     most = PlanRequest(step_x_mm=0.3491, speed_mm_s=5.0).apply(RIG_FILE)
     assert most.grid.columns == MAX_POSITIONS
-    with refused(ErrorCode.VALUE_INVALID, MAX_POSITIONS):
+    with expect_refusal(ErrorCode.VALUE_INVALID, MAX_POSITIONS):
         PlanRequest(step_x_mm=0.348, speed_mm_s=5.0).apply(RIG_FILE)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_shared import geometry
 from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Section, load_instrument
@@ -130,7 +130,7 @@ def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instr
 def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value: object, code: ErrorCode, named: list):
     raw = read_toml(RIG_FILE)
     raw[table][key] = value
-    with refused(code, "my.toml", *named):
+    with expect_refusal(code, "my.toml", *named):
         decode(raw, Instrument, "my.toml")
 
 
@@ -141,17 +141,17 @@ def test_a_trigger_outlasts_the_debounce_by_its_clocks_steps(debounce_us: int):
     raw["stage"]["trigger_width_us"] = debounce_us + DEBOUNCE_TICKS_US
     assert decode(raw, Instrument, "my.toml").pi.trigger_debounce_us == debounce_us
     raw["stage"]["trigger_width_us"] -= 1
-    with refused(ErrorCode.VALUE_INVALID, "trigger_width_us", "trigger_debounce_us"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "trigger_width_us", "trigger_debounce_us"):
         decode(raw, Instrument, "my.toml")
 
 
 def test_a_missing_table_and_a_second_transmitter_are_refused():
     raw = read_toml(RIG_FILE)
     raw["boards"][1]["role"] = "transmit"
-    with refused(ErrorCode.VALUE_INVALID, "transmit"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "transmit"):
         decode(raw, Instrument, "my.toml")
     del raw["chirp"]
-    with refused(ErrorCode.KEY_MISSING, "chirp"):
+    with expect_refusal(ErrorCode.KEY_MISSING, "chirp"):
         decode(raw, Instrument, "my.toml")
 
 
@@ -168,14 +168,14 @@ def test_a_missing_file_bad_toml_and_binary_data_are_refused(tmp_path: Path, con
     path = tmp_path / "rig.toml"
     if content is not None:
         path.write_bytes(content)
-    with refused(code, path):
+    with expect_refusal(code, path):
         load_instrument(path)
 
 
 def test_a_file_in_another_encoding_is_reported_with_its_line(tmp_path: Path):
     path = tmp_path / "rig.toml"
     path.write_bytes("a = 1\n# M\xfcnchen\n".encode("latin-1"))
-    with refused(ErrorCode.FILE_UNREADABLE, path, "line 2", "save it as UTF-8"):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, path, "line 2", "save it as UTF-8"):
         read_toml(path)
 
 
@@ -200,7 +200,7 @@ def test_an_unknown_key_is_refused_with_a_suggestion(line, wrong, suggestion, tm
     text = RIG_FILE.read_text()
     assert text.count(f"\n{line}") == 1
     (tmp_path / "rig.toml").write_text(text.replace(f"\n{line}", f"\n{wrong}"))
-    with refused(ErrorCode.KEY_UNKNOWN, suggestion):
+    with expect_refusal(ErrorCode.KEY_UNKNOWN, suggestion):
         load_instrument(tmp_path / "rig.toml")
 
 

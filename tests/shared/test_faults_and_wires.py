@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tests.support.paths import REPO
 from tests.support.processes import HANG_S
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_shared.errors import DeviceError, ErrorCode, ProtocolError
 from polysight_shared.faults import EXPLANATIONS, PiFault, StageError, explain, format_c_header
@@ -66,5 +66,5 @@ def test_a_client_receives_all_edges_in_order_and_detects_the_end_of_the_hub(tmp
 
 
 def test_a_missing_hub_is_an_error(tmp_path: Path):
-    with refused(ErrorCode.NO_ANSWER, tmp_path):
+    with expect_refusal(ErrorCode.NO_ANSWER, tmp_path):
         WireClient(tmp_path / "none", timeout_s=0.05)

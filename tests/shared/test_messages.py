@@ -7,7 +7,7 @@ import msgspec
 import pytest
 from hypothesis import given, strategies as st
 from msgspec import inspect
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_shared import messages as m
 from polysight_shared.errors import ErrorCode, ProtocolError
@@ -106,7 +106,7 @@ def test_random_bytes_never_raise_anything_else(raw: bytes):
 
 def test_another_major_version_is_refused_by_name():
     raw = msgpack.packb({**msgspec.to_builtins(m.Home()), "version": "2.0"})
-    with refused(ErrorCode.VERSION_UNSUPPORTED, "Home", "2.0", m.WIRE_VERSION):
+    with expect_refusal(ErrorCode.VERSION_UNSUPPORTED, "Home", "2.0", m.WIRE_VERSION):
         m.unpack_command(raw)
 
 
@@ -129,5 +129,5 @@ def test_an_invalid_field_is_refused_by_name(change: dict, named: str):
     event = m.RowFinished(
         scan_id="a", seq=1, t_mono_ns=0, row_index=0, take=1, status="done", points=1, edges=1, bursts=1, pulses=16
     )
-    with refused(ErrorCode.MESSAGE_INVALID, named):
+    with expect_refusal(ErrorCode.MESSAGE_INVALID, named):
         m.unpack_event(msgpack.packb({**msgspec.to_builtins(event), **change}))

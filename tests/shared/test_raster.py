@@ -2,7 +2,7 @@
 
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_shared.config import Burst, Grid, Stage
 from polysight_shared.errors import ErrorCode
@@ -43,7 +43,7 @@ def test_the_grid_is_centred_and_rows_alternate(grid: Grid):
 def test_a_burst_longer_than_the_step_is_refused():
     grid = Grid(10, 10, 2.0, 2.0)
     stage = Stage("x", speed_mm_s=100.0)
-    with refused(ErrorCode.VALUES_CONFLICT, "24.00 ms", "20.00 ms"):
+    with expect_refusal(ErrorCode.VALUES_CONFLICT, "24.00 ms", "20.00 ms"):
         check_burst_fits(grid, Burst(16, 1500.0), stage)
     check_burst_fits(grid, Burst(8, 1500.0), stage)
 

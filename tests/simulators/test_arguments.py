@@ -5,7 +5,7 @@ import threading
 import msgspec
 import pytest
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import NativeRadar
@@ -38,7 +38,7 @@ def test_the_link_to_a_port_replaces_no_file(tmp_path):
     file.write_text("mine")
     arguments = stage.parser().parse_args(["--config", str(RIG_FILE), "--link", str(file)])
     for run in (lambda: stage._run(arguments, threading.Event()), lambda: uno._run(arguments)):
-        with refused(ErrorCode.FILE_EXISTS, file):
+        with expect_refusal(ErrorCode.FILE_EXISTS, file):
             run()
     assert file.read_text() == "mine"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults, PulseFaults
@@ -118,5 +118,5 @@ def test_a_fault_that_does_not_exist_is_refused(setting: str) -> None:
 def test_a_fault_that_cannot_happen_with_the_rigs_radars_is_refused(fault: str, control: str) -> None:
     assert read_faults(None, [fault], ("RH",), control=control)["RH"] != Faults()
     for foreign_control in {"endless", "line_server", "native"} - {control}:
-        with refused(ErrorCode.VALUES_CONFLICT, fault.partition("=")[0], foreign_control):
+        with expect_refusal(ErrorCode.VALUES_CONFLICT, fault.partition("=")[0], foreign_control):
             read_faults(None, [fault], ("RH",), control=foreign_control)

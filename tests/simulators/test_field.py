@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight_shared.config import Instrument
@@ -112,7 +112,7 @@ def test_an_empty_scene_has_no_echo_and_offsets_outside_are_refused() -> None:
     field = build_field(rig, scene, rig.receivers[0], sample_frequencies_hz(rig))
     assert np.all(field.interpolate(np.array([0.0]), np.array([0.0])) == 0)
     assert field.covers(np.array([0.14, 0.3]), np.array([0.1, 0.0])).tolist() == [True, False]
-    with refused(ErrorCode.MISMATCH, "300.00 mm"):
+    with expect_refusal(ErrorCode.MISMATCH, "300.00 mm"):
         field.interpolate(np.array([0.3]), np.array([0.0]))
 
 

@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 from msgspec import convert
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight_shared.errors import ConfigError, ErrorCode
@@ -89,7 +89,7 @@ def test_truth_json_has_plates_and_points(folder: Path) -> None:
 
 def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path) -> None:
     (tmp_path / "note").write_text("mine")
-    with refused(ErrorCode.FILE_EXISTS, tmp_path):
+    with expect_refusal(ErrorCode.FILE_EXISTS, tmp_path):
         simulate(RIG, SCENE, tmp_path)
     fast = decode_scene({**RAW, "stage": {"speed_mm_s": 600.0, "accel_mm_s2": 20000.0}}, "t")
     with pytest.raises(ConfigError):

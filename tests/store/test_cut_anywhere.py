@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 from tests.support.store.small_scan import SmallScan
 
@@ -204,7 +204,7 @@ def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
         (scan.path / name).write_bytes(raw[:cut])
         assert [name in f for f in list_faults(scan)] == [True]
         if suffix == ".bin":
-            with refused(ErrorCode.FILE_DAMAGED):
+            with expect_refusal(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
         # Row 1 is recorded last now
         assert resume(scan, undisturbed_scan, image=not cut) == {1}

@@ -5,7 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.jobs.process import process_rows
@@ -138,7 +138,7 @@ def test_only_rows_that_both_boards_have_are_read(tmp_path):
     (folder / "RV" / f"{COLUMNS - 1}_3.bin").unlink()
     scan = open_source(folder, BASE)
     assert list(scan.rows()) == [0, 1, 2]
-    with refused(ErrorCode.NO_DATA, 3, "RV"):
+    with expect_refusal(ErrorCode.NO_DATA, 3, "RV"):
         scan.read_row("RV", 3)
 
 
@@ -146,13 +146,13 @@ def test_files_that_contradict_each_other_are_refused(tmp_path):
     folder, _ = record(tmp_path, zero_filling=False)
     file = folder / "RH" / "0_0.bin"
     file.write_bytes(file.read_bytes()[:-100])
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         open_source(folder, BASE).read_row("RH", 0)
     (folder / "RH" / "0_0_log.csv").write_text("1,1456,1.0\nnonsense\n")
-    with refused(ErrorCode.FILE_DAMAGED, "0_0_log.csv", "nonsense"):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, "0_0_log.csv", "nonsense"):
         open_source(folder, BASE).read_row("RH", 0)
     file.rename(folder / "RH" / "6_0.bin")
-    with refused(ErrorCode.FILE_FOREIGN, "column 6"):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, "column 6"):
         open_source(folder, BASE)
 
 
@@ -161,7 +161,7 @@ def test_settings_of_another_number_of_chirps_are_refused(tmp_path, pulses):
     folder, _ = record(tmp_path)
     file = folder / "data_collection_cfg.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"num_trigger": pulses}))
-    with refused(ErrorCode.MISMATCH, f"num_trigger = {pulses}", f"{PULSES} chirps at each position"):
+    with expect_refusal(ErrorCode.MISMATCH, f"num_trigger = {pulses}", f"{PULSES} chirps at each position"):
         open_source(folder, BASE)
 
 
@@ -181,7 +181,7 @@ def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):
     folder, _ = record(tmp_path)
     for file in (folder / "RV").iterdir():
         file.unlink()
-    with refused(ErrorCode.NO_DATA, "fetch the files of both receiving boards again") as refusal:
+    with expect_refusal(ErrorCode.NO_DATA, "fetch the files of both receiving boards again") as refusal:
         process_rows(open_source(folder, BASE), folder)
     assert "polysight resume" not in refusal.value.remedy
 

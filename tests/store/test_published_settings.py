@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import load_published_rig
 
 from polysight.cli.options import rig_file
@@ -161,15 +161,15 @@ def test_units_of_tis_tools_are_understood_too(write, base):
 
 
 def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):
-    with refused(ErrorCode.FILE_FOREIGN, tmp_path):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path):
         open_source(tmp_path, base)
     folder = write(moving_direction="spiral")
-    with refused(ErrorCode.VALUE_INVALID, "moving_direction", "spiral"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "moving_direction", "spiral"):
         open_source(folder, base)
-    with refused(ErrorCode.KEY_MISSING):
+    with expect_refusal(ErrorCode.KEY_MISSING):
         open_source(folder)
     (folder / "data_collection_cfg.json").write_text("{")
-    with refused(ErrorCode.FILE_DAMAGED):
+    with expect_refusal(ErrorCode.FILE_DAMAGED):
         open_source(folder, base)
 
 
@@ -189,7 +189,9 @@ def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):
 )
 def test_a_value_that_no_scan_has_is_refused_by_the_files_own_key(write, base, key, value):
     folder = write(**{key: value})
-    with refused(ErrorCode.VALUE_INVALID, key, "data_collection_cfg.json", "docs/how-to/authors-data.md") as refusal:
+    with expect_refusal(
+        ErrorCode.VALUE_INVALID, key, "data_collection_cfg.json", "docs/how-to/authors-data.md"
+    ) as refusal:
         open_source(folder, base)
     assert "instrument.toml" not in str(refusal.value)
     assert "step_x_mm" not in str(refusal.value)
@@ -197,7 +199,7 @@ def test_a_value_that_no_scan_has_is_refused_by_the_files_own_key(write, base, k
 
 def test_a_whole_number_with_a_decimal_point_is_reported_as_such(write, base):
     folder = write(total_y=4.0)
-    with refused(ErrorCode.TYPE_WRONG, "total_y = 4.0: must be a whole number, without a decimal point"):
+    with expect_refusal(ErrorCode.TYPE_WRONG, "total_y = 4.0: must be a whole number, without a decimal point"):
         open_source(folder, base)
 
 
@@ -229,8 +231,8 @@ def test_synchronised_cubes_are_read(tmp_path, base):
     assert list(scan.rows()) == list(range(ROWS))
     np.testing.assert_array_equal(scan.read_row("RV", 2).cube, cube[:, 2])
     np.save(folder / "RH_synced.npy", cube[:, :2])
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         scan.read_row("RH", 0)
     np.save(folder / "RH_synced.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with refused(ErrorCode.FILE_DAMAGED):
+    with expect_refusal(ErrorCode.FILE_DAMAGED):
         scan.read_row("RH", 0)

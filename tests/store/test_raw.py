@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.paths import POLYSIGHT, RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.scenes import write_small_scene
 from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import FaultyDisk
@@ -94,7 +94,7 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     process = run_polysight("validate", scan)
     assert (process.returncode, process.stdout.count("note: raw: ")) == (0, 1)
     assert f"the raw data of {ROWS} rows was dropped after processing into products" in process.stdout
-    with refused(ErrorCode.NO_DATA, ROWS):
+    with expect_refusal(ErrorCode.NO_DATA, ROWS):
         resume(scan, DEFAULT, keep_incomplete=False, process=True)
     assert read_contents(scan / "products") == products
     assert drop_raw(scan, None, yes=True) == 0
@@ -141,7 +141,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             head.write_text(head.read_text().replace('"making": 1', '"making": 0'))
             code = ErrorCode.FILE_DAMAGED
             named = "samples.json"
-        with refused(code, named):
+        with expect_refusal(code, named):
             drop_raw(scan, None, yes=True)
     assert list_payloads(scan) == state_before
     assert not load_facts(scan, "raw_dropped")
@@ -165,11 +165,11 @@ def test_a_damaged_sample_of_a_dropped_row_is_named_and_costs_this_row(scan, tmp
     coverage = json.loads((tmp_path / "less" / "quality.json").read_text())["coverage"]
     assert coverage["rows_absent"] == [2]
     state_before = read_contents(scan / "products")
-    with refused(ErrorCode.NOT_ENOUGH_DATA, "products"):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "products"):
         process(scan, scan / "products")
     assert read_contents(scan / "products") == state_before
     (scan / "samples" / "rows.jsonl").unlink()
-    with refused(ErrorCode.NO_DATA, ROWS):
+    with expect_refusal(ErrorCode.NO_DATA, ROWS):
         process(scan, scan / "products")
 
 
@@ -179,7 +179,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(ConfigError):
             drop_raw(scan, None, yes=False)
-    with refused(ErrorCode.FILE_MISSING):
+    with expect_refusal(ErrorCode.FILE_MISSING):
         drop_raw(scan, tmp_path / "none", yes=True)
     quality = scan / "products" / "quality.json"
     said = json.loads(quality.read_text())
@@ -194,7 +194,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     with pytest.raises(DataError):
         drop_raw(scan, None, yes=True)
     (scan / "products" / "image.npz").write_bytes(b"half of it")
-    with refused(ErrorCode.FILE_DAMAGED):
+    with expect_refusal(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
     assert list_payloads(scan) == state_before
     assert not load_facts(scan, "raw_dropped")
@@ -216,14 +216,14 @@ def test_an_unfinished_scan_keeps_its_rows(scan):
     path = scan / MANIFEST
     lines = path.read_bytes().splitlines(keepends=True)
     path.write_bytes(b"".join(line for line in lines if b'"row":3' not in line))
-    with refused(ErrorCode.NOT_ENOUGH_DATA, "1 of 4", "polysight resume"):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "1 of 4", "polysight resume"):
         find_droppable(ScanFolder.load(scan), find_processed_digests(scan / "products"))
     with pytest.raises(ScanError):
         drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
 
 
 def test_a_scan_in_use_keeps_its_rows(scan):
-    with ScanFolder.load(scan).writer(), refused(ErrorCode.BUSY):
+    with ScanFolder.load(scan).writer(), expect_refusal(ErrorCode.BUSY):
         drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
     assert len(list_payloads(scan)) == ROWS * BOARDS
 
@@ -310,5 +310,5 @@ def test_a_row_taken_again_is_there_again(scan):
     folder.reload()
     assert {Path(file).name for file in dropped_files(folder)} == {"0000.bin", "0002.bin", "0003.bin"}
     assert sum("0001.bin" in e for e in list_errors(scan)) == BOARDS
-    with refused(ErrorCode.NO_DATA, "3 rows"):
+    with expect_refusal(ErrorCode.NO_DATA, "3 rows"):
         require_raw(folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.support.capture.records import Record, make_log, make_mask
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.rigs import make_rig_with
 from tests.support.store.faulty_disk import FaultyDisk, Killed
 from tests.support.store.plain_scan import list_errors
@@ -144,7 +144,7 @@ def test_a_damaged_file_is_reported_and_never_placed(tmp_path, suffix, other):
         (scan.path / "raw/RV").rename(scan.path / "raw/RH")
         (scan.path / "raw/x").rename(scan.path / "raw/RV")
     board = "RV" if other else "RH"
-    with refused(ErrorCode.FILE_DAMAGED):
+    with expect_refusal(ErrorCode.FILE_DAMAGED):
         inspect_placement(scan.path / f"raw/{board}/0000.bin", as_json=False)
     remaining = {r.board: r.damaged for r in replace_rows(scan)}
     assert remaining == {"RH": not other, "RV": other}
@@ -171,7 +171,7 @@ def test_batches_that_take_packets_back_are_damage(tmp_path):
     batches = np.frombuffer(tail, dtype="<i8", count=4).copy()
     batches[1] += 1 << 40
     path.write_bytes(line + b"\n" + batches.tobytes() + tail[32:])
-    with refused(ErrorCode.FILE_DAMAGED, path):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, path):
         read_packets(path, np.zeros(10**6, np.uint8))
 
 

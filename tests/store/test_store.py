@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from tests.support.acquisition.fake_rig import make_small_instrument
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts, parse_fact
 from tests.support.store.plain_scan import write_scan
 
@@ -83,9 +83,9 @@ def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_cont
 def test_two_writers_never_share_a_scan(tmp_path):
     path = tmp_path / "manifest.jsonl"
     with ManifestWriter(path, create=True):
-        with refused(ErrorCode.BUSY):
+        with expect_refusal(ErrorCode.BUSY):
             ManifestWriter(path, create=False)
-        with refused(ErrorCode.FILE_EXISTS):
+        with expect_refusal(ErrorCode.FILE_EXISTS):
             ManifestWriter(path, create=True)
     ManifestWriter(path, create=False).close()
 
@@ -209,14 +209,14 @@ def test_a_scan_that_is_being_recorded_has_not_ended(whole_scan):
 def test_read_row_refuses_damage(whole_scan):
     flip(whole_scan / "raw/RH/0002.bin")
     scan = ScanFolder.load(whole_scan)
-    with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, "0002.bin"):
         _ = scan.read_row("RH", 2).payload
-    with refused(ErrorCode.FILE_DAMAGED, "0002.bin"):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, "0002.bin"):
         for _ in scan.read_row("RH", 2).pieces(100):
             pass
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         scan.read_row("LS", 2)
-    with refused(ErrorCode.NO_DATA):
+    with expect_refusal(ErrorCode.NO_DATA):
         scan.read_row("RH", 17)
 
 
@@ -236,10 +236,10 @@ def test_pieces_of_any_size_are_the_payload(whole_scan, size):
 
 
 def test_other_folders_are_refused(whole_scan, tmp_path):
-    with refused(ErrorCode.FILE_MISSING):
+    with expect_refusal(ErrorCode.FILE_MISSING):
         validate(tmp_path / "nothing")
     (whole_scan / "manifest.jsonl").write_bytes(b"")
-    with refused(ErrorCode.FILE_DAMAGED, "scan_started"):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, "scan_started"):
         ScanFolder.load(whole_scan)
     (whole_scan / "manifest.jsonl").write_bytes(encode_line({"fact": "scan_started", "instrument": {}, "plan": {}}))
     with pytest.raises(ConfigError):

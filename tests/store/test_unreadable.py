@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 from tests.support.store.faulty_disk import GROWS, FaultyDisk
 from tests.support.store.plain_scan import list_errors
@@ -27,7 +27,7 @@ def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(manifest.fcntl, "flock", refuse_lock)
-    with refused(ErrorCode.FILE_UNWRITABLE, os.strerror(errno.ENOLCK)):
+    with expect_refusal(ErrorCode.FILE_UNWRITABLE, os.strerror(errno.ENOLCK)):
         ManifestWriter(path, create=False)
 
 
@@ -47,7 +47,7 @@ def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypa
         Path, "open", lambda path, *arguments, **options: raise_for_bad(path) or path_open(path, *arguments, **options)
     )
     monkeypatch.setattr(Path, "read_bytes", lambda path: raise_for_bad(path) or path_read(path))
-    with refused(ErrorCode.FILE_UNREADABLE, os.strerror(error_number)) as e:
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, os.strerror(error_number)) as e:
         validation.find_damaged_rows(scan)
     assert f"polysight resume {undisturbed_scan.path}" in e.value.remedy
     assert [f.where for f in validation.validate(undisturbed_scan.path)] == [
@@ -124,7 +124,7 @@ def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_pat
     raw = (scan.path / "manifest.jsonl").read_bytes()
     with disk(), folder.writer() as writer:
         disk.at = len(disk.done) + 1
-        with refused(ErrorCode.DISK_FULL):
+        with expect_refusal(ErrorCode.DISK_FULL):
             writer.append({"fact": "row_committed", "row": 0})
         assert (scan.path / "manifest.jsonl").read_bytes() == raw
         disk.free_space()

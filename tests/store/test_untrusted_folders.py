@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 from tests.support.paths import RIG_FILE
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
 
 from polysight.calibration import load_scan_calibration
@@ -60,7 +60,7 @@ def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
     victim.write_bytes(b"mine")
     commit_first_row_as(scan, file)
     for use in (scan.committed_rows, lambda: list(scan.rows()), lambda: find_droppable(scan, {})):
-        with refused(ErrorCode.PATH_OUTSIDE):
+        with expect_refusal(ErrorCode.PATH_OUTSIDE):
             use()
     assert any(f.level == "error" for f in validate(scan.path))
     assert victim.read_bytes() == b"mine"
@@ -71,7 +71,7 @@ def test_a_link_out_of_the_scan_is_refused(scan, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     (scan.path / "raw" / name).rename(elsewhere)
     (scan.path / "raw" / name).symlink_to(elsewhere)
-    with refused(ErrorCode.PATH_OUTSIDE):
+    with expect_refusal(ErrorCode.PATH_OUTSIDE):
         ScanFolder.load(scan.path)
 
 
@@ -111,7 +111,7 @@ def write_bomb(path: Path, size: int = 6 << 30) -> Path:
 
 @pytest.mark.parametrize("read", [read_image, read_patches, Library.load], ids=["image", "patches", "library"])
 def test_an_archive_that_claims_too_much_is_refused_by_its_size(read, tmp_path):
-    with refused(ErrorCode.FILE_TOO_LARGE):
+    with expect_refusal(ErrorCode.FILE_TOO_LARGE):
         read(write_bomb(tmp_path / "big.npz"))
 
 
@@ -149,7 +149,7 @@ def test_a_packet_log_that_claims_too_much_is_refused(scan, change):
     end = 16 * head["batches"] + RUN.itemsize * head["runs"]
     runs = change(head, np.frombuffer(tail[batches_end:end], RUN))
     path.write_bytes(json.dumps(head).encode() + b"\n" + tail[:batches_end] + runs.tobytes() + tail[end:])
-    with refused(ErrorCode.FILE_DAMAGED):
+    with expect_refusal(ErrorCode.FILE_DAMAGED):
         read_packets(path, np.fromfile(scan.path / board.file, dtype=np.uint8))
 
 
@@ -182,7 +182,7 @@ def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_pa
 
 def test_a_pipe_in_a_scan_is_refused(scan):
     os.mkfifo(scan.path / "raw" / "pipe")
-    with refused(ErrorCode.FILE_FOREIGN, "raw/pipe"):
+    with expect_refusal(ErrorCode.FILE_FOREIGN, "raw/pipe"):
         ScanFolder.load(scan.path)
 
 
@@ -218,13 +218,13 @@ def rewrite_first_line(scan: ScanFolder, **answer: object) -> Path:
 @pytest.mark.parametrize("file", ["../hpf.toml", "/etc/passwd"])
 def test_calibration_outside_the_scan_is_not_read(scan, file):
     answer = {"hpf": {"file": file, "crc32": "0", "copied_from": ""}}
-    with refused(ErrorCode.PATH_OUTSIDE):
+    with expect_refusal(ErrorCode.PATH_OUTSIDE):
         load_scan_calibration(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
 
 
 def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
     rig = load_facts(scan)[0]["instrument"]
-    with refused(ErrorCode.PATH_OUTSIDE):
+    with expect_refusal(ErrorCode.PATH_OUTSIDE):
         load_scan_calibration(
             ScanFolder.load(
                 rewrite_first_line(scan, instrument={**rig, "calibration": {"hpf": "/etc/passwd"}}, calibration=None)
@@ -234,7 +234,7 @@ def test_a_rig_file_in_a_manifest_names_no_calibration_elsewhere(scan):
 
 @pytest.mark.parametrize("answer", ["text", ["a"], {"hpf": "a"}, {"hpf": {"file": 3}}])
 def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
-    with refused(ErrorCode.FILE_DAMAGED, "manifest.jsonl"):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, "manifest.jsonl"):
         load_scan_calibration(ScanFolder.load(rewrite_first_line(scan, calibration=answer)))
 
 
@@ -242,7 +242,7 @@ def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
     name, board = next(iter(scan.committed_rows()[0].boards.items()))
     # A hole: the file takes no space, its bytes would
     os.truncate(scan.path / board.file, 1 << 42)
-    with refused(ErrorCode.FILE_DAMAGED, 1 << 42):
+    with expect_refusal(ErrorCode.FILE_DAMAGED, 1 << 42):
         _ = scan.read_row(name, 0).payload
     assert board.file in str(find_droppable(scan, {name: {0: board.crc32}}).kept_files)
 
@@ -280,7 +280,7 @@ def test_a_netcdf_file_that_claims_too_much_is_refused_by_its_size(tmp_path):
     with h5py.File(tmp_path / "big.nc", "w") as f:
         f.create_dataset("h_real", shape=(1 << 20, 1 << 20), dtype="f4", chunks=(1024, 1024), compression="gzip")
     assert (tmp_path / "big.nc").stat().st_size < 1 << 20
-    with refused(ErrorCode.FILE_TOO_LARGE):
+    with expect_refusal(ErrorCode.FILE_TOO_LARGE):
         read_netcdf(tmp_path / "big.nc")
 
 
@@ -296,7 +296,7 @@ def link_folder(f: h5py.File) -> None:
 def test_a_netcdf_file_with_arrays_in_other_files_is_refused(make, tmp_path):
     with h5py.File(tmp_path / "a.nc", "w") as f:
         make(f)
-    with refused(ErrorCode.PATH_OUTSIDE):
+    with expect_refusal(ErrorCode.PATH_OUTSIDE):
         read_netcdf(tmp_path / "a.nc")
 
 

@@ -9,7 +9,7 @@ from polysight_shared.errors import ErrorCode, PolysightError
 
 
 @contextmanager
-def refused(code: ErrorCode, *values: object) -> Iterator[pytest.ExceptionInfo[PolysightError]]:
+def expect_refusal(code: ErrorCode, *values: object) -> Iterator[pytest.ExceptionInfo[PolysightError]]:
     """The block must raise a `PolysightError` with this code whose text has all `values` (names, numbers, paths)."""
     with pytest.raises(PolysightError) as caught:
         yield caught

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.support.kept import assert_kept, collect_figures, describe_figures, summarise_array
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.data import find_packaged
 from polysight.report import surface_figure
@@ -169,7 +169,7 @@ def test_a_file_that_is_not_a_surface_is_refused_by_name(content: Any, tmp_path)
     elif content is not None:
         arrays: dict[str, Any] = content
         np.savez(path, allow_pickle=False, **arrays)
-    with refused(ErrorCode.FILE_UNREADABLE, path):
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, path):
         read_surface(path)
 
 

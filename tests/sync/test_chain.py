@@ -5,7 +5,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.sync import BoardSetup, synchronise_row
 from polysight.sync.cubes import CubeForm
@@ -181,12 +181,12 @@ def test_a_row_without_frames_is_invalid(setup):
 
 @pytest.mark.parametrize("shape", [(3, PULSES, 256), (4, PULSES + 1, 256), (4, PULSES, 128)])
 def test_frames_of_another_rig_are_refused(setup, shape):
-    with refused(ErrorCode.MISMATCH, shape[1]):
+    with expect_refusal(ErrorCode.MISMATCH, shape[1]):
         synchronise_row(np.zeros(shape, np.complex64), np.ones(shape[1], bool), setup)
 
 
 def test_a_truncated_recording_is_refused(setup):
-    with refused(ErrorCode.NOT_ENOUGH_DATA, PULSES):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, PULSES):
         synchronise_row(np.zeros((4, PULSES, 256), np.complex64), np.ones(2 * PULSES, bool), setup)
 
 

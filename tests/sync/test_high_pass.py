@@ -3,7 +3,7 @@
 import msgspec
 import numpy as np
 import pytest
-from tests.support.refusals import refused
+from tests.support.refusals import expect_refusal
 
 from polysight.sync.high_pass_filter import Equaliser, HighPass, apply_filter, fit_high_pass, high_pass
 from polysight_shared.errors import ErrorCode
@@ -86,7 +86,7 @@ def test_a_fit_recovers_the_corners_of_a_sweep(corners):
 
 def test_an_insufficient_sweep_is_refused():
     f = np.linspace(1.5e6, 1.9e6, 40)
-    with refused(ErrorCode.NOT_ENOUGH_DATA, 5):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, 5):
         fit_high_pass(f[:5], np.ones(5))
-    with refused(ErrorCode.MISMATCH):
+    with expect_refusal(ErrorCode.MISMATCH):
         fit_high_pass(f, 1 + 0 * f)

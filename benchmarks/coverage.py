@@ -375,7 +375,7 @@ def _read_names(seed: int) -> list[tuple[float, bool]]:
     plates = truth_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
-    named = [(r.verdict, true[r.patch.label]) for r in result.patches if r.patch.label in true]
+    named = [(r.patch_name, true[r.patch.label]) for r in result.patches if r.patch.label in true]
     return [(v.confidence, v.name == plate.name) for v, plate in named if v is not None and v.name != UNKNOWN]
 
 

@@ -99,7 +99,7 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
         stack = plates[patch.patch.label].stack
         if stack.is_metal:
             continue
-        verdict = patch.verdict
+        patch_name = patch.patch_name
         e = patch.permittivity
         if stack.layers:
             true = stack.layers[0][0]
@@ -115,11 +115,11 @@ def judge_scene(kind: str, seed: int, nuisance: str = "none") -> list[Piece]:
         source = None
         confidence = 0.0
         alike = False
-        if verdict is not None:
-            name = verdict.name
-            source = verdict.source
-            confidence = verdict.confidence
-            alike = any(_is_alike(literature_name, true) for literature_name in verdict.literature)
+        if patch_name is not None:
+            name = patch_name.name
+            source = patch_name.source
+            confidence = patch_name.confidence
+            alike = any(_is_alike(literature_name, true) for literature_name in patch_name.literature)
         out.append(
             Piece(
                 material=plates[patch.patch.label].name,

@@ -146,7 +146,7 @@ def measure(
     scanned = PlanChanges(step_y_mm=every * rig.grid.step_y_mm).apply(rig)
     result = name_patches(rig, images, plates)
     pairs = [(r, r.truth) for r in result.patches if r.truth is not None]
-    right = sum(r.verdict is not None and r.verdict.name == t.name for r, t in pairs)
+    right = sum(r.patch_name is not None and r.patch_name.name == t.name for r, t in pairs)
     errors = [
         abs(r.permittivity.value.real / t.permittivity.real - 1)
         for r, t in pairs

@@ -392,9 +392,9 @@ def compare_with_plate(nuisance: str, patch: PatchResult, plate: generator.Plate
         error = abs(deviation) / abs(plate.stack.below)
     name = UNKNOWN
     confidence = 0.0
-    if patch.verdict is not None:
-        name = patch.verdict.name
-        confidence = patch.verdict.confidence
+    if patch.patch_name is not None:
+        name = patch.patch_name.name
+        confidence = patch.patch_name.confidence
     return PatchFigures(
         nuisance=nuisance,
         material=plate.name,
@@ -403,7 +403,7 @@ def compare_with_plate(nuisance: str, patch: PatchResult, plate: generator.Plate
         error=error,
         name=name,
         confidence=confidence,
-        of_library=patch.verdict is not None and patch.verdict.source == "library",
+        of_library=patch.patch_name is not None and patch.patch_name.source == "library",
         refused=refused,
     )
 
@@ -460,7 +460,7 @@ def judge_metal(kind: str, seed: int, searched: bool) -> MetalFigures:
         shown_analysis = analysis
     else:
         shown_analysis = analysis.without_result()
-    names = [patch.verdict.name for patch in shown_analysis.patches if patch.verdict is not None]
+    names = [patch.patch_name.name for patch in shown_analysis.patches if patch.patch_name is not None]
     withdrawn = analysis.metal.evidence is not None and analysis.metal.evidence.against
     return MetalFigures(kind, seed, verdict.level, withdrawn, tuple(name for name in names if name != UNKNOWN))
 

@@ -87,7 +87,7 @@ def test_two_scans_are_enough_to_learn_from():
     library = fit_library(drawn.library())
     assert library.fit_for([60.0])["pixel_accuracy"] > 0.8
     named = Classifier(library).scan([s.x for s in [drawn.samples().take(drawn.samples().patches == 1)]])
-    assert named[0].verdict.name == drawn.materials[1].name
+    assert named[0].patch_name.name == drawn.materials[1].name
 
 
 def test_another_model_can_be_chosen_and_the_report_names_it(powders):
@@ -119,10 +119,10 @@ def test_patches_under_two_angles_are_named_together(two_angles, scans, model):
     matched = match_patches(scans)
     assert len(matched) == 9
     named = Classifier(two_angles[0], model=model, angles_deg=ANGLES).scan([m.features for m in matched])
-    assert sum(n.verdict.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
+    assert sum(n.patch_name.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
     for n in named:
-        assert 0 < n.verdict.confidence <= 1
-        assert sum(n.verdict.votes.values()) == pytest.approx(1)
+        assert 0 < n.patch_name.confidence <= 1
+        assert sum(n.patch_name.votes.values()) == pytest.approx(1)
 
 
 def test_patches_match_by_place_alone(scans):
@@ -142,11 +142,11 @@ def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(two_angle
     x = scans[0].patches[0].features.copy()
     x[0, 2] = np.nan
     broken, empty, all_nan = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])
-    assert broken.names[0] == UNKNOWN
+    assert broken.pixel_names[0] == UNKNOWN
     assert np.isinf(broken.distance[0])
-    assert broken.verdict.pixels == len(x) - 1
-    assert empty.verdict.name == all_nan.verdict.name == UNKNOWN
-    assert all_nan.names.tolist() == [UNKNOWN] * 2
+    assert broken.patch_name.pixels == len(x) - 1
+    assert empty.patch_name.name == all_nan.patch_name.name == UNKNOWN
+    assert all_nan.pixel_names.tolist() == [UNKNOWN] * 2
 
 
 def test_two_scans_as_typed(folders, capsys):

@@ -23,12 +23,12 @@ def test_an_unknown_patch_has_no_likelier_name(library, ratio, gain):
     rng = np.random.default_rng(5)
     h = 0.45 * gain * (1 + 0.006 * rng.standard_normal(60))
     p = ratio * (1 + 0.006 * rng.standard_normal(60))
-    verdict = Classifier(library, angles_deg=[ANGLE_DEG]).scan([pixel_features(h, np.abs(h / p), p)])[0].verdict
-    if verdict.name == UNKNOWN:
-        assert max(verdict.probabilities, key=lambda n: verdict.probabilities[n]) == UNKNOWN
-        assert verdict.confidence >= 0.5
+    patch_name = Classifier(library, angles_deg=[ANGLE_DEG]).scan([pixel_features(h, np.abs(h / p), p)])[0].patch_name
+    if patch_name.name == UNKNOWN:
+        assert max(patch_name.probabilities, key=lambda n: patch_name.probabilities[n]) == UNKNOWN
+        assert patch_name.confidence >= 0.5
     else:
-        assert max(verdict.probabilities, key=lambda n: verdict.probabilities[n]) == verdict.name
+        assert max(patch_name.probabilities, key=lambda n: patch_name.probabilities[n]) == patch_name.name
 
 
 def test_one_angle_given_twice_is_refused(library):

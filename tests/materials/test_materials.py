@@ -92,14 +92,14 @@ def test_at_least_eight_of_nine_named_right(name_placement):
     for seed in range(5):
         result = name_placement(seed)
         shares.append((materials.pixel_accuracy(result), materials.predict_pixel_accuracy(result)))
-        named = [r for r in result.patches if r.verdict is not None]
+        named = [r for r in result.patches if r.patch_name is not None]
         # The metal reference is not named by itself
         assert len(named) == 8
-        assert sum(r.verdict.name == r.truth.name for r in named) >= 7
+        assert sum(r.patch_name.name == r.truth.name for r in named) >= 7
         assert materials.pixel_accuracy(result) > 0.75
         for r in named:
-            assert 0 < r.verdict.confidence <= 1
-            assert sum(r.verdict.votes.values()) == pytest.approx(1)
+            assert 0 < r.patch_name.confidence <= 1
+            assert sum(r.patch_name.votes.values()) == pytest.approx(1)
     right, expected = np.mean(shares, axis=0)
     # Six scans are few training data: the classifier is rather too cautious
     assert 0.75 < expected < right + 0.05
@@ -149,7 +149,7 @@ def test_pixels_that_are_not_finite_are_unknown(library):
     assert verdicts.names[1] == verdicts.names[2] == materials.UNKNOWN
     assert verdicts.names[0] != materials.UNKNOWN
     assert np.isinf(verdicts.distance[1:]).all()
-    assert empty.verdict.name == materials.UNKNOWN
+    assert empty.patch_name.name == materials.UNKNOWN
 
 
 def test_a_majority_names_the_patch():
@@ -211,7 +211,7 @@ def test_truth_is_carried_but_never_used(synthetic, library, name_placement):
     scene = synthetic(4)
     answer = name_placement(4)
     blind = materials.analyse(scene.pair, Optics(THETA), classifier=materials.Classifier(library))
-    assert [r.verdict for r in answer.patches] == [r.verdict for r in blind.patches]
+    assert [r.patch_name for r in answer.patches] == [r.patch_name for r in blind.patches]
     assert all(r.truth is None for r in blind.patches)
     assert materials.pixel_accuracy(blind) is None
 

@@ -39,28 +39,28 @@ def name_ratios(*ratios: complex, std: float = 0.004, share: float = 0.5):
 @settings(max_examples=40, deadline=None)
 @given(st.floats(1.05, 12.0), st.floats(0.0, 8.0), st.floats(0.002, 0.05), st.integers(1, 2))
 def test_probabilities_sum_to_one_and_the_name_has_the_largest(real, loss, std, scans):
-    verdict = name_ratios(*inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans])), std=std).verdict
-    assert sum(verdict.probabilities.values()) == pytest.approx(1, abs=1e-9)
-    assert verdict.confidence == verdict.probabilities[verdict.name] == max(verdict.probabilities.values())
+    patch_name = name_ratios(*inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans])), std=std).patch_name
+    assert sum(patch_name.probabilities.values()) == pytest.approx(1, abs=1e-9)
+    assert patch_name.confidence == patch_name.probabilities[patch_name.name] == max(patch_name.probabilities.values())
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.floats(1.05, 12.0), st.floats(0.0, 8.0))
 def test_a_name_of_the_literature_is_never_one_of_the_library(real, loss):
-    verdict = name_ratios(complex(inverse_ratio(complex(real, -loss), ANGLES[0]))).verdict
-    if verdict.source == "library":
-        assert verdict.name in LIBRARY
+    patch_name = name_ratios(complex(inverse_ratio(complex(real, -loss), ANGLES[0]))).patch_name
+    if patch_name.source == "library":
+        assert patch_name.name in LIBRARY
     else:
-        assert verdict.name not in LIBRARY
-        assert verdict.name in (UNKNOWN, LAYER) or verdict.source == "literature"
+        assert patch_name.name not in LIBRARY
+        assert patch_name.name in (UNKNOWN, LAYER) or patch_name.source == "literature"
     with pytest.raises(DataError):
-        clean_name(verdict.name if verdict.source != "library" else UNKNOWN)
+        clean_name(patch_name.name if patch_name.source != "library" else UNKNOWN)
 
 
 def test_a_patch_that_only_the_literature_explains_is_named_as_like_it():
-    verdict = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).verdict
-    assert verdict.source == "literature"
-    assert "sapphire" in verdict.literature
+    patch_name = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).patch_name
+    assert patch_name.source == "literature"
+    assert "sapphire" in patch_name.literature
 
 
 @pytest.mark.parametrize(("share", "named"), [(0.79, "polymer"), (0.81, "its likeliest")])
@@ -80,16 +80,16 @@ def test_a_family_is_named_by_a_material_that_holds_four_fifths_of_it(share, nam
 
 def test_a_second_angle_makes_a_true_name_surer():
     t = inverse_ratio(LIBRARY["acrylic"], np.array(ANGLES))
-    alone = name_ratios(t[0], std=0.03).verdict.probabilities["acrylic"]
-    verdict = name_ratios(*t, std=0.03).verdict
-    assert verdict.name == "acrylic"
-    assert verdict.confidence > alone
+    alone = name_ratios(t[0], std=0.03).patch_name.probabilities["acrylic"]
+    patch_name = name_ratios(*t, std=0.03).patch_name
+    assert patch_name.name == "acrylic"
+    assert patch_name.confidence > alone
 
 
 def test_a_thin_plate_that_fits_no_half_space_is_a_possible_layer():
     t, _ = draw_sheets(ANGLES[0])
     far = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
-    names = [name_ratios(complex(far)).verdict.name, name_ratios(-0.25 + 0.2j).verdict.name]
+    names = [name_ratios(complex(far)).patch_name.name, name_ratios(-0.25 + 0.2j).patch_name.name]
     assert LAYER in names
     assert not set(names) & set(LIBRARY)
 
@@ -111,8 +111,8 @@ def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float
         expected = np.log(np.abs(fresnel(half_space, ANGLES[0])[0]))
         row = []
         for brightness in (np.log(np.abs(r_s)) - expected, 0.0):
-            off = float(brightness + brightness_std * rng.standard_normal())
-            evidence = RatioEvidence(ANGLES[0], t, 1e-4 * np.eye(2), 0.5, off, brightness_std)
+            measured_off = float(brightness + brightness_std * rng.standard_normal())
+            evidence = RatioEvidence(ANGLES[0], t, 1e-4 * np.eye(2), 0.5, measured_off, brightness_std)
             row.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
         probabilities.append(row)
     thin, thick = np.median(probabilities, axis=0)
@@ -189,9 +189,11 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
     kinds = Kinds([wood, *list_literature_kinds()], ANGLES[0], with_sheets=True)
     t = complex(inverse_ratio(2.6 - 0.1j, ANGLES[0]))
     evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5)
-    still = name_patch((kinds,), (replace(evidence, dispersion=make_dispersion(np.zeros(3))),), np.array([[t]])).verdict
+    still = name_patch(
+        (kinds,), (replace(evidence, dispersion=make_dispersion(np.zeros(3))),), np.array([[t]])
+    ).patch_name
     changing = make_dispersion(np.array([0.2, -0.1, 0.3]))
-    rippled = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).verdict
+    rippled = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).patch_name
     assert still.name == "wood"
     assert still.confidence > 0.9
     assert rippled.name == LAYER
@@ -211,13 +213,13 @@ def test_each_reason_of_a_name_has_a_subject():
     """Metal has no permittivity that could be it."""
     named = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2)
     for permittivity, subject in ((None, "it is like "), (9.41 - 0.002j, "permittivity 9.41 - j0.00 is like ")):
-        assert add_explanation(named, permittivity, None, LIBRARY).verdict.why.startswith(subject)
+        assert add_explanation(named, permittivity, None, LIBRARY).patch_name.why.startswith(subject)
 
 
 @pytest.mark.parametrize(("unknown", "rival"), [(0.5, "a material that the library lacks 50 %"), (0.001, "no other")])
 def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
     """Half of the probability without a name is another likely material."""
     named = name_ratios(complex(inverse_ratio(LIBRARY["acrylic"], ANGLES[0])))
-    verdict = replace(named.verdict, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})
-    reason = add_explanation(replace(named, verdict=verdict), LIBRARY["acrylic"], None, LIBRARY).verdict.why
+    patch_name = replace(named.patch_name, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})
+    reason = add_explanation(replace(named, patch_name=patch_name), LIBRARY["acrylic"], None, LIBRARY).patch_name.why
     assert reason.partition("; ")[2].removeprefix("it could also be ").startswith(rival)

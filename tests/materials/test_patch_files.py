@@ -18,7 +18,7 @@ def name_from_file(found, scene, classifier, path):
     patches = read_patches(path)
     matched = [m for m in match_patches([patches]) if m.label in patches.evidence]
     renamed = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
-    return {m.label: n.verdict for m, n in zip(matched, renamed, strict=True)}
+    return {m.label: n.patch_name for m, n in zip(matched, renamed, strict=True)}
 
 
 def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placement, tmp_path):
@@ -28,8 +28,8 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placemen
     renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
     for r in analysis.patches:
         if r.named is not None:
-            assert renamed[r.patch.label].name == r.named.verdict.name
-            assert renamed[r.patch.label].probabilities == pytest.approx(r.named.verdict.probabilities, abs=1e-3)
+            assert renamed[r.patch.label].name == r.named.patch_name.name
+            assert renamed[r.patch.label].probabilities == pytest.approx(r.named.patch_name.probabilities, abs=1e-3)
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.25])
@@ -45,7 +45,7 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(
     pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
     analysis = scene.analyse(classifier=classifier, pair=pair)
     renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
-    names = {r.patch.label: r.named.verdict.name for r in plain.patches if r.named is not None}
+    names = {r.patch.label: r.named.patch_name.name for r in plain.patches if r.named is not None}
     wrong = {n: (names[n], v.name) for n, v in renamed.items() if n in names and v.name not in (names[n], UNKNOWN)}
     assert not wrong
     assert sum(v.name == names.get(n) for n, v in renamed.items()) >= 0.7 * len(names)
@@ -67,7 +67,7 @@ def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, na
     assert not patches.evidence
     assert len(patches.patches) == len(analysis.patches)
     matched = match_patches([patches])
-    names = [n.verdict.name for n in Classifier(library).scan([m.features for m in matched])]
+    names = [n.patch_name.name for n in Classifier(library).scan([m.features for m in matched])]
     true = [m.truth for m in matched]
     assert not [n for n, t in zip(names, true, strict=True) if n in library.names and n != t]
 

@@ -136,7 +136,7 @@ def test_what_the_library_lacks_gets_no_name_from_any_model(model):
     strange = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
     test = draw_pixels((0.01, 0.05), 1, 9, kinds=strange)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
-    assert not [n.verdict.name for n in named if n.verdict.source == "library"]
+    assert not [n.patch_name.name for n in named if n.patch_name.source == "library"]
 
 
 @pytest.mark.parametrize("own", [10.0, 40.0])
@@ -165,10 +165,10 @@ def test_only_models_with_probabilities_report_that_no_other_material_is_near(mo
     test = draw_pixels((0.0, 0.0), 1, 4)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
     whys = [
-        add_explanation(n, eps, None, classifier.permittivities).verdict.why
+        add_explanation(n, eps, None, classifier.permittivities).patch_name.why
         for n, eps in zip(named, KINDS.values(), strict=True)
     ]
-    assert all(n.verdict.name in cause for n, cause in zip(named, whys, strict=True))
+    assert all(n.patch_name.name in cause for n, cause in zip(named, whys, strict=True))
     assert any("no other material" in cause for cause in whys) == (model == "discriminant")
 
 
@@ -179,6 +179,9 @@ def test_a_patch_unlike_every_material_is_reported_with_the_nearest():
     named = classifier.scan([x.x[x.patches == p] for p in np.unique(x.patches)])
     permittivities = classifier.permittivities
     for n, eps in zip(named, (7.5 - 0.05j, 9.4 - 18j), strict=True):
-        assert n.verdict.source != "library"
-        assert n.verdict.nearest in permittivities
-        assert f"nearest: {n.verdict.nearest}" in add_explanation(n, eps, None, classifier.permittivities).verdict.why
+        assert n.patch_name.source != "library"
+        assert n.patch_name.nearest in permittivities
+        assert (
+            f"nearest: {n.patch_name.nearest}"
+            in add_explanation(n, eps, None, classifier.permittivities).patch_name.why
+        )

@@ -26,4 +26,4 @@ def test_each_plate_of_the_demo_has_a_permittivity_and_half_of_them_their_names(
     plates = [(r, true[r.patch.label]) for r in result.patches if not true[r.patch.label].metal]
     assert len(plates) == 8
     assert all(r.permittivity.value is not None for r, _ in plates)
-    assert sum(r.verdict is not None and r.verdict.name == plate.name for r, plate in plates) >= 4
+    assert sum(r.patch_name is not None and r.patch_name.name == plate.name for r, plate in plates) >= 4

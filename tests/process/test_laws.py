@@ -110,9 +110,9 @@ def test_the_demo_scene_is_named_right_and_its_permittivities_found(image_scene)
     scan = image_scene("nine-materials")
     names = name_materials(scan)
     assert len(names.patches) == 9
-    named = [p for p in names.patches if p.verdict is not None]
-    assert [p.truth.name for p in names.patches if p.verdict is None] == ["copper"]  # the reference
-    assert sum(p.verdict.name == p.truth.name for p in named) >= 7
+    named = [p for p in names.patches if p.patch_name is not None]
+    assert [p.truth.name for p in names.patches if p.patch_name is None] == ["copper"]  # the reference
+    assert sum(p.patch_name.name == p.truth.name for p in named) >= 7
     assert pixel_accuracy(names) > 0.85
     assert names.metal.certain
     for p in names.patches:

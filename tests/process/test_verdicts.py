@@ -87,7 +87,7 @@ def test_a_measured_rig_and_a_plain_scene_are_good(plain):
     findings, true = plain
     assert findings.verdict.level == "good", join_reasons(findings)
     assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
-    assert sum(r.verdict is not None and r.verdict.name.startswith(true[r.patch.label].name)
+    assert sum(r.patch_name is not None and r.patch_name.name.startswith(true[r.patch.label].name)
                for r in findings.analysis.patches) >= 4  # fmt: skip
     (reference,) = [r for r in findings.analysis.rows() if r.metal_reference]
     assert reference.name is None  # not judged by itself
@@ -127,7 +127,9 @@ def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
     if findings.verdict.level == "good":
         # The plates determine the leakage well enough by themselves
         assert all(
-            p.permittivity.real_std < 0.05 * p.permittivity.value.real for p in findings.analysis.patches if p.verdict
+            p.permittivity.real_std < 0.05 * p.permittivity.value.real
+            for p in findings.analysis.patches
+            if p.patch_name
         )
     else:
         assert findings.verdict.level == "care"

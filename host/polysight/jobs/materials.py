@@ -468,7 +468,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
         "incidence_deg": [s.angle_deg for s in scans],
         "model": classifier.model,
         "library": classifier_sentence(classifier),
-        "patches": [_describe_named_patch(m, n.verdict, n.names) for m, n in zip(matched, named, strict=True)],
+        "patches": [_describe_named_patch(m, n.patch_name, n.pixel_names) for m, n in zip(matched, named, strict=True)],
         "contradictions": _describe_contradictions(library, model, classifier.angles_deg, matched, named),
         "patches_not_in_every_scan": sum(len(s.patches) for s in scans) - len(scans) * len(matched),
         "refused": [
@@ -532,7 +532,7 @@ def _describe_contradictions(
 
     `matched` and `named` are one patch each, in the same order; a name counts if its source is the library.
     """
-    if len(angles_deg) < 2 or all(n.verdict.source == "library" for n in named):
+    if len(angles_deg) < 2 or all(n.patch_name.source == "library" for n in named):
         return []
     names_by_angle = []
     for i, angle_deg in enumerate(angles_deg):
@@ -542,9 +542,9 @@ def _describe_contradictions(
         names_by_angle.append(Classifier(library, model=model, angles_deg=[angle_deg]).scan(features, evidence))
     lines = []
     for match, together, *single_scans in zip(matched, named, *names_by_angle, strict=True):
-        names = [n.verdict.name for n in single_scans]
-        materials_alone = {n.verdict.name for n in single_scans if n.verdict.source == "library"}
-        if together.verdict.source != "library" and len(materials_alone) > 1:
+        names = [n.patch_name.name for n in single_scans]
+        materials_alone = {n.patch_name.name for n in single_scans if n.patch_name.source == "library"}
+        if together.patch_name.source != "library" and len(materials_alone) > 1:
             answers = ", ".join(f"{name} at {a:g} degrees" for name, a in zip(names, angles_deg, strict=True))
             lines.append(
                 f"patch {match.label} contradicts itself: {answers}; was it moved or exchanged between the scans?"

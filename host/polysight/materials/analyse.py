@@ -602,7 +602,7 @@ def name_permittivity(permittivity: complex, covariance: npt.NDArray[np.float64]
         covariance=turn_covariance(slope, covariance),
         library_share=0.5,
     )
-    return name_patch((kinds,), (evidence,), np.array([[inverse]])).verdict
+    return name_patch((kinds,), (evidence,), np.array([[inverse]])).patch_name
 
 
 def _estimate_raised_std(images: Images, patches: Sequence[Patch], metal: npt.NDArray[np.bool_]) -> dict[int, float]:

@@ -463,7 +463,7 @@ class Classifier:
         pixel_distance[is_usable] = voted.pixel_distance
         nearest_name = str(voted.names[0])
         distance = float(voted.distance[0])
-        verdict = PatchName(
+        patch_name = PatchName(
             name=nearest_name if distance <= 1 else UNKNOWN,
             confidence=float(voted.confidence[0]),
             votes=compute_name_shares(pixel_names),
@@ -471,7 +471,7 @@ class Classifier:
             pixels=int(is_usable.sum()),
             nearest=nearest_name,
         )
-        return NamedPatch(pixel_names, pixel_distance, verdict)
+        return NamedPatch(pixel_names, pixel_distance, patch_name)
 
 
 def _check_model_name(given_name: str) -> str:

@@ -115,15 +115,15 @@ class PatchName:
 
 @dataclass(frozen=True)
 class NamedPatch:
-    """Names of a patch's pixels [n], their distances over the threshold [n], and the patch's verdict.
+    """Names of a patch's pixels [n], their distances over the threshold [n], and the name of the patch.
 
     `confidence` [n]: probability of each pixel's likeliest name but "unknown", 0 for unusable pixels; None: the model
     gives none.
     """
 
-    names: npt.NDArray[np.str_]
+    pixel_names: npt.NDArray[np.str_]
     distance: Real
-    verdict: PatchName
+    patch_name: PatchName
     confidence: Real | None = None
 
 
@@ -314,8 +314,8 @@ def name_patch(
     first_kinds = kinds[0]
     names = np.array(first_kinds.names)
     literature_name, in_literature_name = summarise_literature(first_kinds, odds)
-    verdict = _find_verdict(first_kinds, odds, literature_name, in_literature_name)
-    verdict = replace(verdict, pixels=int(usable.sum()))
+    patch_name = _find_patch_name(first_kinds, odds, literature_name, in_literature_name)
+    patch_name = replace(patch_name, pixels=int(usable.sum()))
 
     # Pixels get the corrections of their patch (leakage, tilt, and the scene's common change of V / H over the plane):
     # their median becomes the patch's corrected ratio.
@@ -326,10 +326,12 @@ def name_patch(
     corrected = inverse_ratios * np.where(np.isfinite(correction), correction, 1.0)
     name_of_kind = np.where(first_kinds.in_library, names, np.where(in_literature_name, literature_name, UNKNOWN))
     pixel_names, pixel_distance, confidence = _name_pixels(kinds, kind_evidence, corrected, odds.kinds, name_of_kind)
-    return NamedPatch(pixel_names, pixel_distance, replace(verdict, votes=compute_name_shares(pixel_names)), confidence)
+    return NamedPatch(
+        pixel_names, pixel_distance, replace(patch_name, votes=compute_name_shares(pixel_names)), confidence
+    )
 
 
-def _find_verdict(
+def _find_patch_name(
     kinds: Kinds, odds: Odds, literature_name: str, in_literature_name: npt.NDArray[np.bool_]
 ) -> PatchName:
     """Return the patch's name and its probabilities, without votes of pixels.
@@ -406,8 +408,8 @@ def derive_evidence_from_pixels(inverse_ratios: npt.NDArray[np.complex128], kind
 
 def make_patch_without_pixels(pixels: int) -> NamedPatch:
     """Return the name of an unknown patch with this number of `pixels`, none of which is usable."""
-    verdict = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
-    return NamedPatch(np.full(pixels, UNKNOWN), np.full(pixels, np.inf), verdict)
+    patch_name = PatchName(UNKNOWN, 0.0, {}, np.inf, 0)
+    return NamedPatch(np.full(pixels, UNKNOWN), np.full(pixels, np.inf), patch_name)
 
 
 def _name_pixels(
@@ -479,49 +481,49 @@ def add_explanation(
     `permittivity` is eps' - j eps'' of the patch, `covariance` [2, 2] that of its real and imaginary part; None if it
     has none. `library` are the permittivities of the library's materials.
     """
-    verdict = named.verdict
+    patch_name = named.patch_name
     estimate = _format_estimate(permittivity, covariance)
-    nearest_name = verdict.nearest
-    if verdict.name in library:
-        nearest_name = verdict.name
+    nearest_name = patch_name.nearest
+    if patch_name.name in library:
+        nearest_name = patch_name.name
     nearest_material = ""
     nearest_clause = ""
     if nearest_name is not None:
         nearest_material = _add_permittivity(nearest_name, library.get(nearest_name))
         nearest_clause = f"; nearest: {nearest_material}"
 
-    if verdict.name == UNKNOWN and estimate:
+    if patch_name.name == UNKNOWN and estimate:
         explanation = f"not in the library: {estimate}{nearest_clause}"
-    elif verdict.name == UNKNOWN:
+    elif patch_name.name == UNKNOWN:
         explanation = f"not in the library{nearest_clause}"
-    elif verdict.name == LAYER and estimate:
+    elif patch_name.name == LAYER and estimate:
         explanation = f"{estimate} as a half space, but rather a thin plate{nearest_clause}"
-    elif verdict.name == LAYER:
+    elif patch_name.name == LAYER:
         explanation = f"rather a thin plate{nearest_clause}"
-    elif verdict.from_literature:
-        values = _list_values(verdict.literature)
+    elif patch_name.from_literature:
+        values = _list_values(patch_name.literature)
         # Metal has no permittivity to tell.
         subject = estimate or "it"
         explanation = f"{subject} is like {values} of the literature; not measured by this library{nearest_clause}"
     elif estimate:
-        explanation = f"{estimate} matches the library's {nearest_material}{_list_rivals(verdict)}"
+        explanation = f"{estimate} matches the library's {nearest_material}{_list_rivals(patch_name)}"
     else:
-        explanation = f"it looks like the library's {nearest_material}{_list_rivals(verdict)}"
-    return replace(named, verdict=replace(verdict, why=explanation))
+        explanation = f"it looks like the library's {nearest_material}{_list_rivals(patch_name)}"
+    return replace(named, patch_name=replace(patch_name, why=explanation))
 
 
-def _list_rivals(verdict: PatchName) -> str:
+def _list_rivals(patch_name: PatchName) -> str:
     """Return a clause on the other likely names; empty for the KNN, which has no probabilities."""
     rivals = []
-    for name, probability in verdict.probabilities.items():
+    for name, probability in patch_name.probabilities.items():
         least_probability = LIKELY_UNKNOWN if name == UNKNOWN else LEAST_PROBABILITY
-        if name == verdict.name or probability < least_probability:
+        if name == patch_name.name or probability < least_probability:
             continue
         rival = "a material that the library lacks" if name == UNKNOWN else name
         rivals.append(f"{rival} {100 * probability:.0f} %")
     if rivals:
         return f"; it could also be {' or '.join(rivals[:2])}"
-    if verdict.probabilities:
+    if patch_name.probabilities:
         return "; no other material is likely"
     return ""
 

@@ -157,18 +157,18 @@ class PatchResult:
     refused: Finding | None = None
 
     @property
-    def verdict(self) -> PatchName | None:
+    def patch_name(self) -> PatchName | None:
         """Name with confidence and votes; None if it was not named or is refused."""
         if self.named is None or self.refused is not None:
             return None
-        return self.named.verdict
+        return self.named.patch_name
 
     @property
-    def names(self) -> npt.NDArray[np.str_] | None:
-        """Names of the interior's pixels, str [n] in image order; None as for `verdict`."""
+    def pixel_names(self) -> npt.NDArray[np.str_] | None:
+        """Names of the interior's pixels, str [n] in image order; None as for `patch_name`."""
         if self.named is None or self.refused is not None:
             return None
-        return self.named.names
+        return self.named.pixel_names
 
 
 @dataclass(frozen=True)
@@ -330,8 +330,8 @@ class MaterialsResult:
         )
         if patch_result.truth is not None:
             figures = structs.replace(figures, truth=_describe_truth(patch_result.truth, self.library))
-        if patch_result.verdict is not None:
-            figures = _add_name(figures, patch_result.verdict)
+        if patch_result.patch_name is not None:
+            figures = _add_name(figures, patch_result.patch_name)
         if patch_result.refused is None:
             figures = structs.replace(figures, permittivity=_describe_permittivity(estimate))
             if label in self.tilts.rises:
@@ -488,8 +488,8 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
             name = result.boxes[patch_result.patch.label]
         elif patch_result.patch.label == result.metal.label:
             name = "metal"
-        elif patch_result.verdict is not None and patch_result.verdict.source == "library":
-            name = patch_result.verdict.name
+        elif patch_result.patch_name is not None and patch_result.patch_name.source == "library":
+            name = patch_result.patch_name.name
         interior = patch_result.patch.interior if patch_result.patch.interior.any() else patch_result.patch.mask
         rows = np.flatnonzero(interior.any(axis=1))
         columns = np.flatnonzero(interior.any(axis=0))
@@ -668,7 +668,7 @@ def pixel_accuracy(result: MaterialsResult) -> float | None:
     None also if metal is the only material: it is the reference, and there was nothing to name. Patches rightly called
     unknown, because the library does not hold their material, do not count.
     """
-    right = [n.names == truth for n, truth in _select_true_patches(result)]
+    right = [n.pixel_names == truth for n, truth in _select_true_patches(result)]
     return float(np.concatenate(right).mean()) if right else None
 
 
@@ -692,5 +692,9 @@ def _select_true_patches(result: MaterialsResult) -> list[tuple[NamedPatch, str]
     """
     if not any(r.truth and r.truth.permittivity is not None for r in result.patches):
         return []
-    judged = [(r.named, r.verdict.name, r.truth.name) for r in result.patches if r.named and r.verdict and r.truth]
-    return [(n, truth) for n, name, truth in judged if n.names.size and (name != UNKNOWN or truth in result.library)]
+    judged = [
+        (r.named, r.patch_name.name, r.truth.name) for r in result.patches if r.named and r.patch_name and r.truth
+    ]
+    return [
+        (n, truth) for n, name, truth in judged if n.pixel_names.size and (name != UNKNOWN or truth in result.library)
+    ]

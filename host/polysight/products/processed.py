@@ -320,7 +320,9 @@ class ProcessedScan:
         """Patch to the names of its interior's pixels in image order, and that interior; empty for saved products."""
         if self.analysis is None:
             return {}
-        return {r.patch.label: (r.names, r.patch.interior) for r in self.analysis.patches if r.names is not None}
+        return {
+            r.patch.label: (r.pixel_names, r.patch.interior) for r in self.analysis.patches if r.pixel_names is not None
+        }
 
     @cached_property
     def expected_accuracy(self) -> float | None:

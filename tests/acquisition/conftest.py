@@ -23,14 +23,14 @@ def rig(monkeypatch):
     class Pi(PiClient):
         def __init__(self, *settings):
             super().__init__(*settings)
-            lost = fake.pi.replies_lost
+            replies_lost = fake.pi.replies_lost
             poll = self._commands.poll
 
             def poll_until_lost(_):
-                nonlocal lost
+                nonlocal replies_lost
                 while not poll(5):
-                    if fake.pi.replies_lost > lost:
-                        lost += 1
+                    if fake.pi.replies_lost > replies_lost:
+                        replies_lost += 1
                         return 0
                 return zmq.POLLIN
 

@@ -48,11 +48,11 @@ def test_what_a_command_prints_and_draws_changes_only_on_purpose(name, folder, t
     for table in tmp_path.rglob("*.csv"):
         printed += table.read_text(encoding="utf-8")
     # A path has numbers of the run.
-    shown = re.sub(r"\S*/\S*|[\d.]+ (s|MB|GB)\b", "", printed)
+    text_without_paths = re.sub(r"\S*/\S*|[\d.]+ (s|MB|GB)\b", "", printed)
     pictures = describe_figures(saved)
     if name == "sync-report":
         # One of its panels shows what rounding leaves of an amplitude, magnified.
         for picture in pictures:
             picture["axes"] = [axes["texts"] for axes in picture["axes"]]
-    figures = {"status": status, "numbers": find_numbers(shown), "figures": pictures}
+    figures = {"status": status, "numbers": find_numbers(text_without_paths), "figures": pictures}
     assert_kept(HERE / "kept" / f"{name}.json", figures, 0.02)

@@ -66,8 +66,10 @@ def test_known_leakage_and_angle_are_taken_out_of_every_pixel(scan, angle_error_
 def test_products_without_a_record_of_corrections_are_not_corrected_twice(scan):
     leaking = make_leaking_scan(scan.rig)
     assert leaking.materials is not None
-    known = LeakageError(h=split_complex(LEAKAGE_H), v=split_complex(LEAKAGE_V), std=(0.01, 0.01), source="scene")
-    earlier = ScanMaterials(segments=[], error_budget=ErrorBudget(leakage=known))
+    applied_leakage = LeakageError(
+        h=split_complex(LEAKAGE_H), v=split_complex(LEAKAGE_V), std=(0.01, 0.01), source="scene"
+    )
+    earlier = ScanMaterials(segments=[], error_budget=ErrorBudget(leakage=applied_leakage))
     vars(leaking)["materials"] = earlier
     expected = permittivity_from_ratio(leaking.p, specular_incidence_rad(scan.rig))
     np.testing.assert_allclose(permittivity_dataset(leaking)["permittivity"].values, expected, rtol=1e-12)
@@ -85,13 +87,13 @@ def test_the_mean_of_the_map_over_a_patch_is_the_patchs_permittivity(scan):
     patches = scan.patches()
     judged = 0
     for patch in patches["patch"].values:
-        own = patches.sel(patch=patch)
-        if not np.isfinite(own["permittivity"]):
+        patch_figures = patches.sel(patch=patch)
+        if not np.isfinite(patch_figures["permittivity"]):
             continue
         mean = complex(eps["permittivity"].where((patches["label"] == patch) & patches["interior"]).mean())
-        difference = mean - complex(own["permittivity"])
-        assert abs(difference.real) < 0.5 * float(own["permittivity_real_standard_error"])
-        assert abs(difference.imag) < 0.5 * float(own["permittivity_loss_standard_error"])
+        difference = mean - complex(patch_figures["permittivity"])
+        assert abs(difference.real) < 0.5 * float(patch_figures["permittivity_real_standard_error"])
+        assert abs(difference.imag) < 0.5 * float(patch_figures["permittivity_loss_standard_error"])
         judged += 1
     assert judged == 1
 
@@ -109,11 +111,11 @@ def test_no_pixel_is_more_certain_than_its_patch(scan):
 def test_the_mask_holds_no_value_that_a_half_space_cannot_have(scan):
     """The edges of the metal have no values, either."""
     eps = scan.permittivity_map()
-    shown = eps["permittivity"].values[eps["mask"].values]
+    permittivities = eps["permittivity"].values[eps["mask"].values]
     errors = eps["permittivity_real_standard_error"].values[eps["mask"].values]
-    assert shown.size > 0
-    assert np.all(shown.real + 2 * errors >= 1)
-    assert np.all(shown.imag - 2 * errors <= 1e-6)
+    assert permittivities.size > 0
+    assert np.all(permittivities.real + 2 * errors >= 1)
+    assert np.all(permittivities.imag - 2 * errors <= 1e-6)
     assert bool(eps["mask"].sel(x_mm=slice(32, 58), y_mm=slice(-13, 13)).mean() > 0.9)
     assert not eps["mask"].sel(x_mm=slice(-60, -30), y_mm=slice(-15, 15)).any()
 

@@ -56,8 +56,8 @@ def test_every_parameter_and_result_has_a_specific_type(name, function):
     types = {p.name: p.annotation for p in signature.parameters.values() if p.name not in ("self", "cls")}
     if not name.endswith(".__init__"):
         types["result"] = signature.return_annotation
-    for what, annotation in types.items():
-        assert annotation is not inspect.Parameter.empty, f"{name}: {what}"
+    for parameter, annotation in types.items():
+        assert annotation is not inspect.Parameter.empty, f"{name}: {parameter}"
         # An array of any numbers is typed.
         text = re.sub(r"NDArray\[Any\]", "NDArray", str(annotation))
-        assert not re.search(r"\bAny\b", text), f"{name}: {what}: {annotation}"
+        assert not re.search(r"\bAny\b", text), f"{name}: {parameter}: {annotation}"

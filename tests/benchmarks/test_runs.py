@@ -48,9 +48,9 @@ def test_the_capture_trial_counts_as_lost_only_what_the_kernel_dropped(
     main(["capture", "--seconds", "0.5", "--rate", "20000", "--alone", "--no-compare", "--folder", str(tmp_path)])
     columns = [line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("    20000")]
     assert len(columns) == 2
-    for _, _, _, _, packets, lost, dropped, *_ in columns:
-        assert int(packets) > 0
-        assert int(lost) <= int(dropped)
+    for _, _, _, _, packets_sent, packets_lost, packets_dropped, *_ in columns:
+        assert int(packets_sent) > 0
+        assert int(packets_lost) <= int(packets_dropped)
 
 
 def test_a_repeated_row_counts_every_chirp_of_a_frame(tmp_path: Path) -> None:

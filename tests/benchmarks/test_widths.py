@@ -19,9 +19,9 @@ def test_learnt_intervals_follow_the_noise_of_each_row():
 def test_learnt_intervals_are_narrower_by_what_a_feature_tells():
     rng = np.random.default_rng(5)
     row = np.zeros(1200, np.intp)
-    known = rng.uniform(-1, 1, row.size)
-    deviation = 2 * known + 0.1 * rng.standard_normal(row.size)
-    half_width = learn_half_widths(known[:, None], deviation, row, np.arange(row.size) // 6)
+    feature = rng.uniform(-1, 1, row.size)
+    deviation = 2 * feature + 0.1 * rng.standard_normal(row.size)
+    half_width = learn_half_widths(feature[:, None], deviation, row, np.arange(row.size) // 6)
     # Without the feature it is 1.9. Quantiles of trees follow a slope in steps: 0.2 would be the noise alone.
     assert 0.19 < np.median(half_width) < 0.95
 

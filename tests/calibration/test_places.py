@@ -75,8 +75,8 @@ def file(places_run):
 def test_the_places_found_change_only_on_purpose(file):
     figures = msgspec.to_builtins(file)
     of_the_run = ("made_utc", "sources", "versions")
-    kept = {name: value for name, value in figures.items() if name not in of_the_run}
-    assert_kept(Path(__file__).parent / "kept" / "places.json", kept, 0.01)
+    kept_figures = {name: value for name, value in figures.items() if name not in of_the_run}
+    assert_kept(Path(__file__).parent / "kept" / "places.json", kept_figures, 0.01)
 
 
 def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):

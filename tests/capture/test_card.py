@@ -293,14 +293,14 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
 def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_card, monkeypatch):
     """Cards were exchanged, or a second one answers now. A missing address in the kernel is not an error."""
     client, _ = scripted_card(lambda code, _: [reply(code, 0)])
-    known = {"mac": "12:34:56:78:90:12"}
-    monkeypatch.setattr(card, "neighbour_mac", lambda _: known["mac"])
+    neighbours = {"mac": "12:34:56:78:90:12"}
+    monkeypatch.setattr(card, "neighbour_mac", lambda _: neighbours["mac"])
     client.require_alone()
     client.record_start()
     for forgotten in (None, ""):
-        known["mac"] = forgotten
+        neighbours["mac"] = forgotten
         client.record_start()
-    known["mac"] = "12:34:56:78:90:13"
+    neighbours["mac"] = "12:34:56:78:90:13"
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "12:34:56:78:90:12 and 12:34:56:78:90:13"):
         client.record_start()
 

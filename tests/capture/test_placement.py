@@ -404,7 +404,9 @@ def test_a_second_card_with_equal_counters_fills_no_gap():
     record = Record.make(40 * FULL + 100, 70_000, 9)
     twin = Record.make(40 * FULL + 100, 70_000, 9, seed=1)
     pairs = enumerate(zip(record.packets, twin.packets, strict=True))
-    packets = [p for k, (own, other) in pairs for p in ([other] if k % 20 == 7 else [own, other])]
+    packets = [
+        p for k, (packet, twin_packet) in pairs for p in ([twin_packet] if k % 20 == 7 else [packet, twin_packet])
+    ]
     placed, out = place(len(record.data), packets, Counters(70_000, 9), FRAME)
     assert is_original_or_masked(record, placed, out)
     assert (placed.located, placed.slipped, placed.past.lost) == (False, False, True)

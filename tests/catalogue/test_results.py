@@ -37,20 +37,20 @@ def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
     pixels = Pixels(processed / "one" / "products")
     rows, columns = pixels.p.shape
     pixel_mm = pixels.x_mm[1] - pixels.x_mm[0]
-    left, right, low, high = pixels.extent_mm
-    assert right - left == pytest.approx(columns * pixel_mm)
-    assert high - low == pytest.approx(rows * (pixels.y_mm[1] - pixels.y_mm[0]))
-    assert left == pytest.approx(pixels.x_mm[0] - pixel_mm / 2)
+    x_min_mm, x_max_mm, y_min_mm, y_max_mm = pixels.extent_mm
+    assert x_max_mm - x_min_mm == pytest.approx(columns * pixel_mm)
+    assert y_max_mm - y_min_mm == pytest.approx(rows * (pixels.y_mm[1] - pixels.y_mm[0]))
+    assert x_min_mm == pytest.approx(pixels.x_mm[0] - pixel_mm / 2)
     inside_mm = 0.01
-    assert pixels.nearest(left + inside_mm, low + inside_mm) == (0, 0)
-    assert pixels.nearest(right - inside_mm, high - inside_mm) == (rows - 1, columns - 1)
-    middle_x = (left + right) / 2
-    middle_y = (low + high) / 2
+    assert pixels.nearest(x_min_mm + inside_mm, y_min_mm + inside_mm) == (0, 0)
+    assert pixels.nearest(x_max_mm - inside_mm, y_max_mm - inside_mm) == (rows - 1, columns - 1)
+    middle_x = (x_min_mm + x_max_mm) / 2
+    middle_y = (y_min_mm + y_max_mm) / 2
     for place in (
-        (left - inside_mm, middle_y),
-        (right + inside_mm, middle_y),
-        (middle_x, low - inside_mm),
-        (middle_x, high + inside_mm),
+        (x_min_mm - inside_mm, middle_y),
+        (x_max_mm + inside_mm, middle_y),
+        (middle_x, y_min_mm - inside_mm),
+        (middle_x, y_max_mm + inside_mm),
     ):
         with expect_refusal(ErrorCode.VALUE_INVALID, "outside the image"):
             pixels.nearest(*place)

@@ -108,14 +108,14 @@ def backdate_files(root: Path) -> None:
 def test_what_has_not_changed_is_not_read_again_after_a_restart(root, monkeypatch):
     index = root / ".polysight" / "list.json"
     backdate_files(root)
-    before = Scans(root, index=index).list()
+    scans_before = Scans(root, index=index).list()
     write_notes(root / "done", Notes("new"))
     read: list[str] = []
     summarise = scans.summarise
     monkeypatch.setattr(scans, "summarise", lambda folder, name: read.append(name) or summarise(folder, name))
-    after = Scans(root, index=index).list()
+    scans_after = Scans(root, index=index).list()
     assert read == ["done"]
-    assert after == Scans(root).list() != before
+    assert scans_after == Scans(root).list() != scans_before
 
 
 def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
@@ -132,7 +132,7 @@ def test_what_was_written_a_moment_ago_is_read_again_after_a_restart(root):
 
 def test_a_list_cut_off_by_its_time_limit_continues_at_the_next_request(root):
     """The last name comes first, and entries that were read are kept; the index is written only for complete lists."""
-    whole = Scans(root).list()
+    complete_list = Scans(root).list()
     last = max(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     index = root.parent / "index.json"
     scans = Scans(root, index=index)
@@ -145,18 +145,18 @@ def test_a_list_cut_off_by_its_time_limit_continues_at_the_next_request(root):
         assert scans.unread < unread_before
         assert {s.name for s in lists[-2]} <= {s.name for s in lists[-1]}
     assert len(lists) > 2
-    assert lists[-1] == whole
+    assert lists[-1] == complete_list
     assert index.exists()
     in_parts = Scans(root)
     in_parts.read_in_parts()
     assert in_parts.unread == 0
-    assert in_parts.list() == whole
+    assert in_parts.list() == complete_list
 
 
 @pytest.mark.parametrize(("stuck", "threads"), [("", 1), ("out", 2), ("done", 1)])
 def test_another_thread_reads_on_only_when_one_makes_no_progress(root, monkeypatch, stuck, threads):
     """`done` is the last folder that is read: after it no other one waits."""
-    whole = {s.name for s in Scans(root).list()}
+    all_names = {s.name for s in Scans(root).list()}
     begun = []
 
     class Worker:
@@ -183,7 +183,7 @@ def test_another_thread_reads_on_only_when_one_makes_no_progress(root, monkeypat
 
     listed = Scans(root)
     monkeypatch.setattr(scans, "threading", SimpleNamespace(Thread=Worker))
-    assert {s.name for s in listed.list()} == {name for name in whole if name.partition("/")[0] != stuck}
+    assert {s.name for s in listed.list()} == {name for name in all_names if name.partition("/")[0] != stuck}
     assert len(begun) == threads
 
 

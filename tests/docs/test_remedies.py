@@ -37,14 +37,14 @@ def list_texts(path: Path) -> list[tuple[int, str]]:
     """Strings of a file that are not docstrings, with their lines; a value that is put in is PLACEHOLDER."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     # Docstrings, and the pieces of a string with values in it.
-    others = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    excluded = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     texts = []
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
-            others |= {id(value) for value in node.values}
+            excluded |= {id(value) for value in node.values}
             pieces = [v.value if isinstance(v, ast.Constant) else PLACEHOLDER for v in node.values]
             texts.append((node.lineno, "".join(map(str, pieces))))
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in others:
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in excluded:
             texts.append((node.lineno, node.value))
     return texts
 

@@ -110,8 +110,8 @@ def check_end(words: list[str]) -> None:
     assert output.strip() or status == 0, words
     assert "Traceback" not in output, words
     # A note contains the text of the option; the last line of a list of scans names the folder as it was typed.
-    told = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
-    numbers = {word.strip("(),;:+-").lower() for word in told.split()}
+    computed_text = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
+    numbers = {word.strip("(),;:+-").lower() for word in computed_text.split()}
     assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())
     assert status not in (2, 3, 5, 6) or "usage:" in output or "\n  do: " in output, (words, output)
 

@@ -145,8 +145,10 @@ def test_imagers_in_turn_give_the_images_that_each_gives_alone(aperture):
         forget()
         alone.append((SpectralImager(a).image(y.copy()), SpectralImager(a).image_constant_echo(echo, weights)))
     imagers = SpectralImager(a), SpectralImager(a)
-    kept = [(imagers[i].image(samples[i]), imagers[i].image_constant_echo(echoes[i], weights)) for i in (0, 1, 0, 1)]
-    for i, image in enumerate(kept):
+    kept_images = [
+        (imagers[i].image(samples[i]), imagers[i].image_constant_echo(echoes[i], weights)) for i in (0, 1, 0, 1)
+    ]
+    for i, image in enumerate(kept_images):
         np.testing.assert_array_equal(image, alone[i % 2])
 
 

@@ -473,13 +473,13 @@ def test_only_plates_whose_range_is_known_to_5_cm_have_a_height(monkeypatch):
     monkeypatch.setattr(plane, "_fit_plane_by_phase", lambda *_: None)
     masks, grid = make_masks(3)
     heights_m = (0.004, 0.004, 0.07, 0.07, 0.07, 0.07)
-    for stds_m, known in (((1e-3, 0.0499, 0.0501, 0.06, 0.06, 0.06), (0, 1)), ((0.0501,) * 6, ())):
+    for stds_m, known_plates in (((1e-3, 0.0499, 0.0501, 0.06, 0.06, 0.06), (0, 1)), ((0.0501,) * 6, ())):
         boards = {"RH": SlopedBoard(masks, heights_m, stds_m)}
         estimate = plane.find_plane(SimpleNamespace(grid=grid, boards=boards), masks)
-        assert np.flatnonzero(np.isfinite(estimate.heights_m)).tolist() == list(known)
-        assert estimate.plates == len(known)
-        assert estimate.known is bool(known)
-        np.testing.assert_allclose(estimate.heights_m[list(known)], 0.004)
+        assert np.flatnonzero(np.isfinite(estimate.heights_m)).tolist() == list(known_plates)
+        assert estimate.plates == len(known_plates)
+        assert estimate.known is bool(known_plates)
+        np.testing.assert_allclose(estimate.heights_m[list(known_plates)], 0.004)
 
 
 RANDOM_HEIGHTS_M = np.random.default_rng(3).uniform(0, 6e-3, (40, 10))
@@ -494,21 +494,21 @@ def test_plates_of_any_heights_are_on_a_plane_that_is_tilted_as_the_plates_are(m
     truth_rad = (np.arctan(tilt_rad), 0.0)
     errors_deg = {}
     for name, own_rises in {"seen": [(tilt_rad + 1e-6, 1e-6)] * len(masks), "unseen": []}.items():
-        found = []
+        tilts_rad = []
         for heights_m in RANDOM_HEIGHTS_M:
             board = SlopedBoard(masks, heights_m + tilt_rad * (x_m - x_m.mean()), [3e-4] * len(masks))
             builder = SimpleNamespace(grid=grid, boards={"RH": board})
-            found.append(plane.find_plane(builder, masks, own_rises).tilt_rad)
-        errors_deg[name] = np.sqrt(np.mean(np.degrees(np.array(found) - truth_rad) ** 2))
+            tilts_rad.append(plane.find_plane(builder, masks, own_rises).tilt_rad)
+        errors_deg[name] = np.sqrt(np.mean(np.degrees(np.array(tilts_rad) - truth_rad) ** 2))
     assert errors_deg["seen"] < 0.4
     assert errors_deg["unseen"] > 0.6
 
 
 def test_tilts_of_few_or_differing_plates_determine_the_planes_tilt_poorly():
-    alike = plane.TiltPrior.from_plates([(0.01, 0.0), (0.01, 0.0), (0.01, 0.0)])
-    assert alike.mean[0] == pytest.approx(0.01, rel=0.1)
+    prior_of_equal_tilts = plane.TiltPrior.from_plates([(0.01, 0.0), (0.01, 0.0), (0.01, 0.0)])
+    assert prior_of_equal_tilts.mean[0] == pytest.approx(0.01, rel=0.1)
     # Their tilt along y is not known.
-    assert (alike.mean[1], alike.std[1]) == (0.0, plane.TiltPrior.from_plates([]).std[1])
+    assert (prior_of_equal_tilts.mean[1], prior_of_equal_tilts.std[1]) == (0.0, plane.TiltPrior.from_plates([]).std[1])
     two = plane.TiltPrior.from_plates([(0.01, 0.01), (0.01, 0.01)])
     assert (two.mean == 0).all()
     unlike = plane.TiltPrior.from_plates([(-0.04, 0.01), (0.01, 0.01), (0.05, 0.01)])

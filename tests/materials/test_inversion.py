@@ -208,35 +208,35 @@ def test_paint_on_the_metal_is_found_out_and_does_not_carry_the_permittivities_o
     rng = np.random.default_rng(11)
     prior = RigPrior(1e-3, leakage_std=0.01, leakage_measured=True)
     patches = paint(draw_world(rng, (0.003j, 0.004)), paint_mm)
-    found = invert(patches, prior, KINDS)
-    assert found.painted > 0.8
-    assert found.paint_mm == pytest.approx(paint_mm, abs=0.04)
-    assert sum(d < 5.99 for d in compute_distances(found)) >= 7
+    inversion = invert(patches, prior, KINDS)
+    assert inversion.painted > 0.8
+    assert inversion.paint_mm == pytest.approx(paint_mm, abs=0.04)
+    assert sum(d < 5.99 for d in compute_distances(inversion)) >= 7
 
 
 def test_paint_that_only_may_be_there_is_in_every_error_bar():
     """Four scenes in which paint has a probability of 0.3 to 0.8; without one of the patches the metal seems bare."""
     probabilities = []
-    held = []
+    is_covered = []
     for seed in (101, 118, 124, 125):
         rng = np.random.default_rng(seed)
         parts = 0.041 * rng.standard_normal(4)
         eps = EPS * (1 + 0.02 * rng.standard_normal(EPS.size))
         eps = eps.real + 1j * eps.imag * np.exp(0.3 * rng.standard_normal(EPS.size))
         plates = draw_world(rng, (complex(*parts[:2]), complex(*parts[2:])), noise=0.006, eps=eps)
-        found = invert(paint(plates, rng.uniform(0.05, 0.2)), RigPrior(1e-3), KINDS)
-        probabilities.append(found.painted)
-        held += [d < 5.99 for d in compute_distances(found, eps)]
+        inversion = invert(paint(plates, rng.uniform(0.05, 0.2)), RigPrior(1e-3), KINDS)
+        probabilities.append(inversion.painted)
+        is_covered += [d < 5.99 for d in compute_distances(inversion, eps)]
     assert 0.05 < min(probabilities) < max(probabilities) < 0.95
-    assert np.mean(held) > 0.87
+    assert np.mean(is_covered) > 0.87
 
 
 def test_bare_metal_is_not_called_painted():
     for seed in range(3):
         rng = np.random.default_rng(seed)
         leak = (draw_leakage(rng) / 3, draw_leakage(rng) / 3)
-        found = invert(draw_world(rng, leak), RigPrior(1e-3, leakage_std=0.025), KINDS)
-        assert found.painted < 0.2
+        inversion = invert(draw_world(rng, leak), RigPrior(1e-3, leakage_std=0.025), KINDS)
+        assert inversion.painted < 0.2
 
 
 def test_paint_is_an_error_of_the_reference_from_a_probability_of_a_fifth():
@@ -244,9 +244,9 @@ def test_paint_is_an_error_of_the_reference_from_a_probability_of_a_fifth():
     probabilities = []
     for seed in range(2):
         patches = paint(draw_world(np.random.default_rng(seed), (0.003j, 0.004)), 0.03)
-        found = invert(patches, RigPrior(1e-3, leakage_std=0.01, leakage_measured=True), KINDS)
-        probabilities.append(found.painted)
-        assert (np.diag(found.nuisance_covariance)[5] > 2) == (found.painted > 0.2)
+        inversion = invert(patches, RigPrior(1e-3, leakage_std=0.01, leakage_measured=True), KINDS)
+        probabilities.append(inversion.painted)
+        assert (np.diag(inversion.nuisance_covariance)[5] > 2) == (inversion.painted > 0.2)
     assert 0.05 < probabilities[0] < 0.2 < probabilities[1]
 
 
@@ -273,10 +273,10 @@ def test_images_with_the_other_sign_of_phase_are_distinguished_from_ours():
     right = invert(measurements, prior, KINDS)
     wrong = invert(mirrored_measurements, their_prior, KINDS)
     for prior_probability in (0.1, 0.5, 0.9):
-        _, other = join_signs(right, wrong, prior_probability)
-        _, other_way_round = join_signs(wrong, right, 1 - prior_probability)
-        assert other < 0.5
-        assert other_way_round == pytest.approx(1 - other, abs=1e-9)
+        _, wrong_probability = join_signs(right, wrong, prior_probability)
+        _, right_probability = join_signs(wrong, right, 1 - prior_probability)
+        assert wrong_probability < 0.5
+        assert right_probability == pytest.approx(1 - wrong_probability, abs=1e-9)
 
 
 @pytest.mark.parametrize("evidence", [-1.0, 0.0, 1.0])
@@ -286,15 +286,17 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
     measurements = draw_world(rng, (0j, 0j))
     right = invert(measurements, prior, KINDS)
     wrong = replace(invert(*mirror_phases(measurements, prior), KINDS), log_evidence=right.log_evidence + evidence)
-    joined, other = join_signs(right, wrong, 0.3)
-    for before, mirrored, after in zip(right.patches, wrong.patches, joined.patches, strict=True):
-        assert after.permittivity == before.permittivity
-        apart = abs(mirrored.permittivity - before.permittivity) ** 2
-        expected = (1 - other) * np.trace(before.covariance) + other * (np.trace(mirrored.covariance) + apart)
-        assert np.trace(after.covariance) == pytest.approx(expected)
-        wider = np.sqrt(np.diag(after.covariance) / np.diag(before.covariance))
-        np.testing.assert_allclose(np.array(after.half_widths_68) / before.half_widths_68, wider)
-        assert sum(after.shares.values()) == pytest.approx(1.0)
+    joined, wrong_probability = join_signs(right, wrong, 0.3)
+    for right_patch, wrong_patch, joined_patch in zip(right.patches, wrong.patches, joined.patches, strict=True):
+        assert joined_patch.permittivity == right_patch.permittivity
+        distance2 = abs(wrong_patch.permittivity - right_patch.permittivity) ** 2
+        expected = (1 - wrong_probability) * np.trace(right_patch.covariance) + wrong_probability * (
+            np.trace(wrong_patch.covariance) + distance2
+        )
+        assert np.trace(joined_patch.covariance) == pytest.approx(expected)
+        wider = np.sqrt(np.diag(joined_patch.covariance) / np.diag(right_patch.covariance))
+        np.testing.assert_allclose(np.array(joined_patch.half_widths_68) / right_patch.half_widths_68, wider)
+        assert sum(joined_patch.shares.values()) == pytest.approx(1.0)
     # Without any doubt nothing changes
     assert join_signs(right, wrong, 1e-6)[0] == right
 
@@ -303,14 +305,14 @@ def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():
     patches = draw_world(np.random.default_rng(4), (0.03, 0.02j), eps=EPS[:5])
     measured = RigPrior(2e-3, (0.03 + 0j, 0.02j), 0.003, True)
     unmeasured = RigPrior(2e-3)
-    found = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
+    inversions = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("polysight.materials.inversion.WEIGHT_OF_KINDS", 1.0)
         in_full = [invert(patches, prior, KINDS) for prior in (unmeasured, measured)]
-    errors = [np.trace(p.covariance) for p in found[0].patches]
+    errors = [np.trace(p.covariance) for p in inversions[0].patches]
     errors_in_full = [np.trace(p.covariance) for p in in_full[0].patches]
     assert np.median(np.array(errors) / errors_in_full) > 1.05
-    assert found[1].leakage == in_full[1].leakage
+    assert inversions[1].leakage == in_full[1].leakage
 
 
 def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_plate():
@@ -328,9 +330,9 @@ def test_half_widths_hold_68_percent_of_errors_whose_size_varies_from_plate_to_p
             for patch, error in zip(exact, errors, strict=True)
         ]
         for patch in invert(patches, prior).patches:
-            off = np.abs([patch.permittivity.real - 4.0, patch.permittivity.imag + 0.4])
-            inside_68.append(off < patch.half_widths_68)
-            inside_95.append(off < 1.96 * np.sqrt(np.diag(patch.covariance)))
+            deviation = np.abs([patch.permittivity.real - 4.0, patch.permittivity.imag + 0.4])
+            inside_68.append(deviation < patch.half_widths_68)
+            inside_95.append(deviation < 1.96 * np.sqrt(np.diag(patch.covariance)))
     # Within three standard deviations of the count of 200 draws
     np.testing.assert_allclose(np.mean(inside_68, axis=0), 0.683, atol=0.1)
     np.testing.assert_allclose(np.mean(inside_95, axis=0), 0.95, atol=0.046)
@@ -357,9 +359,9 @@ def test_plates_of_one_foreign_material_do_not_turn_the_boards(eps):
 
 def test_plates_are_of_one_material_if_their_ratios_agree_within_their_errors():
     rng = np.random.default_rng(0)
-    alike = draw_world(rng, (0j, 0j), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
-    others = draw_world(rng, (0j, 0j), noise=0.002, eps=np.array([2.6 - 0.01j, 7.5 - 0.3j]))
-    same = compute_probability_of_same_material([*alike, *others])
+    equal_plates = draw_world(rng, (0j, 0j), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
+    other_plates = draw_world(rng, (0j, 0j), noise=0.002, eps=np.array([2.6 - 0.01j, 7.5 - 0.3j]))
+    same = compute_probability_of_same_material([*equal_plates, *other_plates])
     assert np.diag(same) == pytest.approx(1)
     assert same == pytest.approx(same.T)
     assert same[:5, :5].min() > 0.5

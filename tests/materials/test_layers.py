@@ -132,9 +132,9 @@ def test_as_many_unknowns_as_numbers_are_reported_with_the_missing_measurements(
         6.11 - 1.58j, thickness_m=0.96e-3, std_real=0.1, std_loss=0.1, std_thickness_m=1e-5, chi2=0.02, freedom=0
     )
     fit = replace(rival, permittivity=6.28 - 1.22j, thickness_m=1.74e-3, chi2=0.01, rivals=(rival,))
-    told = fit.warnings()
-    assert any("--bands 4" in words for words in told)
-    assert not any("degrees of freedom" in words for words in told)
+    warnings = fit.warnings()
+    assert any("--bands 4" in words for words in warnings)
+    assert not any("degrees of freedom" in words for words in warnings)
     assert any("9 degrees of freedom" in words for words in replace(fit, freedom=9).warnings())
     assert not any("--bands" in words for words in replace(fit, freedom=9).warnings())
 

@@ -268,10 +268,10 @@ def test_pixels_left_out_are_named_by_most_of_the_nearest_of_other_scans(steps):
     surely_right = []
     possibly_right = []
     for pixel in range(24):
-        others = np.flatnonzero(~same_scan[pixel])
-        limit = np.sort(distance[pixel, others])[4]
-        nearer = names[others[distance[pixel, others] < limit]]
-        as_far = names[others[distance[pixel, others] == limit]]
+        other_pixels = np.flatnonzero(~same_scan[pixel])
+        limit = np.sort(distance[pixel, other_pixels])[4]
+        nearer = names[other_pixels[distance[pixel, other_pixels] < limit]]
+        as_far = names[other_pixels[distance[pixel, other_pixels] == limit]]
         free = 5 - nearer.size
         right = set()
         for chosen in combinations(as_far.tolist(), free):

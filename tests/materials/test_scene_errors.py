@@ -54,8 +54,8 @@ def dim_copper(h, v):
 def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
     """By the median of V / H, which differs from the root mean square by some per cent."""
     scene = dim_copper(*draw_plates())
-    found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    metal = metal_by_label(int(found.labels[30, 30]), found)
+    segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+    metal = metal_by_label(int(segmentation.labels[30, 30]), segmentation)
     relative = divide_by_reference(scene, metal, None)
     assert abs(median_ratio(relative.h[metal.mask], relative.v[metal.mask]) - 1) < 1e-4
     assert metal_unevenness(relative, metal.mask) > 0.01
@@ -66,9 +66,9 @@ def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
 def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
     errors = []
     for scene in (make_images(*draw_plates()), dim_copper(*draw_plates())):
-        found = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-        known = KnownScene(segmentation=found, metal=int(found.labels[30, 30]))
-        result = analyse(scene, Optics(np.radians(55.0)), known)
+        segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
+        known_scene = KnownScene(segmentation=segmentation, metal=int(segmentation.labels[30, 30]))
+        result = analyse(scene, Optics(np.radians(55.0)), known_scene)
         errors.append(result.prior.reference_std)
         uneven = metal_unevenness(divide_by_reference(scene, result.metal, None), result.metal.mask)
         assert errors[-1] >= 0.5 * uneven
@@ -142,8 +142,8 @@ def test_any_drift_is_within_its_error():
         drift = parts[0] + 1j * parts[1]
         true = np.interp(rows_m, along_m, drift)
         slope = np.interp(rows_m, along_m, np.gradient(drift, along_m))
-        seen = 0.9 * slope + slope_std * (rng.standard_normal(9) + 1j * rng.standard_normal(9))
-        slopes = dict(zip(PLACES_M, seen, strict=True))
+        measured_slope = 0.9 * slope + slope_std * (rng.standard_normal(9) + 1j * rng.standard_normal(9))
+        slopes = dict(zip(PLACES_M, measured_slope, strict=True))
         change = estimate_common_change(
             make_scatter(lambda x, y, slopes=slopes: (0j, slopes[x, y]), slope_std), ORIGIN_M
         )

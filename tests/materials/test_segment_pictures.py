@@ -113,9 +113,9 @@ def test_a_sheet_whose_v_is_noise_is_one_plate_of_one_kind(seed, noise_db):
     h, v = draw(seed, plates, strips=1.0, amplitude=0.02, phase_deg=1.0, background_db=-60.0)
     v = v + draw_band_limited_noise(np.random.default_rng(seed), noise_db)[1]
     usable = np.ones(h.shape, bool)
-    found, _ = patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
-    dark = background(h, v, found, usable)
-    assert [check_patch(patch, h, v, dark, 0.05) for patch in found.patches] == [None, None]
+    segmentation, _ = patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
+    dark = background(h, v, segmentation, usable)
+    assert [check_patch(patch, h, v, dark, 0.05) for patch in segmentation.patches] == [None, None]
 
 
 def draw_uneven_light(seed):
@@ -131,8 +131,8 @@ def test_plates_are_found_over_an_uneven_background_whose_levels_overlap_with_th
     channels = np.array(draw(seed, plates, strips=1.0, amplitude=0.15, background_db=-60.0))
     background = draw_band_limited_noise(np.random.default_rng(seed), -24.0) * draw_uneven_light(seed + 50)
     boxes = convert_boxes_to_px(segment(*(channels + background), AXIS, AXIS))
-    found = [any(np.abs(np.subtract(plate, box)).max() <= 4 for box in boxes) for plate in plates]
-    assert sum(found) >= 6
+    is_box_found = [any(np.abs(np.subtract(plate, box)).max() <= 4 for box in boxes) for plate in plates]
+    assert sum(is_box_found) >= 6
     assert len(boxes) <= len(plates) + 1
 
 
@@ -220,9 +220,9 @@ def test_a_plate_cut_off_from_a_larger_patch_is_reported(seed):
     h, v = draw(seed, dict.fromkeys(boxes, (-6.0, 0.25)), strips=1.0, amplitude=0.05)
     segmentation = segment(h, v, AXIS, AXIS)
     x0, y0, x1, y1 = boxes[-1]
-    told = [patch.mask for patch in segmentation.patches] + list(segmentation.left_out)
+    reported_masks = [patch.mask for patch in segmentation.patches] + list(segmentation.left_out)
     # The background may be left out, too: a mask that is mostly of this plate counts.
-    of_plate = [mask for mask in told if mask[y0:y1, x0:x1].sum() > 0.4 * mask.sum()]
+    of_plate = [mask for mask in reported_masks if mask[y0:y1, x0:x1].sum() > 0.4 * mask.sum()]
     assert max((mask[y0:y1, x0:x1].mean() for mask in of_plate), default=0.0) > 0.5
 
 
@@ -318,8 +318,8 @@ def test_a_plate_that_fills_the_picture_is_one_region_and_stated(pixels, stack):
     rig = published_rig()
     plate = Plate("board", (rig.centre_m[0], rig.centre_m[1]), (0.34, 0.34), stack)
     pair = simulate(World((plate,)), rig=rig, pixels=pixels)
-    found = segment(pair.h, pair.v, pair.x_m, pair.y_m)
-    assert found.patches == ()
-    share = max(mask.sum() for mask in found.left_out) / pixels**2
-    (told,) = judge_patches({}, 0, len(found.left_out), share)
-    assert "fills" in told.what
+    segmentation = segment(pair.h, pair.v, pair.x_m, pair.y_m)
+    assert segmentation.patches == ()
+    share = max(mask.sum() for mask in segmentation.left_out) / pixels**2
+    (finding,) = judge_patches({}, 0, len(segmentation.left_out), share)
+    assert "fills" in finding.what

@@ -22,12 +22,12 @@ def test_cups_behind_glass_keep_their_ratio_and_the_measured_leakage():
         liquid = Layer("liquid", 9.37 - 5 * share - 1j * (18 - 20 * share))
         ratios, _ = predict([GLASS, liquid], spectrum, THETA_RAD)
         true.append(complex(ratios[0]))
-    seen = [
+    measurements = [
         PatchMeasurement(ratio, 0.0015, THETA_RAD, brightness, relative_std=scatter)
         for (ratio, brightness), scatter in zip(MEASURED, SCATTER, strict=True)
     ]
     prior = RigPrior(0.003, leakage=LEAKAGE, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
-    inversion = invert(seen, prior, Kinds(list_literature_kinds(), THETA_RAD, with_sheets=True))
+    inversion = invert(measurements, prior, Kinds(list_literature_kinds(), THETA_RAD, with_sheets=True))
     assert np.abs(np.array(inversion.leakage) - LEAKAGE).max() < 0.02
     for t, patch in zip(true, inversion.patches, strict=True):
         assert abs(patch.inverse_ratio - t) < 0.12 * abs(t)

@@ -52,12 +52,12 @@ def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
     along = replace(tilted[0], tilt_x_deg=5.0)
     across = replace(tilted[1], tilt_y_deg=5.0)
     analysis, plates = analyse_world(simulate(World((copper, level, along, across))))
-    found = {plates[patch.patch.label].name: patch for patch in analysis.patches}
+    patch_by_name = {plates[patch.patch.label].name: patch for patch in analysis.patches}
     for name in (along.name, across.name):
-        assert found[name].refused is not None
-        assert "tilted" in found[name].refused.what
-    assert found[level.name].refused is None
-    assert abs(found[level.name].permittivity.value - (3.5 - 0.3j)) < 0.3
+        assert patch_by_name[name].refused is not None
+        assert "tilted" in patch_by_name[name].refused.what
+    assert patch_by_name[level.name].refused is None
+    assert abs(patch_by_name[level.name].permittivity.value - (3.5 - 0.3j)) < 0.3
 
 
 @pytest.mark.slow
@@ -92,9 +92,9 @@ def test_a_dielectric_declared_as_metal_is_found_out(eps):
 def test_the_reference_is_bare_metal_though_coated_metal_is_brighter(coat):
     pair = simulate(make_world(*map(make_half_space, (2.6 - 0.02j, 4 - 0.4j, 5 - 1.1j)), Stack((coat,), METAL.below)))
     # As other plates, metal may be lit less than its neighbours.
-    (left, bottom, right, top), *_ = (box for plate, box in pixel_boxes(pair) if plate.name == "copper")
+    (x0, y0, x1, y1), *_ = (box for plate, box in pixel_boxes(pair) if plate.name == "copper")
     for channel in (pair.h, pair.v):
-        channel[bottom - 4 : top + 4, left - 4 : right + 4] *= 0.9
+        channel[y0 - 4 : y1 + 4, x0 - 4 : x1 + 4] *= 0.9
     analysis, plates = analyse_world(pair, declared=None)
     level = {
         plates[p.label].name: np.median(np.abs((analysis.h * analysis.v)[p.interior]))

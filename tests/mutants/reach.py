@@ -216,12 +216,12 @@ def _find_users(file: Path, name: str, in_class: bool) -> Iterator[tuple[Path, i
     """Statements in functions that use a name of a file: by itself there and where it is imported, or as attribute."""
     if not name:
         return
-    for other in list_files():
-        text = (REPO / other).read_text(encoding="utf-8")
+    for importing_file in list_files():
+        text = (REPO / importing_file).read_text(encoding="utf-8")
         if name not in text:
             continue
-        tree = _parse(other)
-        is_imported = other == file or any(
+        tree = _parse(importing_file)
+        is_imported = importing_file == file or any(
             alias.name == name for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for alias in n.names
         )
         for node in ast.walk(tree):
@@ -230,7 +230,7 @@ def _find_users(file: Path, name: str, in_class: bool) -> Iterator[tuple[Path, i
             if by_itself or as_attribute:
                 function = _find_innermost(tree, node.lineno, (ast.FunctionDef, ast.AsyncFunctionDef))
                 if function is not None:
-                    yield other, _find_statement_line(function, node.lineno)
+                    yield importing_file, _find_statement_line(function, node.lineno)
 
 
 def _find_first_line(function: Any) -> int:

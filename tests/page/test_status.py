@@ -172,8 +172,8 @@ def test_an_abort_is_not_a_fault(history):
     assert "the page" in s.detail
     # The program's last message, which is that of an error.
     failure = Finding("error", "scans/one: stopped on request, 2 of 3 rows are missing")
-    told = make_snapshot(Inputs(FOLDER, history, replace(LIVELY, alive=False, life=None), failure=failure))
-    assert [notice.level for notice in told.notices] == ["note", "note"]
+    snapshot = make_snapshot(Inputs(FOLDER, history, replace(LIVELY, alive=False, life=None), failure=failure))
+    assert [notice.level for notice in snapshot.notices] == ["note", "note"]
 
 
 def test_there_is_no_result_before_materials(history):

@@ -158,8 +158,8 @@ def test_sugar_is_judged_at_the_angle_with_the_most_solutions_whatever_else_was_
         return Entry(name, scan="1", h=np.abs(ratio), v=v, p=ratio, incidence_deg=angle_deg, simulated=True)
 
     solutions = [make_entry(f"sugar ({percent}%)", percent, 60.0) for percent in (2, 4, 6, 8)]
-    others = [make_entry(f"solid {k}", 0, 55.0) for k in range(9)]
-    library = Library((make_entry("sugar (2%)", 2, 55.0), *others, *solutions))
+    solids = [make_entry(f"solid {k}", 0, 55.0) for k in range(9)]
+    library = Library((make_entry("sugar (2%)", 2, 55.0), *solids, *solutions))
     data = AuthorsData(tmp_path, load_instrument(RIG_FILE), {MATERIALS: library}, {}, ())
     judged = authors_fig21(data).data[MATERIALS]
     assert judged["angle_deg"] == 60.0

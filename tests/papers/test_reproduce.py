@@ -167,17 +167,17 @@ def small_scan():
 def test_range_profiles_show_the_plane_only_after_synchronisation(small_scan):
     """The plane is 0.315 m behind the direct path; a cell of the range is 86 mm wide, a bin 16 mm."""
     behind = small_scan.range_m > 0.15
-    before, after = small_scan.profiles
-    assert before.shape == after.shape == (13, small_scan.range_m.size)
-    peaks_m = small_scan.range_m[behind][after[:, behind].argmax(axis=1)]
+    before_sync, after_sync = small_scan.profiles
+    assert before_sync.shape == after_sync.shape == (13, small_scan.range_m.size)
+    peaks_m = small_scan.range_m[behind][after_sync[:, behind].argmax(axis=1)]
     assert np.abs(peaks_m - 0.315).max() < 0.05
-    assert not after.argmax(axis=1).any()
-    assert np.ptp(before.argmax(axis=1)) > 20
+    assert not after_sync.argmax(axis=1).any()
+    assert np.ptp(before_sync.argmax(axis=1)) > 20
 
 
 def test_an_image_forms_only_after_synchronisation(small_scan):
-    before, after = (np.abs(image).max() / np.median(np.abs(image)) for image in small_scan.images)
-    assert after > 2 * before
+    contrast_before, contrast_after = (np.abs(image).max() / np.median(np.abs(image)) for image in small_scan.images)
+    assert contrast_after > 2 * contrast_before
 
 
 @pytest.mark.parametrize("key", ["fig12", "fig15"])

@@ -438,7 +438,13 @@ def test_the_rules_are_whole():
         state = todo.pop()
         if state not in reached:
             reached.add(state)
-            todo += [to for r in RULES if state in r.states.split() for to in r.leads_to.split() if to != "same"]
+            todo += [
+                next_state
+                for r in RULES
+                if state in r.states.split()
+                for next_state in r.leads_to.split()
+                if next_state != "same"
+            ]
     assert reached == states
     lasting = {s for r in RULES if r.event == "stage lost" for s in r.states.split()}
     assert lasting == states, "losing the stage is answered in every state"

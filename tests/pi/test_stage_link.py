@@ -208,11 +208,11 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
 @pytest.mark.parametrize(("number", "tries"), [(StageError.BUSY, 7), (StageError.LIMIT_SWITCH, 1)])
 def test_a_moving_stage_is_asked_again_to_clear_its_alarm_for_three_seconds(number, tries, monkeypatch):
     """Another refusal is final. The clock stands half a second later at each look."""
-    asked = []
+    requests = []
     stops = []
 
     def refuse(verb):
-        asked.append(verb)
+        requests.append(verb)
         raise StageRefusedError(verb, number)
 
     clock = itertools.count(0, 0.5)
@@ -222,5 +222,5 @@ def test_a_moving_stage_is_asked_again_to_clear_its_alarm_for_three_seconds(numb
     driver._open_link = SimpleNamespace(request=refuse, send_byte=stops.append)
     with pytest.raises(StageRefusedError):
         driver.clear(stop=True)
-    assert asked == ["CLEAR"] * tries
+    assert requests == ["CLEAR"] * tries
     assert stops == [Immediate.STOP] * (tries - 1)

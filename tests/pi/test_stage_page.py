@@ -79,8 +79,8 @@ def test_the_stage_is_homed_and_jogged_between_its_limits(browser: Browser, view
     browser.visit(f"{view.address}/new#token={TOKEN}", size)
     browser.wait("document.querySelector('.time')", "the plan")
     browser.value("document.querySelector('#stage > summary').click()")
-    told = "document.getElementById('stage-told').textContent"
-    browser.wait(f"{told}.startsWith('Not homed')", "the state")
+    stage_text = "document.getElementById('stage-told').textContent"
+    browser.wait(f"{stage_text}.startsWith('Not homed')", "the state")
     enabled = "[...document.querySelectorAll('#axes button:enabled')].map((b) => b.getAttribute('aria-label')).join()"
     assert browser.value(enabled) == ""
 
@@ -90,7 +90,7 @@ def test_the_stage_is_homed_and_jogged_between_its_limits(browser: Browser, view
     browser.wait(f"{enabled} == '{forward}'", "buttons that lead within the limits")
     browser.value("document.querySelector('[aria-label=\"Move x by 10 mm\"]').click()")
     place = "document.getElementById('axes').innerText"
-    browser.wait(f"{place}.includes('x 10.0 mm') && {told} == 'At rest.'", "the end of the jog")
+    browser.wait(f"{place}.includes('x 10.0 mm') && {stage_text} == 'At rest.'", "the end of the jog")
     assert f"limits 0 and {travel_mm:g} mm" in browser.value(place)
     browser.wait(f"{enabled}.includes('Move x by -10 mm')", "the way back")
     assert "Move x by -100 mm" not in browser.value(enabled)

@@ -221,6 +221,6 @@ def test_without_a_plan_more_time_is_advised_only_where_it_helps(capsys):
     # The steps themselves have aliases in this scene.
     coarse = ["--step-y-mm", "12", "--scene-mm", "300,300"]
     assert main([*plan, "30", *coarse]) == 1
-    told = capsys.readouterr().err
-    assert "more time does not help" in told
-    assert "--step-y-mm" in told
+    message = capsys.readouterr().err
+    assert "more time does not help" in message
+    assert "--step-y-mm" in message

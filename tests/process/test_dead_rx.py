@@ -83,15 +83,19 @@ def test_noise_instead_of_an_rx_is_reported_and_changes_nothing_else(source, pro
     _, healthy_images, healthy = process()
     pipeline, images, findings = process(kill(board, rx))
     assert findings.verdict.level == "care"
-    (told,) = list_reasons_about_rx(findings)
-    assert f"RX{rx} of {board}" in told
+    (reason,) = list_reasons_about_rx(findings)
+    assert f"RX{rx} of {board}" in reason
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(compute_distances(source, findings)) == len(PLATES)
     assert max(compute_distances(source, findings)) < 9
     assert pipeline.quality.result().boards[board].dead_rx == {rx: list(range(ROWS))}
-    both = images.valid & healthy_images.valid
-    for one, other in ((images.h, healthy_images.h), (images.v, healthy_images.v)):
-        cosine = abs(np.vdot(one[both], other[both])) / np.linalg.norm(one[both]) / np.linalg.norm(other[both])
+    in_both_images = images.valid & healthy_images.valid
+    for image, healthy_image in ((images.h, healthy_images.h), (images.v, healthy_images.v)):
+        cosine = (
+            abs(np.vdot(image[in_both_images], healthy_image[in_both_images]))
+            / np.linalg.norm(image[in_both_images])
+            / np.linalg.norm(healthy_image[in_both_images])
+        )
         assert cosine > 0.995
 
 
@@ -116,7 +120,7 @@ def test_the_images_are_those_of_a_rig_without_the_rx(source):
         def __init__(self) -> None:
             super().__init__(source, lambda *_: None)
             rig = source.instrument
-            rx_mm = tuple(at for k, at in enumerate(rig.antennas.rx_mm) if k != 2)
+            rx_mm = tuple(place_mm for k, place_mm in enumerate(rig.antennas.rx_mm) if k != 2)
             self.instrument = msgspec.structs.replace(rig, antennas=msgspec.structs.replace(rig.antennas, rx_mm=rx_mm))
 
         def read_row(self, board: str, row: int) -> RowData | CubeRow:
@@ -129,16 +133,16 @@ def test_the_images_are_those_of_a_rig_without_the_rx(source):
 
     without = make_pipeline(Three()).form_images()  # type: ignore[arg-type]
     images = form_images(source, both)
-    for one, other in ((images.h, without.h), (images.v, without.v)):
-        np.testing.assert_allclose(one, other, atol=2e-5 * np.abs(other).max())
+    for image, image_without_rx in ((images.h, without.h), (images.v, without.v)):
+        np.testing.assert_allclose(image, image_without_rx, atol=2e-5 * np.abs(image_without_rx).max())
 
 
 @pytest.mark.parametrize("rows", [range(16, ROWS), range(16, 17)])
 def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
     pipeline, _, findings = process(kill("RV", 4, rows=rows))
-    (told,) = list_reasons_about_rx(findings)
-    assert "RX4 of RV" in told
-    assert "first in row 16" in told
+    (reason,) = list_reasons_about_rx(findings)
+    assert "RX4 of RV" in reason
+    assert "first in row 16" in reason
     assert pipeline.quality.result().boards["RV"].dead_rx == {4: list(rows)}
     assert list_other_reasons(findings) <= list_other_reasons(process()[2])
     assert max(compute_distances(source, findings)) < 9
@@ -182,8 +186,8 @@ def test_the_operator_hears_of_it_with_the_first_row(source, monkeypatch, caplog
     processing = LiveProcessing(source.path, Settings())
     for row in range(3):
         processing.add_row(row)
-    (told,) = [r.getMessage() for r in caplog.records if "RX" in r.getMessage()]
-    assert told.startswith("row 0: RX3 of RV gives no signal")
+    (message,) = [r.getMessage() for r in caplog.records if "RX" in r.getMessage()]
+    assert message.startswith("row 0: RX3 of RV gives no signal")
 
 
 def test_kept_samples_and_live_images_know_it(source):
@@ -205,8 +209,8 @@ def test_a_cube_with_a_dead_rx_is_read_like_rows(process, rms):
     level = float(np.sqrt(np.mean(np.abs(cubes.read_row("RV", 15).cube) ** 2)))
     _, _, healthy = process(None, cubes)
     _, _, findings = process(kill("RV", 4, rms=rms * level), cubes)
-    (told,) = list_reasons_about_rx(findings)
-    assert "RX4 of RV" in told
+    (reason,) = list_reasons_about_rx(findings)
+    assert "RX4 of RV" in reason
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(compute_distances(cubes, findings)) == len(PLATES)
     assert max(compute_distances(cubes, findings)) < 9

@@ -306,8 +306,8 @@ def test_a_library_is_trained_on_labelled_products_of_given_images(labels_folder
 
 
 def test_all_images_of_a_folder_are_found(labels_folder):
-    other = shutil.copytree(labels_folder, labels_folder.parent / "other")
-    assert find_scans([labels_folder.parent]) == [other, labels_folder]
+    copied_folder = shutil.copytree(labels_folder, labels_folder.parent / "other")
+    assert find_scans([labels_folder.parent]) == [copied_folder, labels_folder]
 
 
 PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")

@@ -133,8 +133,8 @@ def compute_slope_over_sweep(stack: list[dict], band_hz: tuple[float, float]) ->
     middle_hz = np.mean(band_hz)
     step_hz = 1e7
     ends = (multilayer(eps, thick_m, middle_hz + side * step_hz, np.radians(55.0)) for side in (-1, 1))
-    before, after = (np.log(np.array(end)) for end in ends)
-    of_s, of_p = (after - before) * (band_hz[1] - band_hz[0]) / (2 * step_hz)
+    log_below, log_above = (np.log(np.array(end)) for end in ends)
+    of_s, of_p = (log_above - log_below) * (band_hz[1] - band_hz[0]) / (2 * step_hz)
     return np.array([of_s.real, (of_p - of_s).real, (of_p - of_s).imag])
 
 
@@ -275,5 +275,5 @@ def test_a_tilted_metal_plate_is_known_as_such(rig, tmp_path, tilt_deg):
     # Along the plane of incidence, and across it.
     found_deg = reference.facts().tilt_deg
     np.testing.assert_allclose(found_deg, tilt_deg, atol=0.15)
-    told = rules.judge_reference_tilt(found_deg)
-    assert [r.level for r in told] == ([] if tilt_deg == (0.0, 0.0) else ["warning"])
+    reasons = rules.judge_reference_tilt(found_deg)
+    assert [r.level for r in reasons] == ([] if tilt_deg == (0.0, 0.0) else ["warning"])

@@ -127,9 +127,9 @@ def test_jumps_of_an_independent_world_are_found(independent_rows, degrees, row)
 @pytest.mark.parametrize("jumps", [{60: 30.0, 100: -45.0}, {64: -20.0, 98: -60.0, 130: -58.0}])
 def test_each_of_several_jumps_is_found_one_by_one(independent_rows, jumps):
     """Of three jumps of a board only one was found, and the others tore plates apart (found from outside)."""
-    found = find_phase_jumps(turn(independent_rows, jumps))
-    assert [jump.row for jump in found] == list(jumps)
-    assert np.degrees([jump.angle_rad for jump in found]) == pytest.approx(list(jumps.values()), abs=1.5)
+    phase_jumps = find_phase_jumps(turn(independent_rows, jumps))
+    assert [jump.row for jump in phase_jumps] == list(jumps)
+    assert np.degrees([jump.angle_rad for jump in phase_jumps]) == pytest.approx(list(jumps.values()), abs=1.5)
 
 
 def test_rows_are_turned_back_by_all_jumps_and_the_longest_section_keeps_its_phase(monkeypatch):

@@ -107,10 +107,10 @@ def test_a_scan_waits_at_its_end_for_a_program_that_is_writing_its_products(
     def wait(pause_s: float) -> None:
         waited_s.append(pause_s)
         if sum(waited_s) > 130:
-            other.close()
+            other_process.close()
 
-    with ExitStack() as other:
-        other.enter_context(lock_products(out))
+    with ExitStack() as other_process:
+        other_process.enter_context(lock_products(out))
         for row in range(11):
             running.add_row(row)
         assert not out.exists()
@@ -127,22 +127,22 @@ def test_products_without_the_rows_that_were_recorded_meanwhile_replace_none(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     resumed = Path(shutil.copytree(scan, tmp_path / "scan"))
-    whole = (resumed / MANIFEST).read_bytes()
-    first = b"".join(line for line in whole.splitlines(keepends=True)[:-3])
-    assert first.count(b"row_committed") < whole.count(b"row_committed")
-    (resumed / MANIFEST).write_bytes(first)
+    manifest = (resumed / MANIFEST).read_bytes()
+    unfinished = b"".join(line for line in manifest.splitlines(keepends=True)[:-3])
+    assert unfinished.count(b"row_committed") < manifest.count(b"row_committed")
+    (resumed / MANIFEST).write_bytes(unfinished)
     add_rows = process.add_rows
 
     def add_rows_and_resume(*words: object) -> None:
         add_rows(*words)  # type: ignore[arg-type]
-        (resumed / MANIFEST).write_bytes(whole)
+        (resumed / MANIFEST).write_bytes(manifest)
 
     monkeypatch.setattr(process, "add_rows", add_rows_and_resume)
     with expect_refusal(ErrorCode.BUSY, f"polysight process {resumed} --out {resumed / 'products'}"):
         process.process(resumed, resumed / "products")
     assert not (resumed / "products").exists()
     # Elsewhere they are what was asked for.
-    (resumed / MANIFEST).write_bytes(first)
+    (resumed / MANIFEST).write_bytes(unfinished)
     process.process(resumed, tmp_path / "out")
     assert read_products(tmp_path / "out").quality.coverage.rows_absent
 

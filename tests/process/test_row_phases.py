@@ -92,10 +92,10 @@ def test_a_jump_is_not_taken_for_a_displacement(fine_rows, of_both):
 
 def test_a_jump_among_displaced_rows_is_found_at_its_row(fine_rows):
     rows = displace(fine_rows[1], draw_shifts_mm(1, 0.4))
-    other = displace(fine_rows[0], draw_shifts_mm(1, 0.4))
+    other_rows = displace(fine_rows[0], draw_shifts_mm(1, 0.4))
     for number in range(48, 100):
         rows[number] = rows[number] * np.exp(1.2j)
-    shifts = find_displaced_rows([other, rows], STEP_MM).shifts
+    shifts = find_displaced_rows([other_rows, rows], STEP_MM).shifts
     assert [jump.row for jump in keep_jumps_without_shifts(find_phase_jumps(rows), rows, shifts)] == [48]
 
 

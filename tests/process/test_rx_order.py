@@ -43,9 +43,9 @@ def reorder_rx(rig: Instrument, board: str, *order: int) -> Instrument:
 def test_another_order_is_reported_and_nothing_else(process_six_plates, board, order):
     pipeline, _, findings = process_six_plates(reorder(board, *order))
     assert findings.verdict.level == "none"
-    (told,) = findings.verdict.reasons
-    assert f"the RX of {board} are recorded in another order" in told.what
-    assert f"rx_order = {list(order)}" in told.do
+    (reason,) = findings.verdict.reasons
+    assert f"the RX of {board} are recorded in another order" in reason.what
+    assert f"rx_order = {list(order)}" in reason.do
     assert pipeline.quality.result().boards[board].rx_order == list(order)
 
 
@@ -97,8 +97,8 @@ def test_the_operator_hears_of_it_with_the_first_rows(six_plates, monkeypatch, c
     processing = LiveProcessing(six_plates.path, Settings())
     for row in range(3):
         processing.add_row(row)
-    told = [r.getMessage() for r in caplog.records if "another order" in r.getMessage()]
-    assert len(told) == 1
+    messages = [r.getMessage() for r in caplog.records if "another order" in r.getMessage()]
+    assert len(messages) == 1
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (1, 1, 2, 3), (0, 1, 2, 3), (2, 3, 4, 5)])
@@ -122,7 +122,7 @@ def test_phases_of_a_place_show_the_order_in_spite_of_the_channels(board):
         channels = np.exp(1j * np.radians(rng.uniform(-20, 20, 4)))
         direct = channels * np.exp(1j * expected.direct[places])
         echo = np.exp(1j * (expected.echo[places] + 0.1 * rng.standard_normal(4)))
-        found = rx_order._choose(rx_order._Vectors(direct, echo), expected)
-        chosen = [k - 1 for k in found] or [0, 1, 2, 3]
+        order_found = rx_order._choose(rx_order._Vectors(direct, echo), expected)
+        chosen = [k - 1 for k in order_found] or [0, 1, 2, 3]
         same = abs(np.exp(1j * (expected.echo[places] - expected.echo[chosen])).mean())
         assert same > 0.97

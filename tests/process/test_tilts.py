@@ -87,9 +87,9 @@ def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
 def test_phases_of_four_plates_which_can_contradict_a_plane_decide_it(rig, plates, by_phase):
     pipeline = _make_pipeline(rig, [(0.0, 0.0)] * 6, {"columns": 25, "rows": 25})
     insides = _make_inside_masks(pipeline.form_images())[:plates]
-    found = find_plane(pipeline.samples.filled, insides)
-    assert (found.plates, found.by_phase) == (plates, by_phase)
-    assert (found.offset_std_m < 1e-4) is by_phase
+    plane = find_plane(pipeline.samples.filled, insides)
+    assert (plane.plates, plane.by_phase) == (plates, by_phase)
+    assert (plane.offset_std_m < 1e-4) is by_phase
 
 
 def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(tilted_images):
@@ -160,17 +160,18 @@ def test_a_dim_steep_patch_at_the_end_of_the_scan_is_a_smear(level_h, level_v, r
     axis_m = (np.arange(100) - 49.5) * 2e-3
     plate = np.zeros((100, 100), bool)
     plate[5:23, 30:50] = True
-    other = np.zeros((100, 100), bool)
-    other[row : row + 18, 30:50] = True
+    second_plate = np.zeros((100, 100), bool)
+    second_plate[row : row + 18, 30:50] = True
     h, v = (
-        (plate + level * other * np.exp(-1j * 0.1 * 1900 * axis_m)).astype(np.complex64) for level in (level_h, level_v)
+        (plate + level * second_plate * np.exp(-1j * 0.1 * 1900 * axis_m)).astype(np.complex64)
+        for level in (level_h, level_v)
     )
     images = Images(h, v, axis_m, axis_m, usable)
     lit = Illumination(
         np.ones((2, 100, 100), np.complex64), np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3)
     )
-    patches = tuple(make_patch(i, mask, axis_m, axis_m, 5.0, usable) for i, mask in ((1, plate), (2, other)))
-    tilts = Tilts.estimate(images, lit, Segmentation(plate + 2 * other.astype(np.int32), patches))
+    patches = tuple(make_patch(i, mask, axis_m, axis_m, 5.0, usable) for i, mask in ((1, plate), (2, second_plate)))
+    tilts = Tilts.estimate(images, lit, Segmentation(plate + 2 * second_plate.astype(np.int32), patches))
     assert tilts.refusals() == {2: refused}
 
 

@@ -133,8 +133,8 @@ def test_unmeasured_leakage_is_in_the_error_bars(examine, leak):
         )
     else:
         assert findings.verdict.level == "care"
-    for found, std in zip(inversion.leakage, inversion.leakage_std, strict=True):
-        assert abs(found - complex(*leak)) < 4 * std
+    for leakage, std in zip(inversion.leakage, inversion.leakage_std, strict=True):
+        assert abs(leakage - complex(*leak)) < 4 * std
     assert {e.dominated_by for e in inversion.patches} <= {"leakage", "metal reference", "scatter"}
     assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
 
@@ -176,8 +176,8 @@ def test_a_raised_plate_keeps_its_angle_in_images_and_maps(rig, tmp_path):
     pipeline, _ = form_images(Cubes(rig, msgspec.structs.replace(scene, plates=plates)))
     pipeline.finish(tmp_path)
     scan = ProcessedScan(tmp_path)
-    given = read_given_images(tmp_path / "image.npz", pipeline.rig)
-    np.testing.assert_array_equal(given.images.raised_m, scan.images.raised_m)
+    image_file = read_given_images(tmp_path / "image.npz", pipeline.rig)
+    np.testing.assert_array_equal(image_file.images.raised_m, scan.images.raised_m)
     pixel_angles = np.degrees(nominal_incidence_rad(scan))
     on_rubber = scan.images.raised_m < -0.015
     assert on_rubber.any()

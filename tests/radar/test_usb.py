@@ -83,7 +83,7 @@ def test_a_usb_path_finds_the_board_with_any_serial_number(bus, plugged_chip):
 
     open_usb("usb:1-4.2").write([0x1234])
     assert plugged_chip.chip.words_written == [0x1234]
-    assert all(other.chip.words_written == [] and other.modes == {} for other in other_chips)
+    assert all(other_chip.chip.words_written == [] and other_chip.modes == {} for other_chip in other_chips)
 
     with expect_refusal(ErrorCode.NO_ANSWER, "usb:1-7", "1-4.1, 1-4.2"):
         open_usb("usb:1-7")

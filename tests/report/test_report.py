@@ -361,8 +361,8 @@ def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(sc
 def test_a_standard_deviation_is_not_shown_as_the_value():
     boards = {"RH": {"stage_backlash_mm": {"shift": 0.12, "std": 0.01}}}
     (table,) = quality_tables({"boards": boards})
-    shown = [row["cells"] for row in table["rows"]]
-    assert shown == [["stage backlash shift (mm)", "0.12"], ["stage backlash std (mm)", "0.01"]]
+    cells = [row["cells"] for row in table["rows"]]
+    assert cells == [["stage backlash shift (mm)", "0.12"], ["stage backlash std (mm)", "0.01"]]
 
 
 def test_a_scene_without_plates_to_name_has_no_count_of_them(scan):

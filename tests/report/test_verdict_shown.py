@@ -97,11 +97,11 @@ def test_reasons_of_less_weight_are_folded(tmp_path):
     with skip_rendering():
         page = write_report(folder, write_products(folder)).read_text(encoding="utf-8")
     head = page[page.index("<main>") : page.index('<ul class="keys">')]
-    shown, _, folded = head.partition("17 more")
-    assert "reason 3<" in shown
-    assert "reason 4<" not in shown
-    assert '<ol start="4">' in folded
-    assert "reason 20<" in folded
+    visible_part, _, folded_part = head.partition("17 more")
+    assert "reason 3<" in visible_part
+    assert "reason 4<" not in visible_part
+    assert '<ol start="4">' in folded_part
+    assert "reason 20<" in folded_part
 
 
 @pytest.mark.parametrize("careless", [False, True])

@@ -192,16 +192,16 @@ def test_open_live_views_do_not_prevent_pausing_and_stopping(view, scans):
 
 def test_of_two_live_views_that_are_opened_together_one_follows_the_scan(tmp_path, monkeypatch):
     """The folder is read without a lock, so that another request may open the view meanwhile."""
-    made = []
+    views = []
     # Views that other requests open while one is being made.
-    others = []
+    views_of_others = []
 
     class Watch:
         def __init__(self, folder: Path, _control: bool) -> None:
             self.calls = []
-            made.append(self)
-            if len(made) == 1:
-                others.append(watches.open("one", folder))
+            views.append(self)
+            if len(views) == 1:
+                views_of_others.append(watches.open("one", folder))
 
         def start(self) -> None:
             self.calls.append("start")
@@ -212,8 +212,8 @@ def test_of_two_live_views_that_are_opened_together_one_follows_the_scan(tmp_pat
     monkeypatch.setattr(site, "Watch", Watch)
     watches = site.Watches(control=True)
     opened = watches.open("one", tmp_path)
-    outer, inner = made
-    assert others == [inner]
+    outer, inner = views
+    assert views_of_others == [inner]
     assert opened is inner
     assert watches.open("one", tmp_path) is inner
     assert (outer.calls, inner.calls) == (["close"], ["start"])

@@ -42,8 +42,8 @@ VIEWS = 4
 def run_attack(port: int, attack: Attack, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Clients of another process, which runs for the block."""
     command = [sys.executable, "-m", "tests.serve.attackers", str(port), *map(str, attack), str(VIEWS)]
-    with (folder / "attackers.txt").open("wb") as told:
-        clients = subprocess.Popen(command, cwd=REPO, stdout=told)
+    with (folder / "attackers.txt").open("wb") as output_file:
+        clients = subprocess.Popen(command, cwd=REPO, stdout=output_file)
         try:
             yield clients
             assert clients.poll() is None, "the attackers have ended"

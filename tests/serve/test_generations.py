@@ -37,26 +37,26 @@ def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_p
         browser.click("#maps button[value=p_amplitude]")
         browser.wait(f"document.getElementById('scale').innerText !== {amplitudes}", "the image of P")
         parts = browser.value(PARTS)
-        whole = [parts]
+        complete_states = [parts]
         browser.value("document.querySelector('canvas.imageview').focus()")
         for key, code in (("ArrowRight", 39), ("Enter", 13)):
             browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=key, windowsVirtualKeyCode=code)
         browser.wait("document.getElementById('probe-facts').innerText", "the place")
-        whole.append(browser.value(PARTS))
+        complete_states.append(browser.value(PARTS))
         browser.value(RECORD)
 
         for run in range(1, runs + 1):
             level, seed = GENERATIONS[run % 2]
             with replace_products(products, "s") as new:
                 write_judged_products(new, level, seed=seed)
-            shown = json.dumps(parts[3])
-            browser.wait(f"document.getElementById('scale').innerText !== {shown}", f"generation {run}")
+            scale_text = json.dumps(parts[3])
+            browser.wait(f"document.getElementById('scale').innerText !== {scale_text}", f"generation {run}")
             parts = browser.value(PARTS)
-            if parts not in whole:
-                whole.append(parts)
-        seen = [json.loads(text) for text in browser.value("[...window.seen]")]
+            if parts not in complete_states:
+                complete_states.append(parts)
+        seen_states = [json.loads(text) for text in browser.value("[...window.seen]")]
         # The two generations, the first with and without a place that is probed.
-        assert len(whole) == 3
-        differing = zip(whole[0][:4], whole[2][:4], strict=True)
-        assert all(one != other for one, other in differing), whole
-        assert [parts for parts in seen if parts not in whole] == []
+        assert len(complete_states) == 3
+        differing = zip(complete_states[0][:4], complete_states[2][:4], strict=True)
+        assert all(earlier_part != later_part for earlier_part, later_part in differing), complete_states
+        assert [parts for parts in seen_states if parts not in complete_states] == []

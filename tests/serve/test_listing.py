@@ -49,10 +49,10 @@ def test_a_list_that_is_unchanged_is_not_sent_again(tmp_path):
     for name in ("one", "two"):
         write_judged_products(tmp_path / name / "products", "care")
     with serve_folder(tmp_path) as view:
-        whole = get(view, "/api/scans")
-        while any(scan["bytes"] is None for scan in whole["scans"]):
-            whole = get(view, "/api/scans")
-        assert whole["whole"]
-        same = get(view, f"/api/scans?since={whole['stamp']}")
+        listing = get(view, "/api/scans")
+        while any(scan["bytes"] is None for scan in listing["scans"]):
+            listing = get(view, "/api/scans")
+        assert listing["whole"]
+        same = get(view, f"/api/scans?since={listing['stamp']}")
         assert (same["whole"], same["scans"], same["gone"]) == (False, [], [])
         assert get(view, "/api/scans?since=wrong")["whole"]

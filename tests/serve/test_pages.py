@@ -294,11 +294,11 @@ def test_the_new_page_lists_the_checks_as_the_doctor_prints_them(page, scans):
     (folder / "doctor.log").write_text("".join(map(_format_finding, findings)) + "1 ok\n", encoding="utf-8")
     page.open("/new")
     page.browser.wait("document.querySelectorAll('#findings li').length == 4", "the findings")
-    shown = page.browser.value(
+    shown_findings = page.browser.value(
         "[...document.querySelectorAll('#findings li')].map((n) => [n.querySelector('b').textContent,"
         " n.querySelector('b').parentNode.textContent, n.querySelectorAll('.more').length])"
     )
-    for (name, text, more), finding in zip(shown, findings, strict=True):
+    for (name, text, more), finding in zip(shown_findings, findings, strict=True):
         assert name == f"{finding.where}: "
         assert text == name + finding.what.replace("`", "")
         assert more == bool(finding.why) + bool(finding.do)
@@ -524,8 +524,8 @@ def test_a_long_list_is_shown_while_it_is_read(browser, tmp_path, monkeypatch):
         page.open("/?all", token="")
         browser.wait("document.querySelectorAll('#list li').length == 6", "all of them")
         browser.wait("!document.getElementById('count').innerText.includes('reading')", "that nothing is being read")
-        asked = [url for url in browser.requests if "/api/scans" in url]
-        assert len(asked) >= 6
+        requests = [url for url in browser.requests if "/api/scans" in url]
+        assert len(requests) >= 6
 
 
 def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, scans):
@@ -576,11 +576,11 @@ def test_advice_for_a_terminal_is_in_the_words_of_the_page(page):
         texts += re.findall(r'"([^"\n]*--[a-z][^"\n]*)"', re.sub(r"\{[^}]*\}", "5", source))
     assert len(texts) > 9
     page.open("/")
-    shown = page.browser.value(
+    shown_texts = page.browser.value(
         "import('/common.js').then((common) => "
         f"{json.dumps(texts)}.map((text) => common.rich(text).map((node) => node.textContent).join('')))"
     )
-    assert [text for text in shown if "--" in text] == []
+    assert [text for text in shown_texts if "--" in text] == []
 
 
 @pytest.mark.slow
@@ -607,8 +607,10 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         assert labels.metal == "copper"
         assert labels.boxes["my plastic"] == pytest.approx([24, -6, 48, 18], abs=1.5)
         page.check_whole()
-    known = "[...document.getElementById('known').options].map((option) => option.value)"
-    page.browser.wait(f"{known}.join() == 'copper,my plastic'", "names of the first scan, offered in the second")
+    offered_names = "[...document.getElementById('known').options].map((option) => option.value)"
+    page.browser.wait(
+        f"{offered_names}.join() == 'copper,my plastic'", "names of the first scan, offered in the second"
+    )
     page.open("/")
     assert page.browser.text("list").count("labelled: copper, my plastic") == 2
     page.browser.value("document.querySelectorAll('#list input').forEach(i => i.click())")

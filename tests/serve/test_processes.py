@@ -42,7 +42,7 @@ class Server:
         return self._find_child(lambda priority: priority == 0)
 
     def _find_child(self, is_wanted: Callable[[int], bool]) -> int | None:
-        own = os.getpriority(os.PRIO_PROCESS, self.program.pid)
+        our_priority = os.getpriority(os.PRIO_PROCESS, self.program.pid)
         children = Path(f"/proc/{self.program.pid}/task").glob("*/children")
         # A process may end while it is examined.
         with suppress(FileNotFoundError, ProcessLookupError):
@@ -50,7 +50,7 @@ class Server:
                 # The tracker of the standard library's shared resources is not a process of the server.
                 if b"resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes():
                     continue
-                if is_wanted(os.getpriority(os.PRIO_PROCESS, pid) - own):
+                if is_wanted(os.getpriority(os.PRIO_PROCESS, pid) - our_priority):
                     return pid
         return None
 

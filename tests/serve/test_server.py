@@ -186,9 +186,9 @@ def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
 def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_text):
     address = f"http://192.168.33.7:8080/#token={TOKEN}"
     expected = [[bool(module) for module in row] for row in segno.make(address, error="l").matrix_iter()]
-    shown = show_on_terminal(draw_code(address), black_text)
-    assert shown[: len(expected)] == expected
-    assert not any(map(any, shown[len(expected) :]))
+    modules = show_on_terminal(draw_code(address), black_text)
+    assert modules[: len(expected)] == expected
+    assert not any(map(any, modules[len(expected) :]))
 
 
 @pytest.mark.parametrize("control", [False, True])

@@ -145,11 +145,11 @@ def test_the_size_of_a_growing_folder_is_counted_again_sooner(root, monkeypatch)
     sizes = site.Sizes()
     folder = root / "alive"
     wait_for(lambda: sizes.read_size(folder) is not None, "the first count")
-    before = sizes.read_size(folder)
+    first_size = sizes.read_size(folder)
     (folder / "more").write_bytes(bytes(1000))
     now_s += 10.0
-    assert sizes.read_size(folder) == before
-    wait_for(lambda: sizes.read_size(folder, site.GROWING_SIZE_AGE_S) == before + 1000, "the second count")
+    assert sizes.read_size(folder) == first_size
+    wait_for(lambda: sizes.read_size(folder, site.GROWING_SIZE_AGE_S) == first_size + 1000, "the second count")
 
 
 def test_only_threads_that_may_hang_ask_a_folder_of_the_list_for_its_time(root, monkeypatch):

@@ -23,5 +23,5 @@ def test_a_path_in_a_command_that_is_advised_is_quoted():
     package = Path(polysight.__file__).parent
     sources = [path for path in package.rglob("*.py") if path.relative_to(package) != table]
     assert len(sources) > 100
-    unquoted = [f"{path.name}: {found[0]}" for path in sources for found in command.finditer(path.read_text())]
+    unquoted = [f"{path.name}: {match[0]}" for path in sources for match in command.finditer(path.read_text())]
     assert not unquoted

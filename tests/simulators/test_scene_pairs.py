@@ -140,13 +140,13 @@ def check_scene(scene: dict[str, Any], folder: Path, capsys: pytest.CaptureFixtu
     if not is_small(file):
         return False
     status = simulators(["simulate", str(file), "--config", str(RIG_FILE), "--out", str(scan)])
-    told = capsys.readouterr()
+    output = capsys.readouterr()
     if status:
-        assert "\n  why: " in told.err, (scene, told.err)
-        assert "\n  do: " in told.err, (scene, told.err)
-        assert not (scan / "truth.json").exists(), (scene, told.err)
+        assert "\n  why: " in output.err, (scene, output.err)
+        assert "\n  do: " in output.err, (scene, output.err)
+        assert not (scan / "truth.json").exists(), (scene, output.err)
         return False
-    assert "nan" not in told.out.split(), (scene, told.out)
+    assert "nan" not in output.out.split(), (scene, output.out)
     json.loads((scan / "truth.json").read_text(), parse_constant=pytest.fail)
     assert main(["validate", str(scan)]) == 0, (scene, capsys.readouterr())
     capsys.readouterr()

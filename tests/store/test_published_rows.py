@@ -172,9 +172,9 @@ def test_rows_beyond_the_settings_are_left_out_with_a_notice(tmp_path, rows):
     file.write_text(json.dumps(json.loads(file.read_text()) | {"total_y": rows}))
     scan = open_source(folder, BASE)
     assert list(scan.rows()) == list(range(rows))
-    told = [notice for notice in scan.notices if "left out" in notice]
-    assert len(told) == (ROWS - rows) * len(BASE.boards)
-    assert all(f"{ROWS - rows} files of rows beyond the {rows}" in notice for notice in told)
+    notices = [notice for notice in scan.notices if "left out" in notice]
+    assert len(notices) == (ROWS - rows) * len(BASE.boards)
+    assert all(f"{ROWS - rows} files of rows beyond the {rows}" in notice for notice in notices)
 
 
 def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):

@@ -39,16 +39,16 @@ class EmulatedLibrary(Library):
 
     def _call(self, name: str, arguments: Sequence[NDArray[Any] | float]) -> None:
         """Call a loop in the emulator (call_loop.c has the format); copy the arrays that it has changed back."""
-        given = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else int(x) for x in arguments]
+        plain_arguments = [np.ascontiguousarray(x) if isinstance(x, np.ndarray) else int(x) for x in arguments]
         message = b""
-        for argument in given:
+        for argument in plain_arguments:
             if isinstance(argument, int):
                 message += struct.pack("<qq", -1, argument)
             else:
                 message += struct.pack("<q", argument.nbytes) + argument.tobytes()
         process = subprocess.run([EMULATOR, self._program, name], input=message, stdout=subprocess.PIPE, check=True)
         first = 0
-        for argument in given:
+        for argument in plain_arguments:
             if isinstance(argument, np.ndarray):
                 values = np.frombuffer(process.stdout[first : first + argument.nbytes], argument.dtype)
                 first += argument.nbytes

@@ -35,9 +35,11 @@ def assert_kept(file: Path, figures: object, absolute: float = 1e-5) -> None:
         lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in new.items())
         file.write_text("{\n" + lines + "\n}\n", encoding="utf-8")
         pytest.fail(f"{file} was written: read it, and run the test again")
-    kept = json.loads(file.read_text(encoding="utf-8"))
-    assert sorted(new) == sorted(kept)
-    different = {n: (value, kept[n]) for n, value in new.items() if not are_alike(value, kept[n], absolute)}
+    kept_values = json.loads(file.read_text(encoding="utf-8"))
+    assert sorted(new) == sorted(kept_values)
+    different = {
+        n: (value, kept_values[n]) for n, value in new.items() if not are_alike(value, kept_values[n], absolute)
+    }
     assert different == {}
 
 

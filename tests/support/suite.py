@@ -141,17 +141,19 @@ class ProcessTimes:
             with suppress(OSError):
                 line = Path(f"/proc/{folder}/stat").read_text(errors="replace")
                 table[int(folder)] = line.rpartition(") ")[2].split()
-        own = {pid for pid, fields in table.items() if (pid, fields[19]) in self._followed}
+        our_pids = {pid for pid, fields in table.items() if (pid, fields[19]) in self._followed}
         children: dict[int, list[int]] = {}
         for pid, fields in table.items():
             children.setdefault(int(fields[1]), []).append(pid)
-        waiting = [os.getpid(), *own]
+        waiting = [os.getpid(), *our_pids]
         while waiting:
-            new = set(children.get(waiting.pop(), ())) - own
-            own |= new
+            new = set(children.get(waiting.pop(), ())) - our_pids
+            our_pids |= new
             waiting.extend(new)
-        self._orphans_ticks += self._count_lost({os.getpid(), *own})
-        self._followed = {(pid, table[pid][19]): (int(table[pid][1]), sum(map(int, table[pid][11:15]))) for pid in own}
+        self._orphans_ticks += self._count_lost({os.getpid(), *our_pids})
+        self._followed = {
+            (pid, table[pid][19]): (int(table[pid][1]), sum(map(int, table[pid][11:15]))) for pid in our_pids
+        }
         ticks = self._orphans_ticks + sum(used for _, used in self._followed.values())
         used = [resource.getrusage(process_kind) for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         return ticks / _TICKS_PER_S + sum(u.ru_utime + u.ru_stime for u in used)
@@ -159,12 +161,12 @@ class ProcessTimes:
     def _count_lost(self, running: set[int]) -> int:
         """Ticks of the processes that have ended since the last call without a parent of ours."""
         ended = {pid: values for (pid, _), values in self._followed.items() if pid not in running}
-        lost = 0
+        lost_ticks = 0
         for parent, used in ended.values():
             while parent in ended:
                 parent = ended[parent][0]
-            lost += used if parent not in running else 0
-        return lost
+            lost_ticks += used if parent not in running else 0
+        return lost_ticks
 
 
 class Costs:

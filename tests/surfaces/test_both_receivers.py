@@ -76,8 +76,8 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
     ratios = {}
     share_of_v = np.ones(len(OFFSETS_M))
     for name, stack in (("metal", METAL), ("medium", Stack(below=medium))):
-        seen, shape = see_exactly(sphere("ball", stack, CENTRE_M, RADIUS_M), optics)
-        voltages = find_voltages(seen, optics, shape)
+        measured, shape = see_exactly(sphere("ball", stack, CENTRE_M, RADIUS_M), optics)
+        voltages = find_voltages(measured, optics, shape)
         eps = np.inf if stack.is_metal else medium
         expected = predict_voltages(voltages, reflect_points(eps, voltages, optics.wave_number))
         h, v = (voltages.voltage / expected).T
@@ -90,8 +90,8 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
 
 def find_pattern(antenna: Antenna, points: np.ndarray, at_m: np.ndarray) -> np.ndarray:
     """Gain of an antenna of the worlds in the directions of points [n, 3] from stage offsets [n, 3]."""
-    away = points - at_m - antenna.position
-    return (away @ antenna.boresight / np.linalg.norm(away, axis=1)) ** antenna.exponent
+    from_antenna = points - at_m - antenna.position
+    return (from_antenna @ antenna.boresight / np.linalg.norm(from_antenna, axis=1)) ** antenna.exponent
 
 
 @pytest.mark.parametrize("medium", [2.8 - 0.1j, 4.5 - 0.3j, 8 - 1j], ids=["2.8", "4.5", "8"])
@@ -104,8 +104,8 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
     solid: WorldShape = sphere("solid", Stack(below=medium), (x, y, z + 0.1), 0.1)
     if axis is not None:
         solid = cylinder("solid", Stack(below=medium), (x, y, z + 0.15), 0.15, 4.0, axis=axis)
-    seen, shape = see_exactly(solid, optics)
-    v = find_voltages(seen, optics, shape)
+    measured, shape = see_exactly(solid, optics)
+    v = find_voltages(measured, optics, shape)
     published = published_boards()
     tx = published.tx
     h = replace(published.h[0], position=optics.h.at_m)
@@ -125,8 +125,8 @@ def test_the_level_of_metal_is_known_as_well_as_both_its_directions_are(behind_m
     """At another distance, an arrival angle has another departure angle than in the reference: 15 degrees at 180 mm."""
     learnt = gains(optics)
     x, y, z = CENTRE_M
-    seen, shape = see_exactly(sphere("ball", METAL, (x, y, z + behind_m), RADIUS_M), optics)
-    voltages = find_voltages(seen, optics, shape)
+    measured, shape = see_exactly(sphere("ball", METAL, (x, y, z + behind_m), RADIUS_M), optics)
+    voltages = find_voltages(measured, optics, shape)
     expected = predict_voltages(voltages, reflect_points(np.inf, voltages, optics.wave_number))
     miss = np.log(np.abs(voltages.voltage[:, 0] / expected[:, 0])) - learnt.level(voltages)
     std = learnt.estimate_level_std(voltages)

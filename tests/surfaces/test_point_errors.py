@@ -71,9 +71,9 @@ def test_regions_of_points_hold_where_it_is_quiet_and_where_it_ripples(stated_no
     is_rippled = at_m[:, 0] > x.mean()
     voltages = make_voltages(np.where(is_rippled, 0.03, 0.005), at_m, stated_noise)
     fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
-    away = point_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER) - EPS
+    deviation = point_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER) - EPS
     covariance = point_covariance(voltages, UNIT_GAINS, fit, WAVE_NUMBER)
-    parts = np.stack([away.real, away.imag], axis=1)
+    parts = np.stack([deviation.real, deviation.imag], axis=1)
     distance2 = np.einsum("ni,nij,nj->n", parts, np.linalg.inv(covariance), parts)
     for half in (is_rippled, ~is_rippled):
         assert 0.9 < np.mean(distance2[half] < CHI2_95) < 0.985
@@ -165,12 +165,12 @@ def test_a_rise_that_its_own_scatter_may_be_refuses_no_segment():
 
 
 def test_a_wide_object_averages_over_what_a_reference_leaves_and_a_flat_one_does_not():
-    known = replace(UNIT_GAINS, degree=2, std=0.004, terms_root=np.zeros((6, 1)), cell=np.full(2, 0.05))
+    measured_gains = replace(UNIT_GAINS, degree=2, std=0.004, terms_root=np.zeros((6, 1)), cell=np.full(2, 0.05))
     x, y = np.meshgrid(np.arange(8) * 0.05 + 0.01, np.arange(8) * 0.05 + 0.01)
     directions = np.stack([x.ravel(), y.ravel()], axis=1)
 
     def find_std_of_mean(arrival: np.ndarray) -> float:
-        return float(np.linalg.norm(known.list_errors(arrival).mean(axis=1)))
+        return float(np.linalg.norm(measured_gains.list_errors(arrival).mean(axis=1)))
 
     assert find_std_of_mean(directions[:1]) == pytest.approx(0.004)
     assert find_std_of_mean(directions) == pytest.approx(0.004 / 8)

@@ -128,7 +128,10 @@ def test_it_is_reported_whether_one_medium_explains_a_small_body(metal, gains, o
     # Far from the directions of the reference, as beside a flat plate, the level of the gains is not known.
     elsewhere = replace(learnt, covered=tuple(border + 0.5 for border in learnt.covered))
     brighter = replace(voltages, voltage=1.1 * received, band_rise=np.tile(learnt.band_rise, (len(metal), 1)))
-    reasons = [judge_segment(ball, brighter, known, [], optics.wave_number)[0].reason for known in (learnt, elsewhere)]
+    reasons = [
+        judge_segment(ball, brighter, known_gains, [], optics.wave_number)[0].reason
+        for known_gains in (learnt, elsewhere)
+    ]
     assert reasons[0] == NO_SINGLE_MEDIUM
     assert "below 40 mm" in reasons[1]
 
@@ -255,8 +258,8 @@ def test_ripples_of_edges_average_where_points_near_them_count_less(rippled_plan
         rippled = replace(voltages, voltage=voltages.voltage * of_both)
         fits = [fit_permittivity(rippled, gains(optics), optics.wave_number, counted) for counted in (1.0, share)]
         errors.append([abs(fit.eps - MEDIUM) for fit in fits])
-    alike, slowly = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert slowly < 0.6 * alike
+    error_of_equal_weights, error_of_reduced_weights = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert error_of_reduced_weights < 0.6 * error_of_equal_weights
 
 
 def test_ripples_of_edges_do_not_make_a_plate_a_wall(rippled_plane, metal, gains, optics):
@@ -409,8 +412,8 @@ def test_a_permittivity_at_the_end_of_the_fit_is_none():
 def test_a_gap_of_one_window_does_not_part_a_surface_and_a_wider_one_does(metal, optics, missing_columns, pieces):
     x_m = metal.h.at_m[:, 0]
     column = x_m[np.argmin(np.abs(x_m - np.median(x_m)))]
-    kept = np.abs(x_m - column) > (missing_columns / 2) * STRIDE_M
-    groups = group_echoes(metal.h[kept], optics)
-    is_right = x_m[kept] > column
+    is_kept = np.abs(x_m - column) > (missing_columns / 2) * STRIDE_M
+    groups = group_echoes(metal.h[is_kept], optics)
+    is_right = x_m[is_kept] > column
     assert set(groups) == set(range(pieces))
     assert set(groups[is_right]).isdisjoint(groups[~is_right]) is (pieces == 2)

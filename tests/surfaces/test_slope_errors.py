@@ -21,17 +21,17 @@ BENT = np.array([[1.2, 0.2], [0.2, 0.4]])
 def draw_ripple(rng: np.random.Generator) -> np.ndarray:
     """Normal errors [SIDE, SIDE] that windows share as far as they overlap, with a variance of 1."""
     steps = np.arange(SIDE)
-    apart = np.abs(steps[:, None] - steps) * STRIDE_M / WINDOW_M
-    factor = np.linalg.cholesky(np.maximum(0, 1 - apart) + 1e-9 * np.eye(SIDE))
+    distance = np.abs(steps[:, None] - steps) * STRIDE_M / WINDOW_M
+    factor = np.linalg.cholesky(np.maximum(0, 1 - distance) + 1e-9 * np.eye(SIDE))
     return factor @ rng.standard_normal((SIDE, SIDE)) @ factor.T
 
 
 def draw_noise(rng: np.random.Generator, axis: int) -> np.ndarray:
     """Errors [SIDE, SIDE] of the slope along an axis by noise of positions 2 mm apart, with a variance of 1."""
     samples = round(WINDOW_M / 0.002)
-    every = round(STRIDE_M / 0.002)
-    white = rng.standard_normal((SIDE * every + samples,) * 2)
-    patches = np.lib.stride_tricks.sliding_window_view(white, (samples, samples))[::every, ::every][:SIDE, :SIDE]
+    stride = round(STRIDE_M / 0.002)
+    white = rng.standard_normal((SIDE * stride + samples,) * 2)
+    patches = np.lib.stride_tricks.sliding_window_view(white, (samples, samples))[::stride, ::stride][:SIDE, :SIDE]
     ramp = np.arange(samples) - (samples - 1) / 2
     sums = np.tensordot(patches.sum(axis=3 - axis), ramp, 1)
     return sums / np.sqrt(samples * np.sum(ramp**2))

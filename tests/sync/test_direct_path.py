@@ -209,8 +209,8 @@ def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(
     path = direct_paths[board.name]
     rng = np.random.default_rng(6)
     signal, length = paths(board, 40, 0.0, rng)
-    apart = side * np.mean(path.object_bins) / SEARCH_FFT / FOLD
-    tone = strength * signal * np.exp(2j * np.pi * apart * np.arange(256))
+    distance = side * np.mean(path.object_bins) / SEARCH_FFT / FOLD
+    tone = strength * signal * np.exp(2j * np.pi * distance * np.arange(256))
     is_disturbed = np.arange(40) % 8 == 3
     signal = signal + is_disturbed[:, None, None] * tone + noise(signal.shape, -10, rng)
     signal *= np.exp(2j * np.pi * 0.25 * np.arange(256))
@@ -277,9 +277,9 @@ def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths,
 def check_what_is_left(referenced, path):
     """The other positions have a direct path of that amplitude, but no phase."""
     samples = referenced.samples[:, referenced.found].swapaxes(0, 1)
-    left = samples.reshape(len(samples), -1) @ path.estimator[0]
+    remainder = samples.reshape(len(samples), -1) @ path.estimator[0]
     size = np.abs(referenced.amplitude[referenced.found])
-    np.testing.assert_allclose(left, size, rtol=0, atol=1e-5 * size.max())
+    np.testing.assert_allclose(remainder, size, rtol=0, atol=1e-5 * size.max())
 
 
 @pytest.mark.parametrize("echo", [0.0, 1.0, 2.0])

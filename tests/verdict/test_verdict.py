@@ -241,9 +241,9 @@ def test_paint_is_not_the_cause_where_a_dielectric_reference_explains_the_others
 @pytest.mark.parametrize("labels", [[4], [4, 7]])
 def test_smears_are_reported_with_their_own_cause_and_advice(labels):
     assert rules.judge_smears({}) == []
-    (told,) = rules.judge_smears(dict.fromkeys(labels, SMEAR))
-    assert all(str(label) in told.what for label in labels)
-    assert (told.why, told.do) == (SMEAR.why, SMEAR.do)
+    (reason,) = rules.judge_smears(dict.fromkeys(labels, SMEAR))
+    assert all(str(label) in reason.what for label in labels)
+    assert (reason.why, reason.do) == (SMEAR.why, SMEAR.do)
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -367,11 +367,11 @@ def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, sh
 
 def test_ripple_inside_given_boxes_names_the_edges_before_the_direct_path():
     """Boxes 3 mm inside the edges of undisturbed plates were blamed on a second path (found from outside)."""
-    (boxed,) = rules.judge_flatness((0.1, 0.05), 0.0, is_boxed=True)
-    assert boxed.why.startswith("boxes that reach the plates' edges")
-    assert "6 mm inside" in boxed.do
-    (found,) = rules.judge_flatness((0.1, 0.05), 0.0)
-    assert "boxes" not in found.why
+    (boxed_finding,) = rules.judge_flatness((0.1, 0.05), 0.0, is_boxed=True)
+    assert boxed_finding.why.startswith("boxes that reach the plates' edges")
+    assert "6 mm inside" in boxed_finding.do
+    (finding,) = rules.judge_flatness((0.1, 0.05), 0.0)
+    assert "boxes" not in finding.why
 
 
 def test_positions_without_data_are_the_cause_of_what_they_do_to_an_image():
@@ -384,27 +384,27 @@ def test_positions_without_data_are_the_cause_of_what_they_do_to_an_image():
     ]
     assert len(gaps) == 4
     (masked,) = rules.judge_recording(Coverage(73, 73, 100, 100), 0.034)
-    for found in (*gaps, masked):
-        assert "--sparse" in found.do
-    for found in gaps:
-        assert "positions without data" in found.why
-        assert "second path" not in found.why
-        assert found.weight < masked.weight
-    without = [
+    for finding in (*gaps, masked):
+        assert "--sparse" in finding.do
+    for finding in gaps:
+        assert "positions without data" in finding.why
+        assert "second path" not in finding.why
+        assert finding.weight < masked.weight
+    findings = [
         *rules.judge_copies([7, 13], (122.0, 0.0), -12.0),
         *rules.judge_fringes(0.9),
         *rules.judge_flatness((0.1, 0.05), 0.0),
         *rules.judge_disturbed_plates({2: 0.2}),
     ]
-    assert all("second path" in found.why and "--sparse" not in found.do for found in without)
+    assert all("second path" in found.why and "--sparse" not in found.do for found in findings)
 
 
 @pytest.mark.parametrize(
     ("masked", "is_filled", "advised"), [(0.03, False, True), (0.03, True, False), (0.9, False, False)]
 )
 def test_a_reconstruction_is_advised_where_it_would_help(masked, is_filled, advised):
-    (found,) = rules.judge_recording(Coverage(73, 73, 100, 100), masked, is_filled)
-    assert ("--sparse" in found.do) is advised
+    (finding,) = rules.judge_recording(Coverage(73, 73, 100, 100), masked, is_filled)
+    assert ("--sparse" in finding.do) is advised
 
 
 @pytest.mark.parametrize(("std_deg", "told"), [(0.0, True), (0.29, True), (0.31, False)])
@@ -421,14 +421,18 @@ def test_fringes_are_ascribed_to_the_background_where_it_disturbs_the_plates():
 
 
 def test_a_jump_of_both_boards_alike_is_reported_once_and_blames_no_cable():
-    both = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, 0.38)]})
-    assert [r.what for r in both] == ["the phase of the echo jumps by +23 degrees before row 26 in both boards alike"]
-    assert "no cable of one board" in both[0].why
-    apart = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, -0.38), PhaseJump(40, 0.3)]})
-    assert [r.what.split(":")[0] for r in apart] == ["RH", "RV"]
+    findings = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, 0.38)]})
+    assert [r.what for r in findings] == [
+        "the phase of the echo jumps by +23 degrees before row 26 in both boards alike"
+    ]
+    assert "no cable of one board" in findings[0].why
+    findings_of_boards = row_rules.judge_phase_jumps(
+        {"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, -0.38), PhaseJump(40, 0.3)]}
+    )
+    assert [r.what.split(":")[0] for r in findings_of_boards] == ["RH", "RV"]
 
 
 def test_images_apart_after_a_drift_of_the_phase_blame_no_board():
-    (found,) = rules.judge_image_shift((0.1, 1.5), has_drift=True)
-    assert "boards are out of place" not in found.why
-    assert "drift" in found.why
+    (finding,) = rules.judge_image_shift((0.1, 1.5), has_drift=True)
+    assert "boards are out of place" not in finding.why
+    assert "drift" in finding.why

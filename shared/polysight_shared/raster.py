@@ -27,10 +27,13 @@ WIDTH_US = (0.025, 4.0)
 WIDTH_TEXT = f"{WIDTH_US[0]:g}..{WIDTH_US[1]:g} us"
 MIN_PERIOD_NS = us_to_ns(MIN_PERIOD_US)
 MIN_WIDTH_NS, MAX_WIDTH_NS = map(us_to_ns, WIDTH_US)
-# Types of fields. `_Points` counts columns or rows, `_Motion` is a speed, an acceleration or a number of steps per mm,
-# `_Steps` an index or number of rows or points, `_Offset` a coordinate or signed distance in mm.
+# Types of fields. `_Points` counts columns or rows, `_Step` is the distance of two points in mm, `_Motion` is a speed,
+# an acceleration or a number of steps per mm, `_Steps` an index or number of rows or points, `_Offset` a coordinate or
+# signed distance in mm.
 _Points = Annotated[int, msgspec.Meta(ge=1, lt=100_000)]
 _Motion = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
+# A micrometre, a fifth of a motor step, is chosen: figures of a plan divide by the step.
+_Step = Annotated[float, msgspec.Meta(ge=0.001, le=1e6)]
 _Steps = Annotated[int, msgspec.Meta(ge=0, lt=100_000)]
 # The limits also refuse NaN and infinities.
 _Offset = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
@@ -96,8 +99,8 @@ class Grid(Section, frozen=True):
 
     columns: _Points
     rows: _Points
-    step_x_mm: Positive
-    step_y_mm: Positive
+    step_x_mm: _Step
+    step_y_mm: _Step
 
 
 class Stage(Section, frozen=True):

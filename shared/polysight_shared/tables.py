@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import re
 import tomllib
+import unicodedata
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -36,7 +38,35 @@ def require(ok: bool, rule: str) -> None:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Parse a TOML file. Raises ConfigError if it is missing, unreadable or not TOML."""
+    """Parse a TOML file. Raises ConfigError if it is missing, unreadable or not TOML, or has a control character."""
+    table = _parse_toml(path)
+    # A terminal that shows the text would obey the character, and no path or port has one.
+    for key, text in _list_texts(table):
+        if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in text):
+            raise ConfigError(
+                f"{path}: {key!r}: {text!r} has a control character",
+                "it was pasted, or the file is damaged",
+                "remove the character",
+                code=ErrorCode.VALUE_INVALID,
+            )
+    return table
+
+
+def _list_texts(node: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Yield every text in a parsed table, keys included, with the key at which it stands."""
+    if isinstance(node, str):
+        yield key, node
+    elif isinstance(node, dict):
+        for name, value in node.items():
+            yield name, name
+            yield from _list_texts(value, name)
+    elif isinstance(node, list):
+        for value in node:
+            yield from _list_texts(value, key)
+
+
+def _parse_toml(path: Path) -> dict[str, Any]:
+    """Parse a TOML file; errors as of `read_toml`."""
     try:
         # Editors of Windows write a mark of the byte order first.
         return tomllib.loads(read_bounded(path, _MAX_BYTES).decode("utf-8-sig"))

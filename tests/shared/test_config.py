@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tomli_w
@@ -9,7 +10,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.refusals import expect_refusal
 
 from polysight_shared import geometry
-from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Section, load_instrument
+from polysight_shared.config import DEBOUNCE_TICKS_US, Image, Instrument, MountStep, Pi, Radar, Section, load_instrument
 from polysight_shared.errors import ConfigError, ErrorCode, make_missing_path_error
 from polysight_shared.tables import decode, read_toml, to_builtins
 
@@ -132,6 +133,197 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
     raw[table][key] = value
     with expect_refusal(code, "my.toml", *named):
         decode(raw, Instrument, "my.toml")
+
+
+@pytest.mark.parametrize(
+    ("table", "within", "beyond"),
+    [
+        ("chirp", {"linear_samples": [0, 12]}, {"linear_samples": [0, 11]}),
+        ("chirp", {"linear_samples": [244, 256]}, {"linear_samples": [245, 257]}),
+        ("chirp", {"linear_samples": [0, 12]}, {"linear_samples": [-1, 12]}),
+        ("chirp", {"start_hz": 76e9}, {"start_hz": 75.999e9}),
+        # 100 us of 41 MHz/us
+        ("chirp", {"start_hz": 77e9, "samples": 192, "ramp_end_us": 100.0, "slope_hz_per_s": 41e12},
+         {"start_hz": 77.001e9}),
+        # 200 samples at 2 MHz
+        ("chirp", {"adc_start_us": 7.0, "samples": 200, "sample_rate_hz": 2e6, "ramp_end_us": 107.0},
+         {"adc_start_us": 7.001}),
+        ("chirp", {"hpf1_khz": 0.0, "hpf2_khz": 0.0}, {"hpf2_khz": 175.0}),
+        ("chirp", {"hpf1_khz": 700.0, "hpf2_khz": 2800.0}, {"hpf1_khz": 1400.0}),
+        ("burst", {"period_us": 300.0}, {"period_us": 299.9}),
+        ("burst", {"width_us": 0.025}, {"width_us": 0.024}),
+        ("burst", {"width_us": 4.0}, {"width_us": 4.001}),
+        # Two chirps and the pause of 300 us
+        ("burst", {"chirps": 2, "chirp_us": 100.0, "period_us": 500.0}, {"period_us": 499.9}),
+        ("burst", {"chirps": 1, "chirp_us": 0.0}, {"chirps": 2}),
+        ("burst", {"pulses": 1}, {"pulses": 0}),
+        ("grid", {"step_x_mm": 0.001}, {"step_x_mm": 0.0009}),
+        ("grid", {"step_y_mm": 0.001}, {"step_y_mm": 5e-324}),
+        ("image", {"columns": 2000, "rows": 10, "pixel_mm": 2.0}, {"columns": 2001}),
+        ("image", {"columns": 10, "rows": 2000, "pixel_mm": 2.0}, {"rows": 2001}),
+        ("image", {"columns": 10, "rows": 10, "pixel_mm": 0.05}, {"pixel_mm": 0.049}),
+        ("image", {"columns": 10, "rows": 10, "pixel_mm": 100.0}, {"pixel_mm": 100.1}),
+        ("stage", {"travel_x_mm": 1000.0, "centre_x_mm": 500.0}, {"centre_x_mm": 1000.1}),
+        ("stage", {"travel_y_mm": 1000.0, "centre_y_mm": 500.0}, {"centre_y_mm": 1000.1}),
+        ("pi", {"wiring": "spi", "sync_out": [10], "pulses_in": 9}, {"sync_out": [22]}),
+        ("pi", {"wiring": "spi", "sync_out": [10], "pulses_in": 9}, {"pulses_in": 8}),
+        ("pi", {"wiring": "spi", "spi_device": "/dev/spidev1.0", "sync_out": [20], "pulses_in": 19},
+         {"sync_out": [10]}),
+        ("pi", {"wiring": "spi", "spi_device": "/dev/own.0", "sync_out": [5], "pulses_in": 6}, {"pulses_in": 5}),
+        ("pi", {"pulses_in": 5}, {"pulses_in": 26}),
+        ("pi", {"trigger_in": 63}, {"trigger_in": 64}),
+        ("card", {"packet_bytes": 1470}, {"packet_bytes": 1471}),
+        ("card", {"packet_bytes": 24}, {"packet_bytes": 23}),
+        ("limits", {"command_timeout_s": 86400.0}, {"command_timeout_s": 86401.0}),
+        ("radar", {"servers": {"RH": "rig:65535"}}, {"servers": {"RH": "rig:65536"}}),
+        ("radar", {"servers": {"RH": "rig:1"}}, {"servers": {"RH": "rig:0"}}),
+        ("radar", {"servers": {"RH": "rig:1"}}, {"servers": {"unknown": "rig:1"}}),
+        ("notify", {"url": "https://a.b/c"}, {"url": "ftp://a.b/c"}),
+    ],
+)  # fmt: skip
+def test_a_value_at_its_limit_is_taken_and_one_beyond_is_refused(table: str, within: dict, beyond: dict):
+    raw = read_toml(RIG_FILE)
+    raw.setdefault(table, {}).update(within)
+    decode(raw, Instrument, "my.toml")
+    raw[table].update(beyond)
+    with refused(ErrorCode.VALUE_INVALID, "my.toml"):
+        decode(raw, Instrument, "my.toml")
+
+
+@pytest.mark.parametrize(("width_us", "is_taken"), [(0.4, False), (0.5, True), (2.0, True), (2.1, False)])
+def test_a_pulse_by_spi_is_a_bit_of_the_controller(width_us: float, is_taken: bool):
+    raw = read_toml(RIG_FILE)
+    raw["burst"]["width_us"] = width_us
+    decode(raw, Instrument, "my.toml")
+    raw["pi"].update(wiring="spi", sync_out=[10], pulses_in=9)
+    if is_taken:
+        decode(raw, Instrument, "my.toml")
+        return
+    with refused(ErrorCode.VALUE_INVALID, "burst.width_us"):
+        decode(raw, Instrument, "my.toml")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        # Names: length, first character, characters, and two alike
+        ["x" * 65, "RV"], ["", "RV"], [" RH", "RV"], ["-RH", "RV"], ["R/H", "RV"], ["RV", "RV"], ["RH\n", "RV"],
+    ],
+)  # fmt: skip
+def test_boards_have_names_of_folders(changes: list[str]):
+    raw = read_toml(RIG_FILE)
+    for board, name in zip(raw["boards"][1:], ["x" * 64, "R.1-b c_"], strict=True):
+        board["name"] = name
+    decode(raw, Instrument, "my.toml")
+    for board, name in zip(raw["boards"][1:], changes, strict=True):
+        board["name"] = name
+    with refused(ErrorCode.VALUE_INVALID, "name"):
+        decode(raw, Instrument, "my.toml")
+
+
+def test_boards_may_share_an_address_or_a_port_and_not_both():
+    raw = read_toml(RIG_FILE)
+    first, second = raw["boards"][1:]
+    second["host_address"] = first["host_address"]
+    second["data_port"] = first["data_port"] + 1
+    decode(raw, Instrument, "my.toml")
+    second["data_port"] = first["data_port"]
+    with refused(ErrorCode.VALUE_INVALID, "host_address", "data_port"):
+        decode(raw, Instrument, "my.toml")
+
+
+@pytest.mark.parametrize(
+    ("tables", "places"),
+    [
+        ([{"usb_serial": "A"}, {"usb_serial": "B"}], ["A", "B"]),
+        ([{"usb_serial": "B"}, {"usb_path": "1-4.2"}], ["B", "usb:1-4.2"]),
+        ([{"usb_serial": "A"}, {"usb_serial": "A"}], None),
+        ([{"usb_path": "1-4"}, {"usb_path": "1-4"}], None),
+        ([{"usb_serial": "A", "usb_path": "1-4"}], None),
+        ([{}], None),
+    ],
+)
+def test_each_board_at_usb_has_one_place_of_its_own(tables: list[dict[str, str]], places: list[str] | None):
+    raw = {"native": dict(zip("ab", tables, strict=False))}
+    if places is not None:
+        assert [board.place for board in decode(raw, Radar, "my.toml").native.values()] == places
+        return
+    with refused(ErrorCode.VALUE_INVALID, "usb_serial"):
+        decode(raw, Radar, "my.toml")
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({}, ["libgpiod", "pulses above 4 us", "sent, not seen"]),
+        ({"wiring": "gpiomem"}, ["libgpiod", "spacing by the program"]),
+        ({"one_shot": True, "pulses_in": 5}, ["one-shot", "spacing by the program", "by GPIO 5"]),
+        ({"wiring": "spi", "one_shot": True, "sync_out": (10,)}, ["SPI controller", "by its clock"]),
+    ],
+)
+def test_the_source_of_pulses_is_said(keys: dict[str, Any], words: list[str]):
+    text = Pi(**keys).pulse_source
+    assert all(word in text for word in words)
+
+
+def test_pulses_need_a_line():
+    with pytest.raises(ValueError, match="at least one line"):
+        Pi(sync_out=())
+
+
+def test_data_of_a_scan_are_counted(rig: Instrument):
+    """16 bits each of I and Q, 256 samples, four receivers; 350 columns of 16 pulses, two boards, 200 rows."""
+    assert rig.frame_bytes == 2 * 2 * 256 * 4
+    assert rig.row_bytes == 350 * 16 * 4096
+    assert rig.recorded_row_bytes == 2 * rig.row_bytes
+    assert rig.scan_bytes == 200 * 2 * rig.row_bytes
+    assert rig.card.payload_bytes == 1456
+
+
+def test_a_board_has_the_name_asked_for(rig: Instrument):
+    assert [rig.by_name(board.name) for board in rig.boards] == list(rig.boards)
+    with pytest.raises(KeyError):
+        rig.by_name("MM")
+
+
+def test_antennas_of_a_board_are_those_of_the_table():
+    raw = read_toml(RIG_FILE)
+    transmitter = next(board for board in raw["boards"] if board["role"] == "transmit")
+    for tx_antenna in (0, 2):
+        transmitter["tx_antenna"] = tx_antenna
+        decode(raw, Instrument, "my.toml")
+    for tx_antenna in (3, 4):
+        transmitter["tx_antenna"] = tx_antenna
+        with refused(ErrorCode.VALUE_INVALID, "tx_antenna"):
+            decode(raw, Instrument, "my.toml")
+    transmitter["tx_antenna"] = 1
+    for rx_order, is_taken in (([4, 2, 1, 3], True), ([1, 2, 3], False), ([1, 2, 3, 3], False), ([2, 3, 4, 5], False)):
+        transmitter["rx_order"] = rx_order
+        if is_taken:
+            decode(raw, Instrument, "my.toml")
+            continue
+        with refused(ErrorCode.VALUE_INVALID, "rx_order"):
+            decode(raw, Instrument, "my.toml")
+
+
+@pytest.mark.parametrize(
+    ("line", "key"),
+    [
+        ('name = "red \\u001b[31m"', "name"),
+        ('[stage]\nport = "/dev/tty\\u0000"', "port"),
+        ('[[boards]]\nname = "RH\\u009b"', "name"),
+        ('"a\\u0007b" = 1', "a"),
+        ('names = ["RH", "R\\rV"]', "names"),
+    ],
+)
+def test_a_text_with_a_character_that_a_terminal_obeys_is_refused(tmp_path: Path, line: str, key: str):
+    path = tmp_path / "rig.toml"
+    path.write_text(line)
+    with refused(ErrorCode.VALUE_INVALID, path, key, "control character") as refusal:
+        read_toml(path)
+    assert str(refusal.value).replace("\n", "").isprintable()
+    path.write_text('command = """\nfirst\n\tsecond"""')
+    assert read_toml(path) == {"command": "first\n\tsecond"}
 
 
 @pytest.mark.parametrize("debounce_us", [2_000, 4_000])

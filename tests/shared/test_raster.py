@@ -1,12 +1,14 @@
 """The serpentine plan has every position once, alternating rows, and its centre at offset zero."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given, strategies as st
 from tests.support.refusals import expect_refusal
 
 from polysight_shared.config import Burst, Grid, Stage
 from polysight_shared.errors import ErrorCode
-from polysight_shared.raster import check_burst_fits, mean_burst_travel_mm, plan_raster
+from polysight_shared.raster import Row, check_burst_fits, mean_burst_travel_mm, plan_raster
 
 grids = st.builds(
     Grid,
@@ -46,6 +48,38 @@ def test_a_burst_longer_than_the_step_is_refused():
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "24.00 ms", "20.00 ms"):
         check_burst_fits(grid, Burst(16, 1500.0), stage)
     check_burst_fits(grid, Burst(8, 1500.0), stage)
+    # 20 pulses of 1 ms in 20 ms
+    check_burst_fits(grid, Burst(20, 1000.0), stage)
+
+
+def test_rows_of_a_plan_are_counted_from_zero():
+    plan = plan_raster(Grid(3, 2, 2.0, 1.0))
+    assert [plan.row(index).index for index in (0, 1)] == [0, 1]
+    assert plan.positions == 6
+    for index in (-1, 2):
+        with pytest.raises(IndexError):
+            plan.row(index)
+    # A row whose points lie at one place runs backwards as far as its columns go.
+    assert [Row(0, 0.0, 0.0, 0.0, 2).column(i) for i in (0, 1)] == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("stage", "fits"),
+    [
+        # 3 points 2 mm apart, run-up 2^2 / 2 x 1 + 2 = 4 mm: 6 mm to either side
+        ({"centre_x_mm": 6.0, "travel_x_mm": 12.0}, True),
+        ({"centre_x_mm": 5.9, "travel_x_mm": 12.0}, False),
+        ({"centre_x_mm": 6.0, "travel_x_mm": 11.9}, False),
+        # 2 rows 1 mm apart, and a backlash of 3 mm: 3.5 mm; the run-up is a millimetre longer
+        ({"centre_x_mm": 20.0, "travel_x_mm": 40.0, "backlash_mm": 3.0, "centre_y_mm": 3.5, "travel_y_mm": 7.0}, True),
+        ({"centre_x_mm": 20.0, "travel_x_mm": 40.0, "backlash_mm": 3.1, "centre_y_mm": 3.5, "travel_y_mm": 9.0}, False),
+        ({"centre_x_mm": 7.0, "travel_x_mm": 14.0, "backlash_mm": 3.0}, True),
+        ({"centre_x_mm": 7.0, "travel_x_mm": 14.0, "backlash_mm": 3.1}, False),
+    ],
+)
+def test_a_grid_with_its_run_up_fits_the_travel_or_not(stage: dict[str, Any], fits: bool):
+    misfit = Stage("x", speed_mm_s=2.0, accel_mm_s2=1.0, **stage).misfit(Grid(3, 2, 2.0, 1.0))
+    assert (misfit == "") == fits
 
 
 def test_published_burst_travel():

@@ -198,17 +198,21 @@ def test_the_card_decodes_the_settings_sent(net, ends, mac, ports):
         {"host_address": "224.0.0.1", "card_address": "224.0.0.2"},
         {"card_mac": "01:00:00:00:00:01"},
         {"card_mac": "00:00:00:00:00:00"},
+        {"card_address": "192.168.33.0"},
         {"card_mac": "12:34"},
+        {"card_mac": "12:34:56:78:90:12:34"},
         {"card_mac": "wrong"},
         {"command_port": 1024},
-        {"data_port": 70000},
+        {"data_port": 1024},
+        {"data_port": 65536},
         {"data_port": 4096},
     ],
 )
 def test_a_card_that_could_not_be_reached_is_refused(given):
     good = {"host_address": "192.168.33.30", "card_address": "192.168.33.180"}
     EepromSettings(**good)
-    with expect_refusal(ErrorCode.VALUE_INVALID):
+    EepromSettings(**good, command_port=1025, data_port=65535)
+    with refused(ErrorCode.VALUE_INVALID):
         EepromSettings(**(good | given))
 
 

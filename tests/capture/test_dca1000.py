@@ -22,7 +22,14 @@ def test_vectors_seen():
     assert d.decode_packet_header(bytes.fromhex("ffffffff010000000080") + b"x") == (2**32 - 1, 2**47 + 1)
 
 
-@pytest.mark.parametrize("raw", [b"", b"12345678", bytes.fromhex("5aa509000000aaef"), bytes.fromhex("5aa509000000aa")])
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"", b"12345678", bytes.fromhex("5aa509000000aaef"), bytes.fromhex("5ba509000000aaee"),
+        bytes.fromhex("59a509000000aaee"), bytes.fromhex("5aa509000000a9ee"),
+        bytes.fromhex("5aa509000000aa"), bytes.fromhex("5aa509000000aaee00"),
+    ],
+)  # fmt: skip
 def test_malformed_replies_are_refused(raw):
     with pytest.raises(ProtocolError):
         d.decode_reply(raw)
@@ -36,7 +43,32 @@ def test_out_of_range_is_refused():
     with pytest.raises(ProtocolError):
         d.encode_fpga_configuration(3)
     with pytest.raises(ProtocolError):
+        d.encode_packet_configuration(1470, -0.01)
+    with pytest.raises(ProtocolError):
         d.decode_packet_header(bytes(10))
+
+
+def test_the_largest_and_smallest_values_are_taken():
+    assert d.encode_request(3, bytes(504))[4:6] == (504).to_bytes(2, "little")
+    # 65535 ticks of 8 ns
+    assert d.encode_packet_configuration(1470, 524.28)[2:4] == b"\xff\xff"
+    assert d.encode_packet_configuration(1470, 0.0)[2:4] == b"\0\0"
+    assert d.decode_packet_header(bytes(11)) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("status", "version"),
+    [(0x0402, "2.8"), (0x007F, "127.0"), (0x3F80, "0.127"), (0x4081, "1.1 (playback)"), (0x8000, "0.0")],
+)
+def test_a_version_is_seven_bits_each_and_one_for_playback(status, version):
+    assert str(d.decode_version(status)) == version
+
+
+def test_counters_wrap_at_48_and_32_bits():
+    counters = d.Counters(2**48 - 1, 2**32 - 1)
+    assert counters.advance(1, 1) == d.Counters(0, 0)
+    assert counters.advance(1457, 2) == d.Counters(1456, 1)
+    assert d.Counters(0, 0).advance(2**48 - 1, 2**32 - 1) == counters
 
 
 def draw_cube(frames: int, samples: int, rx: int, seed: int = 0) -> np.ndarray:
@@ -104,8 +136,28 @@ def test_frames_with_a_missing_byte_are_invalid_and_zero(cuts):
     assert np.array_equal(decoded[:, valid], x[:, valid])
 
 
+@pytest.mark.parametrize(
+    ("missing", "invalid"),
+    [
+        ([(99, 100)], [0]),
+        ([(100, 101)], [1]),
+        ([(99, 101)], [0, 1]),
+        ([(100, 300)], [1, 2]),
+        ([(100, 100), (150, 150)], []),
+        ([], []),
+    ],
+)
+def test_a_missing_byte_belongs_to_one_frame(missing, invalid):
+    assert np.flatnonzero(~d.valid_frames(missing, 4, 100)).tolist() == invalid
+
+
+def test_bytes_beyond_the_last_frame_are_ignored():
+    x = draw_cube(2, 4, 4)
+    assert np.array_equal(decode_row(encode_four_lane(x) + b"rest", (), 2, 4)[0], x)
+
+
 def test_short_data_is_refused():
-    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA):
-        decode_row(bytes(100), (), 2, 4)
-    with expect_refusal(ErrorCode.VALUE_INVALID):
+    with refused(ErrorCode.NOT_ENOUGH_DATA, "127 bytes", "128 bytes"):
+        decode_row(bytes(2 * 4 * 16 - 1), (), 2, 4)
+    with refused(ErrorCode.VALUE_INVALID):
         decode_two_lane(bytes(1000), 1, 3)

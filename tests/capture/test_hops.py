@@ -55,8 +55,9 @@ def write_kernel_files(root: Path, routes: str = LOCAL, carrier: str | None = "1
 def test_an_interface_without_a_link_status_is_skipped(tmp_path):
     root = write_kernel_files(tmp_path, carrier=None)
     assert find_silent_hop(CARD, root) is Hop.LINK
-    (root / "sys/class/net/eth1/operstate").write_text("unknown\n")
-    assert find_silent_hop(CARD, root) is Hop.CARD
+    for state in ("unknown", "dormant"):
+        (root / "sys/class/net/eth1/operstate").write_text(f"{state}\n")
+        assert find_silent_hop(CARD, root) is Hop.CARD
 
 
 @pytest.mark.parametrize(
@@ -78,6 +79,49 @@ def test_every_hop_reads_differently(tmp_path, given, hop, says):
     error = explain_silent_card(BOARD, "it did not answer", root)
     assert (error.what, says in error.why) == ("it did not answer", True)
     assert error.remedy
+
+
+@pytest.mark.parametrize(
+    ("routes", "interface"),
+    [
+        # The longest mask wins, in either order, and of two equal ones the first.
+        (
+            "eth1 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\neth2 0000A8C0 00000000 0001 0 0 0 0000FFFF 0 0 0\n",
+            "eth1",
+        ),
+        (
+            "eth2 0000A8C0 00000000 0001 0 0 0 0000FFFF 0 0 0\neth1 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\n",
+            "eth1",
+        ),
+        (LOCAL + LOCAL.replace("eth1", "eth2"), "eth1"),
+        # A route of an interface that is down, and one to another subnet
+        (LOCAL.replace(" 0001 ", " 0000 "), ""),
+        (LOCAL.replace("0021A8C0", "0022A8C0"), ""),
+        (LOCAL.replace("0021A8C0", "0020A8C0"), ""),
+        # A cable from machine to machine may be the only route.
+        ("eth1 00000000 00000000 0001 0 0 0 00000000 0 0 0\n", "eth1"),
+        # A longer route over a gateway hides a shorter one without.
+        ("eth2 0000A8C0 00000000 0001 0 0 0 0000FFFF 0 0 0\neth0 0021A8C0 0102A8C0 0003 0 0 0 00FFFFFF 0 0 0\n", ""),
+        # A line that was cut, and one that ends with its mask
+        ("eth1 0021A8C0 00000000 0001 0 0 0\n", ""),
+        ("eth1 0021A8C0 00000000 0001 0 0 0 00FFFFFF\n", "eth1"),
+    ],
+)
+def test_the_interface_of_a_card_is_that_of_the_longest_route_without_a_gateway(tmp_path, routes, interface):
+    assert route_interface(CARD, write_kernel_files(tmp_path, routes=routes)) == interface
+
+
+def test_a_neighbour_is_the_line_of_its_address(tmp_path):
+    (tmp_path / "proc/net").mkdir(parents=True)
+    lines = [
+        "IP address HW type Flags HW address Mask Device",
+        f"{CARD} 0x1",
+        "192.168.33.181 0x1 0x2 00:00:00:00:00:01 * eth1",
+        "192.168.33.179 0x1 0x2 00:00:00:00:00:02 * eth1",
+        f"{CARD} 0x1 0x6 00:00:00:00:00:03",
+    ]
+    (tmp_path / "proc/net/arp").write_text("\n".join(lines))
+    assert neighbour_mac(CARD, tmp_path) == "00:00:00:00:00:03"
 
 
 def test_unknown_hops_are_not_guessed(tmp_path):

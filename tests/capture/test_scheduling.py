@@ -91,6 +91,23 @@ def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):
         check_receive_buffer("RH", 8192, 8192, burst, tmp_path / "absent")
 
 
+def test_a_buffer_of_exactly_two_bursts_is_enough(tmp_path):
+    """Linux grants twice the bytes, and a full packet of 1456 bytes takes 2304."""
+    assert usable_packets(2304) == 2
+    assert usable_packets(2303) == 1
+    assert usable_packets(1152) == 1
+    # 100 packets
+    granted = 100 * 2304 // 2
+    assert check_receive_buffer("RH", granted, granted, 50 * 1456, tmp_path / "absent") == ""
+    assert check_receive_buffer("RH", granted + 1, granted, 50 * 1456, tmp_path / "absent") == ""
+    with refused(ErrorCode.VALUE_INVALID, f"{granted} bytes, less than two bursts of {50 * 1456 + 1}"):
+        check_receive_buffer("RH", granted, granted, 50 * 1456 + 1, tmp_path / "absent")
+    assert "granted" in check_receive_buffer("RH", granted, granted + 1, 50 * 1456, tmp_path / "absent")
+    # Two bursts and two packets, rounded down to whole bytes of the request
+    with refused(ErrorCode.VALUE_INVALID, f"rmem_max={(100 + 2) * 2304 // 2}`"):
+        check_receive_buffer("RH", 1000, 1000, 50 * 1456, tmp_path / "absent")
+
+
 @pytest.mark.parametrize(("granted", "needed"), [(8192, 8192), (16384, 8192), (8192, 8193), (8192, 1 << 23)])
 def test_what_limits_the_buffer_is_the_kernel_or_the_rig_file_that_asks_for_no_more(tmp_path, granted, needed):
     burst = 16 * 4096

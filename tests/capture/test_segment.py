@@ -14,9 +14,12 @@ from polysight_shared.errors import DataError, DeviceError, ErrorCode
 def test_memory_is_taken_again_and_clean():
     first = PacketLog(9000)
     first.payload[:] = 7
-    second = PacketLog(8000, first.payload)
-    assert np.shares_memory(second.payload, first.payload)
-    assert not second.payload[:8000].any()
+    for expected in (8000, 9000):
+        second = PacketLog(expected, first.payload)
+        assert np.shares_memory(second.payload, first.payload)
+        assert not second.payload[:expected].any()
+    # Not enough for a longer row
+    assert not np.shares_memory(PacketLog(9001, first.payload).payload, first.payload)
 
 
 def test_payload_stays_in_its_memory_until_that_is_full():
@@ -35,6 +38,77 @@ def test_payload_stays_in_its_memory_until_that_is_full():
     assert log.payload is not memory
     assert log.last_arrival_ns == 7
     assert (log.payload[: packets[:, 10:].size] == packets[:, 10:].ravel()).all()
+
+
+def log_packets(*sizes: int, expected: int = 9000) -> PacketLog:
+    """A log of packets of these sizes, the payload of each filled with its number."""
+    log = PacketLog(expected)
+    for number, size in enumerate(sizes):
+        packet = np.full((1, 10 + size), number % 256, np.uint8)
+        log.add(packet, np.array([10 + size]), number)
+    return log
+
+
+def test_a_packet_has_at_least_one_byte_and_at_most_1456():
+    log = log_packets(0, 1, 1456, 1457)
+    assert log.malformed == 2
+    assert log.sizes.tolist() == [1, 1456]
+    assert log.payload_bytes == 1457
+    assert log.arrivals_ns.tolist() == [1, 2]
+    assert log.payload[:1457].tolist() == [1] + 1456 * [2]
+    both = PacketLog(9000)
+    # Nine bytes are less than a header.
+    both.add(np.zeros((4, 12), np.uint8), np.array([10, 12, 9, 11]), np.array([5, 6, 7, 8]))
+    assert (both.malformed, both.sizes.tolist(), both.arrivals_ns.tolist()) == (2, [2, 1], [6, 8])
+
+
+@pytest.mark.parametrize(
+    ("sizes", "is_short"),
+    [((), False), ((5,), False), ((5, 5), False), ((5, 4), True), ((4, 5), False), ((5, 4, 4), False)],
+)
+def test_a_packet_smaller_than_the_one_before_may_end_a_record(sizes, is_short):
+    assert log_packets(*sizes).last_is_short == is_short
+
+
+def test_more_packets_than_a_row_has_are_still_counted():
+    """Packets of one byte: 300 are more than the 256 that a row without bytes has room for."""
+    log = log_packets(*(1 for _ in range(300)), expected=0)
+    assert log.count == 300
+    assert log.arrivals_ns.tolist() == list(range(300))
+    assert log.payload[:300].tolist() == [number % 256 for number in range(300)]
+
+
+def test_payload_of_far_more_than_a_row_is_counted_and_not_kept():
+    """At most four rows, each with a spare of 1 MiB, are kept."""
+    log = PacketLog(0)
+    most = PacketLog.max_kept_bytes(0)
+    assert most == 4 << 20
+    packets = np.zeros((1024, 10 + 1024), np.uint8)
+    lengths = np.full(1024, 10 + 1024)
+    for _ in range(4):
+        log.add(packets, lengths, 0)
+    assert log.kept == log.count == 4096
+    assert log.payload.size <= most
+    log.add(packets[:1], lengths[:1], 0)
+    assert (log.kept, log.count, log.payload_bytes) == (4096, 4097, most + 1024)
+    # None after a gap is kept.
+    log.add(packets[:1, :11], np.array([11]), 0)
+    assert (log.kept, log.count) == (4096, 4098)
+
+
+def test_a_log_is_restored_from_its_arrays():
+    log = log_packets(7, 5, 3)
+    log._heads[:3] = [[1, 2, 3, 4, 5, 6, 7, 8, 9, 10], [255] * 10, [0] * 10]
+    assert log.sequences.tolist() == [0x04030201, 2**32 - 1, 0]
+    assert log.byte_counts.tolist() == [0x0A0908070605, 2**48 - 1, 0]
+    again = PacketLog.restore(
+        expected=9000, sequences=log.sequences, byte_counts=log.byte_counts, sizes=log.sizes,
+        times_ns=log.arrivals_ns, payload=log.payload,
+    )  # fmt: skip
+    for name in ("expected", "count", "kept", "payload_bytes", "last_is_short", "last_arrival_ns"):
+        assert getattr(again, name) == getattr(log, name)
+    for name in ("sequences", "byte_counts", "sizes", "arrivals_ns"):
+        assert getattr(again, name).tolist() == getattr(log, name).tolist()
 
 
 def test_a_segment_holds_the_bytes_given(tmp_path):

@@ -212,7 +212,7 @@ def test_a_card_that_could_not_be_reached_is_refused(given):
     good = {"host_address": "192.168.33.30", "card_address": "192.168.33.180"}
     EepromSettings(**good)
     EepromSettings(**good, command_port=1025, data_port=65535)
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         EepromSettings(**(good | given))
 
 

@@ -157,7 +157,7 @@ def test_bytes_beyond_the_last_frame_are_ignored():
 
 
 def test_short_data_is_refused():
-    with refused(ErrorCode.NOT_ENOUGH_DATA, "127 bytes", "128 bytes"):
+    with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "127 bytes", "128 bytes"):
         decode_row(bytes(2 * 4 * 16 - 1), (), 2, 4)
-    with refused(ErrorCode.VALUE_INVALID):
+    with expect_refusal(ErrorCode.VALUE_INVALID):
         decode_two_lane(bytes(1000), 1, 3)

@@ -100,11 +100,11 @@ def test_a_buffer_of_exactly_two_bursts_is_enough(tmp_path):
     granted = 100 * 2304 // 2
     assert check_receive_buffer("RH", granted, granted, 50 * 1456, tmp_path / "absent") == ""
     assert check_receive_buffer("RH", granted + 1, granted, 50 * 1456, tmp_path / "absent") == ""
-    with refused(ErrorCode.VALUE_INVALID, f"{granted} bytes, less than two bursts of {50 * 1456 + 1}"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, f"{granted} bytes, less than two bursts of {50 * 1456 + 1}"):
         check_receive_buffer("RH", granted, granted, 50 * 1456 + 1, tmp_path / "absent")
     assert "granted" in check_receive_buffer("RH", granted, granted + 1, 50 * 1456, tmp_path / "absent")
     # Two bursts and two packets, rounded down to whole bytes of the request
-    with refused(ErrorCode.VALUE_INVALID, f"rmem_max={(100 + 2) * 2304 // 2}`"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, f"rmem_max={(100 + 2) * 2304 // 2}`"):
         check_receive_buffer("RH", 1000, 1000, 50 * 1456, tmp_path / "absent")
 
 

@@ -15,7 +15,7 @@ from tests.support.store.facts import load_facts
 from polysight.cli.main import main
 from polysight.planning import PlanChanges, row_motion_s
 from polysight.planning.forecast import tail_s, turn_s
-from polysight.planning.plan_command import measure_noise
+from polysight.planning.plan_command import _format_bytes, _format_duration, measure_noise, shortest_period_us
 from polysight.store import manifest
 from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
@@ -224,3 +224,41 @@ def test_without_a_plan_more_time_is_advised_only_where_it_helps(capsys):
     message = capsys.readouterr().err
     assert "more time does not help" in message
     assert "--step-y-mm" in message
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(89, "89 s"), (90, "1.5 min"), (5994, "99.9 min"), (6000, "1.67 h"), (7200, "2.00 h")],
+)
+def test_a_duration_has_the_unit_that_keeps_its_digits_few(seconds, text):
+    assert _format_duration(seconds) == text
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(1e6, "1 MB"), (999e6, "999 MB"), (1e9, "1.00 GB"), (2.5e12, "2500.00 GB")]
+)
+def test_an_amount_of_data_is_in_megabytes_or_gigabytes(count, text):
+    assert _format_bytes(count) == text
+
+
+def test_the_shortest_period_is_that_of_the_radars_in_whole_tens_of_microseconds(rig):
+    # Idle 100 us, ramp 128.5 us, 300 us between two frames, and a margin of 200 us for the trigger
+    assert shortest_period_us(rig) == 730
+    longer = make_rig_with(radar={"idle_us": 110.0})
+    assert shortest_period_us(longer) == shortest_period_us(rig) + 10
+
+
+def test_figures_of_a_burst_are_those_of_its_chirps(capsys):
+    options = [*SMALL, "--speed-mm-s", "40", "--pulses", "10", "--period-us", "2000", "--json"]
+    assert main(["plan", *RIG, *options]) == 0
+    numbers = json.loads(capsys.readouterr().out)
+    assert numbers["burst_ms"] == pytest.approx(20)
+    assert numbers["between_positions_ms"] == pytest.approx(50)
+    # From the first chirp to the last one
+    assert numbers["burst_travel_mm"] == pytest.approx(9 * 2e-3 * 40)
+    assert main(["plan", *RIG, *options[:-1]]) == 0
+    words = capsys.readouterr().out
+    assert "a burst fills 40% of the time" in words
+    assert "10 chirps a position, 2000 us apart" in words
+    assert "78 x 58 mm" in words
+    assert "raw data   98 MB of 2 boards" in words

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from tests.support.refusals import expect_refusal
+from tests.support.rigs import make_programmed_rig, make_rig_with
 
 from polysight.imaging import ImageBuilder, PhaseSlope, backproject, compute_field_limits
 from polysight.imaging.geometry import Antennas
@@ -17,8 +18,10 @@ from polysight.planning.forecast import (
     find_warnings,
     predict_burst,
     predict_noise,
+    tail_s,
 )
 from polysight.planning.plan_command import describe
+from polysight_shared.config import Instrument
 from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
@@ -90,6 +93,10 @@ def test_the_loss_by_motion_is_that_of_the_sum_over_the_pulses(rig):
     path = np.linalg.norm(away_tx, axis=1) + np.linalg.norm(away_rx, axis=1)
     loss = -20 * np.log10(abs(np.mean(np.exp(2j * np.pi * f * path / 299792458.0))))
     assert burst.travel_mm == pytest.approx(1.8)
+    assert burst.travel_wavelengths == pytest.approx(1.8e-3 * f / 299792458.0)
+    assert burst.duration_ms == pytest.approx(16 * 1.2)
+    assert burst.between_ms == pytest.approx(20.0)
+    assert burst.duty == pytest.approx(0.96)
     assert burst.edge_loss_db == pytest.approx(loss, rel=0.2)
 
 
@@ -169,6 +176,100 @@ def test_a_plan_with_a_fault_has_one_warning_about_it(rig, changes, topic, value
     assert [w.level for w in warnings] == sorted(w.level for w in warnings)
 
 
+def list_notes(rig: Instrument, topic: str, scene_mm: tuple[float, float] | None = None) -> list[str]:
+    """Texts of the warnings about one topic."""
+    return [w.what for w in find_warnings(rig, Noise(), scene_mm) if w.where == topic]
+
+
+@pytest.mark.parametrize(
+    ("topic", "at_the_limit", "beyond"),
+    [
+        # 20,000 steps/s
+        ("speed", PlanChanges(speed_mm_s=100.0, pulses=2), PlanChanges(speed_mm_s=101.0, pulses=2)),
+        # Chirps in half of the time
+        ("idle", PlanChanges(pulses=50, period_us=1000.0), PlanChanges(pulses=49, period_us=1000.0)),
+        # A single pulse is not idle between pulses, but measures no noise.
+        ("idle", PlanChanges(pulses=1), PlanChanges(pulses=2)),
+        ("burst", PlanChanges(pulses=2), PlanChanges(pulses=1)),
+        ("burst", PlanChanges(pulses=66), PlanChanges(pulses=67)),
+    ],
+)
+def test_a_warning_begins_beyond_its_limit(rig, topic, at_the_limit, beyond):
+    texts = [list_notes(changes.apply(rig), topic) for changes in (at_the_limit, beyond)]
+    # That a stage is faster than the published one is another note, which both have.
+    within, too_far = ([text for text in found if "published" not in text] for found in texts)
+    assert not within
+    assert len(too_far) == 1
+
+
+def test_what_a_warning_advises_is_enough_and_just_enough(rig):
+    too_fast = PlanChanges(speed_mm_s=100.0)
+    (text,) = list_notes(too_fast.apply(rig), "burst")
+    speed, pulses = re.search(r"at most ([\d.]+) mm/s, or at most (\d+) pulses", text).groups()
+    for factor, is_possible in ((0.999, True), (1.01, False)):
+        assert bool(list_notes(PlanChanges(speed_mm_s=float(speed) * factor).apply(rig), "burst")) != is_possible
+    assert not list_notes(PlanChanges(speed_mm_s=100.0, pulses=int(pulses)).apply(rig), "burst")
+    assert list_notes(PlanChanges(speed_mm_s=100.0, pulses=int(pulses) + 1).apply(rig), "burst")
+    (text,) = list_notes(rig, "idle")
+    # 16 pulses of 1.5 ms in 100 ms
+    assert "for 76% of a row" in text
+    assert "up to 66 pulses" in text
+    wide = PlanChanges(step_y_mm=8.0)
+    (text,) = list_notes(wide.apply(rig), "aliasing")
+    step = float(re.search(r"at most ([\d.]+) mm,", text)[1])
+    assert not list_notes(PlanChanges(step_y_mm=step).apply(rig), "aliasing")
+    assert list_notes(PlanChanges(step_y_mm=step + 0.2).apply(rig), "aliasing")
+
+
+def test_notes_of_the_field_count_from_the_edge_of_the_scene(rig):
+    field = compute_field_limits(PlanChanges(step_y_mm=8.0, height_mm=200.0).apply(rig))
+    image_mm = rig.image.rows * rig.image.pixel_mm
+    wide = PlanChanges(step_y_mm=8.0, height_mm=200.0).apply(rig)
+    ghost_mm = field.alias_free_mm[1]
+    good_mm = 200.0 - 2 * field.mirror_zone_mm[1]
+    # An object at one edge of the scene, and its ghost at the other edge of the image
+    for topic, limit_mm in (("aliasing", 2 * ghost_mm - image_mm), ("aperture", good_mm)):
+        assert not list_notes(wide, topic, (50.0, limit_mm - 0.1))
+        (text,) = list_notes(wide, topic, (50.0, limit_mm + 0.1))
+        assert "in y" in text
+        assert f"{limit_mm + 0.1:.0f} mm" in text
+    (text,) = list_notes(wide, "aliasing", (50.0, 150.0))
+    assert f"ghosts {ghost_mm:.0f} mm" in text
+    assert f"needs {(150 + image_mm) / 2:.0f} mm" in text
+    (text,) = list_notes(wide, "aperture", (50.0, 150.0))
+    assert f"200 mm in y images {good_mm:.0f} mm" in text
+    assert f"({field.mirror_zone_mm[1]:.0f} mm of margin" in text
+
+
+def test_the_note_about_an_unknown_if_ends_with_the_start_offsets(rig):
+    (text,) = list_notes(rig, "IF")
+    # 38.8 MHz/us for 5 ns
+    assert "margin of 194 kHz" in text
+    assert not list_notes(make_programmed_rig(), "IF")
+    # Beyond the rate of the samples
+    assert list_notes(make_programmed_rig(3e6), "IF")
+
+
+def test_the_wait_for_last_packets_is_that_of_all_rows(rig):
+    (text,) = list_notes(rig, "card")
+    assert f"{tail_s(rig) * 200 / 60:.1f} min" in text
+
+
+@pytest.mark.parametrize("samples", [90, 91])
+def test_a_frame_of_at_least_one_packet_is_possible(samples):
+    """16 bytes a sample, 1456 bytes a packet."""
+    short = make_rig_with(chirp={"samples": samples, "linear_samples": [0, 64]})
+    assert any("is smaller than a packet" in text for text in list_notes(short, "card")) == (samples < 91)
+
+
+def test_a_deviation_of_a_step_from_motor_steps_is_refused_along_both_axes(rig):
+    for axis in ("x", "y"):
+        assert not list_notes(PlanChanges(**{f"step_{axis}_mm": 2.005}).apply(rig), f"step {axis}")
+        (text,) = list_notes(PlanChanges(**{f"step_{axis}_mm": 2.0025}).apply(rig), f"step {axis}")
+        assert "2.0025 mm" in text
+        assert "400.5 motor steps" in text
+
+
 def test_proposals_keep_the_time_and_are_possible(rig):
     plans = propose(rig, 30.0, count=2)
     assert len(plans) == 2
@@ -176,6 +277,8 @@ def test_proposals_keep_the_time_and_are_possible(rig):
     for plan in plans:
         assert plan.possible
         assert plan.time.minutes <= 30.0
+        assert plan.burst.duty <= 0.95
+        assert plan.rig.grid.columns * plan.rig.burst.pulses <= 65535
         assert not [w for w in plan.warnings if w.where in ("aliasing", "motion")]
     # More time never gives a worse image.
     assert propose(rig, 60.0, count=1)[0].noise.image_db > plans[0].noise.image_db

@@ -186,7 +186,7 @@ def test_a_value_at_its_limit_is_taken_and_one_beyond_is_refused(table: str, wit
     raw.setdefault(table, {}).update(within)
     decode(raw, Instrument, "my.toml")
     raw[table].update(beyond)
-    with refused(ErrorCode.VALUE_INVALID, "my.toml"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "my.toml"):
         decode(raw, Instrument, "my.toml")
 
 
@@ -199,7 +199,7 @@ def test_a_pulse_by_spi_is_a_bit_of_the_controller(width_us: float, is_taken: bo
     if is_taken:
         decode(raw, Instrument, "my.toml")
         return
-    with refused(ErrorCode.VALUE_INVALID, "burst.width_us"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "burst.width_us"):
         decode(raw, Instrument, "my.toml")
 
 
@@ -217,7 +217,7 @@ def test_boards_have_names_of_folders(changes: list[str]):
     decode(raw, Instrument, "my.toml")
     for board, name in zip(raw["boards"][1:], changes, strict=True):
         board["name"] = name
-    with refused(ErrorCode.VALUE_INVALID, "name"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "name"):
         decode(raw, Instrument, "my.toml")
 
 
@@ -228,7 +228,7 @@ def test_boards_may_share_an_address_or_a_port_and_not_both():
     second["data_port"] = first["data_port"] + 1
     decode(raw, Instrument, "my.toml")
     second["data_port"] = first["data_port"]
-    with refused(ErrorCode.VALUE_INVALID, "host_address", "data_port"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "host_address", "data_port"):
         decode(raw, Instrument, "my.toml")
 
 
@@ -248,7 +248,7 @@ def test_each_board_at_usb_has_one_place_of_its_own(tables: list[dict[str, str]]
     if places is not None:
         assert [board.place for board in decode(raw, Radar, "my.toml").native.values()] == places
         return
-    with refused(ErrorCode.VALUE_INVALID, "usb_serial"):
+    with expect_refusal(ErrorCode.VALUE_INVALID, "usb_serial"):
         decode(raw, Radar, "my.toml")
 
 
@@ -294,7 +294,7 @@ def test_antennas_of_a_board_are_those_of_the_table():
         decode(raw, Instrument, "my.toml")
     for tx_antenna in (3, 4):
         transmitter["tx_antenna"] = tx_antenna
-        with refused(ErrorCode.VALUE_INVALID, "tx_antenna"):
+        with expect_refusal(ErrorCode.VALUE_INVALID, "tx_antenna"):
             decode(raw, Instrument, "my.toml")
     transmitter["tx_antenna"] = 1
     for rx_order, is_taken in (([4, 2, 1, 3], True), ([1, 2, 3], False), ([1, 2, 3, 3], False), ([2, 3, 4, 5], False)):
@@ -302,7 +302,7 @@ def test_antennas_of_a_board_are_those_of_the_table():
         if is_taken:
             decode(raw, Instrument, "my.toml")
             continue
-        with refused(ErrorCode.VALUE_INVALID, "rx_order"):
+        with expect_refusal(ErrorCode.VALUE_INVALID, "rx_order"):
             decode(raw, Instrument, "my.toml")
 
 
@@ -319,7 +319,7 @@ def test_antennas_of_a_board_are_those_of_the_table():
 def test_a_text_with_a_character_that_a_terminal_obeys_is_refused(tmp_path: Path, line: str, key: str):
     path = tmp_path / "rig.toml"
     path.write_text(line)
-    with refused(ErrorCode.VALUE_INVALID, path, key, "control character") as refusal:
+    with expect_refusal(ErrorCode.VALUE_INVALID, path, key, "control character") as refusal:
         read_toml(path)
     assert str(refusal.value).replace("\n", "").isprintable()
     path.write_text('command = """\nfirst\n\tsecond"""')

@@ -18,7 +18,7 @@ from benchmarks.measure import Line, add_arguments, keep_on_one_core, show, writ
 from benchmarks.published import Synchroniser
 from polysight.capture.dca1000 import encode_row_words
 from polysight.imaging import ImageBuilder, backproject
-from polysight.imaging.geometry import Antennas, row_offsets_m, scene_gate_m
+from polysight.imaging.geometry import Antennas, find_scene_gate_m, row_offsets_m
 from polysight.imaging.samples import reduction
 from polysight.sync.direct_path import prepare
 from polysight.sync.loops import estimate_tone
@@ -279,7 +279,7 @@ def _match_filter(
     chirp = rig.chirp
     a, b = chirp.linear_samples
     all_antennas = tuple(Antennas.from_rig(rig, receiver) for receiver in rig.receivers)
-    gate = reduction(chirp, scene_gate_m(all_antennas, plan_raster(rig.grid), builder.grid))
+    gate = reduction(chirp, find_scene_gate_m(all_antennas, plan_raster(rig.grid), builder.grid))
     antennas = Antennas.from_rig(rig, board)
     window = np.asarray(scipy.signal.get_window("hann", b - a + 2, fftbins=False), float)[1:-1]
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(a, b)

@@ -22,7 +22,7 @@ import numpy as np
 
 from polysight.data import find_packaged
 from polysight.imaging import PlaneEstimate
-from polysight.materials import UNKNOWN, match_truth, truth_plates
+from polysight.materials import UNKNOWN, match_truth, read_true_plates
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import PlaneReference, plane_reference
 from polysight.process import NO_INPUTS, Findings, Inputs
@@ -276,7 +276,7 @@ def judge_scan(seed: int, kind: str = "full", raw: bool = False) -> tuple[Scene,
 def figures(seed: int, kind: str = "full", raw: bool = False) -> list[PatchFigures]:
     """Return the judged patches of one scene: the sample from which coverage is counted; arguments of `judge_scan`."""
     scene, rig, findings, _ = judge_scan(seed, kind, raw)
-    plates = truth_plates(truth(rig, scene, scene.seed))
+    plates = read_true_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
     out = []
@@ -372,7 +372,7 @@ def print_pulls(rows: list[PatchFigures]) -> dict[str, Any]:
 def _read_names(seed: int) -> list[tuple[float, bool]]:
     """Return the probability of each name of one scene of kind "named", and whether the name is right."""
     scene, rig, findings, _ = judge_scan(seed, "named")
-    plates = truth_plates(truth(rig, scene, scene.seed))
+    plates = read_true_plates(truth(rig, scene, scene.seed))
     result = findings.analysis
     true = match_truth([r.patch for r in result.patches], plates)
     named = [(r.patch_name, true[r.patch.label]) for r in result.patches if r.patch.label in true]

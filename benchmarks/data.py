@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from polysight.imaging.geometry import Antennas, image_grid, row_offsets_m, scene_gate_m
+from polysight.imaging.geometry import Antennas, find_scene_gate_m, image_grid, row_offsets_m
 from polysight.store.source import RowData, allocate_pages
 from polysight.sync import SyncedRow, sample_frequencies_hz
 from polysight_shared.config import Board, Instrument, load_instrument
@@ -172,7 +172,7 @@ def write_point_cube(path: Path, rig: Instrument, board: Board) -> None:
     points = np.array([(x, y, float(np.mean(grid.z_m))) for x in quarters[0] for y in quarters[1]])
     sweep = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
     nodes = np.linspace(sweep[0], sweep[-1], 24)
-    low, high = scene_gate_m((antennas,), plan, grid)
+    low, high = find_scene_gate_m((antennas,), plan, grid)
     # An echo's exponent per hertz, [path, 1]; `expand` [node, sample] takes echoes at the nodes to those of the chirp.
     exponent = 2j * np.pi / SPEED_OF_LIGHT_M_S * np.linspace(low, high, 200)[:, None]
     expand = np.linalg.lstsq(np.exp(exponent * nodes), np.exp(exponent * sweep), rcond=1e-9)[0].astype(np.complex64)

@@ -26,7 +26,7 @@ from benchmarks.image import Image, worst
 from benchmarks.measure import add_arguments as add_common, count_repeats, keep_on_one_core, write
 from polysight.imaging import spectral
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, Aperture, image_grid, scan_offsets_m, scene_gate_m
+from polysight.imaging.geometry import Antennas, Aperture, find_scene_gate_m, image_grid, scan_offsets_m
 from polysight.imaging.samples import reduction
 from polysight.imaging.spectral import SpectralImager
 from polysight_shared.config import Board, Instrument
@@ -95,7 +95,7 @@ class Chain:
     def __init__(self, rig: Instrument, board: Board, path: Path) -> None:
         grid = image_grid(rig)
         antennas = Antennas.from_rig(rig, board)
-        self.gate = reduction(rig.chirp, scene_gate_m((antennas,), plan_raster(rig.grid), grid), "boxcar")
+        self.gate = reduction(rig.chirp, find_scene_gate_m((antennas,), plan_raster(rig.grid), grid), "boxcar")
         self.aperture = Aperture(antennas, scan_offsets_m(rig), self.gate.frequencies_hz, grid)
         self.path = path
 

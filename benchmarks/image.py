@@ -19,7 +19,14 @@ from benchmarks.data import make_synced_row, published_scene, temporary, write_p
 from benchmarks.measure import Line, Seconds, add_arguments, count_repeats, keep_on_one_core, show, write
 from benchmarks.published import SETTINGS, form_image
 from polysight.imaging import ImageBuilder, spectral
-from polysight.imaging.geometry import Antennas, Aperture, image_grid, row_starts_m, scan_offsets_m, scene_gate_m
+from polysight.imaging.geometry import (
+    Antennas,
+    Aperture,
+    find_scene_gate_m,
+    fit_row_starts_m,
+    image_grid,
+    scan_offsets_m,
+)
 from polysight.imaging.samples import choose_imager, reduction
 from polysight.imaging.spectral import IncrementalImager
 from polysight.store.source import allocate_pages
@@ -75,7 +82,7 @@ class Bench:
         grid = image_grid(self.rig)
         antennas = Antennas.from_rig(self.rig, self.board)
         # Of a sample vector, the gate's matrix makes the few frequencies that describe echoes from the scene.
-        gate = reduction(self.rig.chirp, scene_gate_m((antennas,), plan, grid), window)
+        gate = reduction(self.rig.chirp, find_scene_gate_m((antennas,), plan, grid), window)
         maps = gate.matrix.astype(np.complex64)
         cube = np.load(self.path, mmap_mode="r")
         samples = np.stack([np.matmul(maps, cube[:, row].mT) for row in range(plan.rows)], axis=2)
@@ -188,7 +195,7 @@ def against_batch(bench: Bench, rounds: int) -> tuple[list[Line], dict[str, Any]
     weights = np.ones(samples.shape[2:], np.float32)
     # The echo of the mirror, of whose image the footprint is made: any constant takes the same time.
     mirror = np.ones(samples.shape[:2], np.complex64)
-    starts = row_starts_m(aperture.offsets_m)
+    starts = fit_row_starts_m(aperture.offsets_m)
     images: dict[str, Image] = {}
 
     def by_row() -> None:

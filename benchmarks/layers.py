@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from benchmarks.coverage import CHI2_68, CHI2_95, GRID, PLACES, Cubes, image_scan, lay_metal_plate
 from polysight.data import find_packaged
 from polysight.jobs.process import make_plane_reference
-from polysight.materials import METAL_PERMITTIVITY, Layer, LayerFit, fit_row, match_truth, truth_plates
+from polysight.materials import METAL_PERMITTIVITY, Layer, LayerFit, fit_row, match_truth, read_true_plates
 from polysight.polarimetry import PlaneReference
 from polysight.process import Inputs
 from polysight.results import PatchFigures
@@ -162,7 +162,9 @@ def process_scene(
     pipeline = image_scan(Cubes(rig, scene), IN_BANDS, Inputs(reference=metal))
     findings = pipeline.examine(pipeline.form_images())
     result = findings.analysis
-    plates = match_truth([r.patch for r in result.patches], truth_plates(truth(apply_scene(rig, scene), scene, seed)))
+    plates = match_truth(
+        [r.patch for r in result.patches], read_true_plates(truth(apply_scene(rig, scene), scene, seed))
+    )
     rows = {plates[row.label].name: row for row in result.rows() if row.label in plates}
     return rows, result.prior.theta_std_rad
 

@@ -32,7 +32,7 @@ from polysight.materials import (
     TruthPlate,
     analyse,
     pixel_accuracy,
-    truth_plates,
+    read_true_plates,
 )
 from polysight.planning import PlanChanges, scan_time
 from polysight.polarimetry import incidence_choice
@@ -229,7 +229,7 @@ def main() -> int:
     still = scene.with_disturbances(ideal=True, leakage_h=disturbances.leakage_h, leakage_v=disturbances.leakage_v)
     # Without noise and motion a burst of two pulses is as good as a long one.
     ideal = build_scanned_images(PlanChanges(pulses=2).apply(rig), still)[0].finish()
-    plates = truth_plates(truth(rig, scene, scene.seed))
+    plates = read_true_plates(truth(rig, scene, scene.seed))
     print(HEAD, flush=True)
     measure("ideal", rig, ideal, ideal, plates)
     for make in (s for s in SCANS if s.__name__ in args.scans):

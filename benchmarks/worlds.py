@@ -39,7 +39,7 @@ from polysight.materials import (
 )
 from polysight.materials.inversion import LIBRARY_SHARE, MOVED_PROBABILITY, RigPrior
 from polysight.materials.kinds import inverse_ratio
-from polysight.materials.labels import patches_from_labels
+from polysight.materials.labels import make_patches_from_labels
 from polysight.materials.result import PatchResult
 from polysight.materials.segment import Segmentation
 from polysight.polarimetry import fresnel
@@ -266,7 +266,7 @@ def analyse_world(
         boxes: dict[str, tuple[float, float, float, float]] = {}
         for name, (_, (left, bottom, right, top)) in plates.items():
             boxes[name] = (left, bottom, right, top)
-        segmentation, names = patches_from_labels(boxes, pair.x_m, pair.y_m, margin_mm=MARGIN_MM)
+        segmentation, names = make_patches_from_labels(boxes, pair.x_m, pair.y_m, margin_mm=MARGIN_MM)
         metal = next((label for label, name in names.items() if name == metal_name), None)
         known_scene = KnownScene(segmentation, metal, names)
     elif metal_name is not None:

@@ -12,7 +12,7 @@ import msgspec
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError
 from polysight_shared.raster import check_burst_fits
-from polysight_simulators.process import command_line, count_from_zero, run_program
+from polysight_simulators.process import make_parser, parse_count, run_program
 from polysight_simulators.scene import apply_scene, load_scene, simulate
 
 
@@ -23,11 +23,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder to write")
     layouts = ("own", "authors")
     parser.add_argument("--layout", choices=layouts, default="own", help="scan folder, or the published data set's")
-    parser.add_argument("--seed", type=count_from_zero, default=None, help="of gains and noise, instead of the scene's")
+    parser.add_argument("--seed", type=parse_count, default=None, help="of gains and noise, instead of the scene's")
     parser.add_argument("--columns", action="store_true", help="authors' layout: scanned column by column")
     parser.add_argument("--absent", action="store_true", help="authors' layout: lost packets are absent, not zeros")
     text = "use another set of specimens, number N (scene seed + 1000 N)"
-    parser.add_argument("--specimens", type=count_from_zero, default=0, metavar="N", help=text)
+    parser.add_argument("--specimens", type=parse_count, default=0, metavar="N", help=text)
     parser.add_argument("--json", action="store_true", help="print one JSON line")
 
 
@@ -79,7 +79,7 @@ def _check(args: argparse.Namespace) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run a subcommand; return the exit status."""
     example = "simulate examples/metal-plate.toml --out out/plate"
-    parser = command_line("polysight_simulators", "Simulate scans without hardware.", example)
+    parser = make_parser("polysight_simulators", "Simulate scans without hardware.", example)
     commands = parser.add_subparsers(dest="command", required=True)
 
     def add_command(name: str, run: Callable[..., None], text: str, epilog: str | None) -> argparse.ArgumentParser:

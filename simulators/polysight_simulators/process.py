@@ -11,7 +11,7 @@ from polysight_shared.errors import ConfigError, ErrorCode, PolysightError, conv
 from polysight_shared.program import die_with_parent
 
 
-def command_line(module: str, description: str, example: str) -> argparse.ArgumentParser:
+def make_parser(module: str, description: str, example: str) -> argparse.ArgumentParser:
     """Create a parser for `python -m <module>`, without options; `example` are arguments for the end of its help."""
     return argparse.ArgumentParser(
         prog=f"python -m {module}",
@@ -21,7 +21,7 @@ def command_line(module: str, description: str, example: str) -> argparse.Argume
     )
 
 
-def count_from_zero(text: str) -> int:
+def parse_count(text: str) -> int:
     """Parse a whole number of at least 0, of 63 bits. Raises ArgumentTypeError."""
     try:
         value = int(text)
@@ -70,12 +70,12 @@ def run_until_stopped(run: Callable[[threading.Event], object]) -> int:
 
     `run` gets an event that is set by the signals.
     """
-    stop = stop_requested()
+    stop = catch_stop_signals()
     die_with_parent()
     return run_program(lambda: run(stop))
 
 
-def stop_requested() -> threading.Event:
+def catch_stop_signals() -> threading.Event:
     """Return an event that SIGTERM and SIGINT will set. Call it in the main thread."""
     event = threading.Event()
 

@@ -29,7 +29,7 @@ from polysight_shared.program import die_with_parent
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.faults import read_faults
 from polysight_simulators.loopback import move_to_free_subnet
-from polysight_simulators.process import announce_ready, command_line, count_from_zero, run_until_stopped
+from polysight_simulators.process import announce_ready, make_parser, parse_count, run_until_stopped
 from polysight_simulators.radars import make_image
 from polysight_simulators.scene import Scene, apply_scene, load_scene, truth
 from polysight_simulators.wires import MAX_SOCKET_PATH
@@ -358,7 +358,7 @@ def run(config: Path, scene_path: Path | None, folder: Path, options: RigOptions
 
 def main(argv: list[str] | None = None) -> int:
     """Run a simulated rig until SIGTERM, SIGINT or the end of a process; return the exit status."""
-    parser = command_line(
+    parser = make_parser(
         "polysight_simulators.rig",
         "Start a simulated rig; print `ready FILE` with its rig file, and run until Ctrl-C.",
         "--config instrument.toml --scene examples/metal-plate.toml --dir out/rig --time-scale 30 --with-pi",
@@ -368,7 +368,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--dir", type=Path, required=True, help="folder of this rig: its rig file, logs, serial port")
     parser.add_argument("--time-scale", type=float, default=1.0, help="speed: wire time relative to wall time")
     parser.add_argument("--with-pi", action="store_true", help="run the Pi's program too")
-    parser.add_argument("--seed", type=count_from_zero, help="default: the scene's")
+    parser.add_argument("--seed", type=parse_count, help="default: the scene's")
     parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene's signals")
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table for the cards")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")

@@ -22,7 +22,7 @@ from threading import Event
 
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, ProtocolError
 from polysight_shared.wires import WireMotion, parse
-from polysight_simulators.process import announce_ready, command_line, run_until_stopped
+from polysight_simulators.process import announce_ready, make_parser, run_until_stopped
 
 # Limits, chosen: several times the longest line of the protocol, and about two million edges for a stopped client.
 MAX_LINE_BYTES = 200
@@ -260,7 +260,7 @@ def _listen(path: Path) -> socket.socket:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the hub until SIGTERM or SIGINT."""
-    parser = command_line("polysight_simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
+    parser = make_parser("polysight_simulators.wires", "Hub of the simulated wires.", "--socket out/wires.sock")
     parser.add_argument("--socket", type=Path, required=True, help="Unix socket to serve")
     args = parser.parse_args(argv)
 

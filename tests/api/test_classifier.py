@@ -7,7 +7,7 @@ from sklearn.model_selection import LeaveOneGroupOut, cross_val_score
 from sklearn.utils.estimator_checks import check_estimator
 
 from polysight import Classifier, Library, PaperKNeighborsClassifier
-from polysight.materials import SIMULATED_LIBRARY, Samples, ratio_columns
+from polysight.materials import SIMULATED_LIBRARY, Samples, invert_ratios
 from polysight.materials.classify import PAPER_MODEL, PaperKnn, Weights
 
 # Checks that scikit-learn skips by itself here: array API without its switch, and estimators without decision_function.
@@ -50,8 +50,8 @@ def test_it_names_as_the_model_of_libraries(library):
     samples = Samples.from_library(library)
     model = PaperKnn(weights=Weights(0.7, 1.3, 1.0, "inverse", 5)).fit(samples)
     knn = PaperKNeighborsClassifier(5, weight_h=0.7, weight_v=1.3, measure="inverse")
-    knn.fit(ratio_columns(samples.x), samples.names)
-    ours = model.by_pixel(ratio_columns(X[::29]))[0]
+    knn.fit(invert_ratios(samples.x), samples.names)
+    ours = model.by_pixel(invert_ratios(X[::29]))[0]
     # Ties
     assert (knn.predict(X[::29]) == ours).mean() > 0.99
 
@@ -83,7 +83,7 @@ def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, others):
     """The checks have 1 to 10 columns; the discriminant gets additional columns, so that all angles are complete."""
 
     def fill_angle(X):
-        return ratio_columns(np.pad(X, ((0, 0), (0, -X.shape[1] % 4)), constant_values=1.0))
+        return invert_ratios(np.pad(X, ((0, 0), (0, -X.shape[1] % 4)), constant_values=1.0))
 
     monkeypatch.setattr("polysight.api.classifier._to_features", fill_angle)
     results = check_estimator(Classifier(model), on_skip=None, on_fail=None)

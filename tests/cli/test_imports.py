@@ -14,7 +14,7 @@ from tests.support.rigs import load_published_rig
 from tests.support.scenes import write_small_scene
 
 from polysight.cli.main import FAMILIES
-from polysight.imaging import TAPERS, window_weights
+from polysight.imaging import TAPERS, make_window
 from polysight_simulators.scene import load_scene, simulate
 
 NUMBERS = {"numpy"}
@@ -103,4 +103,4 @@ def test_jobs_load_what_they_compute_with_when_they_compute():
 def test_windows_without_scipy_are_those_of_scipy(window):
     for n in (1, 2, 7, 64):
         expected = scipy.signal.get_window(window, n + 2, fftbins=False)[1:-1]
-        assert_allclose(window_weights(window, n), expected, rtol=0, atol=1e-15)
+        assert_allclose(make_window(window, n), expected, rtol=0, atol=1e-15)

@@ -44,7 +44,7 @@ def test_x_and_y_are_the_rigs_for_scans_by_rows_and_by_columns(tmp_path, capsys,
     swept = Focus(np.linspace(-6, 6, 3), np.array([0.1, 1.0, 0.1]), 0.0, found_by_the_builder, 1.0)
     drawn = []
     monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: swept)
-    monkeypatch.setattr(report, "focus_figure", lambda *given: drawn.append(given) or b"")
+    monkeypatch.setattr(report, "draw_focus_figure", lambda *given: drawn.append(given) or b"")
     assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
     output = capsys.readouterr().out
     assert 0 < output.index("+2.00") < output.index("-1.00")

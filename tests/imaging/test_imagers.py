@@ -7,7 +7,7 @@ import pytest
 
 from polysight.imaging import image_grid
 from polysight.imaging.direct import DirectImager
-from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, scan_offsets_m, scene_gate_m
+from polysight.imaging.geometry import Antennas, Aperture, find_irregularity, find_scene_gate_m, scan_offsets_m
 from polysight.imaging.samples import choose_imager, reduction
 from polysight.imaging.spectral import KEEP_BYTES, IncrementalImager, SpectralImager, forget, get_cached
 from polysight_shared.raster import plan_raster
@@ -38,7 +38,7 @@ def aperture(make_rig):
         offsets = scan_offsets_m(rig)
         if shifts_m is not None:
             offsets[..., 0] += np.asarray(shifts_m)[:, None]
-        gate = reduction(rig.chirp, scene_gate_m((antennas,), plan, grid))
+        gate = reduction(rig.chirp, find_scene_gate_m((antennas,), plan, grid))
         return Aperture(antennas, offsets, gate.frequencies_hz, grid)
 
     return make

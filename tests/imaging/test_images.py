@@ -19,7 +19,7 @@ from polysight.imaging import (
     plane,
     samples as reduced,
 )
-from polysight.imaging.geometry import Antennas, find_ends, row_offsets_m, scene_gate_m
+from polysight.imaging.geometry import Antennas, find_ends, find_scene_gate_m, row_offsets_m
 from polysight.imaging.images import Dispersion
 from polysight.imaging.samples import mirror_samples, reduction
 from polysight.materials.layers import Spectrum
@@ -368,7 +368,7 @@ def test_the_image_is_the_float64_matched_filter_over_all_samples(make_rig, sync
     )
     echo = np.exp(2j * np.pi * f * (d - antennas.direct_m[:, None, None])[..., None] / SPEED_OF_LIGHT_M_S)
     builder = ImageBuilder(rig, taper="boxcar")
-    gate = reduction(chirp, scene_gate_m(tuple(Antennas.from_rig(rig, r) for r in rig.receivers), plan, grid))
+    gate = reduction(chirp, find_scene_gate_m(tuple(Antennas.from_rig(rig, r) for r in rig.receivers), plan, grid))
     # A direct path of 1 / d_rx keeps the receivers' gains at 1; the part of the echo in its estimate is added again.
     echo -= (echo @ gate.direct)[..., None]
     samples = (echo + 1 / antennas.direct_m[:, None, None, None]).astype(np.complex64)

@@ -4,7 +4,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from polysight.imaging.geometry import REACH, burst_filters, undo_burst_motion
+from polysight.imaging.geometry import REACH, design_burst_filters, undo_burst_motion
 
 COUNT = 61
 MIDDLE = slice(REACH, -REACH)
@@ -34,14 +34,14 @@ def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
     average = average_over_burst(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
     valid = np.ones(COUNT, bool)
     turn = np.full(COUNT, 2 * np.pi * centre)
-    undone = undo_burst_motion(average, valid, turn, burst_filters(fast))
+    undone = undo_burst_motion(average, valid, turn, design_burst_filters(fast))
     np.testing.assert_allclose(undone[MIDDLE], still[MIDDLE], atol=6e-3)
     assert turns == centre or abs(average[30]) < 1 - 1.2 * (turns - centre) ** 2
 
 
 def test_a_slow_stage_and_one_pulse_need_no_filter(rig):
     slow = msgspec.structs.replace(rig, burst=msgspec.structs.replace(rig.burst, pulses=1))
-    np.testing.assert_allclose(burst_filters(slow), np.eye(REACH + 1)[np.zeros(REACH + 1, int)], atol=1e-6)
+    np.testing.assert_allclose(design_burst_filters(slow), np.eye(REACH + 1)[np.zeros(REACH + 1, int)], atol=1e-6)
 
 
 def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
@@ -51,7 +51,7 @@ def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
     valid = np.ones(COUNT, bool)
     valid[[20, 21, 40]] = False
     turn = rng.uniform(-1, 1, COUNT)
-    filters = burst_filters(fast)
+    filters = design_burst_filters(fast)
     first = undo_burst_motion(samples, valid, turn, filters)
     changed = np.where(valid, samples, 1e6).astype(np.complex64)
     np.testing.assert_array_equal(undo_burst_motion(changed, valid, turn, filters)[:, valid], first[:, valid])
@@ -64,7 +64,7 @@ def test_a_row_in_the_other_direction_is_filtered_equally(fast):
     samples = (rng.standard_normal((2, COUNT)) + 1j * rng.standard_normal((2, COUNT))).astype(np.complex64)
     valid = rng.uniform(size=COUNT) < 0.9
     turn = rng.uniform(-1, 1, COUNT)
-    filters = burst_filters(fast)
+    filters = design_burst_filters(fast)
     reverse = undo_burst_motion(samples, valid, turn, filters)
     back = undo_burst_motion(samples[:, ::-1], valid[::-1], -turn[::-1], filters)
     np.testing.assert_allclose(back[:, ::-1], reverse, atol=1e-5)

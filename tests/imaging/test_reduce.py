@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 from hypothesis import given, strategies as st
 
-from polysight.imaging.geometry import Antennas, image_grid, scene_gate_m
+from polysight.imaging.geometry import Antennas, find_scene_gate_m, image_grid
 from polysight.imaging.samples import reduction
 from polysight.sync import block_frequencies_hz, decimation
 from polysight_shared.raster import plan_raster
@@ -89,7 +89,7 @@ def test_the_gate_contains_every_pixel_at_every_position(make_rig):
     plan = plan_raster(rig.grid)
     for board in rig.receivers:
         antennas = Antennas.from_rig(rig, board)
-        low, high = scene_gate_m((antennas,), plan, grid)
+        low, high = find_scene_gate_m((antennas,), plan, grid)
         rng = np.random.default_rng(0)
         u = rng.uniform(-0.06, 0.06, (2, 500))
         x = rng.choice(grid.x_m, 500) - u[0]

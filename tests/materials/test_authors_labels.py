@@ -29,7 +29,7 @@ def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down
     scan = train.read_labelled_scan(write_scan(tmp_path, upside_down=upside_down))
     orientation = train.image_orientation([scan])
     assert ("last row" in orientation) == upside_down
-    entries = {e.name: e for e in train.entries_of_boxes(scan.orient(orientation), 60.0)}
+    entries = {e.name: e for e in train.make_entries_of_boxes(scan.orient(orientation), 60.0)}
     assert set(entries) == set(BOXES)
     for name, e in entries.items():
         eps = MATERIALS[name].permittivity
@@ -59,7 +59,7 @@ def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):
     del text["labels"]["Copper plate"]
     (folder / "scan_7.json").write_text(json.dumps(text))
     with expect_refusal(ErrorCode.NO_DATA, "scan_7"):
-        train.entries_of_boxes(train.read_labelled_scan(folder), 60.0)
+        train.make_entries_of_boxes(train.read_labelled_scan(folder), 60.0)
     np.save(folder / "sar_h.npy", np.ones(3))
     with expect_refusal(ErrorCode.TYPE_WRONG, "sar_h.npy", "float64"):
         train.read_labelled_scan(folder)
@@ -108,6 +108,6 @@ def test_folders_and_angles(tmp_path):
     (tmp_path / "empty").mkdir()
     assert [f.name for f in train.label_folders(tmp_path)] == ["another", "scan_7"]
     assert train.label_folders(tmp_path / "none") == []
-    assert train.angle_in_text(["a scan", "plates_at_55deg"]) == 55.0
-    assert train.angle_in_text(["60 degrees"]) == 60.0
-    assert train.angle_in_text(["scan 12"]) is None
+    assert train.find_angle_in_text(["a scan", "plates_at_55deg"]) == 55.0
+    assert train.find_angle_in_text(["60 degrees"]) == 60.0
+    assert train.find_angle_in_text(["scan 12"]) is None

@@ -90,24 +90,26 @@ def test_water_is_the_double_debye_formula(celsius):
 
 
 def test_names_of_one_material():
-    assert materials.same_material("Acrylic (3 mm)", "PMMA")
-    assert materials.same_material("PCB", "FR4")
-    assert materials.same_material("glass fibre", "fr-4")
-    assert materials.same_material("rubber", "RUBBER")
-    assert materials.same_material("water", "water at 37 degrees")
-    assert materials.same_material("glass", "borosilicate glass")
-    assert materials.same_material("wood", "plywood")
-    assert not materials.same_material("plywood", "chipboard")
-    assert not materials.same_material("copper", "PTFE")
-    assert not materials.same_material("own mixture 7", "own mixture 8")
+    assert materials.is_same_material("Acrylic (3 mm)", "PMMA")
+    assert materials.is_same_material("PCB", "FR4")
+    assert materials.is_same_material("glass fibre", "fr-4")
+    assert materials.is_same_material("rubber", "RUBBER")
+    assert materials.is_same_material("water", "water at 37 degrees")
+    assert materials.is_same_material("glass", "borosilicate glass")
+    assert materials.is_same_material("wood", "plywood")
+    assert not materials.is_same_material("plywood", "chipboard")
+    assert not materials.is_same_material("copper", "PTFE")
+    assert not materials.is_same_material("own mixture 7", "own mixture 8")
 
 
 def test_same_is_symmetric():
     names = ["wood", "plywood", "PMMA", "acrylic", "glass", "Pyrex", "water", "copper", "cardboard (rough)"]
     for first_name in names:
-        assert materials.same_material(first_name, first_name)
+        assert materials.is_same_material(first_name, first_name)
         for second_name in names:
-            assert materials.same_material(first_name, second_name) == materials.same_material(second_name, first_name)
+            assert materials.is_same_material(first_name, second_name) == materials.is_same_material(
+                second_name, first_name
+            )
 
 
 def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):

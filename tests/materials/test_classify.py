@@ -11,7 +11,7 @@ from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import main
 from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, fit_library
-from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, classifier_sentence
+from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, describe_classifier
 from polysight.materials.result import PATCHES_FILE, match_patches, pack_patches, read_patches
 from polysight.materials.train import make_entries
 from polysight_papers.sensys2026.patches import Errors, draw, groups
@@ -75,7 +75,7 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabil
         fit = library.fit_for(angles)
         classifier = Classifier(library, angles_deg=angles)
         assert classifier.model == fit["model"]
-        answer = classifier_sentence(classifier)
+        answer = describe_classifier(classifier)
         assert fit["model"] in answer
         assert f"{100 * fit['pixel_accuracy']:.1f} % of the pixels" in answer
         assert "optimistic" in answer
@@ -93,7 +93,7 @@ def test_two_scans_are_enough_to_learn_from():
 def test_another_model_can_be_chosen_and_the_report_names_it(powders):
     knn = Classifier(powders, model="knn", angles_deg=[60.0])
     assert knn.model == PAPER_MODEL
-    assert classifier_sentence(knn).startswith(PAPER_MODEL)
+    assert describe_classifier(knn).startswith(PAPER_MODEL)
     earlier = Classifier(powders, model="linear discriminant", angles_deg=[60.0])
     assert earlier.model == DISCRIMINANT_MODEL
     with expect_refusal(ErrorCode.VALUE_INVALID, "guess"):

@@ -6,7 +6,7 @@ from tests.support.refusals import expect_refusal
 
 from polysight.materials.classify import DISCRIMINANT_MODEL, PAPER_MODEL, fit_weights
 from polysight.materials.discriminant import REJECTED_SHARE, ErrorDiscriminant
-from polysight.materials.library import Samples, feature_matrix
+from polysight.materials.library import Samples, make_features
 from polysight.materials.train import fit_samples, score, score_unseen_materials
 from polysight_shared.errors import ErrorCode
 
@@ -22,7 +22,7 @@ def draw_pixels(seed=0, scans=8, pixels=12, scan=0.02, patch=0.01, pixel=0.03, m
     z = z + patch * rng.standard_normal((*shape[:2], 1, 3)) + pixel * rng.standard_normal(shape)
     h = np.exp(z[..., 0]).ravel()
     v = np.exp(z[..., 1]).ravel()
-    x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
+    x = make_features(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
     s, m, _ = np.indices(shape[:3])
     names = np.char.add("m", m.ravel().astype(str))
     groups = np.char.add("s", s.ravel().astype(str))
@@ -55,7 +55,7 @@ def test_an_error_that_all_patches_of_a_scan_share_changes_no_name():
     h = test.x[:, 0] * gains[0][0]
     v = test.x[:, 1] * gains[0][1]
     p = gains[1] * gains[0][0] / gains[0][1] / (test.x[:, 2] + 1j * test.x[:, 3])
-    moved = feature_matrix(h, v, p)
+    moved = make_features(h, v, p)
     verdicts = model.by_scan(test.x, test.patches)
     moved_verdicts = model.by_scan(moved, test.patches)
     assert verdicts.names.tolist() == moved_verdicts.names.tolist() == [f"m{i}" for i in range(5)]
@@ -125,7 +125,7 @@ def add_metal(samples, stray):
     z[:, stray] += [0.0, -0.5, 0.3]
     h = np.exp(z[..., 0]).ravel()
     v = np.exp(z[..., 1]).ravel()
-    x = feature_matrix(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
+    x = make_features(h, v, h / v * np.exp(1j * z[..., 2].ravel()))
     patches = samples.patches.max() + 1 + np.repeat(np.arange(scans.size), n)
     metal = Samples(x, np.full(len(x), "metal"), np.repeat(scans, n), patches)
     return join_samples(samples, metal)

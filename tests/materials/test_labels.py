@@ -89,7 +89,7 @@ def test_one_box_needs_no_metal_and_a_second_piece_has_a_name_of_its_own():
     ],
 )
 def test_names_of_any_script_are_kept_in_one_form(text, name):
-    assert materials.box_name(text) == name
+    assert materials.normalise_box_name(text) == name
     assert materials.clean_name(name.partition("#")[0]) == name.partition("#")[0]
 
 

@@ -11,8 +11,8 @@ from tests.support.refusals import expect_refusal
 from polysight import materials
 from polysight.materials.analyse import Optics
 from polysight.materials.classify import Weights
-from polysight.materials.library import FORMAT, majority, ratio_distance
-from polysight.materials.measure import median_ratio
+from polysight.materials.library import FORMAT, compute_ratio_distance, name_by_majority
+from polysight.materials.measure import compute_median_ratio
 from polysight.materials.result import pixel_features
 from polysight.materials.segment import TruthPlate
 from polysight.polarimetry import fresnel
@@ -133,14 +133,14 @@ def test_distances_are_distances():
     rng = np.random.default_rng(3)
     a, b, c = rng.standard_normal((3, 200)) + 1j * rng.standard_normal((3, 200))
     for measure in ("paper", "inverse", "log"):
-        ab = ratio_distance(a, b, measure)
-        bc = ratio_distance(b, c, measure)
-        ac = ratio_distance(a, c, measure)
-        np.testing.assert_allclose(ab, ratio_distance(b, a, measure), rtol=1e-9)
+        ab = compute_ratio_distance(a, b, measure)
+        bc = compute_ratio_distance(b, c, measure)
+        ac = compute_ratio_distance(a, c, measure)
+        np.testing.assert_allclose(ab, compute_ratio_distance(b, a, measure), rtol=1e-9)
         assert (ac <= ab + bc + 1e-9).all()
-        np.testing.assert_allclose(ratio_distance(a, a, measure), 0, atol=1e-12)
+        np.testing.assert_allclose(compute_ratio_distance(a, a, measure), 0, atol=1e-12)
     # A gain error of 3 % is the same distance for every material.
-    np.testing.assert_allclose(ratio_distance(a, 1.03 * a, "log"), np.log(1.03), rtol=1e-9)
+    np.testing.assert_allclose(compute_ratio_distance(a, 1.03 * a, "log"), np.log(1.03), rtol=1e-9)
 
 
 def test_pixels_that_are_not_finite_are_unknown(library):
@@ -155,7 +155,7 @@ def test_pixels_that_are_not_finite_are_unknown(library):
 def test_a_majority_names_the_patch():
     names = np.array(["a", "b", "a", "c"])
     distance = np.array([0.1, 0.2, 0.3, 9.0])
-    majority_names = majority(names, distance, np.array([7, 7, 7, 9]))
+    majority_names = name_by_majority(names, distance, np.array([7, 7, 7, 9]))
     assert majority_names.patches.tolist() == [7, 9]
     assert majority_names.names.tolist() == ["a", "c"]
     assert majority_names.confidence == pytest.approx([2 / 3, 1.0])
@@ -191,7 +191,7 @@ def test_median_ratio_is_unbiased_where_v_nearly_vanishes():
     h = r_s + n[0] + 1j * n[1]
     v = r_p + n[2] + 1j * n[3]
     v[:500] = 50.0
-    assert abs(1 / median_ratio(h, v) - r_p / r_s) < 0.006
+    assert abs(1 / compute_median_ratio(h, v) - r_p / r_s) < 0.006
 
 
 def test_rows_are_plain_json(name_placement):

@@ -8,7 +8,7 @@ import pytest
 from polysight.materials.analyse import find_most_like_metal
 from polysight.materials.inversion import RigPrior
 from polysight.materials.kinds import Kinds, PatchMeasurement, list_literature_kinds
-from polysight.materials.metal import MetalEvidence, log_evidence_of_dielectric, metal_evidence
+from polysight.materials.metal import MetalEvidence, log_evidence_of_dielectric, weigh_metal_evidence
 
 THETA = np.radians(55.0)
 KINDS = Kinds(list_literature_kinds(), float(THETA))
@@ -55,7 +55,7 @@ def scenes(request):
 def test_no_dielectric_is_taken_for_metal(plates, scenes):
     for seed in range(scenes):
         patches, _, channel = draw_scene(np.random.default_rng([plates, seed]), plates, False)
-        assert not metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough
+        assert not weigh_metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough
 
 
 def test_evidence_of_a_dielectric_reference_does_not_depend_on_the_paint_of_metal():
@@ -72,7 +72,7 @@ def test_a_dielectric_that_is_declared_as_metal_is_doubted_and_metal_is_not(plat
     for seed in range(max(5, scenes // 2)):
         for metal in (True, False):
             patches, is_metal, _ = draw_scene(np.random.default_rng([plates, seed]), plates, metal)
-            evidence = metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), None, KINDS)
+            evidence = weigh_metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), None, KINDS)
             if is_metal:
                 assert evidence.culprit is None
             else:
@@ -86,12 +86,12 @@ def test_metal_among_dielectrics_is_mostly_recognised(plates, least, scenes):
     for seed in range(scenes):
         patches, metal, channel = draw_scene(np.random.default_rng([plates, seed]), plates, True)
         assert metal
-        recognised.append(metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough)
+        recognised.append(weigh_metal_evidence(dict(enumerate(patches)), RigPrior(3e-3), channel, KINDS).enough)
     assert np.mean(recognised) >= least
 
 
 def test_alone_nothing_is_shown():
-    evidence = metal_evidence({}, RigPrior(3e-3), 1.0 + 0j, KINDS)
+    evidence = weigh_metal_evidence({}, RigPrior(3e-3), 1.0 + 0j, KINDS)
     assert not evidence.enough
     assert evidence.others == 0
 
@@ -99,7 +99,7 @@ def test_alone_nothing_is_shown():
 def test_a_patch_that_looks_the_same_is_not_evidence():
     """Water beside water looks like metal beside metal."""
     equal_patches = [PatchMeasurement(1.01 - 0.02j, 0.005, THETA, 1.02)] * 5
-    evidence = metal_evidence(dict(enumerate(equal_patches)), RigPrior(3e-3), 1.0 + 0j, KINDS)
+    evidence = weigh_metal_evidence(dict(enumerate(equal_patches)), RigPrior(3e-3), 1.0 + 0j, KINDS)
     assert evidence.others == 0
     assert not evidence.enough
 

@@ -18,8 +18,8 @@ from polysight.materials.classify import (
     _LeftOut,
     fit_weights,
 )
-from polysight.materials.library import CHANNELS, Model, Samples, feature_matrix, median_by_patch
-from polysight.materials.train import score, splits
+from polysight.materials.library import CHANNELS, Model, Samples, compute_patch_medians, make_features
+from polysight.materials.train import score, split
 from polysight_shared.errors import ErrorCode
 
 
@@ -35,7 +35,7 @@ def draw_samples(materials=6, groups=6, pixels=20, offset=0.0, noise=0.01, seed=
             q = 0.1 + 0.05 * m + angle + 0.02j * m + offset * complex(*rng.standard_normal(2))
             q = q + noise * (rng.standard_normal(pixels) + 1j * rng.standard_normal(pixels))
             h = 0.7 + 0.002 * m + noise * rng.standard_normal(pixels)
-            x.append(feature_matrix(h, np.abs(q) * h, 1 / q))
+            x.append(make_features(h, np.abs(q) * h, 1 / q))
             names += [f"m{m}"] * pixels
             group += [f"s{g}"] * pixels
             patch += [g * materials + m] * pixels
@@ -76,7 +76,7 @@ def test_with_shuffled_names_no_model_is_better_than_chance(model):
 def test_groups_never_straddle_and_every_pixel_is_judged_once(folds):
     data = draw_samples(groups=5, pixels=7)
     judged = np.zeros(data.names.size, int)
-    for train, test in splits(data, folds=folds):
+    for train, test in split(data, folds=folds):
         assert not set(data.groups[train]) & set(data.groups[test])
         assert not set(data.patches[train]) & set(data.patches[test])
         assert sorted([*train, *test]) == list(range(data.names.size))
@@ -93,7 +93,7 @@ def test_a_material_is_judged_that_is_in_two_groups_one_of_them_two_scans_of_the
     labelled = (data.names == "m1") & np.isin(data.groups, ["s8", "s9"])
     data = replace(data, specimens=np.where(labelled, "one piece", ""))
     assert np.unique(data.independent[data.names == "m1"]).size == 2
-    for train, test in splits(data):
+    for train, test in split(data):
         assert set(data.names[test]) <= set(data.names[train])
 
 
@@ -110,7 +110,7 @@ def test_scans_are_left_out_if_joined_ones_share_no_material():
 
 def test_a_split_by_pixel_divides_patches_and_is_reported_as_optimistic():
     data = draw_samples(groups=5, pixels=7)
-    assert all(set(data.patches[train]) & set(data.patches[test]) for train, test in splits(data, by_pixel=True))
+    assert all(set(data.patches[train]) & set(data.patches[test]) for train, test in split(data, by_pixel=True))
     assert "optimistic" in score(data, DISCRIMINANT_MODEL, by_pixel=True).split
 
 
@@ -118,10 +118,10 @@ def test_a_split_by_pixel_needs_two_pixels_of_a_material():
     two = np.array([0, 1, 2])
     names = np.array(["PET", "PET", "oak"])
     pixels = Samples(np.eye(3, 4), names, two, two)
-    judged = np.concatenate([test for _, test in splits(pixels, by_pixel=True)])
+    judged = np.concatenate([test for _, test in split(pixels, by_pixel=True)])
     assert sorted(judged) == [0, 1, 2]
     with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "two pixels"):
-        list(splits(pixels.take(np.array([False, True, True])), by_pixel=True))
+        list(split(pixels.take(np.array([False, True, True])), by_pixel=True))
 
 
 def test_a_split_by_pixel_flatters():
@@ -251,7 +251,7 @@ def test_the_median_of_each_patch_is_that_of_its_values_alone(seed, patches, odd
     values = rng.integers(0, 4, patch.size) / 4
     values[rng.integers(patch.size)] = odd_one
     expected = [np.median(values[patch == i]) for i in range(patches)]
-    assert np.array_equal(median_by_patch(values, patch), expected, equal_nan=True)
+    assert np.array_equal(compute_patch_medians(values, patch), expected, equal_nan=True)
 
 
 @pytest.mark.parametrize("steps", [None, 5])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from polysight.materials.measure import Scatter, border_errors, estimate_permittivity, relative_errors
+from polysight.materials.measure import Scatter, estimate_border_errors, estimate_permittivity, relative_errors
 from polysight.polarimetry import PlaneReference, permittivity_from_ratio, ratio_from_permittivity
 
 THETA = np.radians(55.0)
@@ -78,17 +78,17 @@ def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synt
 def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):
     scene = synthetic(3)
     patch = scene.analyse().segmentation.patches[0]
-    assert border_errors(patch, patch.mask, scene.x_m) == (0.0, 0.0)
+    assert estimate_border_errors(patch, patch.mask, scene.x_m) == (0.0, 0.0)
     lit = ndimage.binary_dilation(patch.mask)
-    assert min(border_errors(patch, lit, scene.x_m)) > 0.005
-    assert border_errors(patch, np.ones(patch.mask.shape, bool), scene.x_m) == (0.0, 0.0)
+    assert min(estimate_border_errors(patch, lit, scene.x_m)) > 0.005
+    assert estimate_border_errors(patch, np.ones(patch.mask.shape, bool), scene.x_m) == (0.0, 0.0)
 
 
 def test_a_box_over_dark_pixels_has_the_largest_error(synthetic):
     """Boxes drawn by hand may lie in dark parts of the image."""
     scene = synthetic(3)
     patch = scene.analyse().segmentation.patches[0]
-    assert border_errors(patch, ~patch.mask, scene.x_m) == (0.2, 0.2)
+    assert estimate_border_errors(patch, ~patch.mask, scene.x_m) == (0.2, 0.2)
 
 
 def test_the_error_at_the_end_of_the_aperture_falls_with_the_distance(synthetic):
@@ -98,7 +98,7 @@ def test_the_error_at_the_end_of_the_aperture_falls_with_the_distance(synthetic)
     errors = []
     for distance_px in range(1, 24, 2):
         lit = ndimage.binary_dilation(patch.mask, iterations=distance_px)
-        errors.append(border_errors(patch, lit, scene.x_m))
+        errors.append(estimate_border_errors(patch, lit, scene.x_m))
     amplitude, phase = np.array(errors).T
     assert (np.diff(amplitude) < 0).all()
     assert (np.diff(phase) < 0).all()

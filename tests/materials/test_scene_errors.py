@@ -11,8 +11,8 @@ from polysight.imaging import Images
 from polysight.materials import common_change
 from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.common_change import _ExpectedFromSlopes, estimate_common_change
-from polysight.materials.measure import Scatter, median_ratio
-from polysight.materials.metal import divide_by_reference, find_halo, metal_by_label, metal_unevenness
+from polysight.materials.measure import Scatter, compute_median_ratio
+from polysight.materials.metal import divide_by_reference, find_halo, measure_metal_unevenness, take_patch_as_metal
 from polysight.materials.segment import align, segment
 from polysight.polarimetry import calibrate as to_metal_by_paper
 
@@ -55,12 +55,12 @@ def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
     """By the median of V / H, which differs from the root mean square by some per cent."""
     scene = dim_copper(*draw_plates())
     segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
-    metal = metal_by_label(int(segmentation.labels[30, 30]), segmentation)
+    metal = take_patch_as_metal(int(segmentation.labels[30, 30]), segmentation)
     relative = divide_by_reference(scene, metal, None)
-    assert abs(median_ratio(relative.h[metal.mask], relative.v[metal.mask]) - 1) < 1e-4
-    assert metal_unevenness(relative, metal.mask) > 0.01
+    assert abs(compute_median_ratio(relative.h[metal.mask], relative.v[metal.mask]) - 1) < 1e-4
+    assert measure_metal_unevenness(relative, metal.mask) > 0.01
     rms = to_metal_by_paper(scene, metal.mask)
-    assert abs(median_ratio(rms.h[metal.mask], rms.v[metal.mask]) - 1) > 0.01
+    assert abs(compute_median_ratio(rms.h[metal.mask], rms.v[metal.mask]) - 1) > 0.01
 
 
 def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
@@ -70,7 +70,7 @@ def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
         known_scene = KnownScene(segmentation=segmentation, metal=int(segmentation.labels[30, 30]))
         result = analyse(scene, Optics(np.radians(55.0)), known_scene)
         errors.append(result.prior.reference_std)
-        uneven = metal_unevenness(divide_by_reference(scene, result.metal, None), result.metal.mask)
+        uneven = measure_metal_unevenness(divide_by_reference(scene, result.metal, None), result.metal.mask)
         assert errors[-1] >= 0.5 * uneven
     assert errors[1] > 1.5 * errors[0]
 

@@ -7,8 +7,8 @@ from scipy.ndimage import gaussian_filter
 from tests.support.refusals import expect_refusal
 
 from polysight.materials import Labels, SegmentSettings, pack_labels, read_labels
-from polysight.materials.labels import patches_from_labels
-from polysight.materials.metal import find_metals, metal_by_label, metal_in_box
+from polysight.materials.labels import make_patches_from_labels
+from polysight.materials.metal import find_metal_in_box, find_metals, take_patch_as_metal
 from polysight.materials.segment import box_mask, match_truth, segment
 from polysight_shared.errors import ErrorCode
 
@@ -119,13 +119,13 @@ def test_metal_by_box_and_label(synthetic):
     scene = synthetic(0)
     segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     copper = next(p for p in scene.plates if p.metal)
-    by_box = metal_in_box(copper.box_mm, segmentation, scene.x_m, scene.y_m)
+    by_box = find_metal_in_box(copper.box_mm, segmentation, scene.x_m, scene.y_m)
     assert by_box.label is not None
-    assert (by_box.mask == metal_by_label(by_box.label, segmentation).mask).all()
+    assert (by_box.mask == take_patch_as_metal(by_box.label, segmentation).mask).all()
     with expect_refusal(ErrorCode.NO_DATA, "--metal-box x0,y0,x1,y1"):
-        metal_in_box((1e3, 1e3, 2e3, 2e3), segmentation, scene.x_m, scene.y_m)
+        find_metal_in_box((1e3, 1e3, 2e3, 2e3), segmentation, scene.x_m, scene.y_m)
     with expect_refusal(ErrorCode.NO_DATA, 99):
-        metal_by_label(99, segmentation)
+        take_patch_as_metal(99, segmentation)
 
 
 def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
@@ -133,13 +133,13 @@ def test_label_files_round_trip_and_make_patches(tmp_path, synthetic):
     boxes = {"acrylic": (10.0, 20.0, 30.0, 35.0), "copper": (60.0, 60.0, 80.0, 82.0)}
     (tmp_path / "l.json").write_bytes(pack_labels(Labels(boxes)))
     assert read_labels(tmp_path / "l.json").boxes == boxes
-    segmentation, names = patches_from_labels(boxes, scene.x_m, scene.y_m)
+    segmentation, names = make_patches_from_labels(boxes, scene.x_m, scene.y_m)
     assert names == {1: "acrylic", 2: "copper"}
     assert segmentation.patches[0].pixels == 20 * 15
     assert segmentation.labels[20, 10] == 1
     assert segmentation.labels[35, 10] == 0
     with expect_refusal(ErrorCode.NO_DATA, "far"):
-        patches_from_labels({"far": (500.0, 0.0, 600.0, 10.0)}, scene.x_m, scene.y_m)
+        make_patches_from_labels({"far": (500.0, 0.0, 600.0, 10.0)}, scene.x_m, scene.y_m)
 
 
 @pytest.mark.parametrize(

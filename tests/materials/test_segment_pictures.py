@@ -9,8 +9,8 @@ import pytest
 from scipy import ndimage
 
 from polysight.materials.copies import find_copies
-from polysight.materials.labels import patches_from_labels
-from polysight.materials.measure import background, background_mean, check_patch, halves_apart
+from polysight.materials.labels import make_patches_from_labels
+from polysight.materials.measure import background_mean, check_patch, measure_background, measure_difference_of_halves
 from polysight.materials.segment import Segmentation, make_patch, segment
 from polysight.results.rules import judge_patches
 from polysight_worlds import METAL, Plate, Stack, World, published_rig, simulate
@@ -113,8 +113,8 @@ def test_a_sheet_whose_v_is_noise_is_one_plate_of_one_kind(seed, noise_db):
     h, v = draw(seed, plates, strips=1.0, amplitude=0.02, phase_deg=1.0, background_db=-60.0)
     v = v + draw_band_limited_noise(np.random.default_rng(seed), noise_db)[1]
     usable = np.ones(h.shape, bool)
-    segmentation, _ = patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
-    dark = background(h, v, segmentation, usable)
+    segmentation, _ = make_patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
+    dark = measure_background(h, v, segmentation, usable)
     assert [check_patch(patch, h, v, dark, 0.05) for patch in segmentation.patches] == [None, None]
 
 
@@ -149,7 +149,9 @@ def test_halves_are_as_far_apart_as_their_median_ratios():
     h = np.full((SIDE, SIDE), 2.0 + 0j)
     for ratio in (across, across.T):
         extent = np.ptp(ratio[mask]) + 1
-        assert halves_apart(h, h * (0.3 + 0.4j) * ratio, mask) == pytest.approx(0.5 * ((extent + 1) // 2))
+        assert measure_difference_of_halves(h, h * (0.3 + 0.4j) * ratio, mask) == pytest.approx(
+            0.5 * ((extent + 1) // 2)
+        )
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
@@ -157,7 +159,7 @@ def test_halves_are_as_far_apart_as_their_median_ratios():
 def test_channels_agree_at_a_coherence_above_0_7_in_any_unit(unit, coherence, agree):
     rng = np.random.default_rng(3)
     box = (-20.0, -20.0, 20.0, 20.0)
-    patch = patches_from_labels({"plate": box}, AXIS, AXIS)[0].patches[0]
+    patch = make_patches_from_labels({"plate": box}, AXIS, AXIS)[0].patches[0]
     angle = np.arccos(coherence) * np.where(rng.random((SIDE, SIDE)) < 0.5, 1, -1)
     h = np.full((SIDE, SIDE), unit + 0j)
     cause = check_patch(patch, h, 0.5 * h * np.exp(1j * angle), (0.0, 0.0), 0.0)
@@ -173,15 +175,15 @@ def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     assert_found(segmentation, plates)
     patch = min(segmentation.patches, key=lambda p: p.centre_mm[1])
     assert patch.cut is cut
-    refusal_cause = check_patch(patch, h, v, background(h, v, segmentation, np.ones(h.shape, bool)), 0.0)
+    refusal_cause = check_patch(patch, h, v, measure_background(h, v, segmentation, np.ones(h.shape, bool)), 0.0)
     assert (refusal_cause is not None and "border" in refusal_cause.what) is cut
 
 
 def find_refusal(h, v, box, amplitude_of_metal=0.0):
-    segmentation, _ = patches_from_labels({"plate": box}, AXIS, AXIS)
+    segmentation, _ = make_patches_from_labels({"plate": box}, AXIS, AXIS)
     patch = segmentation.patches[0]
-    uneven = max(amplitude_of_metal, halves_apart(h, v, patch.interior) if amplitude_of_metal else 0.0)
-    return check_patch(patch, h, v, background(h, v, segmentation, np.ones(h.shape, bool)), uneven)
+    uneven = max(amplitude_of_metal, measure_difference_of_halves(h, v, patch.interior) if amplitude_of_metal else 0.0)
+    return check_patch(patch, h, v, measure_background(h, v, segmentation, np.ones(h.shape, bool)), uneven)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -279,10 +281,10 @@ def test_a_dim_plate_outside_patches_is_not_background_but_a_table_is():
     h = np.where(plate_mask, 0.3, 0.01).astype(np.complex64)
     patch = make_patch(1, patch_mask, AXIS, AXIS, 5.0, usable)
     beside_plate = Segmentation(patch_mask.astype(np.int32), (patch,), (plate_mask,))
-    assert background(h, h, beside_plate, usable) == pytest.approx((0.01, 0.01))
+    assert measure_background(h, h, beside_plate, usable) == pytest.approx((0.01, 0.01))
     table = np.where(patch_mask, 1.0, 0.3).astype(np.complex64)
     before_table = Segmentation(patch_mask.astype(np.int32), (patch,), (~patch_mask,))
-    assert background(table, table, before_table, usable) == pytest.approx((0.3, 0.3))
+    assert measure_background(table, table, before_table, usable) == pytest.approx((0.3, 0.3))
 
 
 @pytest.mark.parametrize(("pixels", "is_background"), [(6 * 25, False), (6 * 25 + 1, True)])
@@ -295,7 +297,7 @@ def test_a_dim_region_larger_than_six_plates_is_background(pixels, is_background
     patch = make_patch(1, patch_mask, AXIS, AXIS, 5.0, usable)
     segmentation = Segmentation(patch_mask.astype(np.int32), (patch,), (region,))
     h = region.astype(np.complex64)
-    assert (background(h, h, segmentation, usable)[0] > 0) == is_background
+    assert (measure_background(h, h, segmentation, usable)[0] > 0) == is_background
 
 
 def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():

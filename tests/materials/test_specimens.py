@@ -5,7 +5,7 @@ import pytest
 
 from polysight.materials import MODELS, Classifier, Entry, Library, specimens
 from polysight.materials.classify import DISCRIMINANT_MODEL
-from polysight.materials.library import Samples, feature_matrix
+from polysight.materials.library import Samples, make_features
 from polysight.materials.names import add_explanation
 from polysight.materials.specimens import PUBLISHED_SPREAD, effect, features, fit_spread, relative
 from polysight.polarimetry import fresnel
@@ -35,7 +35,7 @@ def draw_pixels(spread, scans, seed=0, pixels=8, gain=0.01, kinds=KINDS, labelle
     i, k, _ = np.indices(h.shape)
     specimens = np.char.add("s", i.ravel().astype(str)) if labelled else None
     names = np.array(list(kinds))[k.ravel()]
-    x = feature_matrix(h, v, h / v).reshape(-1, 4)
+    x = make_features(h, v, h / v).reshape(-1, 4)
     return Samples(x, names, i.ravel().astype(str), (i * eps.size + k).ravel(), specimens, (60.0,))
 
 

@@ -11,7 +11,7 @@ from tests.support.rigs import load_published_rig
 from polysight.imaging import Images
 from polysight.imaging.images import SubBand
 from polysight.materials.layers import Bands, Layer, Spectrum, fit_layer, predict
-from polysight.materials.sub_bands import BAND_AMPLITUDE_STD, band_rows, bands_of_row
+from polysight.materials.sub_bands import BAND_AMPLITUDE_STD, bands_of_row, list_band_rows
 from polysight.polarimetry import fresnel, ratio_from_permittivity
 from polysight.results import ComplexNumber, PatchFigures, to_plain
 
@@ -50,8 +50,8 @@ def cut_left_half(mask):
 def test_metal_that_a_sub_band_does_not_show_is_not_part_of_its_reference(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~cut_left_half(analysis.metal.mask)
-    full_rows = band_rows(analysis, [BAND], [make_channels(scene, everywhere)], (0, 0), 1.5)
-    cut = band_rows(analysis, [BAND], [make_channels(scene, without)], (0, 0), 1.5)
+    full_rows = list_band_rows(analysis, [BAND], [make_channels(scene, everywhere)], (0, 0), 1.5)
+    cut = list_band_rows(analysis, [BAND], [make_channels(scene, without)], (0, 0), 1.5)
     for patch in analysis.patches:
         (row_before,) = full_rows[patch.patch.label]
         (row_after,) = cut[patch.patch.label]
@@ -63,7 +63,9 @@ def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, analys
     dielectric = next(r for r in analysis.patches if r.patch.label != analysis.metal.label)
     everywhere = np.ones(scene.h.shape, bool)
     without = everywhere & ~cut_left_half(dielectric.patch.interior)
-    rows = [band_rows(analysis, [BAND], [make_channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)]
+    rows = [
+        list_band_rows(analysis, [BAND], [make_channels(scene, valid)], (0, 0), 1.5) for valid in (everywhere, without)
+    ]
     (row_before,), (row_after,) = (r[dielectric.patch.label] for r in rows)
     assert row_after.amplitude_h == pytest.approx(row_before.amplitude_h, rel=0.02)
 
@@ -71,7 +73,7 @@ def test_a_patch_that_is_shown_in_part_is_not_darkened_by_the_rest(scene, analys
 def test_a_sub_band_without_metal_is_null_and_the_others_stay(scene, analysis):
     everywhere = np.ones(scene.h.shape, bool)
     images = [make_channels(scene, everywhere), make_channels(scene, everywhere & ~analysis.metal.mask)]
-    rows = band_rows(analysis, [BAND, BAND], images, (0, 0), 1.5)
+    rows = list_band_rows(analysis, [BAND, BAND], images, (0, 0), 1.5)
     for patch in analysis.patches:
         row_with_metal, row_without = rows[patch.patch.label]
         assert row_with_metal.ratio is not None
@@ -97,7 +99,7 @@ def test_brightness_that_a_sub_band_changes_over_a_plate_is_an_error_of_that_ban
     ripple = 1 + 0.05 * np.sin(2 * np.pi * scene.x_m / 0.025)
     images = make_channels(scene, everywhere)
     rippled = replace(images, h=(images.h * ripple).astype(np.complex64), v=(images.v * ripple).astype(np.complex64))
-    rows = band_rows(analysis, [BAND, BAND], [images, rippled], (0, 0), 1.5)
+    rows = list_band_rows(analysis, [BAND, BAND], [images, rippled], (0, 0), 1.5)
     for patch in analysis.patches:
         even, uneven = rows[patch.patch.label]
         assert BAND_AMPLITUDE_STD <= even.own_amplitude_std < uneven.own_amplitude_std / 2

@@ -4,7 +4,7 @@ import numpy as np
 
 from polysight.imaging import Images
 from polysight.materials.analyse import KnownScene, Optics, analyse, smooth_inside
-from polysight.materials.labels import patches_from_labels, patches_from_plates
+from polysight.materials.labels import make_patches_from_labels, make_patches_from_plates
 from polysight.materials.segment import TruthPlate
 from polysight.polarimetry import fresnel
 
@@ -22,7 +22,7 @@ def _make_scene():
     for eps, columns in ((LEFT, slice(0, 30)), (RIGHT, slice(30, 60))):
         h[20:, columns], v[20:, columns] = fresnel(eps, THETA)
     boxes = {"metal": (0, 0, 60, 18), "left": (2, 20, 30, 40), "right": (30, 20, 58, 40), "nowhere": (58, 20, 60, 40)}
-    segmentation, names = patches_from_labels(boxes, X_M, Y_M, unit="pixel")
+    segmentation, names = make_patches_from_labels(boxes, X_M, Y_M, unit="pixel")
     return h, v, segmentation, {name: label for label, name in names.items()}
 
 
@@ -56,7 +56,7 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
 
 def test_plates_of_one_name_are_patches_each():
     plates = [TruthPlate("acrylic", box, 4 - 0.4j) for box in ((-50, -30, -20, 0), (10, -30, 40, 0))]
-    segmentation, names = patches_from_plates(plates, X_M, Y_M, 0.0)
+    segmentation, names = make_patches_from_plates(plates, X_M, Y_M, 0.0)
     assert list(names.values()) == ["acrylic", "acrylic"]
     assert [p.label for p in segmentation.patches] == list(names)
     assert not (segmentation.patches[0].mask & segmentation.patches[1].mask).any()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.materials.test_specimens import KINDS, draw_pixels
 
-from polysight.materials import Library, accuracy_lines
+from polysight.materials import Library, describe_accuracy
 from polysight.materials.train import fit_samples
 from polysight.materials.training_advice import FREEDOM_NEEDED
 
@@ -18,7 +18,7 @@ def fit_of_many_specimens():
 
 
 def advise(fit) -> str:
-    return "\n".join(accuracy_lines(Library((), {"angles": {"60": fit}})))
+    return "\n".join(describe_accuracy(Library((), {"angles": {"60": fit}})))
 
 
 def test_unnamed_pieces_make_an_underconfident_library_that_asks_for_specimens():

@@ -10,7 +10,7 @@ from tests.support.rigs import load_published_rig
 
 from polysight.catalogue import PHASE_COLOURS, colour_bar, draw
 from polysight.imaging import Images
-from polysight.page.watch import range_profile_db
+from polysight.page.watch import compute_range_profile_db
 from polysight.sync import SyncedRow
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
@@ -98,11 +98,11 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
         direct_amplitude=zeros,
     )
     distances_m = np.linspace(-0.2, 1.0, 601)
-    level = range_profile_db(row, chirp, distances_m)
+    level = compute_range_profile_db(row, chirp, distances_m)
     assert abs(distances_m[level.argmax()]) < 0.01
     assert level.max() == pytest.approx(0.0, abs=0.05)
     beyond = np.where(np.abs(distances_m) < 0.2, -200.0, level)
     assert distances_m[beyond.argmax()] == pytest.approx(path_m, abs=0.01)
     assert beyond.max() == pytest.approx(20 * np.log10(0.3), abs=0.5)
     none = replace(row, valid=np.zeros(5, bool))
-    assert np.ptp(range_profile_db(none, chirp, distances_m)) == 0
+    assert np.ptp(compute_range_profile_db(none, chirp, distances_m)) == 0

@@ -328,7 +328,7 @@ def test_training_on_one_scan_of_each_material_claims_no_accuracy(tmp_path, caps
     assert "accuracy not known" in output
     library = Library.load(out)
     assert library.fit["angles"]["60"]["pixel_accuracy"] is None
-    assert "100.0 %" not in classify.classifier_sentence(classify.Classifier(library))
+    assert "100.0 %" not in classify.describe_classifier(classify.Classifier(library))
 
 
 @pytest.mark.parametrize(

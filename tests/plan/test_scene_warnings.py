@@ -14,7 +14,7 @@ import polysight
 from polysight.cli.main import main
 from polysight.data import find_packaged
 from polysight.planning import find_scene_warnings, read_scene, warn_of_scene
-from polysight.planning.plan_command import rig_lines
+from polysight.planning.plan_command import format_rig_lines
 
 OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
@@ -92,7 +92,7 @@ def test_proposals_are_for_the_scene_and_repeat_its_warnings(tmp_path, capsys):
 
 
 def test_a_text_of_the_scene_stays_a_text_in_the_lines_of_the_rig_file():
-    lines = rig_lines(make_rig_with(image={"apodisation": "taylor"}), load_published_rig())
+    lines = format_rig_lines(make_rig_with(image={"apodisation": "taylor"}), load_published_rig())
     assert tomllib.loads(lines) == {"image": {"apodisation": "taylor"}}
 
 

@@ -6,7 +6,7 @@ from hypothesis import given, strategies as st
 from tests.support.calibration import compute_remaining
 from tests.support.refusals import expect_refusal
 
-from polysight.polarimetry import Leakage, leakage_from_images
+from polysight.polarimetry import Leakage, estimate_leakage_from_images
 from polysight.polarimetry.calibrate import (
     PLATE,
     MetalStandard,
@@ -98,7 +98,7 @@ def test_uneven_illumination_has_no_influence(a, b, g, seed):
         return light * (truth.matrix() @ np.array(wave))[:, None, None]
 
     strips = [(psi, *image(strips_wave(psi, THETA))) for psi in (UPRIGHT, LYING)]
-    leakage = leakage_from_images(tuple(image(PLATE)), strips, np.ones((20, 30), bool), THETA)
+    leakage = estimate_leakage_from_images(tuple(image(PLATE)), strips, np.ones((20, 30), bool), THETA)
     np.testing.assert_allclose([leakage.h, leakage.v], [a, b], atol=1e-7)
 
 

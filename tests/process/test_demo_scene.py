@@ -4,7 +4,7 @@ from benchmarks.coverage import Cubes
 from tests.support.paths import EXAMPLES
 from tests.support.rigs import load_published_rig
 
-from polysight.materials import match_truth, truth_plates
+from polysight.materials import match_truth, read_true_plates
 from polysight.pipeline import Pipeline
 from polysight.settings import Settings
 from polysight_simulators.scene.scene_file import apply_scene, load_scene
@@ -20,7 +20,7 @@ def test_each_plate_of_the_demo_has_a_permittivity_and_half_of_them_their_names(
         pipeline.add_row(row)
     result = pipeline.examine(pipeline.form_images()).analysis
     true = match_truth(
-        [r.patch for r in result.patches], truth_plates(truth(apply_scene(rig, scene), scene, scene.seed))
+        [r.patch for r in result.patches], read_true_plates(truth(apply_scene(rig, scene), scene, scene.seed))
     )
     assert {r.patch.label: r.refused.what for r in result.patches if r.refused is not None} == {}
     plates = [(r, true[r.patch.label]) for r in result.patches if not true[r.patch.label].metal]

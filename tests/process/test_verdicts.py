@@ -8,7 +8,7 @@ import pytest
 from benchmarks.coverage import Cubes
 from tests.support.pipelines import make_pipeline
 
-from polysight.materials import match_truth, truth_plates
+from polysight.materials import match_truth, read_true_plates
 from polysight.process import read_given_images
 from polysight.products import ProcessedScan
 from polysight.products.maps import nominal_incidence_rad
@@ -49,7 +49,7 @@ def examine(rig):
         source = Cubes(rig, scene)
         pipeline, images = form_images(source)
         findings = pipeline.examine(images)
-        plates = truth_plates(truth(source.instrument, scene, scene.seed))
+        plates = read_true_plates(truth(source.instrument, scene, scene.seed))
         true = match_truth([r.patch for r in findings.analysis.patches], plates)
         return findings, true
 

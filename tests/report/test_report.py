@@ -15,9 +15,9 @@ from polysight.imaging import Images
 from polysight.materials import TruthPlate
 from polysight.process.quality import find_masked_runs
 from polysight.report import write_report
-from polysight.report.figures import coverage_figure, find_masked_positions
-from polysight.report.report import format_value, imaging_table, quality_tables, render
-from polysight.report.style import png
+from polysight.report.figures import draw_coverage_figure, find_masked_positions
+from polysight.report.report import format_value, make_imaging_table, make_quality_tables, render
+from polysight.report.style import encode_png
 from polysight.results import RxGain, ScanFacts, ScanMaterials, ScanQuality
 from polysight_shared.raster import RasterPlan
 
@@ -276,7 +276,7 @@ def test_the_report_has_the_masked_data_the_gains_and_the_whole_rig_file(scan):
     answer = replace_results(
         replace_boards(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig)
     )
-    picture = png(coverage_figure(answer, find_masked_positions(answer)))
+    picture = encode_png(draw_coverage_figure(answer, find_masked_positions(answer)))
     page = Page(render(answer, {"coverage": picture}))
     assert base64.b64encode(picture).decode() in page.sources[0]
     assert "RH 3 of 24 (12.50%)" in page.words
@@ -298,7 +298,9 @@ BOARD = {
 
 
 def test_the_imaging_table_has_a_column_for_each_board_and_marks_unknown_values():
-    table = imaging_table({"RH": BOARD, "RV": {"masked_positions": 70000}, "notices": ["RV: imaging by direct sum"]})
+    table = make_imaging_table(
+        {"RH": BOARD, "RV": {"masked_positions": 70000}, "notices": ["RV: imaging by direct sum"]}
+    )
     assert table["head"] == ["Board", "RH", "RV"]
     cells = {row["cells"][0]: row["cells"][1:] for row in table["rows"]}
     assert cells["Positions masked"] == ["12", "70000"]
@@ -360,7 +362,7 @@ def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(sc
 
 def test_a_standard_deviation_is_not_shown_as_the_value():
     boards = {"RH": {"stage_backlash_mm": {"shift": 0.12, "std": 0.01}}}
-    (table,) = quality_tables({"boards": boards})
+    (table,) = make_quality_tables({"boards": boards})
     cells = [row["cells"] for row in table["rows"]]
     assert cells == [["stage backlash shift (mm)", "0.12"], ["stage backlash std (mm)", "0.01"]]
 

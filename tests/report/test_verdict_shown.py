@@ -28,10 +28,10 @@ from polysight import open_scan
 from polysight.materials import TruthPlate
 from polysight.products import ProcessedScan, read_products
 from polysight.report import write_report
-from polysight.report.figures import draw_materials, permittivity_map, phase_limits_deg
+from polysight.report.figures import draw_materials, draw_permittivity_map, find_phase_limits_deg
 from polysight.report.permittivity_plot import SHARES, fit_ellipse, region_matrix
-from polysight.report.report import budget_table
-from polysight.report.style import RIGHT_IN, MapLabel, fit_labels, new_figure, shorten_labels
+from polysight.report.report import make_budget_table
+from polysight.report.style import RIGHT_IN, MapLabel, fit_labels, make_figure, shorten_labels
 from polysight.results import ErrorBudget, PermittivityFigures
 from polysight.results.verdict import LEVELS
 
@@ -136,7 +136,7 @@ def test_products_of_earlier_releases_have_no_verdict_and_no_budget(tmp_path):
     assert 'class="verdict' not in page
     assert "Error budget" not in page
     assert "2.90 ± 0.20" in page
-    assert budget_table(ErrorBudget()) is None
+    assert make_budget_table(ErrorBudget()) is None
 
 
 def test_the_inner_region_has_the_half_widths_that_hold_68_percent():
@@ -177,7 +177,7 @@ def test_long_names_of_close_patches_become_numbers_that_do_not_touch(tmp_path):
     fig.draw_without_rendering()
     boxes = [label.text.get_window_extent() for label in labels]
     assert not any(Bbox.intersection(a, b) for i, a in enumerate(boxes) for b in boxes[:i])
-    assert permittivity_map(scan) is not None
+    assert draw_permittivity_map(scan) is not None
 
 
 @pytest.mark.parametrize(("out_px", "replaced"), [(-20, 0), (0.9, 0), (1.1, 1)])
@@ -199,7 +199,7 @@ def test_a_name_may_leave_the_frame_by_a_pixel(side, out_px, replaced):
 @pytest.mark.parametrize("names", [1, 2, 3, 8, 30])
 def test_a_legend_takes_just_the_room_below_the_axes(names):
     """The figure grows by the legend's height; the axes stay as large."""
-    fig = new_figure(5, 4, RIGHT_IN)
+    fig = make_figure(5, 4, RIGHT_IN)
     ax = fig.add_subplot()
     ax.set_xlabel("x, mm")
     height_px = ax.get_window_extent().height
@@ -215,17 +215,17 @@ def test_a_legend_takes_just_the_room_below_the_axes(names):
 def test_the_phase_of_p_has_the_range_of_the_patches_across_180_degrees(tmp_path):
     scan = write_products(write_judged_products(tmp_path, "good"))
     p = np.exp(1j * np.radians(np.where(np.arange(30) % 2, 170.0, -170.0)))[None, :] * np.ones((20, 1))
-    limits = phase_limits_deg(replace_results(scan, images=replace(scan.images, p=p)))
+    limits = find_phase_limits_deg(replace_results(scan, images=replace(scan.images, p=p)))
     assert limits is not None
     low, high = limits
     assert high - low < 40
     assert any(low <= 170 + turn <= high and low <= 190 + turn <= high for turn in (-360, 0))
-    assert phase_limits_deg(replace_results(scan, materials=None)) is None
+    assert find_phase_limits_deg(replace_results(scan, materials=None)) is None
     random = np.exp(2j * np.pi * np.random.default_rng(1).uniform(size=p.shape))
-    assert phase_limits_deg(replace_results(scan, images=replace(scan.images, p=random))) is None
+    assert find_phase_limits_deg(replace_results(scan, images=replace(scan.images, p=random))) is None
 
 
 @pytest.mark.parametrize("key", BUDGET)
 def test_an_error_budget_with_a_part_alone_is_shown(key):
-    assert budget_table(msgspec.convert({key: BUDGET[key]}, ErrorBudget))
-    assert budget_table(msgspec.convert({"plane": {"known": False}}, ErrorBudget))
+    assert make_budget_table(msgspec.convert({key: BUDGET[key]}, ErrorBudget))
+    assert make_budget_table(msgspec.convert({"plane": {"known": False}}, ErrorBudget))

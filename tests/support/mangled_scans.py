@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from polysight.imaging import Images
-from polysight.materials import match_truth, truth_plates
+from polysight.materials import match_truth, read_true_plates
 from polysight.pipeline import Pipeline
 from polysight.process import Findings
 from polysight.store import CubeRow, RowData, Source
@@ -60,7 +60,7 @@ class Mangled:
 def compute_distances(source: Any, findings: Findings) -> list[float]:
     """Squared distances of the true permittivities in the regions."""
     scene = decode_scene(SCENE, "test")
-    plates = truth_plates(truth(source.instrument, scene, scene.seed))
+    plates = read_true_plates(truth(source.instrument, scene, scene.seed))
     true = match_truth([r.patch for r in findings.analysis.patches], plates)
     out = []
     for r in findings.analysis.patches:

@@ -14,7 +14,7 @@ from polysight.surfaces.gains import predict_voltages, reflect_points
 from polysight.surfaces.measure import Shape
 from polysight.surfaces.permittivity import add_common_errors, fit_permittivity
 from polysight.surfaces.points import compute_tangents, find_normals, find_offset_that_sees, predict_echo
-from polysight.surfaces.window import BoardFit, Samples, no_echoes
+from polysight.surfaces.window import BoardFit, Samples, make_empty_echoes
 from polysight_shared.config import load_instrument
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 from polysight_worlds.media import METAL, Stack
@@ -58,7 +58,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[SeenEchoes, Shape]:
         direct_m = np.linalg.norm(receiver_m - optics.tx.at_m)
         path, slope, bend = predict_echo(points, normals, curvature, at_m, optics.tx.at_m, receiver_m)
         echoes[channel] = replace(
-            no_echoes(),
+            make_empty_echoes(),
             at_m=at_m,
             path_m=path,
             slope=slope,

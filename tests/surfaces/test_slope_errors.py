@@ -10,7 +10,7 @@ from polysight.surfaces import Echoes
 from polysight.surfaces.measure import smooth_bends
 from polysight.surfaces.paths import STRIDE_M
 from polysight.surfaces.result import EDGE_SLOPE_STD
-from polysight.surfaces.window import WINDOW_M, no_echoes
+from polysight.surfaces.window import WINDOW_M, make_empty_echoes
 
 SLOPE_STD = (0.004, 0.002)
 SIDE = 60
@@ -43,7 +43,7 @@ def make_echoes(bend: np.ndarray, errors: np.ndarray, slope_std: tuple[float, fl
     at_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     count = len(at_m)
     return replace(
-        no_echoes(),
+        make_empty_echoes(),
         at_m=at_m,
         path_m=np.zeros(count),
         slope=at_m[:, :2] @ bend + np.array(SLOPE_STD) * errors.reshape(2, -1).T,

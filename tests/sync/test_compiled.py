@@ -259,7 +259,7 @@ def test_three_receivers_are_aligned_in_numpy():
 
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     library = sync_loops.Library(library_file)
-    monkeypatch.setattr(sync_loops, "library", lambda: library)
+    monkeypatch.setattr(sync_loops, "load_library", lambda: library)
     monkeypatch.setattr("polysight.sync.offsets.align_in_numpy", None)
     assert align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 

@@ -360,7 +360,7 @@ def test_an_if_outside_the_band_is_masked(rig, paths, direct_paths, align_single
 
 def test_the_compiled_search_is_never_given_more_blocks_than_it_has_room_for(rig, align_single, noise, monkeypatch):
     """Otherwise the loop would write beyond its arrays."""
-    compiled = loops.library()
+    compiled = loops.load_library()
     if compiled is None:
         pytest.skip("nothing is compiled here")
     blocks_searched = []

@@ -17,10 +17,10 @@ def align(request):
     """Align bursts in one form of the loops."""
     if request.param == "numpy":
         by = align_in_numpy
-    elif sync_loops.library() is None:
+    elif sync_loops.load_library() is None:
         pytest.skip("no compiled loops: python -m polysight.sync.build")
     else:
-        by = sync_loops.library().align
+        by = sync_loops.load_library().align
 
     def run(words, valid=None):
         valid = np.ones(words.shape[:2], bool) if valid is None else valid
@@ -135,7 +135,7 @@ def test_clipped_chirps_among_others_are_left_out(align, receive_bursts, counts)
 
 
 def test_both_forms_leave_out_the_same(receive_bursts, counts):
-    library = sync_loops.library()
+    library = sync_loops.load_library()
     if library is None:
         pytest.skip("no compiled loops: python -m polysight.sync.build")
     rng = np.random.default_rng(1)

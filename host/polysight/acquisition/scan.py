@@ -65,7 +65,7 @@ from polysight.store import (
     check_same_scan,
     extract_connection,
     find_damaged_rows,
-    new_scan_id,
+    make_scan_id,
     read_events,
     utc_now,
 )
@@ -510,7 +510,7 @@ def run_scan(
             instrument,
             plan,
             simulated=simulated,
-            scan_id=new_scan_id(),
+            scan_id=make_scan_id(),
             pi=describe_pi(hello),
             calibration=_copy_calibration(instrument, folder, simulated),
         )

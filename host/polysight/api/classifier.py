@@ -25,7 +25,7 @@ from polysight.materials import (
     PaperKNeighborsClassifier,
     Samples,
     Score,
-    ratio_columns,
+    invert_ratios,
     score,
 )
 
@@ -166,4 +166,4 @@ def _to_features(X: Columns) -> Columns:
         raise ValueError(
             f"X has {X.shape[1]} feature(s): {CHANNELS} for each incidence angle, |H|, |V|, real and imaginary P"
         )
-    return ratio_columns(X)
+    return invert_ratios(X)

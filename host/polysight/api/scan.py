@@ -29,12 +29,12 @@ from polysight.products import (
     ProcessedScan,
     Rows,
     find_products,
+    format_ranges,
     full_dataset,
     image_dataset,
     label_folder,
     patch_dataset,
     permittivity_dataset,
-    ranges_text,
     surface_dataset,
     write_netcdf,
 )
@@ -558,7 +558,7 @@ class Scan:
             rows = self.rows
         except DataError:
             return "number of rows not known"
-        missing = f" (missing {ranges_text(rows.missing)})" if rows.missing else ""
+        missing = f" (missing {format_ranges(rows.missing)})" if rows.missing else ""
         return f"{len(rows.committed)} of {rows.planned} rows{missing}"
 
     @property

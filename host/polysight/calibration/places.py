@@ -25,7 +25,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.calibration import files
-from polysight.imaging import Antennas, image_grid, reduction, row_offsets_m, scene_gate_m
+from polysight.imaging import Antennas, find_scene_gate_m, image_grid, reduction, row_offsets_m
 from polysight.store import RawSource
 from polysight.sync import BoardSetup, HighPass, synchronise_row
 from polysight_shared.config import Instrument
@@ -194,7 +194,7 @@ def _load_board(source: RawSource, rig: Instrument, name: str, model: HighPass |
     plan = plan_raster(rig.grid)
     setup = BoardSetup.from_rig(rig, board, model=model)
     receivers = tuple(Antennas.from_rig(rig, b) for b in rig.receivers)
-    gate = scene_gate_m(receivers, plan, image_grid(rig), DEPTH_M)
+    gate = find_scene_gate_m(receivers, plan, image_grid(rig), DEPTH_M)
     maps = reduction(rig.chirp, gate)
     reduced = []
     direct = []

@@ -37,7 +37,7 @@ from polysight.planning import scan_time
 from polysight.process import explain_unnamed
 from polysight.radar import RadarState, check_constraints
 from polysight.settings import DEFAULT
-from polysight.store import new_scan_id
+from polysight.store import make_scan_id
 from polysight_shared import __version__
 from polysight_shared.config import Board, load_instrument
 from polysight_shared.errors import ConfigError, DeviceError
@@ -318,7 +318,7 @@ def _run_row(context: CheckContext) -> RowFinished:
     rig = context.rig
     pi = context.pi
     plan = RasterPlan(_POINTS, 1, rig.grid.step_x_mm, rig.grid.step_y_mm)
-    scan_id = f"doctor-{new_scan_id()}"
+    scan_id = f"doctor-{make_scan_id()}"
     pi.follow(scan_id, last_seq=0, on_event=lambda _event: None)
     pi.begin_run(make_begin_run(rig, scan_id, plan))
     try:

@@ -21,11 +21,11 @@ from polysight.imaging.geometry import (
     Aperture as Aperture,
     ImageGrid as ImageGrid,
     find_needed_gate_m as find_needed_gate_m,
+    find_scene_gate_m as find_scene_gate_m,
     image_grid as image_grid,
+    make_window as make_window,
     row_offsets_m as row_offsets_m,
     scan_offsets_m as scan_offsets_m,
-    scene_gate_m as scene_gate_m,
-    window_weights as window_weights,
 )
 from polysight.imaging.images import (
     AS_IN_RIG_FILE as AS_IN_RIG_FILE,

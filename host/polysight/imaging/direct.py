@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar, overload
 import numpy as np
 import numpy.typing as npt
 
-from polysight.imaging.geometry import Aperture, excess_path_m, get_device, namespace, turn
+from polysight.imaging.geometry import Aperture, excess_path_m, find_array_namespace, get_device, turn
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 # Products of position and voxel that are in memory at a time (chosen).
@@ -101,7 +101,7 @@ def backproject(
 
 def project(reflectivity: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any) -> Any:
     """Compute the echoes of voxels [n], complex128 [position, frequency]; the adjoint of :func:`backproject`."""
-    voxels = namespace(reflectivity).asarray(reflectivity)
+    voxels = find_array_namespace(reflectivity).asarray(reflectivity)
     # Only the shape of these samples is used.
     no_samples = np.empty((len(tx_m), len(frequencies_hz)))
     scene = _Scene(no_samples, frequencies_hz, tx_m, rx_m, voxels_m, reference_m, like=voxels)
@@ -123,7 +123,7 @@ class _Scene:
         self, samples: Any, frequencies_hz: Any, tx_m: Any, rx_m: Any, voxels_m: Any, reference_m: Any, like: Any = None
     ) -> None:
         pattern = samples if like is None else like
-        self.xp = namespace(pattern)
+        self.xp = find_array_namespace(pattern)
         self.device = get_device(pattern)
         # Lists have no shape of their own; arrays of other libraries are unknown to `np.shape`.
         shape = tuple(samples.shape) if hasattr(samples, "shape") else np.shape(samples)
@@ -175,7 +175,7 @@ class DirectImager:
 
     def image(self, samples: Any) -> Any:
         """Return the matched filter of samples [rx, frequency, row, column], complex128 [ny, nx]."""
-        xp = namespace(samples)
+        xp = find_array_namespace(samples)
         rx, m, rows, columns = self.aperture.shape
         total = 0
         for r in range(rx):
@@ -185,12 +185,12 @@ class DirectImager:
 
     def image_constant_echo(self, echo: Any, weights: Any) -> Any:
         """Return the image of an echo [rx, frequency] at every position, times weights [row, column]."""
-        xp = namespace(echo)
+        xp = find_array_namespace(echo)
         return self.image(echo[:, :, None, None] * xp.astype(weights, echo.dtype)[None, None, :, :])
 
     def samples(self, image: Any) -> Any:
         """Return the echoes of pixels [ny, nx], [rx, frequency, row, column]; the adjoint of :meth:`image`."""
-        xp = namespace(image)
+        xp = find_array_namespace(image)
         rx, m, rows, columns = self.aperture.shape
         pixels = xp.reshape(image, (-1,))
         answers = [xp.permute_dims(project(pixels, *self._list_geometry(r)), (1, 0)) for r in range(rx)]

@@ -166,7 +166,7 @@ def scan_offsets_m(rig: Instrument) -> NDArray[np.float64]:
     return offsets
 
 
-def scene_gate_m(
+def find_scene_gate_m(
     antennas: tuple[Antennas, ...], plan: RasterPlan, grid: ImageGrid, depth_m: float = 0.0
 ) -> tuple[float, float]:
     """Return the smallest and largest excess path of all pixels (`depth_m` nearer and farther) and stage positions."""
@@ -186,7 +186,7 @@ def scene_gate_m(
 def find_needed_gate_m(rig: Instrument, depth_m: float = 0.0) -> tuple[float, float]:
     """Return the smallest and largest excess path in a rig's image, with planes `depth_m` nearer and farther."""
     antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
-    return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
+    return find_scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig), depth_m)
 
 
 @dataclass(frozen=True)
@@ -226,8 +226,8 @@ def find_irregularity(aperture: Aperture) -> str | None:
         return "the stage's positions are not in one plane"
     if np.ptp(offsets[..., 1], axis=1).max() > _SAME_M:
         return "the rows are not straight"
-    places = np.arange(offsets.shape[1]) * column_step_m(offsets)
-    if np.abs(offsets[..., 0] - row_starts_m(offsets)[:, None] - places).max() > _SAME_M:
+    places = np.arange(offsets.shape[1]) * measure_column_step_m(offsets)
+    if np.abs(offsets[..., 0] - fit_row_starts_m(offsets)[:, None] - places).max() > _SAME_M:
         return "the positions of a row are not evenly spaced"
     y = offsets[:, 0, 1]
     if np.abs(y - np.linspace(y[0], y[-1], y.size)).max() > _SAME_M:
@@ -237,16 +237,16 @@ def find_irregularity(aperture: Aperture) -> str | None:
     return None
 
 
-def column_step_m(offsets_m: NDArray[np.float64]) -> float:
+def measure_column_step_m(offsets_m: NDArray[np.float64]) -> float:
     """Return the mean spacing of positions [row, column, axis] in a row, metres; 0 for rows of one position."""
     x = offsets_m[..., 0]
     return float((x[:, -1] - x[:, 0]).mean()) / max(1, x.shape[1] - 1)
 
 
-def row_starts_m(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def fit_row_starts_m(offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the x of each row's first position, [row]: best fit of evenly spaced positions to the row."""
     x = offsets_m[..., 0]
-    return (x - np.arange(x.shape[1]) * column_step_m(offsets_m)).mean(axis=1)
+    return (x - np.arange(x.shape[1]) * measure_column_step_m(offsets_m)).mean(axis=1)
 
 
 def pitch_y_m(aperture: Aperture) -> float | None:
@@ -260,7 +260,7 @@ def pitch_y_m(aperture: Aperture) -> float | None:
     return None
 
 
-def burst_filters(rig: Instrument) -> NDArray[np.float32]:
+def design_burst_filters(rig: Instrument) -> NDArray[np.float32]:
     """Return inverse filters of the motion in a burst with 0, 1, .. `REACH` taps per side, float32 [reach, REACH + 1].
 
     The first tap is the middle one, the others apply on both sides. Least squares up to 0.45 cycles per position.
@@ -295,7 +295,7 @@ def undo_burst_motion(
     turn
         float64 [position]: centre of the filter's band, radians per position.
     filters
-        Filters that :func:`burst_filters` returned.
+        Filters that :func:`design_burst_filters` returned.
     """
     count = valid.size
     reach = np.zeros(valid.size, int)
@@ -312,7 +312,7 @@ def undo_burst_motion(
     return filtered
 
 
-def window_weights(name: Window, n: int) -> NDArray[np.float64]:
+def make_window(name: Window, n: int) -> NDArray[np.float64]:
     """Return a symmetric window, float64 [n]: one of n + 2 points without its end points (zero for some windows)."""
     # Common ones in NumPy: scipy.signal loads scipy.stats, which takes a second.
     match name:
@@ -329,7 +329,7 @@ def window_weights(name: Window, n: int) -> NDArray[np.float64]:
     return weights[1:-1]
 
 
-def namespace(array: Any) -> Any:
+def find_array_namespace(array: Any) -> Any:
     """Return the array API namespace of an array; numpy for lists and numbers.
 
     Raises

@@ -40,7 +40,7 @@ import scipy
 from numpy.typing import NDArray
 
 from polysight.imaging import geometry
-from polysight.imaging.geometry import Antennas, StageWindow, Window, image_grid, scan_offsets_m, window_weights
+from polysight.imaging.geometry import Antennas, StageWindow, Window, image_grid, make_window, scan_offsets_m
 from polysight.imaging.samples import BoardSamples, reduction
 from polysight.sync import HighPass, SyncedRow, high_pass
 from polysight_shared.config import Board, Chirp, Instrument
@@ -438,8 +438,8 @@ class ImageBuilder:
         antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
         self.gate_m = geometry.find_needed_gate_m(rig, depth_m) if gate_m is None else gate_m
         self.taper = TAPERS[rig.image.apodisation] if taper is None else taper
-        weights_y = window_weights(self.taper, plan.rows)
-        weights = np.outer(weights_y, window_weights(self.taper, plan.columns)).astype(np.float32)
+        weights_y = make_window(self.taper, plan.rows)
+        weights = np.outer(weights_y, make_window(self.taper, plan.columns)).astype(np.float32)
         gated = reduction(rig.chirp, self.gate_m)
         self._antennas = antennas
         self._middle_hz = float(np.mean(gated.frequencies_hz))
@@ -523,7 +523,7 @@ class ImageBuilder:
         along_x, along_y = (
             StageWindow(
                 places_px=(specular_m[axis] + offsets - start_m) / pitch,
-                weights=window_weights(self.taper, len(offsets)),
+                weights=make_window(self.taper, len(offsets)),
                 bend_px=float(bend_rad_m2[axis] * pitch**2),
             )
             for axis, offsets, start_m in (

@@ -127,7 +127,7 @@ def reduction(chirp: Chirp, gate_m: tuple[float, float], window: geometry.Window
     """
     a, b = chirp.linear_samples
     sweep = sample_frequencies_hz(chirp)[a:b]
-    weight = geometry.window_weights(window, b - a)
+    weight = geometry.make_window(window, b - a)
     weight = weight / weight.sum()
     band = sweep[-1] - sweep[0]
     product = (gate_m[1] - gate_m[0]) * band / SPEED_OF_LIGHT_M_S
@@ -249,14 +249,14 @@ class BoardSamples:
         self._reduction = reduction
         # Maps for pairs of real numbers and the samples they use, by the row's number of samples.
         self._maps: dict[int, tuple[slice, NDArray[np.float32]]] = {}
-        self._filters = geometry.burst_filters(rig)
+        self._filters = geometry.design_burst_filters(rig)
         self._antennas = geometry.Antennas.from_rig(rig, board)
         self._chirp = rig.chirp
         # Samples of an ideal mirror on the rig file's plane after the range gate, [rx, frequency].
         self.mirror = mirror_reduced(self._antennas, float(np.mean(grid.z_m)), rig.chirp, reduction)
         # Stage offsets [row, column, 3], and the x of each row's first position as planned [row], metres.
         self._offsets = geometry.scan_offsets_m(rig)
-        self._planned = geometry.row_starts_m(self._offsets)
+        self._planned = geometry.fit_row_starts_m(self._offsets)
         rx = len(self._antennas.rx_m)
         shape = taper.shape
         # Reduced samples [rx, frequency, row, column] and the direct path [rx, row, column], as received.
@@ -399,7 +399,7 @@ class BoardSamples:
             self._offsets[index, :, : offsets_m.shape[1]] = offsets_m[forward]
             self._final = None
             self._moved = True
-            deviation = abs(geometry.row_starts_m(self._offsets)[index] - self._planned[index])
+            deviation = abs(geometry.fit_row_starts_m(self._offsets)[index] - self._planned[index])
             if deviation > SLACK_M or geometry.find_irregularity(self.aperture) is not None:
                 self._live = None
         self.has_rx[:, index] = self._cube[:, :, index].any(axis=(1, 2))
@@ -506,7 +506,7 @@ class BoardSamples:
             spectra_of_weights = self._final.spectra_of_row(weights.astype(np.complex64), index)
             self._live.add_spectra(index, sign * self._compute_row_spectra(self._final, index), spectra_of_weights)
         else:
-            start = float(geometry.row_starts_m(self._offsets)[index])
+            start = float(geometry.fit_row_starts_m(self._offsets)[index])
             self._live.add_row(index, self._cube[:, :, index] * weights, weights, start)
 
     def rx_calibration(self) -> NDArray[np.complex128]:

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from polysight.imaging.geometry import (
     Aperture,
-    column_step_m,
     excess_path_m,
+    fit_row_starts_m,
+    measure_column_step_m,
     pitch_y_m,
-    row_starts_m,
     transform_in_place,
     turn,
 )
@@ -119,7 +119,7 @@ def lattice(aperture: Aperture, slack_m: float = 0.0) -> Lattice:
 
     first = grid.x_m[0] - x.max() - slack_m
     last = grid.x_m[-1] - x.min() + slack_m
-    step = column_step_m(offsets) or grid.pixel_m
+    step = measure_column_step_m(offsets) or grid.pixel_m
     exact_columns = (last - first) / step + 1
     # Number of columns of one period: the exact lags and the cross-fade.
     columns = _find_fast_length(math.ceil(exact_columns + max(_FADE_SHARE * exact_columns, _FADE_COLUMNS)))
@@ -234,9 +234,9 @@ def lattice_key(aperture: Aperture, slack_m: float) -> tuple[Any, ...]:
     grid = aperture.grid
     offsets = aperture.offsets_m
     # Positions of a regular aperture: starts and spacing of its rows are enough, and a thousandth of the bytes.
-    numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, row_starts_m(offsets), offsets[:, 0, 1], grid.x_m, grid.y_m)
+    numbers = (a.tx_m, a.rx_m, aperture.frequencies_hz, fit_row_starts_m(offsets), offsets[:, 0, 1], grid.x_m, grid.y_m)
     heights = float(grid.z_m), float(offsets[0, 0, 2])
-    sizes = offsets.shape[1], column_step_m(offsets), grid.pixel_m
+    sizes = offsets.shape[1], measure_column_step_m(offsets), grid.pixel_m
     return ("lattice", slack_m, *heights, *sizes, *(n.tobytes() for n in numbers))
 
 
@@ -302,7 +302,7 @@ class RowSpectra:
         # Columns of a transform of rows; its spectrum repeats, so that each bin of the band is one of it.
         self.period = self.lattice.size_x // self.lattice.stride_x
         self._runs = _list_runs(self.lattice.band % self.period)
-        self._origin = float(row_starts_m(aperture.offsets_m).min())
+        self._origin = float(fit_row_starts_m(aperture.offsets_m).min())
         # Inverse transform along x at the pixels only, [k, nx].
         self._to_pixels = get_cached(("pixels", xp.__name__, str(device), *key), self._compute_waves_at_pixels)
 
@@ -369,7 +369,7 @@ class SpectralImager(RowSpectra):
     def __init__(self, aperture: Aperture, xp: Any = np, device: Any = None, slack_m: float = 0.0) -> None:
         super().__init__(aperture, xp, device, slack_m)
         key = (xp.__name__, str(device), *lattice_key(aperture, slack_m))
-        self._ramps = get_cached(("ramps", *key), lambda: self.ramps(row_starts_m(aperture.offsets_m)))
+        self._ramps = get_cached(("ramps", *key), lambda: self.ramps(fit_row_starts_m(aperture.offsets_m)))
         sizes = self.lattice
         # The last constant echo and its kernel, of all imagers with the same kernels; empty before the first.
         self._echoes: list[tuple[Any, Any]] = get_cached(self.key("echo", sizes.size_y), list)
@@ -561,7 +561,7 @@ class IncrementalImager(RowSpectra):
         xp = self.xp
         rx, m, rows, columns = self.aperture.shape
         lines = self.evaluate_pixels_adjoint(image).mT[:, :, None]
-        ramps = self.ramps(row_starts_m(self.aperture.offsets_m))
+        ramps = self.ramps(fit_row_starts_m(self.aperture.offsets_m))
         out = []
         for index in range(rows):
             # [k, component, ny] @ [k, ny, 1], then [k, channel, component] @ [k, component, 1]
@@ -583,7 +583,7 @@ class IncrementalImager(RowSpectra):
 
     def _add_all(self, samples: Any, weights: Any) -> None:
         """Add every row at its place in the aperture."""
-        for index, start in enumerate(row_starts_m(self.aperture.offsets_m)):
+        for index, start in enumerate(fit_row_starts_m(self.aperture.offsets_m)):
             self.add_row(index, samples[:, :, index, :], weights[index, :], float(start))
 
     def _find_lags(self, index: int) -> slice:

@@ -27,7 +27,7 @@ from polysight.calibration import (
 from polysight.imaging import Image, Mask
 from polysight.jobs.output import load_rig_file, print_json, print_lines, say, steps
 from polysight.jobs.process import form_scan_images, load_reference, make_plane_reference
-from polysight.polarimetry import Leakage, leakage_from_images, specular_incidence_rad
+from polysight.polarimetry import Leakage, estimate_leakage_from_images, specular_incidence_rad
 from polysight.settings import Settings, path_text
 from polysight_shared.config import Instrument
 from polysight_shared.errors import ConfigError, DataError, ErrorCode
@@ -259,7 +259,7 @@ def leakage_of_scans(
             "plate and strips must cover the same part of the plane",
             "scan them in the same place, larger than the grid on every side",
         )
-    leakage = leakage_from_images((plate_reference.h, plate_reference.v), strips_by_angle, mask, theta)
+    leakage = estimate_leakage_from_images((plate_reference.h, plate_reference.v), strips_by_angle, mask, theta)
     largest = max(abs(leakage.h), abs(leakage.v))
     if largest > MAX_LEAKAGE:
         raise DataError(
@@ -288,7 +288,7 @@ def _estimate_leakage_std(
     for up in (rows > middle[0], rows <= middle[0]):
         for right in (columns > middle[1], columns <= middle[1]):
             try:
-                quarter = leakage_from_images(plate, strips, mask & up & right, theta_rad)
+                quarter = estimate_leakage_from_images(plate, strips, mask & up & right, theta_rad)
             except DataError:
                 continue
             parts.append([quarter.h.real, quarter.h.imag, quarter.v.real, quarter.v.imag])

@@ -22,15 +22,15 @@ from polysight.materials import (
     Labels,
     SegmentSettings,
     box_mask,
-    box_name,
     check_labels,
     clean_name,
     format_box,
     image_extent_mm,
     make_name_taken_error,
     make_unknown_box_error,
-    material_name,
+    normalise_box_name,
     pack_labels,
+    remove_specimen,
 )
 from polysight.products import IMAGE, LABELS, LABELS_PICTURE, ProcessedScan, find_labels, find_products, label_folder
 from polysight.store import MANIFEST
@@ -290,14 +290,14 @@ def apply_edits(labels: Labels, patches: Sequence[PatchToName], edits: Edits) ->
     new_names = {name: name for name in boxes}
     for text in edits.renames:
         old, new = _split_at_equals(text, boxes)
-        new_names[old] = box_name(new)
+        new_names[old] = normalise_box_name(new)
     boxes = _rename_boxes(boxes, new_names)
     specimens = {new_names[name]: specimen for name, specimen in specimens.items()}
     # None stays None: no box has an empty name.
     metal = new_names.get(metal or "")
 
     for name, box in edits.boxes:
-        clean_box_name = box_name(name)
+        clean_box_name = normalise_box_name(name)
         # The same box under the same name is accepted, so that a command that was killed can be repeated.
         if boxes.get(clean_box_name) != box:
             _refuse_taken_name(clean_box_name, boxes)
@@ -343,7 +343,7 @@ def _find_box(name: str, boxes: Mapping[str, Box]) -> str:
     # A patch that has no name yet is called by its number.
     clean_name = name.strip()
     if not clean_name.isdecimal():
-        clean_name = box_name(name)
+        clean_name = normalise_box_name(name)
     if clean_name not in boxes:
         raise make_unknown_box_error(clean_name, boxes)
     return clean_name
@@ -397,13 +397,13 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
             return "", False
         try:
             name = METAL if is_metal else answer
-            name = box_name(name)
+            name = normalise_box_name(name)
             if name not in boxes:
                 _refuse_taken_name(name, boxes)
                 return name, is_metal
             piece = ask(f"  {name} is there already. Another piece of it? Its name, such as 2 (Enter: another name): ")
             if piece.strip():
-                name = box_name(f"{material_name(name)}{SPECIMEN_SEPARATOR}{piece}")
+                name = normalise_box_name(f"{remove_specimen(name)}{SPECIMEN_SEPARATOR}{piece}")
                 _refuse_taken_name(name, boxes)
                 return name, is_metal
         except DataError as e:
@@ -425,7 +425,7 @@ def _format_table(labels: Labels) -> list[str]:
     rows = [("name", "specimen", "box", "")]
     for name, box in labels.boxes.items():
         text = "metal reference" if name == labels.metal else ""
-        rows.append((material_name(name), labels.specimen(name) or "-", format_box(box), text))
+        rows.append((remove_specimen(name), labels.specimen(name) or "-", format_box(box), text))
     # The last column needs no padding.
     widths = [*(max(cell_len(row[column]) for row in rows) for column in range(3)), 0]
     lines = []

@@ -35,9 +35,9 @@ from polysight.materials import (
     concentrations,
     fit_concentration,
     fit_row,
+    format_layer_content,
     format_permittivity,
     incidence_std_rad,
-    layer_content,
     load_catalogue,
     match_patches,
     read_materials,
@@ -149,7 +149,7 @@ def permittivity(
             _check_bands(patch, chirp, str(config or products.folder / SCAN))
             fit = fit_row(patch, chirp, stack, bands, amplitude_error, incidence_std_rad(products.materials))
             if fit is not None:
-                row["layer"] = layer_content(fit)
+                row["layer"] = format_layer_content(fit)
         rows.append(row)
     if as_json:
         print_json(rows)
@@ -444,7 +444,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
 
     Raises DataError if no place has a patch in every scan.
     """
-    from polysight.materials import classifier_sentence
+    from polysight.materials import describe_classifier
 
     status = max(print_verdict(p, to_terminal=not as_json) for p in products)
     if status:
@@ -467,7 +467,7 @@ def _name_patches(products: Sequence[ProcessedScan], library_path: Path, model: 
         "source": _describe_origin(any(s.simulated for s in scans)),
         "incidence_deg": [s.angle_deg for s in scans],
         "model": classifier.model,
-        "library": classifier_sentence(classifier),
+        "library": describe_classifier(classifier),
         "patches": [_describe_named_patch(m, n.patch_name, n.pixel_names) for m, n in zip(matched, named, strict=True)],
         "contradictions": _describe_contradictions(library, model, classifier.angles_deg, matched, named),
         "patches_not_in_every_scan": sum(len(s.patches) for s in scans) - len(scans) * len(matched),

@@ -450,7 +450,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
 
     `depth_mm` is the largest distance from the rig file's plane that is searched. Raises PolysightError.
     """
-    from polysight.report import focus_figure
+    from polysight.report import draw_focus_figure
 
     check_results_folder(out)
     source = open_source(data, config, dropped=True)
@@ -478,7 +478,7 @@ def focus(data: Path, out: Path, config: Path | None, depth_mm: float) -> int:
         pictures = (pictures[0].T, pictures[1].T)
     sweep = sharpest.to_dict() | {"plates": plates_plane.to_dict()}
     write_json(out / "focus.json", {"scan_id": source.scan_id, "simulated": source.simulated, **sweep})
-    (out / "focus.png").write_bytes(focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
+    (out / "focus.png").write_bytes(draw_focus_figure(sweep, *pictures, *pixel_axes(pipeline), source.simulated))
     head = name_scan(source.scan_id, source.simulated)
     print_lines(_format_focus(head, pipeline.rig.geometry.object_distance_mm, sharpest, plates_plane))
     sys.stdout.write(f"figure: {out / 'focus.png'}\n")

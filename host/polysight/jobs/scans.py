@@ -33,8 +33,8 @@ from polysight.products import (
     REPORT,
     ProcessedScan,
     find_products,
+    format_ranges,
     lock_products,
-    ranges_text,
     read_products,
     write_json,
 )
@@ -290,7 +290,7 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
     paths = [path for boards in rows.files.values() for path in boards.values()]
     for folder_of_board in sorted({path.parent for path in paths}):
         indices = sorted(int(path.stem) for path in paths if path.parent == folder_of_board)
-        files = f"{ranges_text(indices)} ({len(indices)} files)"
+        files = f"{format_ranges(indices)} ({len(indices)} files)"
         sys.stdout.write(f"to be removed: {folder_of_board.relative_to(folder)}: rows {files}\n")
     answer = confirm(text, CONFIRMATION_WORD, yes)
     if answer != CONFIRMATION_WORD:
@@ -316,7 +316,7 @@ def _check_samples(scan: store.ScanFolder, rows: set[int]) -> None:
     if damaged:
         names = sorted({name for files in damaged.values() for name in files})
         raise DataError(
-            f"{scan.path}: samples of rows {ranges_text(sorted(damaged))} are damaged or missing: {', '.join(names)}",
+            f"{scan.path}: samples of rows {format_ranges(sorted(damaged))} are damaged or missing: {', '.join(names)}",
             "without these samples images can be made from the raw data only",
             f"`polysight process {quote(scan.path)} --out DIR` makes them again",
             code=ErrorCode.FILE_DAMAGED,

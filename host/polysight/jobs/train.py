@@ -27,13 +27,13 @@ from polysight.materials import (
     MaterialsResult,
     Optics,
     TrainingScan,
-    accuracy_lines,
     analyse,
     check_labels,
+    describe_accuracy,
     make_library,
-    material_name,
-    patches_from_plates,
+    make_patches_from_plates,
     read_truth,
+    remove_specimen,
     specimen_seed,
 )
 from polysight.polarimetry import incidence_choice
@@ -212,7 +212,7 @@ def _add_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: 
     for patch in materials.patches:
         if patch.patch.label in boxes and not materials.usable_pixels(patch.patch).any():
             sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
-    names = {label: material_name(box) for label, box in boxes.items()}
+    names = {label: remove_specimen(box) for label, box in boxes.items()}
     specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}
     return TrainingScan(scan, materials, simulated, versions=versions(), names=names, specimens=specimens)
 
@@ -226,7 +226,7 @@ def _process_simulated(data: Path, config: Path) -> TrainingScan:
         raise DataError(f"{data}: no metal plate in {TRUTH}", "features are relative to metal", "add one to the scene")
     pipeline = process_rows(source, data)
     images = pipeline.form_images()
-    segmentation, names = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
+    segmentation, names = make_patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     materials = pipeline.find_materials(images, KnownScene(segmentation, metal.box_mm, plates=plates))
     seed = specimen_seed(data / TRUTH)
     specimens = {}
@@ -311,7 +311,7 @@ def train(scenes: Path | None, data: Iterable[Path], config: Path, out: Path, ti
         note = "simulated scans of " + ", ".join(dict.fromkeys(s.scan for s in scans))
     library = make_library(number_equal_names(scans), note)
     library.save(out)
-    print_lines([*_summarise_library(out, library), *accuracy_lines(library)])
+    print_lines([*_summarise_library(out, library), *describe_accuracy(library)])
     return 0
 
 

@@ -23,10 +23,10 @@ from polysight.materials.catalogue import (
     CATALOGUE as CATALOGUE,
     CatalogueMaterial as CatalogueMaterial,
     find_material as find_material,
+    is_same_material as is_same_material,
     load_catalogue as load_catalogue,
     normalise_name as normalise_name,
     read_catalogue as read_catalogue,
-    same_material as same_material,
 )
 from polysight.materials.classify import (
     DISCRIMINANT_MODEL as DISCRIMINANT_MODEL,
@@ -34,7 +34,7 @@ from polysight.materials.classify import (
     MODELS as MODELS,
     PAPER_MODEL as PAPER_MODEL,
     Classifier as Classifier,
-    classifier_sentence as classifier_sentence,
+    describe_classifier as describe_classifier,
 )
 from polysight.materials.common_change import (
     PhaseAlongPlate as PhaseAlongPlate,
@@ -48,7 +48,6 @@ from polysight.materials.labels import (
     SPECIMEN_SEPARATOR as SPECIMEN_SEPARATOR,
     Labels as Labels,
     Plates as Plates,
-    box_name as box_name,
     check_labels as check_labels,
     clean_name as clean_name,
     find_label_file as find_label_file,
@@ -57,14 +56,15 @@ from polysight.materials.labels import (
     image_extent_mm as image_extent_mm,
     is_metal as is_metal,
     make_name_taken_error as make_name_taken_error,
+    make_patches_from_plates as make_patches_from_plates,
     make_unknown_box_error as make_unknown_box_error,
-    material_name as material_name,
+    normalise_box_name as normalise_box_name,
     pack_labels as pack_labels,
-    patches_from_plates as patches_from_plates,
     read_labels as read_labels,
+    read_true_plates as read_true_plates,
     read_truth as read_truth,
+    remove_specimen as remove_specimen,
     specimen_seed as specimen_seed,
-    truth_plates as truth_plates,
 )
 from polysight.materials.layers import METAL_PERMITTIVITY as METAL_PERMITTIVITY, Layer as Layer, LayerFit as LayerFit
 from polysight.materials.library import (
@@ -75,8 +75,8 @@ from polysight.materials.library import (
     Library as Library,
     Model as Model,
     Samples as Samples,
-    feature_matrix as feature_matrix,
-    ratio_columns as ratio_columns,
+    invert_ratios as invert_ratios,
+    make_features as make_features,
     split_by_angle as split_by_angle,
 )
 from polysight.materials.measure import (
@@ -125,8 +125,8 @@ from polysight.materials.sub_bands import (
     concentrations as concentrations,
     fit_concentration as fit_concentration,
     fit_row as fit_row,
+    format_layer_content as format_layer_content,
     incidence_std_rad as incidence_std_rad,
-    layer_content as layer_content,
     parse_layer as parse_layer,
     polarisation_angle_rad as polarisation_angle_rad,
 )
@@ -134,12 +134,12 @@ from polysight.materials.train import (
     LabelledScan as LabelledScan,
     Score as Score,
     TrainingScan as TrainingScan,
-    angle_in_text as angle_in_text,
     calibration_error as calibration_error,
-    entries_of_boxes as entries_of_boxes,
+    find_angle_in_text as find_angle_in_text,
     fit_library as fit_library,
     image_orientation as image_orientation,
     label_folders as label_folders,
+    make_entries_of_boxes as make_entries_of_boxes,
     make_library as make_library,
     read_labelled_scan as read_labelled_scan,
     read_material as read_material,
@@ -147,7 +147,7 @@ from polysight.materials.train import (
     score as score,
     score_unseen_materials as score_unseen_materials,
 )
-from polysight.materials.training_advice import accuracy_lines as accuracy_lines
+from polysight.materials.training_advice import describe_accuracy as describe_accuracy
 
 if TYPE_CHECKING:
     from polysight.materials.paper_knn import PaperKNeighborsClassifier as PaperKNeighborsClassifier

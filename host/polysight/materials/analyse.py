@@ -29,32 +29,32 @@ from polysight.materials.kinds import (
 from polysight.materials.measure import (
     LEAST_STD,
     Scatter,
-    background,
     background_mean,
-    border_errors,
     check_patches,
+    compute_median_ratio,
+    estimate_border_errors,
+    estimate_patch_permittivity,
+    find_usual_scatter,
+    measure_background,
     measure_dispersions,
     measure_patch,
     measure_scatter,
-    median_ratio,
-    permittivity_of_patch,
     refuse_impossible,
     relative_errors,
-    usual_scatter,
 )
 from polysight.materials.metal import (
     NO_HALO,
     Halo,
     MetalReference,
-    channel_ratio_of,
     divide_by_reference,
     find_halo,
+    find_metal_in_box,
     find_metals,
+    fit_channel_ratio,
     make_missing_reference,
-    metal_by_label,
-    metal_evidence,
-    metal_in_box,
-    metal_unevenness,
+    measure_metal_unevenness,
+    take_patch_as_metal,
+    weigh_metal_evidence,
 )
 from polysight.materials.names import NamedPatch, PatchName, add_explanation, name_patch
 from polysight.materials.phase_sign import join_signs, mirror_phases
@@ -246,7 +246,7 @@ def analyse(
     patches = {}
     for p in segmentation.patches:
         pixels = (smoothed_h[p.interior], smoothed_v[p.interior])
-        patches[p.label] = permittivity_of_patch(*pixels, _mean_angle(theta, p), estimates.get(p.label))
+        patches[p.label] = estimate_patch_permittivity(*pixels, _mean_angle(theta, p), estimates.get(p.label))
     refused = relative.refused | refuse_impossible(patches, estimates, kinds)
     named = _name_patches(classifier, (smoothed_h, smoothed_v, smoothed_p), inversion, judged)
     truth = match_truth(segmentation.patches, known_scene.plates)
@@ -375,15 +375,15 @@ class SceneScatter:
         metal_rise = tilts.in_plane(reference.label or 0) if plane is None else plane.rise
         evenly = images.illumination is not None and images.illumination.known
         lit = images.usable if plane is None else images.usable & plane.valid
-        border = {p.label: border_errors(p, lit, images.x_m) for p in segmentation.patches}
+        border = {p.label: estimate_border_errors(p, lit, images.x_m) for p in segmentation.patches}
         # In the order of `scatters`; the metal, the last one, never counts as at the end: it is the origin.
         border_flags = [*(border[label][0] > UNEVEN_AT_END for label in scatter), False]
         change = None if metal is None else estimate_common_change(scatters, metal.centre_m, border_flags)
         halo = NO_HALO if metal is None else find_halo(reference.mask, segmentation.patches, images)
         metal_at_end = np.hypot(*border.get(reference.label or 0, (0.0, 0.0))) / np.sqrt(2)
-        uneven = 0.0 if metal is None else UNEVEN_METAL_SHARE * metal_unevenness(raw, reference.mask)
+        uneven = 0.0 if metal is None else UNEVEN_METAL_SHARE * measure_metal_unevenness(raw, reference.mask)
         return cls(
-            scatter=scatter, usual=usual_scatter(scatters), metal=metal, change=change, metal_spread=spread,
+            scatter=scatter, usual=find_usual_scatter(scatters), metal=metal, change=change, metal_spread=spread,
             border=border, tilts=tilts, lit_evenly=evenly, metal_rise=metal_rise, halo=halo,
             metal_std=float(np.hypot(uneven, metal_at_end)),
             behind=background_mean(raw.h, raw.v, segmentation, images.usable),
@@ -512,7 +512,7 @@ class _Scene:
         # H and V relative to metal, smoothed.
         relative_h = smooth_inside(raw.h, segmentation, self.optics.smooth_px)
         relative_v = smooth_inside(raw.v, segmentation, self.optics.smooth_px)
-        background_rms = background(raw.h, raw.v, segmentation, images.usable)
+        background_rms = measure_background(raw.h, raw.v, segmentation, images.usable)
         refused = check_patches(segmentation, relative_h, relative_v, background_rms, reference.mask)
         refused |= self.tilts.refusals()
         judged = [p for p in segmentation.patches if p.label not in refused and p.label != reference.label]
@@ -574,7 +574,7 @@ def _name_patches(
         interior = patch.interior
         if classifier.model == PAPER_MODEL:
             # The paper's classifier compares pixels: their V / H gets the correction of their patch.
-            correction = estimate.evidence.inverse_ratio * median_ratio(h[interior], v[interior])
+            correction = estimate.evidence.inverse_ratio * compute_median_ratio(h[interior], v[interior])
             pixels_p = p[interior].astype(np.complex128) / correction
             pixels = pixel_features(np.abs(h[interior]), np.abs(v[interior]), pixels_p)
             (name,) = classifier.scan([pixels])
@@ -630,9 +630,9 @@ def _weigh_metal(
     """
     evidence = []
     for measured, prior, inversion in solution.signs[:1] if metal.given else solution.signs:
-        channel_ratio = channel_ratio_of(images, metal) if prior.channels_known else None
+        channel_ratio = fit_channel_ratio(images, metal) if prior.channels_known else None
         patches = dict(zip(labels, measured, strict=True))
-        evidence.append(metal_evidence(patches, prior, channel_ratio, kinds, inversion))
+        evidence.append(weigh_metal_evidence(patches, prior, channel_ratio, kinds, inversion))
     return replace(metal, evidence=min(evidence, key=lambda of_sign: of_sign.score))
 
 
@@ -659,9 +659,9 @@ def _list_references(images: Images, known_scene: KnownScene, segmentation: Segm
     if isinstance(known_scene.metal, PlaneReference):
         return (MetalReference(known_scene.metal.valid, None, known_scene.metal.how, given=True),)
     if isinstance(known_scene.metal, int):
-        return (metal_by_label(known_scene.metal, segmentation),)
+        return (take_patch_as_metal(known_scene.metal, segmentation),)
     if known_scene.metal is not None:
-        return (metal_in_box(known_scene.metal, segmentation, images.x_m, images.y_m, images.valid),)
+        return (find_metal_in_box(known_scene.metal, segmentation, images.x_m, images.y_m, images.valid),)
     return find_metals(images.h, images.v, segmentation) or (make_missing_reference(images.usable),)
 
 

@@ -151,7 +151,7 @@ def find_material(name: str) -> CatalogueMaterial | None:
     return _index_names().get(normalise_name(name))
 
 
-def same_material(name: str, other: str) -> bool:
+def is_same_material(name: str, other: str) -> bool:
     """True if both names are, or may be, of one material: equal, aliases, or one the generic name of the other."""
     first = normalise_name(name)
     second = normalise_name(other)

@@ -32,12 +32,12 @@ from polysight.materials.library import (
     NamedScan,
     Real,
     Samples,
-    channel_distances,
+    compute_channel_distances,
     count_votes,
-    majority,
-    ratio_columns,
+    find_usable_pixels,
+    invert_ratios,
+    name_by_majority,
     split_by_angle,
-    usable,
 )
 from polysight.materials.names import (
     UNKNOWN,
@@ -136,7 +136,7 @@ class PaperKnn(Model):
         )
         self._materials, self._material_of_pixel = np.unique(samples.names, return_inverse=True)
         # Numbers, which scikit-learn checks faster than names.
-        self._knn.fit(ratio_columns(samples.x), self._material_of_pixel)
+        self._knn.fit(invert_ratios(samples.x), self._material_of_pixel)
         self._samples = samples
         self._distributions = None
         return self
@@ -154,7 +154,7 @@ class PaperKnn(Model):
         `x` features [n, columns], `patches` patch number [n]. A patch's distance is at least that to its material's
         distribution: beyond 1 its name does not hold, and the caller calls it unknown.
         """
-        voted = majority(*self.by_pixel(x), patches)
+        voted = name_by_majority(*self.by_pixel(x), patches)
         distances = self.distributions.by_scan(x, patches).distances
         if distances is None:
             return voted
@@ -164,7 +164,7 @@ class PaperKnn(Model):
 
     def by_pixel(self, x: Real) -> tuple[npt.NDArray, Real]:
         """Return each pixel's name [n], and its mean distance to its neighbours over the material's threshold [n]."""
-        distance, nearest = self._knn.kneighbors(ratio_columns(x))
+        distance, nearest = self._knn.kneighbors(invert_ratios(x))
         votes = count_votes(self._material_of_pixel[nearest], self._materials.size)
         names = self._materials[votes.argmax(axis=1)]
         thresholds = np.array([self.thresholds.get(str(name), np.inf) for name in names])
@@ -218,7 +218,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
     tried: list[tuple[float, float, Weights]] = []
     p_alone: dict[str, float] = {}
     for measure in MEASURES:
-        distances = channel_distances(few.x, few.x, measure)
+        distances = compute_channel_distances(few.x, few.x, measure)
         # Each channel is scaled by its usual distance, so that the grid's weights compare channels.
         scale = [1 / max(float(np.median(c)), 1e-12) for c in distances]
         for wh, wv in grid:
@@ -232,7 +232,7 @@ def fit_weights(samples: Samples, channels: str = "H+V+P") -> Fit:
                 p_alone[measure] = accuracy
     top = max(accuracy for accuracy, _, _ in tried)
     accuracy, _, weights = max((t for t in tried if t[0] >= top - 0.005), key=lambda t: t[1])
-    distances = channel_distances(few.x, few.x, weights.measure)
+    distances = compute_channel_distances(few.x, few.x, weights.measure)
     accuracy_by_channel = {c: judge.accuracy(distances[i]) for i, c in enumerate("hv")}
     accuracy_by_channel["p"] = p_alone[weights.measure]
     return Fit(
@@ -435,7 +435,7 @@ class Classifier:
     ) -> list[NamedPatch]:
         """Name the patches of one scan, or of several scans of the same patches under different angles.
 
-        `patches` are the features of each patch's pixels, [n, 4 * angles] (:func:`feature_matrix`); pixels that are not
+        `patches` are the features of each patch's pixels, [n, 4 * angles] (:func:`make_features`); pixels that are not
         finite are unknown. `evidence` is that of each scan on each patch; None where only the pixels are known. The
         paper's KNN uses the pixels alone.
         """
@@ -453,7 +453,7 @@ class Classifier:
 
     def _name_by_votes(self, x: Real) -> NamedPatch:
         """Name a patch by the votes of its pixels' nearest neighbours."""
-        is_usable = usable(x)
+        is_usable = find_usable_pixels(x)
         if not is_usable.any():
             return make_patch_without_pixels(is_usable.size)
         voted = self._model.by_scan(x[is_usable], np.zeros(int(is_usable.sum()), np.intp))
@@ -485,7 +485,7 @@ def _check_model_name(given_name: str) -> str:
     return name
 
 
-def classifier_sentence(classifier: Classifier) -> str:
+def describe_classifier(classifier: Classifier) -> str:
     """Describe a classifier, its library, and its score on scans left out of training."""
     library = classifier.library
     fit = classifier.fit

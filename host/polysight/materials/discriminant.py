@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.library import Model, NamedScan, Real, Samples, median_by_patch, split_by_angle
+from polysight.materials.library import Model, NamedScan, Real, Samples, compute_patch_medians, split_by_angle
 from polysight.materials.specimens import (
     METAL_SPECIMENS,
     METAL_WITHOUT_ERROR,
@@ -321,7 +321,8 @@ class ErrorDiscriminant(Model):
         """Return true for patches 0, 1, ... whose median V / H is nearly 1 under all angles, bool [patch]."""
         inverse_ratio = split_by_angle(x)[2]
         middle = np.stack(
-            [median_by_patch(t.real, patch) + 1j * median_by_patch(t.imag, patch) for t in inverse_ratio.T], axis=1
+            [compute_patch_medians(t.real, patch) + 1j * compute_patch_medians(t.imag, patch) for t in inverse_ratio.T],
+            axis=1,
         )
         return np.asarray((np.abs(middle - 1) < METAL_WITHOUT_ERROR).all(axis=1), np.bool_)
 

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.materials.catalogue import load_catalogue, same_material
+from polysight.materials.catalogue import is_same_material, load_catalogue
 from polysight.materials.specimens import PUBLISHED_SPREAD
 from polysight.polarimetry import multilayer, permittivity_from_ratio, ratio_from_permittivity
 
@@ -497,7 +497,7 @@ def list_literature_kinds(library: Collection[str] = ()) -> list[Kind]:
     return [
         Kind(material.name, material.permittivity, material.spread, "literature", material.kind)
         for material in load_catalogue()
-        if not any(same_material(material.name, name) for name in library)
+        if not any(is_same_material(material.name, name) for name in library)
     ]
 
 

@@ -3,7 +3,7 @@
 A label file holds boxes with names, the metal reference among them, and their specimens. `polysight label` writes the
 boxes of a person, in millimetres; `polysight process` writes a box around the interior of each patch that it found, in
 pixels, named by the classifier. Both forms are read, and the published data set's files too. `Labels.patches` makes
-patches of the boxes; `check_labels` checks a file before training, `clean_name` and `box_name` one name.
+patches of the boxes; `check_labels` checks a file before training, `clean_name` and `normalise_box_name` one name.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from polysight_shared.files import read_json
 _DRAWN_HERE = "labels.json"
 
 
-def truth_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
+def read_true_plates(truth: Mapping[str, Any]) -> tuple[TruthPlate, ...]:
     """Return the plates in the content of truth.json.
 
     A plate has a name, `centre_mm`, `size_mm`, and its material: permittivity, metal, layers or strips.
@@ -58,7 +58,7 @@ def read_truth(path: Path) -> tuple[TruthPlate, ...]:
     """Read the plates of a truth.json. Raises DataError."""
     remedy = f"give the one that polysight simulate wrote beside its data, or move {path.name} away"
     try:
-        return truth_plates(read_json(path))
+        return read_true_plates(read_json(path))
     except DataError as e:
         raise DataError(f"{path}: {e.what}", e.why, remedy, code=e.code) from None
     except (OSError, ValueError) as e:
@@ -131,7 +131,7 @@ def is_metal(name: str) -> bool:
     return any(word in METAL_WORDS for word in re.findall(r"[a-z]+", name.lower()))
 
 
-def material_name(name: str) -> str:
+def remove_specimen(name: str) -> str:
     """Return the material of a box named material or material#specimen."""
     return name.partition(SPECIMEN_SEPARATOR)[0]
 
@@ -175,7 +175,7 @@ class Labels:
         """Return true if this box is the metal reference, or has a metal's name if the file has no reference."""
         if self.metal is not None:
             return name == self.metal
-        return is_metal(material_name(name))
+        return is_metal(remove_specimen(name))
 
     def specimen(self, name: str) -> str | None:
         """Return the physical piece in a box: as given, or the part of its name after `#`; None if not known."""
@@ -200,8 +200,8 @@ class Labels:
         return replace(self, boxes={n: convert_box(b) for n, b in self.boxes.items()}, unit="mm")
 
     def patches(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> tuple[Segmentation, dict[int, str]]:
-        """Return patches of the boxes, and the box name of each; see :func:`patches_from_labels`."""
-        return patches_from_labels(dict(self.boxes), x_m, y_m, unit=self.unit)
+        """Return patches of the boxes, and the box name of each; see :func:`make_patches_from_labels`."""
+        return make_patches_from_labels(dict(self.boxes), x_m, y_m, unit=self.unit)
 
 
 def find_label_file(folder: Path) -> Path:
@@ -286,7 +286,7 @@ def pack_labels(labels: Labels) -> bytes:
     return (json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
 
 
-def patches_from_plates(
+def make_patches_from_plates(
     plates: Sequence[TruthPlate], x_m: npt.ArrayLike, y_m: npt.ArrayLike, margin_mm: float
 ) -> tuple[Segmentation, dict[int, str]]:
     """Return patches at the known plates, and a patch's number to its name; several plates may have the same name.
@@ -295,11 +295,11 @@ def patches_from_plates(
     DataError if a plate has no pixel.
     """
     boxes = {f"{plate.name} ({n})": plate.box_mm for n, plate in enumerate(plates, 1)}
-    patches, _ = patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
+    patches, _ = make_patches_from_labels(boxes, x_m, y_m, unit="mm", margin_mm=margin_mm)
     return patches, {n: plate.name for n, plate in enumerate(plates, 1)}
 
 
-def patches_from_labels(
+def make_patches_from_labels(
     boxes: dict[str, Box],
     x_m: npt.ArrayLike,
     y_m: npt.ArrayLike,
@@ -387,7 +387,7 @@ def clean_line(value: object) -> str:
     return "".join(character if character.isprintable() else "?" for character in line)
 
 
-def box_name(text: str) -> str:
+def normalise_box_name(text: str) -> str:
     """Clean the name of a box: material or material#specimen. Raises DataError as :func:`clean_name`."""
     material, mark, specimen = text.partition(SPECIMEN_SEPARATOR)
     if not mark:
@@ -417,7 +417,7 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
     boxes = {}
     extent = image_extent_mm(x_m, y_m)
     for name, box in labels_mm.boxes.items():
-        clean_box = box_name(name)
+        clean_box = normalise_box_name(name)
         if existing_name := next(
             (other_name for other_name in boxes if other_name.casefold() == clean_box.casefold()), None
         ):
@@ -435,8 +435,8 @@ def check_labels(labels: Labels, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: 
             )
     for (first_name, a), (other_name, b) in combinations(boxes.items(), 2):
         _check_apart(first_name, a, other_name, b)
-    specimens = {box_name(n): clean_name(s, "specimen") for n, s in labels_mm.specimens.items()}
-    metal = None if labels_mm.metal is None else box_name(labels_mm.metal)
+    specimens = {normalise_box_name(n): clean_name(s, "specimen") for n, s in labels_mm.specimens.items()}
+    metal = None if labels_mm.metal is None else normalise_box_name(labels_mm.metal)
     named_boxes = list(specimens)
     if metal is not None:
         named_boxes.append(metal)
@@ -452,7 +452,7 @@ def make_name_taken_error(name: str, existing_name: str) -> DataError:
     return DataError(
         f"the name {name} exists already{spelling_text}",
         "each box needs its own name",
-        f"name a second piece of the same material {material_name(name)}{SPECIMEN_SEPARATOR}2;"
+        f"name a second piece of the same material {remove_specimen(name)}{SPECIMEN_SEPARATOR}2;"
         f" to move a box: --remove {existing_name} --box {existing_name}=x0,y0,x1,y1",
         code=ErrorCode.NAME_TAKEN,
     )
@@ -505,7 +505,7 @@ def _find_metal_by_name(boxes: Mapping[str, Box]) -> str | None:
 
     Raises DataError if there are several boxes and not exactly one has such a name.
     """
-    metals = [name for name in boxes if is_metal(material_name(name))]
+    metals = [name for name in boxes if is_metal(remove_specimen(name))]
     if len(metals) == 1:
         return metals[0]
     if len(boxes) > 1:

@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from polysight.imaging import window_weights
+from polysight.imaging import make_window
 from polysight.materials.names import format_permittivity
 from polysight.polarimetry import multilayer
 from polysight_shared.config import Chirp
@@ -66,7 +66,7 @@ class Spectrum:
         # A few frequencies suffice for a smooth window: the phase of inner echoes changes slowly with frequency.
         share_of_band = (np.arange(_FREQUENCIES) + 0.5) / _FREQUENCIES
         # Every second point of the longer window lies where `share_of_band` does: in the middle of one of equal parts.
-        weight = window_weights(window, 2 * _FREQUENCIES - 1)[::2]
+        weight = make_window(window, 2 * _FREQUENCIES - 1)[::2]
         frequency = chirp.first_sample_hz + chirp.hz_per_sample * (starts[:, None] + length * share_of_band)
         return cls(frequency, np.tile(weight / weight.sum(), (bands, 1)))
 

@@ -1,9 +1,9 @@
 """Labelled pixels: the reference library and its file, samples for classifiers, and the interface of classifiers.
 
 A library's file is an .npz with plain arrays and a JSON text; it is read with `allow_pickle=False`, so that a library
-of unknown origin cannot run code. `Samples` holds features, material, scan and patch of each pixel; `channel_distances`
-are the POLySIGHT paper's distances of pixels. A `Model` is fitted to samples and names pixels; the result for one scan
-is a `NamedScan`, whose patches are named by `majority` or by the model itself.
+of unknown origin cannot run code. `Samples` holds features, material, scan and patch of each pixel;
+`compute_channel_distances` returns the POLySIGHT paper's distances of pixels. A `Model` is fitted to samples and names
+pixels; the result for one scan is a `NamedScan`, whose patches are named by `name_by_majority` or by the model itself.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ class Library:
         names = np.repeat([entry.name for entry in self.entries], count)
         scans = np.repeat([entry.scan for entry in self.entries], count)
         x = np.concatenate(parts).astype(np.float64)
-        usable_rows = usable(x)
+        usable_rows = find_usable_pixels(x)
         return x[usable_rows], names[usable_rows], scans[usable_rows]
 
     def fit_for(self, angles_deg: Sequence[float]) -> dict[str, Any]:
@@ -257,7 +257,7 @@ CHANNELS = ("H", "V", "P", "H+V+P")
 """Channels that a classifier may use (Fig. 20 of the paper)."""
 
 
-def feature_matrix(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
+def make_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
     """Return features [n, 4] of metal-referenced pixels: |H|, |V|, real and imaginary part of V / H = 1 / P.
 
     V / H is used instead of P because it stays bounded where V vanishes (Brewster angle).
@@ -266,7 +266,7 @@ def feature_matrix(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real
     return np.stack([np.abs(h), np.abs(v), inverse.real, inverse.imag], axis=-1)
 
 
-def usable(x: Real) -> npt.NDArray[np.bool_]:
+def find_usable_pixels(x: Real) -> npt.NDArray[np.bool_]:
     """Return the pixels whose features are all finite, bool [n]."""
     return np.asarray(np.isfinite(x).all(axis=1), np.bool_)
 
@@ -289,7 +289,7 @@ Distances = tuple[Real, Real, Real]
 _LARGEST_RATIO = 1e12
 
 
-def ratio_columns(features: Real) -> Real:
+def invert_ratios(features: Real) -> Real:
     """Return columns |H|, |V|, Re P, Im P [n, 4] of features |H|, |V|, Re 1/P, Im 1/P; or the features of columns.
 
     Several angles follow each other, four columns each.
@@ -302,7 +302,7 @@ def ratio_columns(features: Real) -> Real:
     return table.reshape(features.shape)
 
 
-def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:
+def compute_ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128], measure: Measure) -> Real:
     """Return the distance of ratios P, float64, broadcast; the measures are described above."""
     if measure == "paper":
         return np.abs(a - b)
@@ -312,7 +312,7 @@ def ratio_distance(a: npt.NDArray[np.complex128], b: npt.NDArray[np.complex128],
     return np.hypot(np.log(np.abs(quotient)), np.angle(quotient))
 
 
-def channel_distances(a: Real, b: Real, measure: Measure | None) -> Distances:
+def compute_channel_distances(a: Real, b: Real, measure: Measure | None) -> Distances:
     """Return the distances of features a [n, 4 * angles] to b [m, 4 * angles] in |H|, |V| and P, [n, m] each.
 
     They are summed over the angles. Without a measure those of P are zero.
@@ -326,7 +326,7 @@ def channel_distances(a: Real, b: Real, measure: Measure | None) -> Distances:
         h_distance += np.abs(a_h[:, None, angle] - b_h[None, :, angle])
         v_distance += np.abs(a_v[:, None, angle] - b_v[None, :, angle])
         if measure is not None:
-            p_distance += ratio_distance(1 / a_inverse[:, None, angle], 1 / b_inverse[None, :, angle], measure)
+            p_distance += compute_ratio_distance(1 / a_inverse[:, None, angle], 1 / b_inverse[None, :, angle], measure)
     return h_distance, v_distance, p_distance
 
 
@@ -426,8 +426,8 @@ class Samples:
         specimens = []
         for i, entry in enumerate(library.entries):
             with np.errstate(divide="ignore", invalid="ignore"):
-                features = feature_matrix(entry.h, entry.v, entry.p)
-            usable_pixels = np.flatnonzero(usable(features))
+                features = make_features(entry.h, entry.v, entry.p)
+            usable_pixels = np.flatnonzero(find_usable_pixels(features))
             pixels = rng.permutation(usable_pixels)[:pixels_per_patch]
             x.append(features[pixels])
             names += [entry.name] * pixels.size
@@ -559,10 +559,10 @@ class Model(ABC):
 
         By default a patch gets the name of most of its pixels.
         """
-        return majority(*self.by_pixel(x), patches)
+        return name_by_majority(*self.by_pixel(x), patches)
 
 
-def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
+def name_by_majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> NamedScan:
     """Name each patch as most of its pixels, given the name, distance and patch number of each pixel, [n].
 
     Its confidence is their share, its distance the median over all of its pixels.
@@ -571,10 +571,12 @@ def majority(pixel_names: npt.NDArray, distance: Real, patches: npt.NDArray) -> 
     names, name_of_pixel = np.unique(pixel_names, return_inverse=True)
     votes = np.bincount(patch * names.size + name_of_pixel, minlength=ids.size * names.size).reshape(ids.size, -1)
     share = votes.max(axis=1) / count
-    return NamedScan(pixel_names, distance, ids, names[votes.argmax(axis=1)], share, median_by_patch(distance, patch))
+    return NamedScan(
+        pixel_names, distance, ids, names[votes.argmax(axis=1)], share, compute_patch_medians(distance, patch)
+    )
 
 
-def median_by_patch(values: Real, patch: npt.NDArray[np.intp]) -> Real:
+def compute_patch_medians(values: Real, patch: npt.NDArray[np.intp]) -> Real:
     """Return the median of the values [n] of each patch, [patches]; `patch` [n] are numbers from 0, all of them in use.
 
     All patches are computed together: `numpy.median` takes 30 us a call, and scores need it for thousands of patches.

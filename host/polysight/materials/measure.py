@@ -1,7 +1,7 @@
 """Measure patches: ratio, brightness and their errors, and the permittivity.
 
-`measure_patch` gives the input of the joint inversion, `permittivity_of_patch` combines its result with the percentiles
-of the pixels. `check_patches` refuses patches that are not flat plates.
+`measure_patch` gives the input of the joint inversion, `estimate_patch_permittivity` combines its result with the
+percentiles of the pixels. `check_patches` refuses patches that are not flat plates.
 
 The constants of errors were fitted to scenes of two generators, this project's simulator and an independent one with
 other physics (package `polysight_worlds`), and to a picture that the authors of POLySIGHT published.
@@ -110,7 +110,7 @@ ALLOWED_EXCESS = 0.02
 """Gain, real part below 1, or |V / H| above 1 that is allowed in addition, however small the error is. Chosen."""
 
 
-def background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
+def measure_background(h: Image, v: Image, segmentation: Segmentation, usable: Mask) -> tuple[float, float]:
     """Return the rms of |H| and |V| away from patches and dim plates (noise, sidelobes); NaN without such pixels."""
     background_mask = _select_background(h, v, segmentation, usable)
     if not background_mask.any():
@@ -176,9 +176,9 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     h, v
         complex [ny, nx], smoothed inside patches; any reference.
     dark
-        Result of :func:`background`, in the same units.
+        Result of :func:`measure_background`, in the same units.
     uneven
-        :func:`halves_apart` of the metal reference: the scan's own effect on a single material.
+        :func:`measure_difference_of_halves` of the metal reference: the scan's own effect on a single material.
     """
     pixels = patch.interior & np.isfinite(h) & np.isfinite(v)
     remedy = "check the image, the direct path and the range profile"
@@ -215,9 +215,9 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     allowed = max(HALVES_APART, uneven) * (1 + 2 * float(np.median(np.abs(v[pixels])) / np.median(level)))
     several = "several kinds together"
     separate_plates = "move the plates apart, or draw boxes"
-    if halves_apart(h, v, pixels) > np.hypot(allowed, NOISE_OF_HALVES * noise / np.sqrt(pixels.sum())):
+    if measure_difference_of_halves(h, v, pixels) > np.hypot(allowed, NOISE_OF_HALVES * noise / np.sqrt(pixels.sum())):
         return Finding("error", several, "its halves have different ratios", separate_plates)
-    middle = 1 / median_ratio(h[pixels], v[pixels])
+    middle = 1 / compute_median_ratio(h[pixels], v[pixels])
     odd = np.abs(v[pixels] / h[pixels] - middle) > np.hypot(
         max(ODD_RATIO, RIPPLE_SHARE * abs(middle)), ODD_NOISE * noise
     )
@@ -226,7 +226,7 @@ def check_patch(patch: Patch, h: Image, v: Image, dark: tuple[float, float], une
     return None
 
 
-def halves_apart(h: Image, v: Image, mask: Mask) -> float:
+def measure_difference_of_halves(h: Image, v: Image, mask: Mask) -> float:
     """Return the largest difference of the median V / H between opposite halves of a patch; 0 with too few pixels."""
     rows, columns = np.nonzero(mask & np.isfinite(h) & np.isfinite(v) & (h != 0))
     values = v[rows, columns] / h[rows, columns]
@@ -325,7 +325,7 @@ def _measure_relief(h: Image, centred: Real) -> float:
     return float(np.std(phase - design @ fit))
 
 
-def usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
+def find_usual_scatter(all_plates: Sequence[Scatter]) -> tuple[float, float]:
     """Return the usual scatter of ln|V / H| and of its phase in a scene: the medians over its plates."""
     if not all_plates:
         return 0.0, 0.0
@@ -369,7 +369,7 @@ def measure_patch(
     theta_rad
         Its angle of incidence.
     scatter, usual
-        The patch's :func:`measure_scatter`, and the scene's :func:`usual_scatter`.
+        The patch's :func:`measure_scatter`, and the scene's :func:`find_usual_scatter`.
     change
         Change of ln(V / H) from the metal to the patch by drift and fringes, which is removed, and its standard
         deviations (:meth:`CommonChange.log_ratio`); None if it is not known, or the reference covers the plane.
@@ -379,7 +379,7 @@ def measure_patch(
         Its rise along the plane of incidence and across it, radians.
     """
     pixels = patch.interior
-    ratio = median_ratio(h[pixels], v[pixels])
+    ratio = compute_median_ratio(h[pixels], v[pixels])
     inverse = 1 / ratio if ratio else complex(np.inf, 0.0)
     level = np.abs(h[pixels])
     level = level[np.isfinite(level)]
@@ -395,7 +395,7 @@ def measure_patch(
     return PatchMeasurement(inverse, std, theta_rad, brightness, relative, rise)
 
 
-def border_errors(patch: Patch, lit: Mask, x_m: Real) -> tuple[float, float]:
+def estimate_border_errors(patch: Patch, lit: Mask, x_m: Real) -> tuple[float, float]:
     """Return the errors of a patch's ln|V / H| and of its phase by the end of what the aperture lights.
 
     `lit`, bool [ny, nx]: illuminated pixels, in the images of a separate metal plate, too; `x_m` [nx]: the image's
@@ -487,7 +487,7 @@ def check_patches(
 
     `metal`, bool [ny, nx], is the metal reference's interior.
     """
-    uneven = halves_apart(h, v, metal)
+    uneven = measure_difference_of_halves(h, v, metal)
     reasons = ((p.label, check_patch(p, h, v, dark, uneven)) for p in segmentation.patches)
     return {label: reason for label, reason in reasons if reason is not None}
 
@@ -572,7 +572,7 @@ class Permittivity:
         return bool(np.isfinite(self.ratio)) and not self.metal_distance >= METAL_WITHOUT_PERMITTIVITY
 
 
-def median_ratio(h: Image, v: Image) -> complex:
+def compute_median_ratio(h: Image, v: Image) -> complex:
     """Return a robust mean of P = H / V over pixels: the reciprocal of the median of V / H; NaN without usable pixels.
 
     Dielectrics reflect s more strongly than p. With the strong channel in the denominator the noise of the ratio is
@@ -606,7 +606,7 @@ def estimate_permittivity(
     `h` and `v` complex [n] are the pixels of the interior, metal-referenced and leakage-corrected; `theta_rad` is the
     incidence angle, one number or [n].
     """
-    ratio = median_ratio(h, v)
+    ratio = compute_median_ratio(h, v)
     usable = np.isfinite(h) & np.isfinite(v) & (h != 0)
     distance = min(abs(ratio - 1), abs(1 / ratio - 1) if ratio != 0 else np.inf)
     n = int(usable.sum())
@@ -635,7 +635,7 @@ def estimate_permittivity(
     )
 
 
-def permittivity_of_patch(
+def estimate_patch_permittivity(
     h: Image,
     v: Image,
     theta_rad: float,

@@ -31,10 +31,10 @@ import scipy
 from polysight.imaging import Image, Images, Mask
 from polysight.materials.inversion import PARTICLE_WIDTH, Inversion, RigPrior, SceneLikelihood, invert, sample_posterior
 from polysight.materials.kinds import METAL_SHARE, METAL_SPREAD, HalfSpaces, Kinds, PatchMeasurement, inverse_ratio
-from polysight.materials.measure import median_ratio
+from polysight.materials.measure import compute_median_ratio
 from polysight.materials.segment import Box, Patch, Segmentation, box_mask
 from polysight.materials.specimens import METAL_UNLIKE
-from polysight.polarimetry import PlaneReference, divide_by_metal, metal_gains
+from polysight.polarimetry import PlaneReference, divide_by_metal, measure_metal_gains
 from polysight_shared.errors import DataError, ErrorCode
 
 Real = npt.NDArray[np.float64]
@@ -228,7 +228,7 @@ class _DielectricReference(SceneLikelihood):
         return float(self.theta.mean()) if self.theta.size else 0.0
 
 
-def metal_evidence(
+def weigh_metal_evidence(
     patches: Mapping[int, PatchMeasurement],
     prior: RigPrior,
     channel_ratio: complex | None,
@@ -296,7 +296,7 @@ class MetalReference:
         return is_declared or self.evidence.sure
 
 
-def metal_in_box(
+def find_metal_in_box(
     box_mm: Box, segmentation: Segmentation, x_m: npt.ArrayLike, y_m: npt.ArrayLike, valid: Mask | None = None
 ) -> MetalReference:
     """Take the metal reference from a box (x0, y0, x1, y1), millimetres from the image centre.
@@ -328,7 +328,7 @@ def metal_in_box(
     )
 
 
-def metal_by_label(label: int, segmentation: Segmentation) -> MetalReference:
+def take_patch_as_metal(label: int, segmentation: Segmentation) -> MetalReference:
     """Take the patch `label` as the metal reference. Raises DataError if there is no such patch."""
     for patch in segmentation.patches:
         if patch.label == label:
@@ -346,15 +346,15 @@ def make_missing_reference(usable: Mask) -> MetalReference:
     return MetalReference(usable, None, "none: no patch was found")
 
 
-def gains_as_plates(images: Images, metal_mask: Mask) -> tuple[complex, complex]:
+def find_median_gains(images: Images, metal_mask: Mask) -> tuple[complex, complex]:
     """Return the gains of H and V: after division by them the median ratio of H and V over the metal is 1.
 
-    Plates are measured by their median, too. The paper uses root mean squares over the metal (:func:`metal_gains`);
-    where the end of the scan lights the metal unevenly, their ratio differs from the median by up to 7 %. They are
-    returned if the median is zero or not finite. Raises DataError as :func:`metal_gains`.
+    Plates are measured by their median, too. The paper uses root mean squares over the metal
+    (:func:`measure_metal_gains`); where the end of the scan lights the metal unevenly, their ratio differs from the
+    median by up to 7 %. They are returned if the median is zero or not finite. Raises DataError as they do.
     """
-    gain_h, gain_v = metal_gains(images.h, images.v, metal_mask)
-    metal_p = median_ratio(images.h[metal_mask] / gain_h, images.v[metal_mask] / gain_v)
+    gain_h, gain_v = measure_metal_gains(images.h, images.v, metal_mask)
+    metal_p = compute_median_ratio(images.h[metal_mask] / gain_h, images.v[metal_mask] / gain_v)
     if not np.isfinite(metal_p) or metal_p == 0:
         return gain_h, gain_v
     return gain_h * metal_p, gain_v
@@ -369,14 +369,14 @@ def divide_by_reference(images: Images, metal: MetalReference, reference: PlaneR
     if reference is not None:
         return reference.apply(images)
     try:
-        return divide_by_metal(images, *gains_as_plates(images, metal.mask))
+        return divide_by_metal(images, *find_median_gains(images, metal.mask))
     except DataError:
         if metal.given:
             raise
         return divide_by_metal(images, 1.0 + 0j, 1.0 + 0j)
 
 
-def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
+def fit_channel_ratio(images: Images, metal: MetalReference) -> complex | None:
     """Return V / H of the region `metal` in the images, by least squares over its pixels; None if H is zero there."""
     h = images.h[metal.mask]
     v = images.v[metal.mask]
@@ -386,12 +386,12 @@ def channel_ratio_of(images: Images, metal: MetalReference) -> complex | None:
     return None
 
 
-def metal_unevenness(images: Images, metal_mask: Mask) -> float:
+def measure_metal_unevenness(images: Images, metal_mask: Mask) -> float:
     """Return |ln(V / H)| of the root mean squares of H and V over the metal: 0 if it is lit evenly.
 
-    The images are divided by `gains_as_plates`, so that the median of V / H is 1 there.
+    The images are divided by `find_median_gains`, so that the median of V / H is 1 there.
     """
-    rms_h, rms_v = metal_gains(images.h, images.v, metal_mask)
+    rms_h, rms_v = measure_metal_gains(images.h, images.v, metal_mask)
     return float(abs(np.log(rms_v / rms_h)))
 
 
@@ -400,8 +400,8 @@ def find_metals(h: Image, v: Image, segmentation: Segmentation) -> tuple[MetalRe
 
     The brightness is the median of |H| times that of |V|. Metal reflects both polarisations fully (|r_s| = |r_p| = 1);
     every dielectric loses most of p at these angles. The unknown gains of H and V do not change the order of the
-    products. In a scene without metal the brightest patch is a dielectric: :func:`metal_evidence` judges whether it is
-    metal, and which of several metals is bare.
+    products. In a scene without metal the brightest patch is a dielectric: :func:`weigh_metal_evidence` judges whether
+    it is metal, and which of several metals is bare.
     """
     patches = [p for p in segmentation.patches if p.interior.any()]
     size_h = np.array([np.median(np.abs(h[p.interior])) for p in patches])

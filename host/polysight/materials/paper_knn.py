@@ -19,9 +19,9 @@ from polysight.materials.library import (
     COLUMNS_PER_ANGLE,
     Measure,
     Real,
-    channel_distances,
+    compute_channel_distances,
     find_neighbours,
-    ratio_columns,
+    invert_ratios,
 )
 
 # Pixels whose distances are computed together: 512 x 20,000 numbers are 80 MB.
@@ -42,8 +42,8 @@ def paper_distance(
     if first.shape[1] % COLUMNS_PER_ANGLE:
         distance = np.abs(first[:, None, :] - second[None, :, :]).sum(axis=2)
     else:
-        # `channel_distances` takes 1/P in place of P. Without a weight of P it is spared the work: its distance is 0.
-        channels = channel_distances(ratio_columns(first), ratio_columns(second), measure if p else None)
+        # `compute_channel_distances` takes 1/P in place of P. Without a weight of P its distance is not computed (0).
+        channels = compute_channel_distances(invert_ratios(first), invert_ratios(second), measure if p else None)
         distance = h * channels[0] + v * channels[1] + p * channels[2]
     if np.ndim(a) > 1 or np.ndim(b) > 1:
         return distance

@@ -25,8 +25,8 @@ from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior
 from polysight.materials.kinds import PatchDispersion, RatioEvidence, find_permittivity_slope
 from polysight.materials.labels import Labels
-from polysight.materials.library import Real, feature_matrix
-from polysight.materials.measure import Permittivity, background, ratio_sigma
+from polysight.materials.library import Real, make_features
+from polysight.materials.measure import Permittivity, measure_background, ratio_sigma
 from polysight.materials.metal import MetalReference
 from polysight.materials.names import UNKNOWN, NamedPatch, PatchName
 from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm
@@ -274,7 +274,7 @@ class MaterialsResult:
         v = self.calibrated.v
         if self.withheld:
             return np.full(h.shape, np.nan, np.float32)
-        background_rms = background(h, v, self.segmentation, usable)
+        background_rms = measure_background(h, v, self.segmentation, usable)
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = np.where(usable, v / h, np.nan)
         return ratio_sigma(h, v, background_rms, ratio_error(self.inversion, self.prior, inverse))
@@ -471,9 +471,9 @@ class MatchedPatch:
 
 
 def pixel_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
-    """Return features [n, 4] of pixels (`library.feature_matrix`); not finite for unusable pixels."""
+    """Return features [n, 4] of pixels (`library.make_features`); not finite for unusable pixels."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        return feature_matrix(np.ravel(h), np.ravel(v), np.ravel(p))
+        return make_features(np.ravel(h), np.ravel(v), np.ravel(p))
 
 
 def make_labels(result: MaterialsResult, description: str = "") -> Labels:

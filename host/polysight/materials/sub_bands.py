@@ -38,7 +38,7 @@ from polysight.materials.layers import (
     fit_layer,
 )
 from polysight.materials.library import Library
-from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, measure_scatter, median_ratio, relative_errors
+from polysight.materials.measure import LEAST_STD, NOT_PASSIVE, compute_median_ratio, measure_scatter, relative_errors
 from polysight.materials.metal import MetalReference, divide_by_reference
 from polysight.materials.result import MaterialsResult, ratio_slopes
 from polysight.polarimetry import PlaneReference, inverse_spread, remove_leakage
@@ -81,15 +81,17 @@ def add_bands(
 ) -> MaterialsResult:
     """Return the result with each patch's ratios in sub-bands; unchanged without sub-bands.
 
-    `plane` is metal scanned separately, imaged in the same sub-bands. Parameters and errors as :func:`band_rows`.
+    `plane` is metal scanned separately, imaged in the same sub-bands. Parameters and errors as :func:`list_band_rows`.
     """
     if not bands:
         return result
     parts = None if plane is None else plane.bands
-    return replace(result, bands=band_rows(result, bands, images, result.inversion.leakage, optics.smooth_px, parts))
+    return replace(
+        result, bands=list_band_rows(result, bands, images, result.inversion.leakage, optics.smooth_px, parts)
+    )
 
 
-def band_rows(
+def list_band_rows(
     result: MaterialsResult,
     bands: Sequence[SubBand],
     images: Sequence[Images],
@@ -151,7 +153,7 @@ def _estimate_common_std(result: MaterialsResult, interior: Mask) -> float:
     scatter = measure_scatter(interior, result.h, result.v, images.x_m, images.y_m)
     if scatter is None:
         return float("nan")
-    inverse = 1 / median_ratio(result.h[interior], result.v[interior])
+    inverse = 1 / compute_median_ratio(result.h[interior], result.v[interior])
     amplitude, phase = relative_errors(scatter, result.ripple)
     return float(np.hypot(abs(inverse) * np.hypot(amplitude, phase) / np.sqrt(2), LEAST_STD))
 
@@ -205,7 +207,7 @@ def _measure_band(band: SubBand, h: Image, v: Image, sweep_channels: tuple[Image
     `sweep_channels` are H and V of the same pixels of the whole sweep, `error` the metal reference's relative error.
     """
     # The ratio is H / V, standard deviations are those of V / H: a relative error of the metal counts times |V / H|.
-    ratio = median_ratio(h, v)
+    ratio = compute_median_ratio(h, v)
     std = math.hypot(inverse_spread(h, v), error / abs(ratio)) if ratio else float("nan")
     if not (math.isfinite(abs(ratio)) and math.isfinite(std)):
         return BandFigures(first_hz=band.first_hz, last_hz=band.last_hz)
@@ -410,7 +412,7 @@ def incidence_std_rad(materials: ScanMaterials | None) -> float:
     return float(np.radians(std_deg or 0.0))
 
 
-def layer_content(fit: LayerFit) -> dict[str, Any]:
+def format_layer_content(fit: LayerFit) -> dict[str, Any]:
     """Return a fit as plain values for JSON; permittivities as [eps', eps''], lengths in millimetres."""
     has_thickness = fit.std_thickness_m > 0
     # Units of eps', eps'' and the thickness (millimetres a metre).

@@ -37,11 +37,11 @@ import numpy.typing as npt
 
 from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, fit_weights
 from polysight.materials.labels import METAL_WORDS, clean_line, find_label_file, is_metal, read_labels
-from polysight.materials.library import Entry, Library, Real, Samples, majority
+from polysight.materials.library import Entry, Library, Real, Samples, name_by_majority
 from polysight.materials.result import MaterialsResult
 from polysight.materials.segment import Box
-from polysight.materials.training_advice import alike_pairs, specimen_freedom
-from polysight.polarimetry import metal_gains
+from polysight.materials.training_advice import count_specimen_freedom, find_alike_pairs
+from polysight.polarimetry import measure_metal_gains
 from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.files import read_bounded, read_json
 
@@ -191,7 +191,7 @@ def image_orientation(scans: Sequence[LabelledScan]) -> str:
     return best if shares[best] > shares[first] + _CLEAR_DIFFERENCE else first
 
 
-def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
+def make_entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
     """Return library entries of a labelled scan, each box relative to the scan's metal; leakage is not removed.
 
     The scan is in the right orientation.
@@ -204,7 +204,7 @@ def entries_of_boxes(scan: LabelledScan, angle_deg: float) -> list[Entry]:
             "everything is measured relative to metal",
             f"a metal box has one of these words in its name: {', '.join(METAL_WORDS)}", code=ErrorCode.NO_DATA,
         )  # fmt: skip
-    metal_h, metal_v = metal_gains(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
+    metal_h, metal_v = measure_metal_gains(scan.h, scan.v, scan.mask(scan.metal) & (scan.h != 0) & (scan.v != 0))
     h = scan.h / np.asarray(metal_h, scan.h.dtype)
     v = scan.v / np.asarray(metal_v, scan.v.dtype)
     entries = []
@@ -238,7 +238,7 @@ def label_folders(folder: Path) -> list[Path]:
     return []
 
 
-def angle_in_text(texts: Iterable[str]) -> float | None:
+def find_angle_in_text(texts: Iterable[str]) -> float | None:
     """Return the incidence angle in texts such as "60 deg" or "scan_55degrees", degrees; None without one."""
     for text in texts:
         match = re.search(r"(\d{2}(?:\.\d+)?)\s*(?:°|deg)", text.lower())
@@ -439,7 +439,7 @@ def calibration_error(confidence: npt.NDArray, right: npt.NDArray) -> float:
     return float(np.abs(difference).sum() / count.sum())
 
 
-def splits(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
+def split(samples: Samples, by_pixel: bool = False, folds: int = FOLDS) -> Iterator[tuple[npt.NDArray, npt.NDArray]]:
     """Yield indices [k] of the training and test pixels of each fold: whole groups, or single pixels.
 
     Every group is a fold of its own if `folds` could put all groups of a material into one fold.
@@ -499,7 +499,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     patch_name = np.empty_like(samples.names)
     unknown, learnt = np.zeros((2, samples.names.size), bool)
     confidence = np.zeros(samples.names.size)
-    for train, test in splits(samples, by_pixel, folds):
+    for train, test in split(samples, by_pixel, folds):
         learnt[test] = np.isin(samples.names[test], samples.names[train])
         model_of_fold = MODELS[model](channels)
         model_of_fold.fit(samples.take(train))
@@ -511,7 +511,7 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
             if model_of_fold.knows_scans:
                 predicted = model_of_fold.by_scan(samples.x[test_set], samples.patches[test_set])
             else:
-                predicted = majority(pixel_name[test_set], distance, samples.patches[test_set])
+                predicted = name_by_majority(pixel_name[test_set], distance, samples.patches[test_set])
             row = np.searchsorted(predicted.patches, samples.patches[test_set])
             name_in_scan[test_set] = predicted.pixel_names
             patch_name[test_set] = predicted.names[row]
@@ -528,9 +528,9 @@ def score(samples: Samples, model: str, channels: str = "H+V+P", by_pixel: bool 
     right = (patch_name == samples.names)[named]
     pixels_right, in_scan_right, by_patch_right = (float(np.mean(np.diag(t)[judged])) for t in tables)
     scans = np.unique(samples.independent).size
-    split = OPTIMISTIC_SPLIT if by_pixel else f"whole scans left out, {scans} scans"
+    fold_kind = OPTIMISTIC_SPLIT if by_pixel else f"whole scans left out, {scans} scans"
     return Score(
-        model=model, channels=channels, split=split,
+        model=model, channels=channels, split=fold_kind,
         pixels=pixels_right, in_scan=in_scan_right, by_patch=by_patch_right,
         patches=float(np.mean((patch_name == samples.names)[first])), unknown=float(np.mean(unknown[first])),
         confusion=tables[0], patch_confusion=tables[2],
@@ -556,7 +556,7 @@ def score_unseen_materials(samples: Samples, model: str) -> dict[str, float]:
     scores = {}
     for name in np.unique(samples.names):
         called_unknown = []
-        for train, test in splits(samples):
+        for train, test in split(samples):
             other_samples = train[samples.names[train] != name]
             fitted = MODELS[model]("H+V+P")
             fitted.fit(samples.take(other_samples))
@@ -614,8 +614,8 @@ def fit_samples(samples: Samples) -> dict[str, Any]:
         "said": own_score.said,
         "right": own_score.right,
         "scans": int(np.unique(samples.groups).size),
-        "specimen_freedom": specimen_freedom(samples),
-        "alike": alike_pairs(samples),
+        "specimen_freedom": count_specimen_freedom(samples),
+        "alike": find_alike_pairs(samples),
         "judged": judged,
         "materials": len(own_score.names),
         "not_judged": list(own_score.not_judged),

@@ -15,7 +15,7 @@ from polysight.materials.labels import is_metal
 from polysight.materials.library import Library, Samples
 
 
-def accuracy_lines(library: Library) -> list[str]:
+def describe_accuracy(library: Library) -> list[str]:
     """Return for each angle how often names are correct on scans left out of training, or why this is not known."""
     lines: list[str] = []
     for angle, fit in library.fit["angles"].items():
@@ -100,7 +100,7 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def alike_pairs(samples: Samples) -> list[tuple[str, str, float]]:
+def find_alike_pairs(samples: Samples) -> list[tuple[str, str, float]]:
     """Return pairs of materials that a patch hardly distinguishes, and their distance in standard deviations."""
     model = ErrorDiscriminant().fit(samples)
     distances = model.distances()
@@ -111,7 +111,7 @@ def alike_pairs(samples: Samples) -> list[tuple[str, str, float]]:
     return sorted(pairs, key=lambda pair: pair[2])
 
 
-def specimen_freedom(samples: Samples) -> int:
+def count_specimen_freedom(samples: Samples) -> int:
     """Return the number of specimens beyond the first of each material, metals left out."""
     counts = {name: np.unique(samples.plates[samples.names == name]).size for name in np.unique(samples.names)}
     return sum(count - 1 for name, count in counts.items() if not is_metal(str(name)))

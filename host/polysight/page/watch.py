@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polysight.acquisition import LAPSE_S, read_life
 from polysight.catalogue import Picture, Program, draw, explain_failure, find_program, read_generation
-from polysight.imaging import Antennas, image_grid, scene_gate_m
+from polysight.imaging import Antennas, find_scene_gate_m, image_grid
 from polysight.page.history import PiState, ScanHistory, make_error_notice, make_fault_notice
 from polysight.page.status import (
     Inputs,
@@ -82,10 +82,10 @@ UNATTENDED_ROWS = 3.0
 def scene_m(rig: Instrument) -> tuple[float, float]:
     """Return the excess paths that the scene can have: nearest and farthest, metres."""
     antennas = tuple(Antennas.from_rig(rig, board) for board in rig.receivers)
-    return scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig))
+    return find_scene_gate_m(antennas, plan_raster(rig.grid), image_grid(rig))
 
 
-def range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def compute_range_profile_db(row: SyncedRow, chirp: Chirp, excess_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean power over RX and positions against excess path, relative to the direct path at 0.
 
     An echo of excess path d is `exp(+j 2 pi f d / c)` (sync/chain.py), so a Fourier transform along the linear
@@ -188,7 +188,7 @@ class RowViewer:
         nearest, farthest = scene_m(rig)
         excess = np.linspace(-BEFORE_M, farthest + BEYOND_M, PROFILE_POINTS)
         boards = {
-            name: range_profile_db(synced, rig.chirp, excess).round(1).tolist()
+            name: compute_range_profile_db(synced, rig.chirp, excess).round(1).tolist()
             for name, synced in pipeline.synchronise_row(row).items()
         }
         return Profile(row, excess.round(4).tolist(), boards, (round(nearest, 3), round(farthest, 3)))

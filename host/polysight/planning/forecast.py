@@ -267,7 +267,7 @@ def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
     """Return the aperture of the H receiver, at the frequencies that the imager keeps, and its taper [row, column]."""
     grid = imaging.image_grid(rig)
     antennas = tuple(imaging.Antennas.from_rig(rig, board) for board in rig.receivers)
-    gate_m = imaging.scene_gate_m(antennas, plan_raster(rig.grid), grid)
+    gate_m = imaging.find_scene_gate_m(antennas, plan_raster(rig.grid), grid)
     frequencies_hz = imaging.reduction(rig.chirp, gate_m, _FAST_TIME_WINDOW).frequencies_hz
     aperture = imaging.Aperture(antennas[0], imaging.scan_offsets_m(rig), frequencies_hz, grid)
     return aperture, np.outer(*_compute_tapers(rig))
@@ -276,7 +276,7 @@ def describe_aperture(rig: Instrument) -> tuple[imaging.Aperture, Real]:
 def _compute_tapers(rig: Instrument) -> tuple[Real, Real]:
     """Return the tapers over the rows [row] and over the columns [column], as the rig file names them."""
     name = imaging.TAPERS[rig.image.apodisation]
-    return imaging.window_weights(name, rig.grid.rows), imaging.window_weights(name, rig.grid.columns)
+    return imaging.make_window(name, rig.grid.rows), imaging.make_window(name, rig.grid.columns)
 
 
 def predict_burst(rig: Instrument) -> BurstForecast:
@@ -310,7 +310,7 @@ def predict_noise(rig: Instrument, noise: Noise) -> NoiseForecast:
     rx = len(rig.antennas.rx_mm)
     position = 10 ** (noise.direct_snr_db / 10) * rig.burst.chirps_a_position
     gain = rx
-    for window in (imaging.window_weights(_FAST_TIME_WINDOW, samples), *_compute_tapers(rig)):
+    for window in (imaging.make_window(_FAST_TIME_WINDOW, samples), *_compute_tapers(rig)):
         gain *= window.sum() ** 2 / (window**2).sum()
     return NoiseForecast(
         position_db=float(10 * np.log10(position)),

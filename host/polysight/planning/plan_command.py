@@ -1,8 +1,8 @@
 """`polysight plan`: print a forecast, or the best plans within a time, as text or JSON.
 
 `measure_noise` and `measure_row_overhead` take noise and standstill from a recorded scan (`--like`). `PlanChanges`
-holds the values of a plan that differ from the rig file; `rig_lines` writes them as lines for a rig file. `propose`
-varies speed, steps and burst, and keeps the aperture.
+holds the values of a plan that differ from the rig file; `format_rig_lines` returns them as lines for a rig file.
+`propose` varies speed, steps and burst, and keeps the aperture.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ class PlanChanges:
             raise ConfigError(e.what, cause, "give others: `polysight plan --help` lists them", code=e.code) from None
 
 
-def rig_lines(plan: Instrument, original: Instrument) -> str:
+def format_rig_lines(plan: Instrument, original: Instrument) -> str:
     """Return the lines of the rig file that differ between `plan` and `original`; "" if none differs."""
     new = to_builtins(plan)
     old = to_builtins(original)
@@ -556,7 +556,7 @@ def run_plan(config: Path, changes: PlanChanges, options: PlanOptions) -> int:
         content = {"minutes": options.minutes, "plans": [forecast_values(p) for p in plans]}
         sys.stdout.write(json.dumps(content, indent=1) + "\n")
     elif plans:
-        lines = rig_lines(plans[0].rig, original)
+        lines = format_rig_lines(plans[0].rig, original)
         if lines:
             differences = f"Its lines in the rig file, all that differ:\n\n{lines}"
         else:

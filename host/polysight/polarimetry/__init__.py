@@ -1,9 +1,9 @@
 """Polarimetry: from the H and V images to reflection and permittivity.
 
 `calibrate` divides the images by a metal region in the scene, a `PlaneReference` by a metal plate from another scan.
-`correct_leakage` removes cross-polar leakage; `leakage_from_images` estimates it from metal at two orientations.
-`incidence_choice` gives the incidence angle of each pixel. `fresnel` and `multilayer` compute the reflection of a
-material, `permittivity_from_ratio` the permittivity from a polarisation ratio (Eq. 2 and 3 of the
+`correct_leakage` removes cross-polar leakage; `estimate_leakage_from_images` finds it in images of metal at two
+orientations. `incidence_choice` gives the incidence angle of each pixel. `fresnel` and `multilayer` compute the
+reflection of a material, `permittivity_from_ratio` the permittivity from a polarisation ratio (Eq. 2 and 3 of the
 POLySIGHT paper).
 """
 
@@ -13,9 +13,9 @@ from polysight.polarimetry.calibrate import (
     calibrate as calibrate,
     correct_leakage as correct_leakage,
     divide_by_metal as divide_by_metal,
+    estimate_leakage_from_images as estimate_leakage_from_images,
     inverse_spread as inverse_spread,
-    leakage_from_images as leakage_from_images,
-    metal_gains as metal_gains,
+    measure_metal_gains as measure_metal_gains,
     plane_reference as plane_reference,
     ratio as ratio,
     remove_leakage as remove_leakage,

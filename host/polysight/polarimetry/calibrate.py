@@ -13,8 +13,8 @@ one per pixel (`PlaneReference`), which also removes differences between H and V
 patterns, illumination). Samples are referenced to the direct path, so that reference stays valid after a power cycle;
 geometry and boards must be the same, see :meth:`PlaneReference.check_rig`.
 
-Leakage is estimated from metal at two orientations (`leakage_from_images`). Metal strips with a pitch well below a
-wavelength reflect only the field along them. Strips rotated by psi from the vertical (s), flat on the plane at
+Leakage is estimated from metal at two orientations (`estimate_leakage_from_images`). Metal strips with a pitch well
+below a wavelength reflect only the field along them. Strips rotated by psi from the vertical (s), flat on the plane at
 incidence theta, project the wave on w = (cos psi, sin psi cos theta): the current along them cancels the field along
 them and radiates both polarisations. TX sends s and p equally, so the reflected wave is proportional to w. Vertical
 strips reflect s alone, so V receives only leakage; horizontal strips reflect p alone, so H receives only leakage.
@@ -74,7 +74,7 @@ def with_ratio(images: Images) -> Images:
     return replace(images, p=ratio(images.h, images.v))
 
 
-def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]:
+def measure_metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]:
     """Return the gains of H and V over a metal region (Eq. 8 and 9 of the paper).
 
     Amplitudes are RMS values over the region, and the phase of the ratio is that of sum(h conj(v)): a common phase of
@@ -109,8 +109,8 @@ def metal_gains(h: Image, v: Image, metal_mask: Mask) -> tuple[complex, complex]
 
 
 def calibrate(images: Images, metal_mask: Mask) -> Images:
-    """Divide both channels by their gains over a metal region, see :func:`metal_gains`; adds the ratio p."""
-    return divide_by_metal(images, *metal_gains(images.h, images.v, metal_mask))
+    """Divide both channels by their gains over a metal region, see :func:`measure_metal_gains`; adds the ratio p."""
+    return divide_by_metal(images, *measure_metal_gains(images.h, images.v, metal_mask))
 
 
 def divide_by_metal(images: Images, metal_h: complex | Image, metal_v: complex | Image) -> Images:
@@ -557,7 +557,7 @@ def estimate_axial_ratio(plate: MetalStandard, strips: MetalStandard) -> Leakage
     return Leakage(a, a, plate.measured[0] / plate.measured[1], 0.0)
 
 
-def leakage_from_images(
+def estimate_leakage_from_images(
     plate: tuple[Image, Image], strips: Sequence[tuple[float, Image, Image]], mask: Mask, theta_rad: float
 ) -> Leakage:
     """Estimate leakage from images of a plate and of strips that cover the same plane.

@@ -404,7 +404,7 @@ def _read_folder(folder: Path, rig: Instrument) -> GivenPair:
         x_m=x_m,
         y_m=y_m,
         labels=labels,
-        incidence_deg=materials.angle_in_text([scan.description, scan.scan]),
+        incidence_deg=materials.find_angle_in_text([scan.description, scan.scan]),
         simulated=scan.simulated,
         assumed=tuple(assumed),
         other_sign=PUBLISHED_OTHER_SIGN,

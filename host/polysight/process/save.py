@@ -17,7 +17,7 @@ from polysight.materials import (
     Classifier,
     MaterialsResult,
     TruthPlate,
-    classifier_sentence,
+    describe_classifier,
     make_labels,
     pack_labels,
     pack_patches,
@@ -145,7 +145,7 @@ def assemble_result(
     library = unnamed or "Nothing was named."
     model = None
     if findings.classifier is not None:
-        library = classifier_sentence(findings.classifier)
+        library = describe_classifier(findings.classifier)
         model = findings.classifier.model
     materials = ScanMaterials(
         scan_id=facts.scan_id or "",

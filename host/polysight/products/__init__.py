@@ -9,12 +9,12 @@ context manager: products are written to a temporary folder, which replaces the 
 from polysight.products.exports import (
     PLANE_DIMENSIONS as PLANE_DIMENSIONS,
     export as export,
+    format_ranges as format_ranges,
     full_dataset as full_dataset,
     image_dataset as image_dataset,
     patch_coordinates as patch_coordinates,
     patch_dataset as patch_dataset,
     permittivity_dataset as permittivity_dataset,
-    ranges_text as ranges_text,
     read_netcdf as read_netcdf,
     surface_dataset as surface_dataset,
     write_netcdf as write_netcdf,

@@ -51,7 +51,7 @@ UNREFERENCED = "none: h, v and p are in arbitrary units"
 """Value of the attribute `metal_reference` if only images were made."""
 
 
-def ranges_text(numbers: Sequence[int]) -> str:
+def format_ranges(numbers: Sequence[int]) -> str:
     """Return ascending numbers as text, `3, 7-9`; `none` without numbers."""
     ranges: list[list[int]] = []
     for n in numbers:
@@ -111,7 +111,7 @@ def provenance(scan: ProcessedScan) -> dict[str, Any]:
         attrs["versions"] = json.dumps(scan.facts.versions)
     if scan.rows is not None:
         attrs["rows_planned"] = scan.rows.planned
-        attrs["rows_missing"] = ranges_text(scan.rows.missing)
+        attrs["rows_missing"] = format_ranges(scan.rows.missing)
     masked = [
         f"{name} {board.positions_masked} of {board.positions}"
         for name, board in scan.quality.boards.items()

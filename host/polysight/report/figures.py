@@ -3,7 +3,7 @@
 Amplitude has a perceptually uniform, colour-blind safe map (cividis), phase a cyclic one (twilight); the phase of P,
 where its colours span only a part of the circle, cividis. *Patches* (`ProcessedScan.segments`) are the regions that the
 processing found, *plates* the true ones of a simulated scan. `label_figure` shows the boxes of a label file,
-`focus_figure` a sweep over depth, `surface_figure` surfaces from three sides.
+`draw_focus_figure` a sweep over depth, `surface_figure` surfaces from three sides.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from msgspec import UNSET
 from polysight.materials import Box, axis_mm
 from polysight.products import Limits, ProcessedScan, map_scan
 from polysight.report import style
-from polysight.report.permittivity_plot import permittivity_figure
+from polysight.report.permittivity_plot import draw_permittivity_figure
 from polysight.results import BoardQuality
 from polysight.surfaces import Segment, Surface, describe_form, describe_material
 from polysight_shared.raster import RasterPlan
@@ -80,7 +80,7 @@ _GAP_SHARE = 0.26
 _POSITION_COLOURS = ("#dfe5ec", "#882255")
 
 
-def phase_limits_deg(scan: ProcessedScan) -> Limits | None:
+def find_phase_limits_deg(scan: ProcessedScan) -> Limits | None:
     """Return the range of the phase of P inside the judged patches, degrees.
 
     None if it is nearly the whole circle, or without pixels of patches. The metal reference, 0 degrees by definition,
@@ -147,11 +147,11 @@ def draw_channel(ax: Axes, scan: ProcessedScan, key: str, phase_deg: Limits | No
     return image, unit
 
 
-def channel_figure(scan: ProcessedScan, key: str) -> bytes:
+def draw_channel_figure(scan: ProcessedScan, key: str) -> bytes:
     """Return a PNG of one of FIGURES with a colour bar. The phase of P spans the range of the patches."""
-    fig = style.new_figure(5.0, 4.6, style.BAR_IN)
+    fig = style.make_figure(5.0, 4.6, style.BAR_IN)
     ax = fig.add_subplot()
-    limits = phase_limits_deg(scan) if key == "phase_p" else None
+    limits = find_phase_limits_deg(scan) if key == "phase_p" else None
     image, unit = draw_channel(ax, scan, key, limits)
     style.style_axes(ax, FIGURES[key], scan.stamped)
     if key.endswith("_p"):
@@ -164,7 +164,7 @@ def channel_figure(scan: ProcessedScan, key: str) -> bytes:
         bar = style.colour_bar(fig, ax, image, unit, extend="both")
         ticks = [t for t in bar.get_ticks() if limits[0] <= t <= limits[1]]
         bar.set_ticks(ticks, labels=[_wrap_degrees(t) for t in ticks])
-    return style.png(fig)
+    return style.encode_png(fig)
 
 
 def _wrap_degrees(angle: float) -> str:
@@ -276,18 +276,20 @@ def draw_truth(ax: Axes, scan: ProcessedScan, size: float = 7.5) -> list[style.M
     return labels
 
 
-def map_figure(scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[style.MapLabel]], title: str) -> bytes:
+def draw_map_figure(
+    scan: ProcessedScan, draw: Callable[[Axes, ProcessedScan], list[style.MapLabel]], title: str
+) -> bytes:
     """Return a PNG of a material map or of the truth. If names lack room all become numbers, with a legend below."""
-    fig = style.new_figure(4.6, 4.6, style.RIGHT_IN)
+    fig = style.make_figure(4.6, 4.6, style.RIGHT_IN)
     ax = fig.add_subplot()
     labels = draw(ax, scan)
     style.style_axes(ax, title, scan.stamped)
     ax.set_facecolor("#f3f5f8")
     style.fit_labels(fig, labels, style.RIGHT_IN)
-    return style.png(fig)
+    return style.encode_png(fig)
 
 
-def permittivity_map(scan: ProcessedScan) -> bytes | None:
+def draw_permittivity_map(scan: ProcessedScan) -> bytes | None:
     """Return a PNG of eps' with its standard error in each patch, and of the relative error; None without errors.
 
     The relative error is the root of the sum of both parts' variances, over |eps|, in percent.
@@ -307,7 +309,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
             texts[patch.label] = f"{estimate.real:.2f}\n± {estimate.spread.real_std:.2f}"
     if not real:
         return None
-    fig = style.new_figure(9.4, 4.6, style.BAR_IN)
+    fig = style.make_figure(9.4, 4.6, style.BAR_IN)
     percents = {label: _format_percent(error) for label, error in errors.items()}
     low = min(real.values())
     high = max(real.values())
@@ -323,7 +325,7 @@ def permittivity_map(scan: ProcessedScan) -> bytes | None:
     for ax in (value_axes, error_axes):
         ax.set_facecolor("#f3f5f8")
     error_axes.set_ylabel("")
-    return style.png(fig)
+    return style.encode_png(fig)
 
 
 def _format_percent(value: float) -> str:
@@ -394,7 +396,7 @@ def _mask(board: BoardQuality, plan: RasterPlan) -> npt.NDArray[np.bool_]:
     return mask
 
 
-def coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
+def draw_coverage_figure(scan: ProcessedScan, masks: dict[str, npt.NDArray[np.bool_]]) -> Figure:
     """Return a map of masked stage positions for each board, millimetres from the middle of the grid.
 
     `masks` as of :func:`find_masked_positions`; the scan's plan must be known.
@@ -444,18 +446,21 @@ def _map_title(scan: ProcessedScan) -> str:
     return "Patches"
 
 
-def figures(scan: ProcessedScan) -> dict[str, bytes]:
+def draw_figures(scan: ProcessedScan) -> dict[str, bytes]:
     """Return all figures of a report as PNG, by file name without suffix."""
-    out = {key: channel_figure(scan, key) for key in FIGURES}
+    out = {key: draw_channel_figure(scan, key) for key in FIGURES}
     if scan.segments:
-        out["materials"] = map_figure(scan, draw_materials, f"{_map_title(scan)} found")
-        permittivities = {"permittivity": permittivity_figure(scan), "permittivity_map": permittivity_map(scan)}
+        out["materials"] = draw_map_figure(scan, draw_materials, f"{_map_title(scan)} found")
+        permittivities = {
+            "permittivity": draw_permittivity_figure(scan),
+            "permittivity_map": draw_permittivity_map(scan),
+        }
         out |= {name: picture for name, picture in permittivities.items() if picture is not None}
     masks = find_masked_positions(scan)
     if any(m.any() for m in masks.values()):
-        out["coverage"] = style.png(coverage_figure(scan, masks))
+        out["coverage"] = style.encode_png(draw_coverage_figure(scan, masks))
     if scan.plates:
-        out["truth"] = map_figure(scan, draw_truth, "Truth")
+        out["truth"] = draw_map_figure(scan, draw_truth, "Truth")
     return out
 
 
@@ -471,7 +476,7 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
     metal
         Name of the metal reference; None without one.
     """
-    fig = style.new_figure(5.4, 4.8, style.BAR_IN)
+    fig = style.make_figure(5.4, 4.8, style.BAR_IN)
     ax = fig.add_subplot()
     image, unit = draw_channel(ax, scan, "amplitude_h")
     labels = []
@@ -491,10 +496,10 @@ def label_figure(scan: ProcessedScan, boxes_mm: Mapping[str, Box], metal: str | 
     style.style_axes(ax, "Amplitude H, and the boxes", scan.stamped)
     style.colour_bar(fig, ax, image, unit)
     style.fit_labels(fig, labels, style.BAR_IN)
-    return style.png(fig)
+    return style.encode_png(fig)
 
 
-def focus_figure(
+def draw_focus_figure(
     sweep: dict[str, Any],
     before: npt.NDArray[np.complexfloating],
     after: npt.NDArray[np.complexfloating],
@@ -536,7 +541,7 @@ def focus_figure(
         style.colour_bar(fig, ax, mesh, "dB")
     if simulated:
         fig.suptitle("SIMULATED", fontsize=9, color=style.STAMP_COLOUR, fontweight="bold", x=0.99, ha="right")
-    return style.png(fig)
+    return style.encode_png(fig)
 
 
 def surface_figure(surface: Surface) -> bytes:
@@ -544,7 +549,7 @@ def surface_figure(surface: Surface) -> bytes:
     fig = Figure(figsize=(11.5, 4.9), dpi=150, layout="constrained", facecolor="white")
     panels = fig.subplots(1, 3)
     points_mm = 1e3 * surface.points_m
-    colour = surface_colours(surface)
+    colour = find_point_permittivities(surface)
     low, high = colour_range(surface)
     colours = colormaps["viridis"].with_extremes(bad=NO_PERMITTIVITY)
     coloured = None
@@ -573,10 +578,10 @@ def surface_figure(surface: Surface) -> bytes:
         bar.set_label("permittivity, real part", fontsize=9, color=style.MUTED)
     lines = [segment_text(segment) for segment in surface.segments[:MAX_LINES]]
     fig.supxlabel("\n".join(lines), fontsize=9, color=style.INK, x=0.01, ha="left")
-    return style.png(fig)
+    return style.encode_png(fig)
 
 
-def surface_colours(surface: Surface) -> npt.NDArray[np.float64]:
+def find_point_permittivities(surface: Surface) -> npt.NDArray[np.float64]:
     """Return the real part of the permittivity of each point's segment, [n]; not a number without one."""
     colours = np.full(len(surface.segment), np.nan)
     for segment in surface.segments:

@@ -21,10 +21,10 @@ from polysight.report.style import (
     MUTED,
     RIGHT_IN,
     assign_colours,
-    new_figure,
+    encode_png,
+    make_figure,
     patch_colour,
     patch_label,
-    png,
     set_margins,
     short_label,
     style_axes,
@@ -38,8 +38,8 @@ _STYLES: dict[float, dict[str, Any]] = {
     0.68: {"linestyle": "-", "linewidth": 1.2},
     0.95: {"linestyle": "--", "linewidth": 0.8},
 }
-# Room for a patch's number (width, height) and for its point in `permittivity_figure`, in points of 1/72 inch; chosen.
-# A digit is 6 wide and 8 high, so that numbers of two digits may touch; a point with its edge is 6.6.
+# Room for a patch's number (width, height) and for its point in `draw_permittivity_figure`, in points of 1/72 inch;
+# chosen. A digit is 6 wide and 8 high, so that numbers of two digits may touch; a point with its edge is 6.6.
 _LABEL_PT = (9.0, 9.0)
 _POINT_PT = 5.0
 # Places that `place_numbers` tries: rings around the point, and directions on each; chosen.
@@ -118,7 +118,7 @@ def place_numbers(points: Array, obstacles: Array) -> Array:
     return np.array(taken_places).reshape(-1, 2)
 
 
-def permittivity_figure(scan: ProcessedScan) -> bytes | None:
+def draw_permittivity_figure(scan: ProcessedScan) -> bytes | None:
     """Return a PNG of the estimates with ellipses of 68 % and 95 %, and the truth as crosses; None without estimates.
 
     Patches are numbered; a legend names them. Without a covariance, bars show the spread of the pixels.
@@ -129,7 +129,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     colours = assign_colours(scan)
     # Inches; the legend needs a line for each patch.
     size_in = (7.8, max(4.4, 1.5 + 0.19 * len(estimates)))
-    fig = new_figure(*size_in, RIGHT_IN)
+    fig = make_figure(*size_in, RIGHT_IN)
     ax = fig.add_subplot()
     truths = [t for patch, _ in estimates if (t := _find_truth(patch))]
     title = "Permittivity"
@@ -154,7 +154,7 @@ def permittivity_figure(scan: ProcessedScan) -> bytes | None:
     legend = _draw_legend(fig, estimates, colours, bool(truths))
     set_margins(fig, legend.get_window_extent().width / fig.dpi + RIGHT_IN)
     _write_numbers(fig, ax, estimates, truths)
-    return png(fig)
+    return encode_png(fig)
 
 
 def _find_truth(patch: PatchFigures) -> Point | None:

@@ -21,7 +21,7 @@ from markupsafe import Markup, escape
 
 from polysight.materials import UNKNOWN
 from polysight.products import REPORT, ProcessedScan
-from polysight.report.figures import FIGURES, figures, find_masked_positions, surface_figure
+from polysight.report.figures import FIGURES, draw_figures, find_masked_positions, surface_figure
 from polysight.report.style import assign_colours, patch_colour, patch_label, plate_label
 from polysight.results import (
     ErrorBudget,
@@ -74,7 +74,7 @@ UNITS = {"hz": "Hz", "rad": "rad", "deg": "°", "s": "s", "db": "dB", "mm": "mm"
 
 def write_report(out_dir: Path, scan: ProcessedScan) -> Path:
     """Write `report.html` and `figures/*.png` into a folder; return the path of the page."""
-    pictures = figures(scan)
+    pictures = draw_figures(scan)
     if (out_dir / SURFACE).exists():
         pictures["surface"] = surface_figure(read_surface(out_dir / SURFACE))
     for name, data in pictures.items():
@@ -112,7 +112,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
             metal_how = scan.materials.metal_reference.how
     budget = None
     if scan.materials is not None and scan.materials.error_budget:
-        budget = budget_table(scan.materials.error_budget)
+        budget = make_budget_table(scan.materials.error_budget)
     missed_plates: list[str] = []
     if rows:
         missed_plates = [plate.name for plate in scan.plates if plate.name not in plates_found]
@@ -127,7 +127,7 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         images={key: base64.b64encode(pictures.get(key, b"")).decode("ascii") for key in ALTERNATIVE_TEXTS},
         alt=ALTERNATIVE_TEXTS,
         lead=_write_lead(scan),
-        keys=key_numbers(scan, rows),
+        keys=list_key_numbers(scan, rows),
         centre=centre,
         verdict=scan.verdict,
         remedies=_list_remedies(rows),
@@ -137,8 +137,8 @@ def render(scan: ProcessedScan, pictures: dict[str, bytes]) -> str:
         budget=budget,
         replaced=_list_replaced_names(scan),
         missed=missed_plates,
-        quality=quality_tables(to_plain(scan.quality)),
-        coverage=coverage_sentence(find_masked_positions(scan)),
+        quality=make_quality_tables(to_plain(scan.quality)),
+        coverage=describe_coverage(find_masked_positions(scan)),
         config=config,
         rig_file=tomli_w.dumps(scan.facts.instrument or {}),
         provenance=_list_provenance(scan),
@@ -306,7 +306,7 @@ def _format_estimate(estimate: PermittivityFigures) -> dict[str, str]:
     return row
 
 
-def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
+def describe_coverage(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
     """Say how many positions of each board are masked; `masks`: board to bool [row, column]. "" if it is empty."""
     if not masks:
         return ""
@@ -316,7 +316,7 @@ def coverage_sentence(masks: dict[str, npt.NDArray[np.bool_]]) -> str:
     return f"Positions without data, left out of the images: {', '.join(counts)}."
 
 
-def imaging_table(imaging: Any) -> Table | None:
+def make_imaging_table(imaging: Any) -> Table | None:
     """Return the table of `imaging` of quality.json, a column for each board; None without it."""
     if not isinstance(imaging, dict):
         return None
@@ -391,7 +391,7 @@ def format_heading(key: str) -> str:
     return " ".join(words) + unit
 
 
-def key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+def list_key_numbers(scan: ProcessedScan, rows: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Return the headline figures: value and text."""
     out: list[dict[str, str]] = []
 
@@ -441,14 +441,14 @@ def _compute_received_shares(quality: ScanQuality) -> list[tuple[str, str]]:
     return [(percent(received, expected, 2), f"of {format_value(expected)} frames of recorded rows received")]
 
 
-def quality_tables(quality: dict[str, Any]) -> list[Table]:
+def make_quality_tables(quality: dict[str, Any]) -> list[Table]:
     """Return tables of boards, synchronisation, imaging and times of quality.json, then one of all other keys."""
     shown_elsewhere = {"boards", "seconds_per_stage", "imaging", "verdict", "error_budget"}
     boards = quality.get("boards")
     parts = (
         _tabulate_boards(boards),
         _tabulate_residuals(boards),
-        imaging_table(quality.get("imaging")),
+        make_imaging_table(quality.get("imaging")),
         _tabulate_seconds(quality.get("seconds_per_stage")),
     )
     out = [part for part in parts if part]
@@ -467,7 +467,7 @@ _SOURCES = {
 }
 
 
-def budget_table(budget: ErrorBudget) -> Table | None:
+def make_budget_table(budget: ErrorBudget) -> Table | None:
     """Return the table of the error budget: leakage, plane, angle, evidence for metal; None without any of them."""
     rows = [*_tabulate_leakage(budget.leakage), *_tabulate_incidence(budget.incidence), *_tabulate_plane(budget.plane)]
     metal = budget.metal

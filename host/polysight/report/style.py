@@ -120,7 +120,7 @@ def assign_colours(scan: ProcessedScan) -> dict[str, str]:
     return {**table, "unknown": UNKNOWN_COLOUR}
 
 
-def new_figure(width: float, height: float, right_in: float) -> Figure:
+def make_figure(width: float, height: float, right_in: float) -> Figure:
     """Return a white figure of this size in inches, with :func:`set_margins`."""
     fig = Figure(figsize=(width, height), dpi=160, facecolor="white")
     # The canvas attaches itself to the figure; texts are measured as it draws them.
@@ -300,7 +300,7 @@ def style_legend(legend: Legend) -> None:
         text.set(family=list(font_families()), parse_math=False, color=INK, fontsize=7.5)
 
 
-def png(fig: Figure) -> bytes:
+def encode_png(fig: Figure) -> bytes:
     """Return a figure as PNG bytes without matplotlib's version (`Software`): the same data gives the same file."""
     buffer = io.BytesIO()
     # `savefig` would draw everything twice, the first time only to place the axes; `print_png` places them as it draws.

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from polysight.products import write_json
-from polysight.report.style import INK, MUTED, STAMP_COLOUR, png
+from polysight.report.style import INK, MUTED, STAMP_COLOUR, encode_png
 from polysight.sync import PUBLISHED_STD, STAGES, SyncedRow
 from polysight_shared.files import write_atomically
 
@@ -172,7 +172,7 @@ def figure_png(report: SyncReport, title: str, simulated: bool) -> bytes:
                     -1.1 * max(reach, PUBLISHED_STD[QUANTITIES[i]]), 1.1 * max(reach, PUBLISHED_STD[QUANTITIES[i]])
                 )
             ax.legend(fontsize=7, loc="upper right", frameon=False)
-    return png(fig)
+    return encode_png(fig)
 
 
 def format_report(boards: dict[str, dict[str, Any]], simulated: bool) -> str:

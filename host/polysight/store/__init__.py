@@ -55,7 +55,7 @@ from polysight.store.scan_folder import (
     extract_connection,
     find_damaged_samples,
     lock_samples,
-    new_scan_id,
+    make_scan_id,
     open_npz,
     open_records,
     raw_digest,

@@ -21,7 +21,7 @@ from polysight import capture
 from polysight.store.logs import crc32
 from polysight.store.manifest import BoardRow, DroppedFile, ManifestWriter, RawDropped, Reception, RowCommitted
 from polysight.store.scan_folder import SAMPLES, ScanFolder, dropped_files, utc_now
-from polysight.store.validation import board_faults, to_text
+from polysight.store.validation import find_board_faults, to_text
 from polysight_shared.errors import DataError, DeviceError, ErrorCode, ScanError, quote
 from polysight_shared.files import sync_folder
 
@@ -240,7 +240,7 @@ def _place_row_again(scan: ScanFolder, row: RowCommitted, board: BoardRow) -> tu
     if not board.packets_crc32:
         return replace(unchanged, why_unchanged="its packets were not kept"), None
     try:
-        if faults := board_faults(scan, board, row.pulses):
+        if faults := find_board_faults(scan, board, row.pulses):
             return replace(unchanged, why_unchanged="; ".join(map(to_text, faults)), damaged=True), None
         placed = place_again(path)
     except DataError as e:

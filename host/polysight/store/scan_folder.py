@@ -47,8 +47,8 @@ from polysight.store.manifest import (
     ScanEnded,
     ScanResumed,
     ScanStarted,
+    find_manifest_fault,
     lock_file,
-    manifest_fault,
 )
 from polysight.store.source import HEADER_LOCK, RowData, allocate_pages
 from polysight_shared import __version__
@@ -150,7 +150,7 @@ def _describe_value(value: Any) -> str:
     return repr(value)
 
 
-def new_scan_id() -> str:
+def make_scan_id() -> str:
     """Return a scan id: the start time and four random hex digits."""
     return f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(2)}"
 
@@ -242,7 +242,7 @@ class ScanFolder:
         """
         fact = ScanStarted(
             format=FORMAT,
-            scan_id=scan_id or new_scan_id(),
+            scan_id=scan_id or make_scan_id(),
             simulated=simulated,
             started_utc=utc_now(),
             instrument=to_builtins(instrument),
@@ -329,7 +329,7 @@ class ScanFolder:
         if lost_rows <= sum(fault.facts["lost"] for fault in faults):
             return faults
         problem = f"scan_ended counts {counted} rows, the lines before it commit {len(rows)}"
-        return (*faults, manifest_fault(content.numbers[last], problem, lost_rows))
+        return (*faults, find_manifest_fault(content.numbers[last], problem, lost_rows))
 
     @property
     def rows_absent(self) -> list[int]:

@@ -119,7 +119,7 @@ def describe_damage(scan: scan_folder.ScanFolder, path: Path) -> str:
     for row in scan.committed_rows().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():
-                return "; ".join(map(to_text, board_faults(scan, board, row.pulses)))
+                return "; ".join(map(to_text, find_board_faults(scan, board, row.pulses)))
     return "the manifest has no such committed row"
 
 
@@ -158,11 +158,11 @@ def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]
     if set(row.boards) != boards:
         findings.append(_make_error(row_text, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
-        findings += board_faults(scan, board, pulses)
+        findings += find_board_faults(scan, board, pulses)
     return findings
 
 
-def board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
+def find_board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int) -> list[Finding]:
     """Compare the files of one board's committed row of `frames` frames with the manifest."""
     file_name = board.file
     path = scan.path / board.file

@@ -29,8 +29,8 @@ from polysight.surfaces.window import (
     choose_thinned,
     gather_windows,
     make_echoes,
+    make_empty_echoes,
     maximise,
-    no_echoes,
     pack_values,
     replace_samples,
     select_maxima,
@@ -149,7 +149,7 @@ def find_echoes(board: Samples, gate_m: tuple[float, float]) -> Echoes:
         if worth.any():
             parts += _separate_echoes(fit, search, select_windows(windows, worth))
     if not parts:
-        return no_echoes()
+        return make_empty_echoes()
     echoes = Echoes.join(parts)
     level = np.abs(echoes.amplitude)
     is_strong = level**2 > MIN_POWER * np.percentile(level, 99) ** 2
@@ -313,7 +313,7 @@ def measure_echoes(
             parts.append(_measure_windows(fit, windows, values))
             order.append(part)
     if not parts:
-        return no_echoes(), is_inside
+        return make_empty_echoes(), is_inside
     return Echoes.join(parts)[np.argsort(np.concatenate(order))], is_inside
 
 

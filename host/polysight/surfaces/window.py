@@ -408,7 +408,7 @@ def synthesise(
     return echoes
 
 
-def no_echoes() -> Echoes:
+def make_empty_echoes() -> Echoes:
     """Return an empty set of echoes."""
     return Echoes(
         at_m=np.zeros((0, 3)),

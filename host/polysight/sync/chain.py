@@ -227,7 +227,7 @@ class RowSynchroniser:
 
     def __init__(self, source: Source, rig: Instrument, filters: Mapping[str, hpf.HighPass | None]) -> None:
         # Compiled loops: loaded now, with the warning if there are none, and not by the first of several threads.
-        loops.library()
+        loops.load_library()
         self._source = source
         self.setups = {b.name: BoardSetup.from_rig(rig, b, model=filters.get(b.name)) for b in rig.receivers}
         self._forms: dict[str, CubeForm] = {}

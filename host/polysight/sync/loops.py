@@ -7,8 +7,8 @@
   [position, chirp, sample, 2, rx] as the card sends them, I before Q. Mixing multiplies by
   `exp(-j 2 pi f (n - centre))`, with f in cycles per sample and `centre` the middle of the linear samples.
 * `NumpyLoops`: loops over positions that find the direct path from TX to RX (`direct_path.c`; method: `offsets.py`).
-* `Library` calls `burst.c` and `direct_path.c` through ctypes, which releases the interpreter. :func:`library` returns
-  it, or None and one warning if nothing was compiled; then the slower NumPy form is used.
+* `Library` calls `burst.c` and `direct_path.c` through ctypes, which releases the interpreter. :func:`load_library`
+  returns it, or None and one warning if nothing was compiled; then the slower NumPy form is used.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def search_size(n: int) -> int:
     return 4 ** int(np.ceil(np.log2(1.25 * n) / 2))
 
 
-def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
+def find_strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     """Return the strongest tone of each record, within some hundredths of a bin: FFT peak with parabolic interpolation.
 
     Parameters
@@ -162,7 +162,7 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
     bin_below = spectrum[spectrum_rows, (top - 1) % size]
     bin_value = spectrum[spectrum_rows, top]
     bin_above = spectrum[spectrum_rows, (top + 1) % size]
-    fraction = peak_between(np.abs(bin_below), np.abs(bin_value), np.abs(bin_above))
+    fraction = find_peak_between(np.abs(bin_below), np.abs(bin_value), np.abs(bin_above))
     bin_frequency = np.where(top < size // 2, top, top - size) / size
     # The transform of a symmetrical window is real, so the phase of the bin is that of the tone at the centre.
     amplitude = bin_value * cis(2 * np.pi * bin_frequency * (samples - 1) / 2)
@@ -171,11 +171,11 @@ def strongest(z: NDArray[np.complex64], samples: int) -> Tone:
 
 
 def estimate_tone(z: NDArray[np.complex64]) -> Tone:
-    """Return the strongest tone of each record [..., sample]: FFT, then Newton. Amplitude as in :func:`strongest`."""
+    """Return the strongest tone of each record [..., sample]: FFT, then Newton. Amplitude as `find_strongest`."""
     n = z.shape[-1]
     padded = np.zeros((*z.shape[:-1], search_size(n)), np.complex64)
     padded[..., :n] = z
-    coarse = strongest(padded, n).frequency
+    coarse = find_strongest(padded, n).frequency
     demodulated = z * phasor(-coarse, np.zeros(coarse.shape), n, (n - 1) / 2)
     edges = block_edges(n)
     sums = np.add.reduceat(demodulated, edges[:-1], axis=-1).astype(complex)
@@ -214,7 +214,7 @@ def match(
     reference_chirp = linear_part[np.arange(positions), reference]
     products = np.zeros((positions, chirps, size), np.complex64)
     products[..., :n] = (linear_part * reference_chirp[:, None].conj()).sum(axis=2)
-    tone = strongest(products, n)
+    tone = find_strongest(products, n)
     energy = (linear_part.real**2 + linear_part.imag**2).sum(axis=(2, 3))
     return tone.frequency, tone.amplitude.astype(complex), find_band(reference_chirp), energy
 
@@ -234,10 +234,10 @@ def find_band(chirps: NDArray[np.complex64]) -> NDArray[np.float64]:
     below = smooth[np.arange(positions), (top - 1) % size]
     middle = smooth[np.arange(positions), top]
     above = smooth[np.arange(positions), (top + 1) % size]
-    return (top + peak_between(below, middle, above)) / size % 1.0
+    return (top + find_peak_between(below, middle, above)) / size % 1.0
 
 
-def peak_between(below: Real, middle: Real, above: Real) -> NDArray[np.float64]:
+def find_peak_between(below: Real, middle: Real, above: Real) -> NDArray[np.float64]:
     """Return the place of the maximum between three values [any], relative to the middle one, by a parabola; or 0."""
     bend = below.astype(np.float64) - 2 * middle + above
     return np.divide(0.5 * (below - above), bend, out=np.zeros(bend.shape), where=bend < 0)
@@ -681,7 +681,7 @@ def _convert_argument(value: NDArray[Any] | float) -> Any:
     return ctypes.c_void_p(value.ctypes.data)
 
 
-def library() -> Library | None:
+def load_library() -> Library | None:
     """Return the compiled loops; None, and one warning, if they cannot be used."""
     with _lock:
         return _load()

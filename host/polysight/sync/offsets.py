@@ -202,7 +202,7 @@ def align_pieces(
 def _choose_loop(chirps: int, rx: int) -> Align:
     """Return the compiled alignment if it supports these numbers, otherwise that in NumPy."""
     is_supported = rx == loops.RX and chirps <= loops.MOST_CHIRPS
-    library = loops.library() if is_supported else None
+    library = loops.load_library() if is_supported else None
     return library.align if library else align_in_numpy
 
 
@@ -547,7 +547,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
     n = (b - a) // FOLD
     # The compiled search has room for as many blocks as its transform.
     is_supported = len(path.beam) == loops.RX and n <= SEARCH_FFT
-    run = by or (loops.library() if is_supported else None) or NumpyLoops
+    run = by or (loops.load_library() if is_supported else None) or NumpyLoops
     good_chirps = aligned.good.sum(axis=1)
     usable = good_chirps > 0
     first = run.find(

@@ -164,7 +164,7 @@ def _make_entries(
     entries = []
     for scan in scans:
         try:
-            entries += materials.entries_of_boxes(scan, angles[scan.scan])
+            entries += materials.make_entries_of_boxes(scan, angles[scan.scan])
         except DataError as e:
             notices.append(f"left out: {e.what}")
     return entries
@@ -178,7 +178,7 @@ def _find_angle(folder: Path, scan: materials.LabelledScan, base: Instrument, no
             rig, notices_of_rig = build_rig(read_settings(path), base, path)
             notices += notices_of_rig
             return incidence_deg(rig, rig.receivers[0])
-    if (angle := materials.angle_in_text([scan.description, scan.scan])) is not None:
+    if (angle := materials.find_angle_in_text([scan.description, scan.scan])) is not None:
         return angle
     angle = incidence_deg(base, base.receivers[0])
     notices.append(f"{scan.scan}: no file has its incidence angle; that of the rig file is used, {angle:.1f} degrees")
@@ -366,7 +366,7 @@ def train_authors(folder: Path, config: Path, out: Path) -> int:
     library = materials.Library(tuple(fitted), {"angles": fits}, library.note)
     library.save(out)
     head = f"{out}: {len(library.entries)} patches of {len(library.names)} materials from {len(library.scans)} scans"
-    print_lines([head, *materials.accuracy_lines(library)])
+    print_lines([head, *materials.describe_accuracy(library)])
     return 0
 
 

@@ -21,7 +21,7 @@ from matplotlib.patheffects import withStroke
 
 from polysight.jobs.demo import run_simulator
 from polysight.jobs.train import EDGE_MM
-from polysight.materials import KnownScene, MaterialsResult, TruthPlate, patches_from_plates, read_truth
+from polysight.materials import KnownScene, MaterialsResult, TruthPlate, make_patches_from_plates, read_truth
 from polysight.pipeline import Pipeline
 from polysight.polarimetry import ratio_from_permittivity
 from polysight.products import ProcessedScan
@@ -85,7 +85,7 @@ def process_scan(source: RawSource, plates: tuple[TruthPlate, ...]) -> Imaged:
         pipeline.add_row(row)
     images = pipeline.form_images()
     metal = next(p for p in plates if p.metal)
-    labelled_patches, _ = patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
+    labelled_patches, _ = make_patches_from_plates(plates, images.x_m, images.y_m, EDGE_MM)
     result = pipeline.find_materials(images, KnownScene(labelled_patches, metal.box_mm, plates=plates))
     return Imaged(result, images.x_m, images.y_m)
 

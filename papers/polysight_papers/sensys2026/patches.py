@@ -30,7 +30,7 @@ from polysight.materials import (
     Model,
     Samples,
     calibration_error,
-    feature_matrix,
+    make_features,
     score,
     split_by_angle,
 )
@@ -96,7 +96,7 @@ class Pixels:
         names = np.array([m.name for m in self.materials])
         # A row for each pixel: four features, material, scan (the group), number of the patch, specimen.
         return Samples(
-            feature_matrix(self.h, self.v, self.h / self.v).reshape(-1, 4),
+            make_features(self.h, self.v, self.h / self.v).reshape(-1, 4),
             names[material.ravel()],
             np.array([f"scan {i + 1}" for i in scan.ravel()]),
             (scan * len(self.materials) + material).ravel(),
@@ -366,7 +366,7 @@ def _find_outside(test_samples: Samples, training_samples: Samples) -> npt.NDArr
 def _patch_features(samples: Samples) -> tuple[Real, npt.NDArray]:
     """Return mean ln|H|, ln|V| and arg 1/P under each angle, [patch, 3 * angles], and the patches' names.
 
-    1/P, because samples hold it instead of P (`feature_matrix`).
+    1/P, because samples hold it instead of P (`make_features`).
     """
     h, v, inverse = split_by_angle(samples.x)
     x = np.concatenate([np.log(h), np.log(v), np.angle(inverse)], axis=1)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from polysight.jobs.output import steps
 from polysight.products import write_json
-from polysight.report import STAMP_COLOUR, png
+from polysight.report import STAMP_COLOUR, encode_png
 from polysight_papers.sensys2026.classification import fig18, fig20
 from polysight_papers.sensys2026.images import fig4, fig13, fig14, fig19
 from polysight_papers.sensys2026.item import Item, Run, Table
@@ -178,7 +178,7 @@ def make_items(
 def stamped_png(figure: Figure, origin: Origin = SIMULATED) -> bytes:
     """Return a figure as PNG with its origin, such as SIMULATED, above it."""
     figure.suptitle(origin.word.upper(), x=0.995, ha="right", fontsize=9, color=STAMP_COLOUR, fontweight="bold")
-    return png(figure)
+    return encode_png(figure)
 
 
 def write_item(out: Path, item: Item, origin: Origin = SIMULATED) -> dict[str, bytes]:

@@ -20,7 +20,7 @@ from polysight_simulators.cards.card import SimulatedCard
 from polysight_simulators.cards.server import CardServer
 from polysight_simulators.cards.sync_in import StageTrack
 from polysight_simulators.faults import read_faults
-from polysight_simulators.process import announce_ready, command_line, count_from_zero, run_until_stopped
+from polysight_simulators.process import announce_ready, make_parser, parse_count, run_until_stopped
 from polysight_simulators.radars import LineServer, RadarSocket
 from polysight_simulators.scene import (
     Disturbances,
@@ -35,7 +35,7 @@ from polysight_simulators.scene import (
 
 def _make_parser() -> argparse.ArgumentParser:
     """Build the parser of the command line."""
-    parser = command_line(
+    parser = make_parser(
         "polysight_simulators.cards",
         "Radars and capture cards of a simulated rig; `python -m polysight_simulators.rig` starts them.",
         "--config rig/instrument.toml --wires rig/wires.sock --pattern",
@@ -52,7 +52,7 @@ def _make_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--pattern", action="store_true", help="send a counting pattern instead of the scene")
     parser.add_argument("--time-scale", type=float, default=1.0, help="wire time over wall time")
-    parser.add_argument("--seed", type=count_from_zero, default=None, help="default: the scene's")
+    parser.add_argument("--seed", type=parse_count, default=None, help="default: the scene's")
     parser.add_argument("--boards", default="", help="names, with commas; default: every board")
     parser.add_argument("--faults", type=Path, help="TOML file with a [faults] table")
     parser.add_argument("--fault", action="append", default=[], metavar="[BOARD.]KEY=VALUE", help="a single fault")

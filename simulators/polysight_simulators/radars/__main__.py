@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from polysight_simulators.process import command_line
+from polysight_simulators.process import make_parser
 from polysight_simulators.radars.board import FUNCTIONAL_LEVELS, RadarBoard
 from polysight_simulators.radars.cores import make_image
 
@@ -79,7 +79,7 @@ def _list_words(text: str) -> list[int]:
 
 def main() -> int:
     """Return 0 if the simulated board answers the same, 1 if not, 2 if the trace cannot be read."""
-    parser = command_line("polysight_simulators.radars", str(__doc__), "first-day.jsonl")
+    parser = make_parser("polysight_simulators.radars", str(__doc__), "first-day.jsonl")
     parser.add_argument("trace", type=Path, metavar="TRACE", help="file of `polysight radar check BOARD --trace FILE`")
     parser.add_argument("--empty-flash", action="store_true", help="simulate a new board")
     args = parser.parse_args()

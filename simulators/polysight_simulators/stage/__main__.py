@@ -22,7 +22,7 @@ from polysight_shared.errors import DeviceError
 from polysight_shared.units import NS_PER_MS
 from polysight_shared.wires import WireClient
 from polysight_simulators.builds import build_sketch, sketch_compiler
-from polysight_simulators.process import announce_ready, check_link, command_line, run_until_stopped
+from polysight_simulators.process import announce_ready, check_link, make_parser, run_until_stopped
 from polysight_simulators.stage.motion import TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
 
@@ -183,7 +183,7 @@ def serve(
 
 def parser() -> argparse.ArgumentParser:
     """Build the parser of the command line."""
-    argument_parser = command_line(
+    argument_parser = make_parser(
         "polysight_simulators.stage", str(__doc__), "--config instrument.toml --link out/ttySTAGE"
     )
     argument_parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")

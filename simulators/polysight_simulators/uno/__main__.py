@@ -13,14 +13,14 @@ from pathlib import Path
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import PolysightError
 from polysight_shared.program import die_with_parent
-from polysight_simulators.process import check_link, command_line, run_program
+from polysight_simulators.process import check_link, make_parser, run_program
 from polysight_simulators.stage import count_steps_to_zero
 from polysight_simulators.uno import ENABLING_COMMAND, compile_emulator, compile_firmware, list_missing_packages
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run until SIGTERM or SIGINT."""
-    parser = command_line("polysight_simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
+    parser = make_parser("polysight_simulators.uno", str(__doc__), "--config instrument.toml --link out/ttySTAGE")
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="rig file, instrument.toml")
     parser.add_argument(
         "--wires", type=Path, metavar="SOCKET", help="hub of the simulated wires: gets trigger and motion"

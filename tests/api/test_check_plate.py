@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
+from msgspec.structs import replace
 from tests.support.products import name_check_plate
 from tests.support.refusals import expect_refusal
 
@@ -24,6 +25,42 @@ def patch(real: float, loss: float, covariance: list[list[float | None]] | None 
     covariance = covariance or [[0.01, 0.0], [0.0, 0.01]]
     value = PermittivityFigures(real=real, imag=-loss, covariance=covariance)
     return PatchFigures(label=1, box_mm=(10.0, -20.0, 50.0, 20.0), permittivity=value)
+
+
+@pytest.mark.parametrize(
+    ("off", "level"), [(2.44, "good"), (2.46, "warning"), (3.40, "warning"), (3.42, "action"), (-3.42, "action")]
+)
+def test_a_distance_is_in_standard_deviations_of_the_scan_and_of_the_plate(off, level):
+    """Errors of 0.03 and 0.04 are 0.05 together."""
+    plate = replace(PLATE, std=(0.04, 0.04))
+    for real_off, loss_off in ((off, 0.0), (0.0, off)):
+        value = patch(2.05 + 0.05 * real_off, 0.01 + 0.05 * loss_off, [[0.0009, 0.0], [0.0, 0.0009]])
+        result = check_plate(plate, [value])
+        assert result is not None
+        assert result.level == level
+        assert result.sigmas == pytest.approx(abs(off), abs=1e-3)
+        assert result.measured == pytest.approx((2.05 + 0.05 * real_off, 0.01 + 0.05 * loss_off))
+        assert result.measured_std == pytest.approx((0.03, 0.03))
+
+
+@pytest.mark.parametrize(
+    ("place_mm", "is_on_it"),
+    [
+        ((10.0, -20.0), True), ((50.0, 20.0), True), ((9.9, 0.0), False), ((50.1, 0.0), False),
+        ((30.0, -20.1), False), ((30.0, 20.1), False),
+    ],
+)  # fmt: skip
+def test_a_check_plate_lies_where_a_patch_does(place_mm, is_on_it):
+    result = check_plate(replace(PLATE, place_mm=place_mm), [patch(2.05, 0.01)])
+    assert result is not None
+    assert (result.level == "good") == is_on_it
+
+
+def test_a_patch_without_an_error_is_not_judged():
+    value = PermittivityFigures(real=2.05, imag=-0.01)
+    result = check_plate(PLATE, [PatchFigures(label=3, box_mm=(10.0, -20.0, 50.0, 20.0), permittivity=value)])
+    assert result is not None
+    assert (result.level, result.why) == ("missing", "patch 3 there has no permittivity")
 
 
 @pytest.mark.parametrize(

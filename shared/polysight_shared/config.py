@@ -18,8 +18,15 @@ from polysight_shared.tables import Count, NonNegative, Positive, Section, decod
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 # Number of a line of the Pi's GPIO chip, as gpioinfo counts.
 GpioLine = Annotated[int, msgspec.Meta(ge=0, le=63)]
+# Millimetres, up to 10 m (chosen: a rig stands in a room), and degrees. The limits also refuse NaN and infinities.
+Coordinate = Annotated[float, msgspec.Meta(ge=-10_000.0, le=10_000.0)]
+Angle = Annotated[float, msgspec.Meta(ge=-360.0, le=360.0)]
 # X, y, z.
-Vector = tuple[float, float, float]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+# A part of an amplitude relative to the wave that it leaks from.
+Leakage = Annotated[float, msgspec.Meta(ge=-1.0, le=1.0)]
+# Deviation of a frequency: the radar has 76 to 81 GHz.
+Deviation = Annotated[float, msgspec.Meta(ge=-5e9, le=5e9)]
 # Corners of the two high-pass filters that an AWR2243 has (docs/spec/mmwavelink.md).
 HPF_FIRST_KHZ = (175.0, 235.0, 350.0, 700.0)
 HPF_SECOND_KHZ = (350.0, 700.0, 1400.0, 2800.0)
@@ -181,7 +188,7 @@ class MountStep(Section, frozen=True):
     # Vector that is added; None for a rotation.
     shift_mm: Vector | None = None
     # Angle and axis; None for a shift.
-    turn_deg: float | None = None
+    turn_deg: Angle | None = None
     about: Literal["x", "y", "z"] | None = None
 
     def __post_init__(self) -> None:
@@ -197,8 +204,8 @@ class MountStep(Section, frozen=True):
 class Antennas(Section, frozen=True):
     """Antenna positions in the frame of a board, millimetres from RX1."""
 
-    rx_mm: tuple[Vector, ...]
-    tx_mm: tuple[Vector, ...]
+    rx_mm: Annotated[tuple[Vector, ...], msgspec.Meta(min_length=1)]
+    tx_mm: Annotated[tuple[Vector, ...], msgspec.Meta(min_length=1)]
 
 
 class Board(Section, frozen=True):
@@ -222,7 +229,7 @@ class Board(Section, frozen=True):
     # Index in `antennas.tx_mm`, of the transmitting board.
     tx_antenna: Annotated[int, msgspec.Meta(ge=0)] = 1
     # Deviation of its chirp's start from `chirp.start_hz`.
-    start_offset_hz: float = 0.0
+    start_offset_hz: Deviation = 0.0
     # Place in `antennas.rx_mm`, counted from 1, of each recorded RX; empty: in their order.
     rx_order: tuple[Annotated[int, msgspec.Meta(ge=1)], ...] = ()
 
@@ -337,8 +344,8 @@ class Polarimetry(Section, frozen=True):
     Its phases are those of time as exp(+j omega t), where a permittivity with losses is eps' - j eps''.
     """
 
-    leakage_h: tuple[float, float] = (0.0, 0.0)
-    leakage_v: tuple[float, float] = (0.0, 0.0)
+    leakage_h: tuple[Leakage, Leakage] = (0.0, 0.0)
+    leakage_v: tuple[Leakage, Leakage] = (0.0, 0.0)
     leakage_std: NonNegative | None = None
     # Rms magnitude of unmeasured leakage of any phase; 0.058 is the rms of amplitudes distributed uniformly up to 0.1.
     leakage_prior: NonNegative = 0.058
@@ -367,7 +374,7 @@ class CheckPlate(Section, frozen=True):
     name: str = ""
     permittivity: tuple[Positive, NonNegative] = (1.0, 0.0)
     std: tuple[Positive, Positive] = (0.02, 0.02)
-    place_mm: tuple[float, float] = (0.0, 0.0)
+    place_mm: tuple[Coordinate, Coordinate] = (0.0, 0.0)
 
 
 class Limits(Section, frozen=True):

@@ -179,6 +179,12 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
         ("radar", {"servers": {"RH": "rig:1"}}, {"servers": {"RH": "rig:0"}}),
         ("radar", {"servers": {"RH": "rig:1"}}, {"servers": {"unknown": "rig:1"}}),
         ("notify", {"url": "https://a.b/c"}, {"url": "ftp://a.b/c"}),
+        ("antennas", {"rx_mm": [[1e4, -1e4, 0.0]]}, {"rx_mm": [[1.1e4, 0.0, 0.0]]}),
+        ("antennas", {"rx_mm": [[0.0, 0.0, 0.0]]}, {"rx_mm": [[0.0, math.nan, 0.0]]}),
+        ("antennas", {"rx_mm": [[0.0, 0.0, 0.0]]}, {"rx_mm": []}),
+        ("polarimetry", {"leakage_h": [1.0, -1.0]}, {"leakage_h": [1.1, 0.0]}),
+        ("polarimetry", {"leakage_v": [1.0, -1.0]}, {"leakage_v": [0.0, math.nan]}),
+        ("check", {"place_mm": [1e4, -1e4]}, {"place_mm": [math.inf, 0.0]}),
     ],
 )  # fmt: skip
 def test_a_value_at_its_limit_is_taken_and_one_beyond_is_refused(table: str, within: dict, beyond: dict):
@@ -278,6 +284,20 @@ def test_data_of_a_scan_are_counted(rig: Instrument):
     assert rig.recorded_row_bytes == 2 * rig.row_bytes
     assert rig.scan_bytes == 200 * 2 * rig.row_bytes
     assert rig.card.payload_bytes == 1456
+
+
+@pytest.mark.parametrize(
+    ("step", "beyond"),
+    [
+        ({"turn_deg": 360.0, "about": "x"}, {"turn_deg": 361.0, "about": "x"}),
+        ({"turn_deg": -360.0, "about": "x"}, {"turn_deg": math.nan, "about": "x"}),
+        ({"shift_mm": [1e4, 0.0, -1e4]}, {"shift_mm": [0.0, 0.0, 1e300]}),
+    ],
+)
+def test_a_board_is_mounted_in_the_room(step: dict[str, Any], beyond: dict[str, Any]):
+    decode(step, MountStep, "my.toml")
+    with expect_refusal(ErrorCode.VALUE_INVALID):
+        decode(beyond, MountStep, "my.toml")
 
 
 def test_a_board_has_the_name_asked_for(rig: Instrument):

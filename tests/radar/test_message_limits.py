@@ -1,0 +1,182 @@
+"""Messages and commands at the limits of their fields, and events of every kind."""
+
+import binascii
+import struct
+from dataclasses import replace
+
+import msgspec
+import pytest
+from tests.support.radar.boards import make_native_rig
+
+from polysight.radar import messages as m
+from polysight.radar.commands import Channels, DataFormat, Profile, direct_if_hz, make_program
+from polysight_shared.errors import ProtocolError
+from polysight_shared.geometry import direct_path_m
+
+# A message of an empty body, 4 bytes of sync word, 12 of header and 4 of CRC, holds at most 236 bytes of body.
+LARGEST_BODY = 256 - 20
+
+
+def make_command(*sizes: int, **values: int) -> m.Message:
+    """A command of sub-blocks with this many bytes of data each."""
+    blocks = tuple(m.SubBlock(0x4000, bytes(range(1, size + 1))) for size in sizes)
+    return replace(m.command(blocks), **values)
+
+
+def build_device_message(body: bytes, block_count: int) -> bytes:
+    """An event of the RF core with a body as given, valid but for it, and a CRC of 16 bits."""
+    opcode = m.Direction.RF_TO_HOST | m.Kind.EVENT << 4 | 0x80 << 6
+    head = struct.pack("<5H", opcode, 12 + len(body) + 2, 0, 0, block_count)
+    head += m.checksum(head).to_bytes(2, "little")
+    return bytes.fromhex("badccdab") + head + body + binascii.crc_hqx(head + body, 0xFFFF).to_bytes(2, "little")
+
+
+@pytest.mark.parametrize("size", range(1, 9))
+def test_a_body_is_padded_with_ff_to_four_bytes(size):
+    message = make_command(size)
+    raw = m.encode(message)
+    body = raw[16:-4]
+    # Four bytes of a sub-block's own header
+    padding = -(4 + size) % 4
+    assert len(body) == 4 + size + padding
+    assert body[4 + size :] == padding * b"\xff"
+    assert m.decode(raw).blocks == message.blocks
+
+
+def test_a_message_holds_as_much_as_a_chunk():
+    largest = make_command(LARGEST_BODY - 4)
+    raw = m.encode(largest)
+    assert len(raw) == 256
+    assert m.decode(raw).blocks == largest.blocks
+    with pytest.raises(ValueError, match="260 bytes"):
+        m.encode(make_command(LARGEST_BODY - 3))
+
+
+@pytest.mark.parametrize(
+    ("values", "is_taken"),
+    [
+        ({"sequence": 0}, True), ({"sequence": 15}, True), ({"sequence": 16}, False), ({"sequence": -1}, False),
+        ({"message_id": 0}, True), ({"message_id": 1023}, True), ({"message_id": 1024}, False),
+        ({"message_id": -1}, False),
+    ],
+)  # fmt: skip
+def test_fields_of_a_header_have_their_bits(values, is_taken):
+    message = make_command(4, **values)
+    if not is_taken:
+        with pytest.raises(ValueError, match="must be"):
+            m.encode(message)
+        return
+    decoded = m.decode(m.encode(message))
+    assert (decoded.sequence, decoded.message_id) == (message.sequence, message.message_id)
+
+
+def test_sub_blocks_of_a_command_share_one_message_id():
+    """The RF core has the ids below 0x200; each has 32 sub-blocks."""
+    for blocks in ((), (m.SubBlock(0x0040, b""), m.SubBlock(0x0080, b""))):
+        with pytest.raises(ValueError, match="share one message id"):
+            m.command(blocks)
+    assert m.command((m.SubBlock(0x3FFF, b""),)).direction is m.Direction.HOST_TO_RF
+    assert m.command((m.SubBlock(0x4000, b""),)).direction is m.Direction.HOST_TO_MAIN
+
+
+def block(number: int, data: bytes, length: int | None = None) -> bytes:
+    return struct.pack("<2H", number, len(data) + 4 if length is None else length) + data
+
+
+@pytest.mark.parametrize(
+    ("body", "count", "data"),
+    [
+        (block(1, b"abcd"), 1, [b"abcd"]),
+        (block(1, b"abc") + b"\xff", 1, [b"abc"]),
+        (block(1, b"a") + 3 * b"\xff", 1, [b"a"]),
+        (block(1, b"") + block(2, b"xy") + 2 * b"\xff", 2, [b"", b"xy"]),
+        # Four bytes after the last, shorter than its own header, longer than the body, and missing
+        (block(1, b"abcd") + 4 * b"\xff", 1, None),
+        (block(1, b"abcd", length=3) + b"", 1, None),
+        (block(1, b"abcd", length=9), 1, None),
+        (block(1, b"abcd"), 2, None),
+        (block(1, b"abcd") + b"\xff" * 3, 2, None),
+    ],
+)
+def test_a_body_holds_the_sub_blocks_announced_and_up_to_three_bytes(body, count, data):
+    raw = build_device_message(body, count)
+    if data is None:
+        with pytest.raises(ProtocolError, match="sub-block"):
+            m.decode(raw)
+        return
+    assert [part.data for part in m.decode(raw).blocks] == data
+
+
+def test_a_message_shorter_or_longer_than_its_header_says_is_refused():
+    raw = m.encode(make_command(4))
+    for wrong in (raw[:-1], raw + b"\0"):
+        with pytest.raises(ProtocolError):
+            m.decode(wrong)
+    for length in (13, 253):
+        head = struct.pack("<5H", m.Direction.RF_TO_HOST | m.Kind.EVENT << 4, length, 0, 0, 0)
+        with pytest.raises(ProtocolError, match="invalid length"):
+            m.decode_header(bytes.fromhex("badccdab") + head + m.checksum(head).to_bytes(2, "little"))
+
+
+@pytest.mark.parametrize(
+    ("event", "kind", "fatal", "words"),
+    [
+        (m.RF_CPU_FAULT, 3, True, "firmware line 300"),
+        (m.RF_CPU_FAULT, 2, True, "data access abort"),
+        (m.RF_CPU_FAULT, 4, True, "chirp error"),
+        (m.MAIN_CPU_FAULT, 3, True, "firmware fatal error"),
+        (m.RF_CPU_FAULT, 7, True, "code 7"),
+        (m.RF_CPU_FAULT, 255, False, "no fault"),
+    ],
+)
+def test_only_a_fatal_error_of_the_firmware_has_a_line(event, kind, fatal, words):
+    found = m.decode_event(m.SubBlock(event, struct.pack("<BBH", kind, 1, 300)))
+    assert (found.fatal, words in found.detail) == (fatal, True)
+    assert ("firmware line" in found.detail) == ("line" in words)
+
+
+def test_times_of_power_up_are_ticks_of_5_ns():
+    found = m.decode_event(m.SubBlock(m.RF_POWER_UP_DONE, struct.pack("<II", 0xFFFFFFFF, 200_000)))
+    assert found.values["power_up_us"] == pytest.approx(1000.0)
+    assert found.detail == ""
+    found = m.decode_event(m.SubBlock(m.MAIN_POWER_UP, struct.pack("<IQQ", 200_000, 0, 0)))
+    assert found.values["power_up_us"] == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize("names", [("LS", "RH", "RV"), ("M", "A", "Z")])
+def test_the_transmitting_board_alone_has_a_transmitter(names):
+    rig = make_native_rig()
+    boards = tuple(msgspec.structs.replace(board, name=name) for board, name in zip(rig.boards, names, strict=True))
+    native = dict(zip(names, rig.radar.native.values(), strict=True))
+    rig = msgspec.structs.replace(rig, boards=boards, radar=msgspec.structs.replace(rig.radar, native=native))
+    for board in boards:
+        program = make_program(rig, board)
+        tx = 1 << board.tx_antenna if board == rig.transmitter else 0
+        assert (Channels(0b1111, tx) in program.basic, program.transmits) == (True, tx > 0)
+        assert DataFormat(0b1111) in program.basic
+
+
+def test_a_profile_has_the_chirp_of_the_rig_file_and_the_offset_of_its_board():
+    rig = make_native_rig()
+    chirp = msgspec.structs.replace(rig.chirp, hpf1_khz=0.0, hpf2_khz=0.0, sample_rate_hz=2_150_000.0)
+    (profile,) = [part for part in make_program(rig, rig.boards[1]).waveform if isinstance(part, Profile)]
+    assert profile.start_hz == rig.chirp.start_hz + rig.boards[1].start_offset_hz
+    assert rig.boards[1].start_offset_hz > 0
+    assert (profile.hpf1_khz, profile.hpf2_khz) == (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz)
+    # A simulated rig without filters: the radar has the lowest corners.
+    without = msgspec.structs.replace(rig, chirp=chirp)
+    (profile,) = [part for part in make_program(without, rig.boards[1]).waveform if isinstance(part, Profile)]
+    assert (profile.hpf1_khz, profile.hpf2_khz) == (175.0, 350.0)
+    # Samples a second in thousands, in bytes 34 and 35
+    assert struct.unpack_from("<H", profile.data(), 34) == (2150,)
+    assert struct.unpack_from("<H", replace(profile, sample_rate_hz=2_150_900.0).data(), 34) == (2151,)
+
+
+def test_the_direct_path_is_the_mean_over_the_antennas():
+    """Codes of the radar are 53.6 Hz and 48.3 kHz/us wide."""
+    rig = make_native_rig()
+    for board in rig.receivers:
+        paths_m = direct_path_m(rig, board)
+        slope = round(rig.chirp.slope_hz_per_s / 48.2797623e9) * 48.2797623e9
+        expected = slope * sum(paths_m) / len(paths_m) / 299_792_458 + board.start_offset_hz
+        assert direct_if_hz(rig, board) == pytest.approx(expected, abs=60.0)

@@ -82,7 +82,7 @@ def make_uno(uno_programs: tuple[Path, Path]) -> Iterator[Callable[..., Emulated
 @pytest.fixture
 def host(make_uno: Callable[..., EmulatedUno]) -> Host:
     """A host at the serial line of an emulated board; greeted, switched on and homed."""
-    return Host(make_uno(start=(300, 250))).ready()
+    return Host(make_uno(start=(300, 250))).prepare()
 
 
 @pytest.fixture(params=["pc", "sanitized", "python", "uno", "port"])

@@ -40,26 +40,26 @@ COMMANDS = (
 
 
 def test_every_damaged_line_is_refused(talker):
-    talker.ready()
+    talker.prepare()
     for verb, args in COMMANDS:
         talker.run_until_rest()
-        talker.replies()
-        at_rest = talker.status()
-        talker.still()
+        talker.read_replies()
+        at_rest = talker.ask_status()
+        talker.has_stood_still()
         line = Command(talker.sequence + 1, verb, args).encode()
         flips = [line[: i // 8] + bytes([line[i // 8] ^ 1 << i % 8]) + line[i // 8 + 1 :] for i in range(8 * len(line))]
         for damaged in flips + [line[:i] + line[i + 1 :] for i in range(len(line) - 1)]:
             # The empty line ends a line whose end is damaged
-            talker.rx(damaged + b"\n")
-            replies = talker.replies()
+            talker.send(damaged + b"\n")
+            replies = talker.read_replies()
             assert replies, f"{damaged!r}: no answer"
             assert all(r.kind == "error" and r.sequence is None for r in replies), f"{damaged!r}: {replies}"
-            assert talker.still()
-        assert talker.status() == at_rest
+            assert talker.has_stood_still()
+        assert talker.ask_status() == at_rest
         talker.run_ms(20)
-        assert talker.still()
+        assert talker.has_stood_still()
         # Undamaged it is executed
-        assert talker.command(verb, *args).kind == "ok"
+        assert talker.send_command(verb, *args).kind == "ok"
 
 
 CHUNK = 4096
@@ -68,18 +68,18 @@ CHUNK = 4096
 def test_random_bytes(talker, request: pytest.FixtureRequest):
     amount = 1_000_000 if request.config.getoption("--long") else 24_000
     rng = random.Random(amount)
-    talker.ready()
-    talker.still()
+    talker.prepare()
+    talker.has_stood_still()
     for _ in range(-(-amount // CHUNK)):
-        talker.rx(rng.randbytes(CHUNK))
-        assert talker.still()
+        talker.send(rng.randbytes(CHUNK))
+        assert talker.has_stood_still()
         talker.received = b""
     talker.run_ms(200)
-    assert talker.still()
-    talker.resync()
+    assert talker.has_stood_still()
+    talker.resynchronise()
     # Some of the bytes may have been a STOP
-    assert talker.command("CLEAR").kind == "ok"
-    done, _ = talker.motion("MOVE", 500, 400, 4000)
+    assert talker.send_command("CLEAR").kind == "ok"
+    done, _ = talker.run_motion("MOVE", 500, 400, 4000)
     assert (done.kind, done.integer("x"), done.integer("y")) == ("done", 500, 400)
 
 
@@ -87,13 +87,13 @@ def test_almost_lines(talker, request: pytest.FixtureRequest):
     """Random lines of the characters of commands."""
     amount = 10_000 if request.config.getoption("--long") else 300
     rng = random.Random(amount)
-    talker.ready()
-    talker.still()
+    talker.prepare()
+    talker.has_stood_still()
     for _ in range(amount):
         words = [rng.choice(["N", "N1", "N65536", "MOVE", "ROW", "HOME", "-", "-1", "0", "99999999999", "*", "*0000"])]
         words += [
             rng.choice([" ", "", "N2", "MOVE", "1", "-2147483648", "\t", "*FFFF"]) for _ in range(rng.randint(0, 40))
         ]
-        talker.rx("".join(words).encode() + b"\n")
-        assert all(r.kind == "error" for r in talker.replies())
-    assert talker.still()
+        talker.send("".join(words).encode() + b"\n")
+        assert all(r.kind == "error" for r in talker.read_replies())
+    assert talker.has_stood_still()

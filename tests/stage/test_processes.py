@@ -74,12 +74,12 @@ def test_opening_resets(start: Start, speed: float):
     stage = start(speed)
     with closing(PortDriver(str(stage.link), speed)) as driver:
         assert driver.received.startswith(b"polysight-stage")
-        driver.replies()
-        assert driver.command("HELLO").kind == "ok"
+        driver.read_replies()
+        assert driver.send_command("HELLO").kind == "ok"
     with closing(PortDriver(str(stage.link), speed)) as driver:
-        driver.replies()
-        assert driver.command("ENABLE", 1).number == 18
-        assert driver.status().integer("homed") == 0
+        driver.read_replies()
+        assert driver.send_command("ENABLE", 1).number == 18
+        assert driver.ask_status().integer("homed") == 0
     stage.end()
     assert stage.rising == []
 
@@ -94,9 +94,9 @@ def test_signals_end_it_cleanly(start: Start, number: signal.Signals):
 def test_the_stage_ends_when_its_wires_are_closed(start: Start, speed: float):
     stage = start(speed)
     with closing(PortDriver(str(stage.link), speed)) as driver:
-        driver.replies()
+        driver.read_replies()
         for command in (("HELLO",), ("SET", 1, 20_000), ("ENABLE", 1), ("HOME",)):
-            assert driver.command(*command).kind == "ok"
+            assert driver.send_command(*command).kind == "ok"
         stage.wires.shutdown(2)
         stage.process.wait(HANG_S)
 

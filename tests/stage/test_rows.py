@@ -34,7 +34,7 @@ def check_row(wires, x0: int, pitch: int, points: int, y: int, width_us: int):
 @pytest.mark.parametrize("seed", range(6))
 def test_random_rows(stage, seed: int):
     rng = random.Random(seed)
-    stage.ready()
+    stage.prepare()
     for _ in range(4):
         if rng.random() < 0.5:
             rate = rng.choice([31, 100, 640, 3999, 4000, 7001, 20_000])
@@ -46,8 +46,8 @@ def test_random_rows(stage, seed: int):
         reach = abs(pitch) * points + rate * rate // (2 * ACCEL) + 1
         x0 = rng.randint(reach, 160_000 - reach)
         y = rng.randint(0, 100_000)
-        assert stage.command("SET", 2, width_us).kind == "ok"
-        done, wires = stage.motion("ROW", x0, pitch, points, y, rate)
+        assert stage.send_command("SET", 2, width_us).kind == "ok"
+        done, wires = stage.run_motion("ROW", x0, pitch, points, y, rate)
         assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
         assert done.integer("held") == 0
         rising = check_row(wires, x0, pitch, points, y, width_us)
@@ -64,32 +64,32 @@ def test_random_rows(stage, seed: int):
         # At rest the reported motion is where the stage says it is.
         last = list_motions(wires)[-1]
         assert (last.vx_um_s, last.x_um, last.y_um) == (0, done.integer("x") * UM, y * UM)
-    done, wires = stage.motion("MOVE", 0, 0, 10_000)
+    done, wires = stage.run_motion("MOVE", 0, 0, 10_000)
     assert (list_motions(wires)[-1].x_um, list_motions(wires)[-1].y_um) == (0, 0)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_hold_resumes_on_the_exact_grid(stage, seed: int):
     rng = random.Random(seed)
-    stage.ready()
+    stage.prepare()
     x0 = 40_000
     pitch = rng.choice([-300, 300])
     points = 30
     y = 500
     rate = 5000
-    stage.motion("MOVE", x0 - pitch, y, 10_000)
+    stage.run_motion("MOVE", x0 - pitch, y, 10_000)
     stage.wires.clear()
-    assert stage.command("ROW", x0, pitch, points, y, rate).kind == "ok"
+    assert stage.send_command("ROW", x0, pitch, points, y, rate).kind == "ok"
     hold_count = 0
     for _ in range(3):
         stage.run_ms(rng.uniform(350, 650))
-        stage.rx(bytes([Immediate.HOLD]))
+        stage.send(bytes([Immediate.HOLD]))
         stage.run_ms(600)
-        hold_count += stage.status().fields["state"] == "hold"
+        hold_count += stage.ask_status().fields["state"] == "hold"
         assert list_motions(stage.wires)[-1].vx_um_s == 0
-        stage.rx(Immediate.RESUME.sent)
+        stage.send(Immediate.RESUME.sent)
     stage.run_until_rest()
-    (done,) = stage.replies()
+    (done,) = stage.read_replies()
     assert hold_count == 3
     assert (done.integer("points"), done.integer("pulses"), done.integer("held")) == (points, points, 1)
     check_row(stage.wires, x0, pitch, points, y, 20)
@@ -98,10 +98,10 @@ def test_hold_resumes_on_the_exact_grid(stage, seed: int):
 
 @pytest.mark.parametrize("accel", [2_000, 40_000, 400_000])
 def test_ramps_keep_to_the_acceleration(stage, accel: int):
-    stage.ready()
-    assert stage.command("SET", 0, accel).kind == "ok"
+    stage.prepare()
+    assert stage.send_command("SET", 0, accel).kind == "ok"
     stage.wires.clear()
-    _, wires = stage.motion("MOVE", 60_000, 20_000, 6000)
+    _, wires = stage.run_motion("MOVE", 60_000, 20_000, 6000)
     speeds = {m.t_ns: m.vx_um_s / UM for m in list_motions(wires) if m.vx_um_s > 0}
     for (t0, v0), (t1, v1) in itertools.pairwise(speeds.items()):
         assert abs(v1 - v0) <= 1.1 * accel * (t1 - t0) * 1e-9 + 5
@@ -112,16 +112,16 @@ def test_ramps_keep_to_the_acceleration(stage, accel: int):
 
 
 def test_stop_ends_the_triggers_and_keeps_the_position(stage):
-    stage.ready()
+    stage.prepare()
     stage.wires.clear()
-    assert stage.command("ROW", 20_000, 400, 50, 0, 4000).kind == "ok"
+    assert stage.send_command("ROW", 20_000, 400, 50, 0, 4000).kind == "ok"
     stage.run_ms(5_500)
     rising_edges = len([e for e in list_edges(stage.wires) if e.value])
     assert 0 < rising_edges < 50
-    stage.rx(bytes([Immediate.STOP]))
+    stage.send(bytes([Immediate.STOP]))
     stage.run_until_rest()
-    assert [r.kind for r in stage.replies()] == ["alarm"]
-    status = stage.status()
+    assert [r.kind for r in stage.read_replies()] == ["alarm"]
+    status = stage.ask_status()
     rising = [e for e in list_edges(stage.wires) if e.value]
     assert rising_edges <= len(rising) <= rising_edges + 1
     assert status.integer("points") == status.integer("pulses") == len(rising)
@@ -198,6 +198,6 @@ def test_same_words_and_same_wires(both, seed: int):
 def test_same_positions_with_other_screws(both, steps_per_mm: float):
     firmware, python = both(steps_per_mm)
     for driver in (firmware, python):
-        driver.ready()
-        driver.motion("ROW", 3000, 77, 10, 1234, 1111)
+        driver.prepare()
+        driver.run_motion("ROW", 3000, 77, 10, 1234, 1111)
     assert firmware.wires == python.wires

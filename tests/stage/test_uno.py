@@ -61,7 +61,7 @@ def test_random_rows(host, batch: int):
             host.uno.run_ms(rng.uniform(0, 150))
             host.uno.feed(Immediate.RESUME.sent)
         host.uno.run_until_rest()
-        (done,) = host.replies()
+        (done,) = host.read_replies()
         x = done.integer("x")
         hold_count = done.integer("held")
         assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
@@ -69,7 +69,7 @@ def test_random_rows(host, batch: int):
         rising = host.uno.edges[::2]
         falling = host.uno.edges[1::2]
         assert [e.value for e in host.uno.edges] == [1, 0] * points
-        assert [host.at(e) for e in rising] == [(x0 + i * pitch, y) for i in range(points)]
+        assert [host.find_position(e) for e in rising] == [(x0 + i * pitch, y) for i in range(points)]
         steps_to_trigger |= {e.cycle - e.step_cycle for e in rising}
         # A step waits at most for another interrupt to end, and lateness never adds up.
         spacing = abs(pitch) * HZ / rate
@@ -80,7 +80,7 @@ def test_random_rows(host, batch: int):
         assert host.uno.motors == (host.zero[0] + x, host.zero[1] + y, host.zero[1] + y)
     assert max(steps_to_trigger) - min(steps_to_trigger) <= 4 * US
     assert max(steps_to_trigger) <= 4 * US
-    host.motion("MOVE", 0, 0, TOP_RATE)
+    host.run_motion("MOVE", 0, 0, TOP_RATE)
     assert host.uno.motors == (host.zero[0], host.zero[1], host.zero[1])
     assert [t for t in host.uno.troubles if t != "reset"] == []
 
@@ -90,8 +90,8 @@ def test_homing_finds_the_same_zero(host, accel: int):
     """From any position, and at the zero of the simulated rig."""
     host.set(Parameter.ACCEL, accel)
     for x, y in ((900, 700), (377, 1111)):
-        host.motion("MOVE", x, y, 2000)
-        host.motion("HOME")
+        host.run_motion("MOVE", x, y, 2000)
+        host.run_motion("HOME")
         assert host.uno.motors == (count_steps_to_zero(),) * 3
 
 
@@ -100,12 +100,12 @@ def test_backlash_comes_from_below_and_runs_up(host):
     host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
     host.uno.watch(TRIGGER, RIGHT_PUL, X_PUL)
     for y, pitch in ((3000, 100), (2500, -100), (2500, 100), (4000, -100)):
-        host.motion("ROW", 9000, pitch, 5, y, 4000)
-        ys = [host.at(e)[1] for e in host.uno.edges if e.pin == RIGHT_PUL and e.value]
+        host.run_motion("ROW", 9000, pitch, 5, y, 4000)
+        ys = [host.find_position(e)[1] for e in host.uno.edges if e.pin == RIGHT_PUL and e.value]
         assert len(ys) >= 700
         # The last of y's steps go upwards
         assert ys[-700:] == list(range(y - 699, y + 1))
-        xs = [host.at(e)[0] for e in host.uno.edges if e.pin == X_PUL and e.value]
+        xs = [host.find_position(e)[0] for e in host.uno.edges if e.pin == X_PUL and e.value]
         first = xs.index(9000) if pitch > 0 else len(xs) - 1 - xs[::-1].index(9000)
         x_before = xs[first - 700 : first]
         assert len({b - a for a, b in itertools.pairwise(x_before)}) == 1  # so do those of x in the row's direction
@@ -121,22 +121,24 @@ def test_a_short_hold_is_reported_and_costs_no_step(host):
         host.uno.run_ms(83)
         host.uno.feed(bytes([Immediate.HOLD]) + Immediate.RESUME.sent)
     host.uno.run_until_rest()
-    (done,) = host.replies()
+    (done,) = host.read_replies()
     assert [done.integer(k) for k in ("points", "pulses", "held")] == [60, 60, 1]
-    assert [host.at(e) for e in host.uno.edges if e.value] == [(3000 + 100 * i, 0) for i in range(60)]
+    assert [host.find_position(e) for e in host.uno.edges if e.value] == [(3000 + 100 * i, 0) for i in range(60)]
 
 
 @pytest.mark.parametrize("chatty", [False, True])
 def test_no_command_is_lost_silently(host, chatty: bool):
     """A host that does not wait for answers: every line is answered, or a loss is reported."""
-    lines = [host.line("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.line("CLEAR") for i in range(100)]
+    lines = [
+        host.encode_command("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.encode_command("CLEAR") for i in range(100)
+    ]
     # Six times as many bytes of answers, so that the board is busy writing
     gap = b"?\n" * 12 if chatty else b""
     host.uno.feed(b"".join(gap + line for line in lines))
     host.uno.settle()
     host.uno.run_until_rest()
     host.uno.run_ms(300)
-    replies = host.replies()
+    replies = host.read_replies()
     answered = {r.sequence for r in replies if r.kind in ("ok", "error") and r.sequence is not None}
     unread = [r for r in replies if r.kind == "error" and r.sequence is None]
     expected_sequence = set(range(host.sequence - 99, host.sequence + 1))
@@ -146,17 +148,21 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     assert (answered == expected_sequence) != chatty
     # The conversation continues: greet, then any number may follow.
     host.uno.feed(b"\n")
-    host.replies()
-    assert host.command("HELLO").kind == "ok"
+    host.read_replies()
+    assert host.send_command("HELLO").kind == "ok"
     host.must_obey("CLEAR")
 
 
 def test_a_second_command_on_its_way_is_answered(host):
-    host.uno.feed(host.line("MOVE", 400, 0, 4000) + host.line("MOVE", 0, 0, 4000) + host.line("CLEAR"))
+    host.uno.feed(
+        host.encode_command("MOVE", 400, 0, 4000)
+        + host.encode_command("MOVE", 0, 0, 4000)
+        + host.encode_command("CLEAR")
+    )
     host.uno.run_until_rest()
-    kinds = [(r.kind, r.number) for r in host.replies()]
+    kinds = [(r.kind, r.number) for r in host.read_replies()]
     assert kinds == [("ok", 0), ("error", 7), ("error", 7), ("done", 0)]
-    assert host.status().integer("x") == 400
+    assert host.ask_status().integer("x") == 400
 
 
 @pytest.mark.parametrize(("mask", "number"), [(1, 12), (2, 12), (4, 14)])
@@ -165,20 +171,20 @@ def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest
     rng = random.Random(mask)
     host.must_obey("MOVE", 200, 200, 4000)
     host.uno.run_until_rest()
-    host.replies()
+    host.read_replies()
     for _ in range(100 if request.config.getoption("--long") else 3):
         host.must_obey("MOVE", 900, 900, 2000)
         host.uno.run(rng.randint(20 * MS, 200 * MS))
         host.uno.press(mask)
         host.uno.run_ms(60)
-        assert [(r.kind, r.number) for r in host.replies()] == [("alarm", number)]
+        assert [(r.kind, r.number) for r in host.read_replies()] == [("alarm", number)]
         host.uno.press(0)
         host.uno.run_ms(8)
         host.must_obey("CLEAR")
         # The emergency stop has switched the motors off as well.
-        assert host.command("MOVE", 0, 0, 4000).number == (19 if number == 14 else 8)
+        assert host.send_command("MOVE", 0, 0, 4000).number == (19 if number == 14 else 8)
         host.must_obey("ENABLE", 1)
-        host.motion("HOME")
+        host.run_motion("HOME")
 
 
 def test_damaged_lines_do_not_disturb_a_row(host):
@@ -194,8 +200,8 @@ def test_damaged_lines_do_not_disturb_a_row(host):
         host.uno.feed(bytes(damaged) + b"\n")
         host.uno.run_ms(10)
     host.uno.run_until_rest()
-    replies = host.replies()
+    replies = host.read_replies()
     assert replies[-1].kind == "done"
     assert all(r.kind == "error" and r.sequence is None for r in replies[:-1])
     rising = [e for e in host.uno.edges if e.value]
-    assert [host.at(e) for e in rising] == [(4000 + 200 * i, 500) for i in range(60)]
+    assert [host.find_position(e) for e in rising] == [(4000 + 200 * i, 500) for i in range(60)]

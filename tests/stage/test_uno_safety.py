@@ -60,7 +60,7 @@ def test_other_traffic_is_not_a_heartbeat(host, kind: str):
     host.uno.feed(b"\n")
     host.uno.run_ms(20)
     host.uno.received.clear()
-    status = host.status()
+    status = host.ask_status()
     assert (status.integer("alarm"), status.integer("homed")) == (StageError.HEARTBEAT_LOST, 0)
 
     host.uno.edges.clear()
@@ -68,7 +68,7 @@ def test_other_traffic_is_not_a_heartbeat(host, kind: str):
     assert host.uno.edges == []
 
     host.must_obey("CLEAR")
-    assert host.command("MOVE", 0, 0, 4000).number == StageError.NOT_HOMED
+    assert host.send_command("MOVE", 0, 0, 4000).number == StageError.NOT_HOMED
 
 
 @pytest.mark.parametrize("verb", ["MOVE", "ROW", "HOME"])
@@ -76,7 +76,7 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     """The main program hangs during motion: the motors stop, and the position is unknown."""
     arguments = {"MOVE": (100_000, 0, TOP_RATE), "ROW": (9000, 400, 100, 0, 4000), "HOME": ()}[verb]
     if verb == "HOME":
-        host.motion("MOVE", 20_000, 20_000, TOP_RATE)
+        host.run_motion("MOVE", 20_000, 20_000, TOP_RATE)
     host.uno.watch(X_PUL, TRIGGER, DRIVERS_OFF)
     host.must_obey(verb, *arguments)
     host.uno.run_ms(800)
@@ -92,18 +92,18 @@ def test_a_program_that_hangs_is_reset_by_the_watchdog(host, verb: str):
     assert host.uno.troubles == ["watchdog"]
     assert [e.cycle for e in host.uno.edges if e.pin == X_PUL and e.value][-1] <= hung + WATCHDOG_MS * MS
     assert [(e.pin, e.value) for e in host.uno.edges][-1] == (DRIVERS_OFF, 1)
-    replies = host.replies()
+    replies = host.read_replies()
     assert replies[0].kind == "banner"
     assert replies[-1].integer("homed") == 0
 
     # After a reset it requires everything again: a greeting, motors on, homing.
-    assert host.command("MOVE", 0, 0, 4000).number == StageError.SEQUENCE
+    assert host.send_command("MOVE", 0, 0, 4000).number == StageError.SEQUENCE
     host.must_obey("HELLO")
-    assert host.command("MOVE", 0, 0, 4000).number == StageError.DISABLED
+    assert host.send_command("MOVE", 0, 0, 4000).number == StageError.DISABLED
     host.must_obey("ENABLE", 1)
-    assert host.command("MOVE", 0, 0, 4000).number == StageError.NOT_HOMED
+    assert host.send_command("MOVE", 0, 0, 4000).number == StageError.NOT_HOMED
     host.set(Parameter.HEARTBEAT, 60_000)
-    host.motion("HOME")
+    host.run_motion("HOME")
 
 
 def test_a_program_that_works_is_never_reset(host):
@@ -115,7 +115,7 @@ def test_a_program_that_works_is_never_reset(host):
             host.uno.feed(bytes([Immediate.STATUS]))
             host.uno.run_ms(25)
         host.uno.run_until_rest()
-        host.replies()
+        host.read_replies()
     assert host.uno.troubles == []
 
 
@@ -137,10 +137,10 @@ def test_a_glitch_is_not_a_switch(host, request: pytest.FixtureRequest, mask: in
             host.uno.press(0)
         glitches += 250
         host.uno.run_until_rest()
-        (answer,) = host.replies()
+        (answer,) = host.read_replies()
         assert (answer.kind, answer.integer("points"), answer.integer("pulses")) == ("done", points, points)
     rising = [e for e in host.uno.edges if e.value]
-    assert [host.at(e) for e in rising[-points:]] == [(4000 + 400 * i, 500) for i in range(points)]
+    assert [host.find_position(e) for e in rising[-points:]] == [(4000 + 400 * i, 500) for i in range(points)]
 
 
 @pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
@@ -162,7 +162,7 @@ def test_a_real_switch_stops_immediately(host, rate: int, mask: int, number: int
     assert not steps or steps[-1] <= pressed + 6 * HZ // rate
     host.uno.press(0)
     host.uno.run_ms(50)
-    assert [(r.kind, r.number) for r in host.replies()] == [("alarm", number)]
+    assert [(r.kind, r.number) for r in host.read_replies()] == [("alarm", number)]
 
 
 def test_no_stray_byte_ends_a_hold(host):
@@ -172,7 +172,7 @@ def test_no_stray_byte_ends_a_hold(host):
     host.uno.run_ms(1200)
     host.uno.feed(bytes([Immediate.HOLD]))
     host.uno.run_until_rest()
-    host.replies()
+    host.read_replies()
     host.uno.edges.clear()
     for byte in set(range(256)) - {Immediate.STOP}:
         host.uno.feed(bytes([byte]) + b"\n")
@@ -181,28 +181,28 @@ def test_no_stray_byte_ends_a_hold(host):
     assert host.uno.edges == []
     host.uno.feed(Immediate.RESUME.sent)
     host.uno.run_until_rest()
-    assert host.replies()[-1].kind == "done"
+    assert host.read_replies()[-1].kind == "done"
 
 
 @pytest.mark.parametrize("accel", [400, 2_000, 40_000])
 def test_homing_overruns_the_switch_by_little(host, accel: int):
     """Homing overruns the switch by about a millimetre, which a switch tolerates, at any acceleration of the rows."""
-    host.motion("MOVE", 12_000, 300, TOP_RATE)
+    host.run_motion("MOVE", 12_000, 300, TOP_RATE)
     host.set(Parameter.ACCEL, accel)
     host.uno.watch(X_PUL)
     host.uno.edges.clear()
     host.must_obey("HOME")
     host.uno.run_until_rest()
-    host.replies()
+    host.read_replies()
     lowest = min(e.x for e in host.uno.edges)
     # Steps after the closing point, 200 of which are 1 mm.
     assert -250 <= lowest <= 0
-    assert host.motion("ROW", 6000, 200, 3, 500, 1000).integer("points") == 3
+    assert host.run_motion("ROW", 6000, 200, 3, 500, 1000).integer("points") == 3
 
 
 def test_homing_reports_the_lost_steps(host):
-    host.motion("MOVE", 9000, 700, TOP_RATE)
+    host.run_motion("MOVE", 9000, 700, TOP_RATE)
     host.uno.slip(-7, 12)
-    answer = host.motion("HOME")
+    answer = host.run_motion("HOME")
     assert (answer.integer("lostx"), answer.integer("losty")) == (-7, 12)
-    assert (host.motion("HOME").integer("lostx"), answer.integer("x"), answer.integer("y")) == (0, 0, 0)
+    assert (host.run_motion("HOME").integer("lostx"), answer.integer("x"), answer.integer("y")) == (0, 0, 0)

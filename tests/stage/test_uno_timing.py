@@ -55,7 +55,7 @@ def measure_busiest_step(host: Host) -> int:
                 host.uno.feed(bytes([byte]) * 4)
                 host.uno.run_ms(30)
             host.uno.run_until_rest()
-            assert host.replies()[-1].kind == "done"
+            assert host.read_replies()[-1].kind == "done"
         cost = host.uno.read_cost()
         # 8 us: longest wait of a step
         assert max(v for k, v in cost.interrupts.items() if k != STEP_VECTOR) <= 128
@@ -77,7 +77,7 @@ def test_interrupt_cost_with_another_compiler(make_uno, folder: Path | None):
     """The same for the image that another avr-gcc makes."""
     if folder is None:
         pytest.skip("no other avr-gcc: the Arduino IDE's is looked for in ~/.arduino15, others in POLYSIGHT_AVR_GCC")
-    host = Host(make_uno(start=(300, 250), image=compile_firmware(folder))).ready()
+    host = Host(make_uno(start=(300, 250), image=compile_firmware(folder))).prepare()
     assert measure_busiest_step(host) <= HZ // TOP_RATE - MARGIN
 
 
@@ -96,7 +96,7 @@ def test_top_rate_is_kept(host):
     cruise = times[2000:18_000]
     late = [t - i * HZ / TOP_RATE for i, t in enumerate(cruise)]
     assert max(late) - min(late) <= 30 * US
-    assert host.replies()[-1].kind == "done"
+    assert host.read_replies()[-1].kind == "done"
 
 
 @pytest.mark.parametrize("byte", [Immediate.HOLD, Immediate.STOP])
@@ -120,21 +120,21 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     paces = [(b - a) / 20 for a, b in zip(late_edges, late_edges[20:], strict=False)]
     assert not paces or min(paces) > 1.01 * HZ / rate
     assert times[-1] <= sent + 20 * MS + 1.1 * HZ * rate / accel
-    assert [r.number for r in host.replies()] == ([15] if byte == Immediate.STOP else [])
+    assert [r.number for r in host.read_replies()] == ([15] if byte == Immediate.STOP else [])
 
 
 def test_half_a_second_of_silence_is_the_default(host):
     """A board after reset, without SET HEARTBEAT, that is homed."""
-    host.motion("MOVE", 20_000, 0, 8000)
+    host.run_motion("MOVE", 20_000, 0, 8000)
     host.uno.reset()
     host.uno.run_ms(5)
-    assert [r.kind for r in host.replies()] == ["banner"]
+    assert [r.kind for r in host.read_replies()] == ["banner"]
     host.must_obey("HELLO")
     host.must_obey("ENABLE", 1)
     host.uno.watch(X_PUL)
     silent_from = host.uno.cycle
     host.must_obey("HOME")
     host.uno.run_until_rest()
-    assert [(r.kind, r.number) for r in host.replies()] == [("alarm", 11)]
+    assert [(r.kind, r.number) for r in host.read_replies()] == [("alarm", 11)]
     steps = [e.cycle for e in host.uno.edges if e.value]
     assert silent_from + 500 * MS < steps[-1] <= silent_from + (500 + 100 + 15) * MS  # with the command's own time

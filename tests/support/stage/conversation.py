@@ -26,7 +26,7 @@ class Conversation:
 
     def send(self, texts: list[str]) -> None:
         """Send the bytes of these texts in one piece."""
-        self.stage.rx(b"".join([self._bytes(text) for text in texts]))
+        self.stage.send(b"".join([self._bytes(text) for text in texts]))
 
     def _bytes(self, text: str) -> bytes:
         """Return the bytes of a text to send: a byte's name, a string, `sealed` and a string, `again` or a command."""
@@ -52,10 +52,10 @@ class Conversation:
     def expect(self, text: str) -> None:
         """Wait for a line and compare it: `#` is the last line's number, `#VERB` that verb's, `?` any value."""
         if text == "silence":
-            self.stage.linger()
+            self.stage.collect_late_bytes()
             assert self.stage.received == b""
             return
-        self.stage.until(lambda: b"\n" in self.stage.received)
+        self.stage.wait_until(lambda: b"\n" in self.stage.received)
         line, newline, self.stage.received = self.stage.received.partition(b"\n")
         text = re.sub(r"#([A-Z]+)", lambda m: str(self.by_verb[m[1]]), text).replace("#", str(self.sequence))
         assert re.fullmatch(re.escape(text).replace(r"\?", r"[-+.:A-Za-z0-9]+"), unseal(line + newline)), (
@@ -92,7 +92,7 @@ def play(stage, path: Path) -> None:
                 talk.act(texts[0])
         except (AssertionError, ProtocolError) as e:
             pytest.fail(f"{path.name}:{number}: {sign} {texts[-1]}: {e}")
-    stage.linger()
+    stage.collect_late_bytes()
     assert stage.received == b"", f"{path.name}: not expected"
 
 

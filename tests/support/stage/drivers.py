@@ -33,7 +33,7 @@ def list_motions(wires: list[WireMessage]) -> list[WireMotion]:
 class Driver:
     """Sends lines, advances the time, and collects the replies.
 
-    Each kind has `rx` (bytes to the stage), `run` (ticks), `rest` (until nothing moves), `press` (mask of switches),
+    Each kind has `send` (bytes to the stage), `run` (ticks), `rest` (until nothing moves), `press` (mask of switches),
     `slip` (steps lost in x and y) and `reset`.
     """
 
@@ -46,14 +46,14 @@ class Driver:
     def close(self) -> None:
         return
 
-    def until(self, there: Callable[[], bool]) -> None:
+    def wait_until(self, there: Callable[[], bool]) -> None:
         """Wait until a condition holds for the received bytes. In virtual time no further bytes can come."""
         assert there(), f"received {self.received!r}"
 
-    def linger(self) -> None:
+    def collect_late_bytes(self) -> None:
         """Wait for bytes still under way. In virtual time there are none."""
 
-    def still(self) -> bool:
+    def has_stood_still(self) -> bool:
         """True if nothing has moved and no trigger was sent since the last call."""
         quiet = not self.wires
         self.wires.clear()
@@ -62,57 +62,61 @@ class Driver:
     def run_ms(self, ms: float) -> None:
         self.run(round(ms * TICKS_PER_MS))
 
-    def replies(self) -> list[Reply]:
+    def read_replies(self) -> list[Reply]:
         """Everything received since the last call."""
         lines = self.received.splitlines(keepends=True)
         self.received = b""
         return [Reply.decode(line) for line in lines]
 
-    def line(self, verb: str, *args: int) -> bytes:
+    def encode_command(self, verb: str, *args: int) -> bytes:
         """The bytes of the next command."""
         self.sequence = (self.sequence + 1) % 65536
         return Command(self.sequence, verb, args).encode()
 
-    def command(self, verb: str, *args: int) -> Reply:
+    def send_command(self, verb: str, *args: int) -> Reply:
         """Send the next command and return its only answer."""
-        self.rx(self.line(verb, *args))
-        (reply,) = self.replies()
+        self.send(self.encode_command(verb, *args))
+        (reply,) = self.read_replies()
         assert reply.sequence == self.sequence
         return reply
 
-    def motion(self, verb: str, *args: int) -> tuple[Reply, list[WireMessage]]:
+    def run_motion(self, verb: str, *args: int) -> tuple[Reply, list[WireMessage]]:
         """Send a valid motion command, wait for its end; return the last reply and the changes of the wires."""
         self.wires.clear()
-        reply = self.command(verb, *args)
+        reply = self.send_command(verb, *args)
         assert reply.kind == "ok", reply
         self.run_until_rest()
-        *_, last = self.replies()
+        *_, last = self.read_replies()
         return last, list(self.wires)
 
-    def status(self) -> Reply:
+    def ask_status(self) -> Reply:
         """Ask for the status; everything else that was received is kept."""
         messages_before = self.received
         self.received = b""
-        self.rx(bytes([Immediate.STATUS]))
-        self.until(lambda: b"status " in self.received)
+        self.send(bytes([Immediate.STATUS]))
+        self.wait_until(lambda: b"status " in self.received)
         status = next(line for line in self.received.splitlines(keepends=True) if line.startswith(b"status "))
         self.received = messages_before + self.received.replace(status, b"", 1)
         return Reply.decode(status)
 
-    def resync(self) -> None:
+    def resynchronise(self) -> None:
         """Greet again and drop everything received before the answer."""
-        hello = self.line("HELLO")
+        hello = self.encode_command("HELLO")
         answer = b"ok N%d " % self.sequence
-        self.rx(b"\n" + hello)
-        self.until(lambda: answer in self.received)
+        self.send(b"\n" + hello)
+        self.wait_until(lambda: answer in self.received)
         *_, self.received = self.received.partition(answer)[2].partition(b"\n")
 
-    def ready(self, heartbeat_ms: int = 60_000) -> Driver:
+    def prepare(self, heartbeat_ms: int = 60_000) -> Driver:
         """Greeted, switched on and homed."""
-        self.replies()
-        answers = [self.command("HELLO"), self.command("SET", 1, heartbeat_ms), self.command("ENABLE", 1)]
+        self.read_replies()
+        answers = [
+            self.send_command("HELLO"),
+            self.send_command("SET", 1, heartbeat_ms),
+            self.send_command("ENABLE", 1),
+        ]
         assert [r.kind for r in answers] == ["ok"] * 3
-        last, _ = self.motion("HOME")
+        last, _ = self.run_motion("HOME")
         assert last.kind == "done"
         return self
 
@@ -146,7 +150,7 @@ class FirmwareDriver(Driver):
         self._process.stdin.flush()
         self._collect()
 
-    def rx(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         for i in range(0, len(data), 1024):
             self._do(f"rx {data[i : i + 1024].hex()}")
 
@@ -189,7 +193,7 @@ class PythonDriver(Driver):
         self._stage.replies.clear()
         self.t_ns = self._stage.tick * NS_PER_TICK
 
-    def rx(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self._stage.receive(data)
         self._collect()
 
@@ -238,7 +242,7 @@ class UnoDriver(Driver):
         self.received += data
         self.t_ns = self.uno.cycle * 125 // 2
 
-    def rx(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         for i in range(0, len(data), 1024):
             self._written += self._port.write(data[i : i + 1024]) or 0
             self._collect()
@@ -261,7 +265,7 @@ class UnoDriver(Driver):
         self.uno.reset()
         self._collect()
 
-    def still(self) -> bool:
+    def has_stood_still(self) -> bool:
         quiet = not self.uno.edges and self.uno.motors == self._stood
         self.uno.edges.clear()
         self._stood = self.uno.motors
@@ -298,27 +302,27 @@ class PortDriver(Driver):
 
     def _listen_for_banner(self) -> None:
         """Wait for the banner: opening the port resets the board. Bytes before it are dropped."""
-        self.until(lambda: b"polysight-stage" in self.received)
+        self.wait_until(lambda: b"polysight-stage" in self.received)
         self.received = self.received[self.received.index(b"polysight-stage") :]
 
-    def until(self, there: Callable[[], bool]) -> None:
+    def wait_until(self, there: Callable[[], bool]) -> None:
         limit = read_idle_s() + LIMIT_S
         while not there():
             if read_idle_s() > limit:
                 raise ProtocolError(f"not within {LIMIT_S:g} s; received {self.received!r}")
             self._listen()
 
-    def linger(self) -> None:
+    def collect_late_bytes(self) -> None:
         self._listen(0.2)
 
-    def rx(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         """Send bytes and wait for the answers: one for each line and one for a single STATUS byte."""
         *lines, self._sent = (self._sent + data).split(b"\n")
         answers = sum(bool(line.translate(None, bytes(Immediate))) for line in lines)
         answers += data == bytes([Immediate.STATUS])
         complete = self.received.count(b"\n")
         self._port.write(data)
-        self.until(lambda: self.received.count(b"\n") >= complete + answers)
+        self.wait_until(lambda: self.received.count(b"\n") >= complete + answers)
 
     def run(self, ticks: int) -> None:
         self._listen(ticks / TICK_HZ / self._speed)
@@ -327,7 +331,7 @@ class PortDriver(Driver):
         """Request the status until the stage rests; these answers are not kept."""
         limit = read_idle_s() + max(limit_ticks / TICK_HZ / self._speed, LIMIT_S)
         while read_idle_s() < limit:
-            if self.status().fields["state"] in ("idle", "alarm", "hold"):
+            if self.ask_status().fields["state"] in ("idle", "alarm", "hold"):
                 return
             self._listen(0.1 / self._speed)
         raise ProtocolError("the stage does not come to rest")
@@ -357,48 +361,48 @@ class Host(Driver):
         self.uno = uno
         self.zero = (0, 0)
 
-    def rx(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self.uno.feed(data)
 
     def run_until_rest(self) -> None:
         self.uno.run_until_rest()
 
-    def replies(self) -> list[Reply]:
+    def read_replies(self) -> list[Reply]:
         self.uno.settle()
         self.received = bytes(self.uno.received)
         self.uno.received.clear()
-        return super().replies()
+        return super().read_replies()
 
-    def status(self) -> Reply:
-        self.rx(bytes([Immediate.STATUS]))
-        (*_, last) = self.replies()
+    def ask_status(self) -> Reply:
+        self.send(bytes([Immediate.STATUS]))
+        (*_, last) = self.read_replies()
         assert last.kind == "status"
         return last
 
     def must_obey(self, verb: str, *args: int) -> None:
-        assert self.command(verb, *args).kind == "ok"
+        assert self.send_command(verb, *args).kind == "ok"
 
     def set(self, parameter: Parameter, value: int) -> None:
         self.must_obey("SET", int(parameter), value)
 
-    def motion(self, verb: str, *args: int) -> Reply:
+    def run_motion(self, verb: str, *args: int) -> Reply:
         self.uno.edges.clear()
-        done, _ = super().motion(verb, *args)
+        done, _ = super().run_motion(verb, *args)
         assert (done.kind, done.sequence) == ("done", self.sequence), done
         return done
 
-    def ready(self) -> Host:
-        assert [r.kind for r in self.replies()] == ["banner"]
+    def prepare(self) -> Host:
+        assert [r.kind for r in self.read_replies()] == ["banner"]
         self.must_obey("HELLO")
         self.set(Parameter.HEARTBEAT, 60_000)
         self.must_obey("ENABLE", 1)
-        self.motion("HOME")
+        self.run_motion("HOME")
         x, left_motor, right = self.uno.motors
         assert left_motor == right
         self.zero = (x, left_motor)
         return self
 
-    def at(self, edge: PinEdge) -> tuple[int, int]:
+    def find_position(self, edge: PinEdge) -> tuple[int, int]:
         """Return the position of the motors at an edge, in the firmware's coordinates."""
         assert edge.left == edge.right
         return edge.x - self.zero[0], edge.left - self.zero[1]

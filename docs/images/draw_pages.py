@@ -33,25 +33,25 @@ LOOK = (
 def take_preview(browser: Browser, address: str) -> None:
     """Take both pictures, once the six images are there and the page says that all of it is simulated."""
     for name, size in (("preview", DESK), ("preview-phone", PHONE)):
-        browser.size(*size)
+        browser.set_size(*size)
         browser.open("about:blank")
         browser.wait("location.href == 'about:blank'", "an empty page")
         browser.open(address)
         browser.wait("document.body?.innerText.toUpperCase().includes('SIMULATED')", "that it is simulated")
         browser.wait(ROWS_IN, "the first row in the images")
         browser.wait(f"{PICTURES}.length >= 6 && {PICTURES}.every(i => i.complete && i.naturalWidth > 1)", "images")
-        browser.screenshot(HERE / f"{name}.png")
+        browser.save_screenshot(HERE / f"{name}.png")
 
 
 def take_serve(browser: Browser, address: str, scan: str) -> None:
     """Take the picture, once the probe has answered."""
     base, _, token = address.partition("/#")
-    browser.size(*DESK)
+    browser.set_size(*DESK)
     browser.open(f"{base}/scan?scan={quote(scan)}#{token}")
     browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", "the image")
-    browser.value(LOOK)
+    browser.evaluate(LOOK)
     browser.wait("document.querySelectorAll('#probe-facts dt').length > 3", "the probe")
-    browser.screenshot(HERE / "serve.png")
+    browser.save_screenshot(HERE / "serve.png")
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ def timed_rig(make_instrument, monkeypatch, request):
     fake.start()
     fake.pi.timed = True
 
-    def receive(event, _):
+    def receive_in_time(event, _):
         return ReceivedCapture(event, event.last_pulse_ns - PI_AHEAD_NS + 1_000_000)
 
     def read_timed_index(path):
@@ -35,7 +35,7 @@ def timed_rig(make_instrument, monkeypatch, request):
         times_ns = fake.cards[path.parent.name].arrivals_ns
         return facts, np.array([(times_ns[count], count) for count in arrivals[:, 1].tolist()])
 
-    monkeypatch.setattr(pulse_times, "ReceivedCapture", receive)
+    monkeypatch.setattr(pulse_times, "ReceivedCapture", receive_in_time)
     monkeypatch.setattr(pulse_times, "read_index", read_timed_index)
     yield fake
     fake.close()

@@ -72,11 +72,11 @@ def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
 
 
 def test_lost_reply_runs_no_row_twice(rig, tmp_path):
-    lose = {"done": False}
+    losing = {"done": False}
 
     def progress(p):
-        if p.phase == "row" and p.row == 1 and not lose["done"]:
-            lose["done"] = True
+        if p.phase == "row" and p.row == 1 and not losing["done"]:
+            losing["done"] = True
             rig.pi.lose_replies = 2
 
     assert run_scan(rig.instrument, tmp_path / "s", progress=progress).exit_status == "success"
@@ -146,7 +146,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "abort"
     assert list(result.folder.committed_rows()) == [0, 1]
-    state_before = compute_digests(result.folder)
+    digests_before = compute_digests(result.folder)
     (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
     with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
         f.write(b'{"fact": "row_comm')
@@ -154,8 +154,8 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     result = resume_scan(tmp_path / "s", on_row=rows.append)
     assert result.exit_status == "success"
     assert rows == [0, 1, 2, 3]
-    state_after = compute_digests(result.folder)
-    assert {k: state_after[k] for k in state_before} == state_before
+    digests_after = compute_digests(result.folder)
+    assert {k: digests_after[k] for k in digests_before} == digests_before
     assert result.folder.read_row("RV", 3).payload.tobytes() == payload("RV", 3, rig.instrument.row_bytes)
     assert list_errors(tmp_path / "s") == []
     assert set(find_last_takes(result.folder)) == {0, 1, 2, 3}
@@ -176,12 +176,12 @@ def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_p
     rig.pi.wanted_end = True
     wait_for(lambda: rig.pi.hanging is None, "the end of row 2")
     scan = ScanFolder.load(tmp_path / "s")
-    state_before = compute_digests(scan)
+    digests_before = compute_digests(scan)
     assert list(scan.rows()) == [0, 1]
     assert list_errors(tmp_path / "s") == []
     result = resume_scan(tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
-    assert {k: v for k, v in compute_digests(result.folder).items() if k in state_before} == state_before
+    assert {k: v for k, v in compute_digests(result.folder).items() if k in digests_before} == digests_before
     assert [r.take for r in result.folder.committed_rows().values()] == [1, 1, 2, 1]
     assert result.folder.read_row("RH", 2).payload.tobytes() == payload("RH", 2, rig.instrument.row_bytes)
     assert validate(tmp_path / "s") == []
@@ -242,10 +242,10 @@ def test_frames_below_a_packet_end_the_scan_before_it_begins(rig, tmp_path):
 
 def test_existing_scan_is_not_overwritten(rig, tmp_path):
     run_scan(rig.instrument, tmp_path / "s")
-    state_before = compute_digests(ScanFolder.load(tmp_path / "s"))
+    digests_before = compute_digests(ScanFolder.load(tmp_path / "s"))
     with expect_refusal(ErrorCode.FILE_EXISTS, "manifest"):
         run_scan(rig.instrument, tmp_path / "s")
-    assert compute_digests(ScanFolder.load(tmp_path / "s")) == state_before
+    assert compute_digests(ScanFolder.load(tmp_path / "s")) == digests_before
 
 
 TAIL_S = 0.6  # time from the last data to the short last packet; a real card takes 2 s
@@ -323,11 +323,11 @@ def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path)
     """The card lost power for a moment: it replies again, but its configuration is lost."""
     card = rig.cards["RH"]
 
-    def answer(p) -> None:
+    def mute_until_set_up_again(p) -> None:
         if (p.state, p.row, p.phase) == ("running", 1, "state"):
             card.silent_data = card.codes_received.count(CONFIGURE) == 2
 
-    result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
+    result = run_scan(rig.instrument, tmp_path / "s", progress=mute_until_set_up_again)
     assert (result.exit_status, result.retakes) == ("success", 1)
     assert (card.codes_received.count(CONFIGURE), rig.cards["RV"].codes_received.count(CONFIGURE)) == (4, 2)
 

@@ -300,7 +300,7 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
 
 def test_lost_terminal_is_ignored_and_then_as_before():
     signals = []
-    state_before = signal.signal(signal.SIGHUP, lambda *_: signals.append(1))
+    earlier_handler = signal.signal(signal.SIGHUP, lambda *_: signals.append(1))
     try:
         with ignore_hangup():
             os.kill(os.getpid(), signal.SIGHUP)
@@ -308,7 +308,7 @@ def test_lost_terminal_is_ignored_and_then_as_before():
         wait_for(lambda: signals, "the signal")
         assert signals == [1], "the second one alone"
     finally:
-        signal.signal(signal.SIGHUP, state_before)
+        signal.signal(signal.SIGHUP, earlier_handler)
 
 
 @pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", "", "look")])

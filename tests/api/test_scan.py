@@ -274,14 +274,14 @@ def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch
     scan = shutil.copytree(folder, tmp_path / "scan")
     saved = shutil.copytree(products, tmp_path / "products")
     monkeypatch.chdir(tmp_path)
-    state_before = read_file_states(tmp_path)
+    files_before = read_file_states(tmp_path)
     for path in (scan, saved):
         opened = open_scan(path)
         repr(opened)
         for name in DATASETS:
             getattr(opened, name)()
         opened.plot()
-    assert read_file_states(tmp_path) == state_before
+    assert read_file_states(tmp_path) == files_before
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

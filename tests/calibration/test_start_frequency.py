@@ -57,34 +57,34 @@ def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_
 def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
     rig = make_rig(set_offset(50e3))
     board = rig.receivers[1]
-    better = msgspec.structs.replace(board, start_offset_hz=predict_by_geometry(rig, board))
+    board_of_advice = msgspec.structs.replace(board, start_offset_hz=predict_by_geometry(rig, board))
     # Steps of 54 Hz
-    assert direct_if_hz(rig, better) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
+    assert direct_if_hz(rig, board_of_advice) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
 
 
 def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_rig, make_scan, tmp_path, capsys):
     """The boards were programmed 260 kHz away from what the rig file says, and their crystals differ."""
-    wrong = {"if_offset_hz": 260e3, "crystal_ppm": {"receive_h": 0.8, "receive_v": -1.1}}
+    disturbances = {"if_offset_hz": 260e3, "crystal_ppm": {"receive_h": 0.8, "receive_v": -1.1}}
 
     def make_advice(rig, name):
-        folder = make_scan(tmp_path / name, rig, seed=4, disturbances=wrong)
+        folder = make_scan(tmp_path / name, rig, seed=4, disturbances=disturbances)
         assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / name / "c")]) == 0
         boards = read_calibration(next((tmp_path / name / "c").iterdir()), StartFile, "start_frequency").boards
         output = capsys.readouterr().out
         assert all(f"start_offset_hz = {b.start_offset_hz:.0f}" in output for b in boards.values())
         return {n: to_builtins(b) for n, b in boards.items()}
 
-    first = make_advice(make_rig(set_offset(300e3), **TABLES), "first")
+    first_advice = make_advice(make_rig(set_offset(300e3), **TABLES), "first")
 
     def set_advice(table):
         for board in table["boards"]:
-            if board["name"] in first:
-                board["start_offset_hz"] = first[board["name"]]["start_offset_hz"]
+            if board["name"] in first_advice:
+                board["start_offset_hz"] = first_advice[board["name"]]["start_offset_hz"]
 
-    second = make_advice(make_rig(set_advice, **TABLES), "second")
-    for name, board in second.items():
-        assert abs(first[name]["start_offset_hz"] - 300e3) > 100e3
-        error = np.hypot(board["direct_if_standard_error_hz"], first[name]["direct_if_standard_error_hz"])
+    second_advice = make_advice(make_rig(set_advice, **TABLES), "second")
+    for name, board in second_advice.items():
+        assert abs(first_advice[name]["start_offset_hz"] - 300e3) > 100e3
+        error = np.hypot(board["direct_if_standard_error_hz"], first_advice[name]["direct_if_standard_error_hz"])
         assert abs(board["start_offset_hz"] - board["start_offset_was_hz"]) < 5 * error
         assert board["direct_if_hz"] == pytest.approx(board["middle_hz"], abs=5 * error)
 

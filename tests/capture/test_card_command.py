@@ -23,7 +23,7 @@ def card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended
 
     def run(*words: str, typed: str = "") -> Ended:
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
-        return Bench(tmp_path).here("card", *words)
+        return Bench(tmp_path).run_here("card", *words)
 
     return run
 
@@ -74,13 +74,13 @@ def test_every_hop_of_every_card(cards, card):
 )
 def test_refused_commands_write_nothing(cards, card, words, says):
     running_cards = cards("RH")
-    state_before = running_cards.endpoints["RH"].card.network
+    earlier_network = running_cards.endpoints["RH"].card.network
     process = card(*words)
     assert process.status == 2, process
     assert says in process.err
     assert "\n  do: " in process.err
     running_cards.power_cycle("RH")
-    assert running_cards.endpoints["RH"].card.network == state_before
+    assert running_cards.endpoints["RH"].card.network == earlier_network
 
 
 def program_card(power_cycle: Callable[[], None], folder: Path, typed: str, *words: str) -> str:

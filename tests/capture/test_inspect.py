@@ -228,7 +228,7 @@ def test_other_files_are_recognised_by_their_first_bytes(head, kind):
 
 @pytest.fixture
 def polysight(tmp_path):
-    return functools.partial(Bench(tmp_path).here, "inspect")
+    return functools.partial(Bench(tmp_path).run_here, "inspect")
 
 
 def test_the_command_reads_the_layout_that_is_given(polysight, tmp_path):

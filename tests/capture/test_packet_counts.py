@@ -116,11 +116,11 @@ def test_late_packets_of_the_record_before_are_left_over(grid, lost_packets, bat
     start = Counters(145_600_123, 100_001)
     card = Card(size, start.byte_count, start.sequence)
     past = place(size, card.record().packets, start, frame, batch)[0].past
-    state_before = card.record()
-    lost_packets = min(lost_packets, len(state_before.packets) - 1)
-    past = place(size, state_before.packets[lost_packets:], past, frame, batch)[0].past
+    earlier_record = card.record()
+    lost_packets = min(lost_packets, len(earlier_record.packets) - 1)
+    past = place(size, earlier_record.packets[lost_packets:], past, frame, batch)[0].past
     record = card.record()
-    mixed = [*record.packets[:2], *state_before.packets[:lost_packets], *record.packets[2:]]
+    mixed = [*record.packets[:2], *earlier_record.packets[:lost_packets], *record.packets[2:]]
     placed, _ = place(size, mixed, past, frame, batch)
     assert placed.complete
     assert placed.counts.leftover == lost_packets

@@ -46,8 +46,8 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, c
     """Start known. Unmasked bytes are original; where the record's place is certain, the mask is exactly the loss."""
     record = Record.make(frame * frames, count, sequence)
     sent = [(k, p) for k, p in enumerate(record.packets) if chance.random() >= rate]
-    sent += [kp for kp in sent if chance.random() < rate]
-    order = sorted(sent, key=lambda kp: kp[0] + (chance.randint(-3, 3) if chance.random() < rate else 0))
+    sent += [numbered for numbered in sent if chance.random() < rate]
+    order = sorted(sent, key=lambda numbered: numbered[0] + (chance.randint(-3, 3) if chance.random() < rate else 0))
     placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
     received = {k for k, _ in sent}
@@ -127,8 +127,10 @@ def test_every_disorder_together(
     leftovers = malformed = 0
     for position in range(len(arriving), 1, -1):
         if chance.random() < strange:
-            back = chance.randint(1, 5)
-            arriving.insert(position, (-1, encode_packet(sequence - back, count - back * FULL, bytes([0xEE]) * FULL)))
+            distance = chance.randint(1, 5)
+            arriving.insert(
+                position, (-1, encode_packet(sequence - distance, count - distance * FULL, bytes([0xEE]) * FULL))
+            )
             leftovers += 1
         if chance.random() < strange:
             arriving.insert(position, (-2, chance.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
@@ -138,15 +140,22 @@ def test_every_disorder_together(
         if k >= 0:
             oracle.take(k * FULL, k * FULL + len(packet) - 10)
     placed, out = place(size, [p for _, p in arriving], Counters(count, sequence), frame, batch)
-    c = placed.counts
+    counts = placed.counts
     assert is_original_or_masked(record, placed, out)
-    assert c.placed + c.duplicates + c.conflicting + c.leftover + c.outside + c.disagreeing + c.malformed == len(
-        arriving
+    assert (
+        counts.placed
+        + counts.duplicates
+        + counts.conflicting
+        + counts.leftover
+        + counts.outside
+        + counts.disagreeing
+        + counts.malformed
+        == len(arriving)
     )
-    assert c.malformed == malformed
-    if arriving and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL) and not c.disagreeing:
-        assert (c.placed, c.duplicates, c.late) == (oracle.placed, oracle.duplicates, oracle.late)
-        assert (c.leftover, c.outside) == (leftovers, 0)
+    assert counts.malformed == malformed
+    if arriving and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL) and not counts.disagreeing:
+        assert (counts.placed, counts.duplicates, counts.late) == (oracle.placed, oracle.duplicates, oracle.late)
+        assert (counts.leftover, counts.outside) == (leftovers, 0)
         assert placed.received == oracle.there.sum()
         losses = placed.losses
         assert losses.head_bytes + losses.gap_bytes + losses.tail_bytes == size - placed.received
@@ -342,10 +351,10 @@ def test_a_lost_start_is_known_again_after_a_reset(size):
     assert past.lost
     assert not place(size, card.record().packets, past, FRAME)[0].located
     card.reset()
-    again = card.record()
-    placed, out = place(size, again.packets, EarlierRecords.after_reset(), FRAME)
+    record_after_reset = card.record()
+    placed, out = place(size, record_after_reset.packets, EarlierRecords.after_reset(), FRAME)
     assert placed.complete
-    assert out.tobytes() == again.data
+    assert out.tobytes() == record_after_reset.data
 
 
 @pytest.mark.parametrize("size", [FULL_ENDS, SHORT_END])
@@ -428,9 +437,9 @@ def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
     placed, out = place_record(log, FRAME, past)
     assert (log.payload[: payload_before.size] == payload_before).all()
     write_packets(tmp_path / "0000.pkt", log, Evidence(size, FRAME, past=past), placed)
-    again, same = place_record(read_packets(tmp_path / "0000.pkt", out)[1], FRAME, past)
-    assert (again.counts, again.missing) == (placed.counts, placed.missing)
-    assert (same == out).all()
+    second_placement, second_out = place_record(read_packets(tmp_path / "0000.pkt", out)[1], FRAME, past)
+    assert (second_placement.counts, second_placement.missing) == (placed.counts, placed.missing)
+    assert (second_out == out).all()
 
 
 def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():

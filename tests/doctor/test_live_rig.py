@@ -54,14 +54,14 @@ def test_all_checks_of_a_healthy_rig_pass(live, capsys):
 
 
 def test_nothing_moves_and_no_pulse_is_sent_by_default(live):
-    def place():
-        with live.pi() as pi:
+    def read_place():
+        with live.connect_to_pi() as pi:
             status = pi.status()
             return status.x_mm, status.y_mm, status.state
 
-    state_before = place()
-    findings = live.doctor(pulse=False)
-    assert place() == state_before
+    place_before = read_place()
+    findings = live.run_doctor(pulse=False)
+    assert read_place() == place_before
     assert_failed(findings)
     assert {n for n, f in findings.items() if f.level == "note"} == {
         "trigger line", "pulses", "radar RH", "radar RV", "level RH", "level RV", "direct path RH", "direct path RV",
@@ -70,14 +70,14 @@ def test_nothing_moves_and_no_pulse_is_sent_by_default(live):
 
 
 def test_the_pis_clock_is_off(live):
-    findings = live.doctor(system=dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + 3_600_000_000_000))
+    findings = live.run_doctor(system=dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + 3_600_000_000_000))
     assert_failed(findings, "pi clock")
     assert findings["pi clock"].facts["offset_s"] == pytest.approx(-3600, abs=10)
 
 
 def test_a_pi_that_hangs(live):
     with live.stop_process("polysight-pi"):
-        findings = live.doctor(pulse=True)
+        findings = live.run_doctor(pulse=True)
     assert_failed(findings, "pi")
     assert list_skipped(findings, "pi") == [
         "pi clock", "rig is free", "stage", "trigger line", "pulses", "radar RH", "radar RV", "level RH", "level RV",
@@ -88,7 +88,7 @@ def test_a_pi_that_hangs(live):
 
 def test_a_card_that_is_mute(live):
     with live.stop_process("--boards RV"):
-        findings = live.doctor(pulse=True)
+        findings = live.run_doctor(pulse=True)
     assert_failed(findings, "card RV")
     assert list_skipped(findings, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
     # The other board is checked to its end
@@ -96,13 +96,13 @@ def test_a_card_that_is_mute(live):
 
 
 def test_a_receive_buffer_that_is_too_small(live):
-    findings = live.doctor(live.variant(lambda table: table["card"].update(receive_buffer_bytes=4096)))
+    findings = live.run_doctor(live.write_variant(lambda table: table["card"].update(receive_buffer_bytes=4096)))
     assert_failed(findings, "buffer RH", "buffer RV")
 
 
 def test_a_sync_in_wire_that_is_cut(live):
     with live.cut(live.instrument.pi.sync_out[0]):
-        findings = live.doctor(pulse=True)
+        findings = live.run_doctor(pulse=True)
     assert_failed(findings, "radar RH", "radar RV")
     # The Pi cannot detect it
     assert findings["pulses"].level == "ok"
@@ -111,9 +111,9 @@ def test_a_sync_in_wire_that_is_cut(live):
 def test_a_scan_in_progress_is_not_disturbed(live):
     rig = live.instrument
     run = BeginRun(scan_id="another", plan=plan_raster(rig.grid), pulses=16, period_us=1500, width_us=1, speed_mm_s=20)
-    with live.pi() as pi:
+    with live.connect_to_pi() as pi:
         pi.begin_run(run)
-        findings = live.doctor(pulse=True, move=True)
+        findings = live.run_doctor(pulse=True, move=True)
         with expect_refusal(ErrorCode.REFUSED_BY_PEER, "another"):
             pi.pulse(16, 1500, 1)
         pi.end_run("another", "abort", "test")
@@ -125,11 +125,11 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     filters = filter_file(rv=read_board_filter(172.5, 347.0))
     path = write_calibration(filters, live.folder / "calibration")
 
-    def small(table):
+    def shorten_scan(table):
         table["calibration"] = {"hpf": str(path)}
         table["grid"] |= {"rows": 2, "columns": 3}
 
-    config = live.variant(small)
+    config = live.write_variant(shorten_scan)
     live.home()
     scan = run_scan(load_instrument(config), live.folder / "scan").folder
     path.unlink()
@@ -145,7 +145,7 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
 
 def test_a_trigger_wire_that_is_cut(live):
     with live.cut(live.instrument.pi.trigger_in):
-        findings = live.doctor(move=True)
+        findings = live.run_doctor(move=True)
     try:
         assert_failed(findings, "trigger line")
         assert findings["trigger line"].facts["edges"] == 0
@@ -156,9 +156,9 @@ def test_a_trigger_wire_that_is_cut(live):
 def test_a_stage_that_is_silent(live):
     try:
         with live.stop_process("--trigger-line" if sketch_compiler() else "polysight_simulators.stage"):
-            with live.pi() as pi:
+            with live.connect_to_pi() as pi:
                 wait_for(lambda: pi.status().state == "fault", "the fault")
-            findings = live.doctor(move=True)
+            findings = live.run_doctor(move=True)
         assert_failed(findings, "stage")
         assert findings["stage"].facts["fault"] == 101
         assert list_skipped(findings, "stage") == ["trigger line"]
@@ -177,7 +177,7 @@ def reply(**changes):
 
 def test_a_pi_of_this_release_is_ok(deaf_rig):
     with answering(deaf_rig.instrument, reply()):
-        findings = deaf_rig.doctor()
+        findings = deaf_rig.run_doctor()
     assert findings["pi"].level == findings["stage"].level == findings["rig is free"].level == "ok"
     assert findings["pi clock"].level == "note"
     assert [n for n, f in findings.items() if f.level == "error"] == ["card RH", "card RV"]
@@ -195,7 +195,7 @@ def test_a_pi_of_this_release_is_ok(deaf_rig):
 )
 def test_a_pi_of_another_release_is_an_error(deaf_rig, changes, version, check, skips):
     with answering(deaf_rig.instrument, reply(**changes), version):
-        findings = deaf_rig.doctor()
+        findings = deaf_rig.run_doctor()
     assert findings[check].level == "error"
     assert all(value in findings[check].what for value in changes.values())
     assert skips in list_skipped(findings, check)

@@ -28,7 +28,7 @@ def test_stopped_while_scanning(bench, scene_file, number):
     assert ended.status == 128 + signal.SIGINT
     assert ended.err.splitlines()[-1] == "polysight demo: stopped"
     assert "Traceback" not in ended.err
-    assert bench.processes() == {}
+    assert bench.list_processes() == {}
     assert "Traceback" not in "".join(log.read_text() for log in (out / "rig" / "logs").iterdir())
 
 
@@ -37,7 +37,7 @@ def test_without_a_compiler(rig_without_compiler):
     assert "Python stand-in" in (rig.folder / "rig" / "logs" / "stage.log").read_text()
     ended = rig.scan("--no-process").wait()
     assert ended.status == 0, ended.err
-    validated = rig.here("validate", rig.folder / "scan")
+    validated = rig.run_here("validate", rig.folder / "scan")
     assert (validated.status, validated.err) == (0, "")
 
 

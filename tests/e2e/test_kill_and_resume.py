@@ -31,7 +31,7 @@ def check_whole(rig, before):
     digests_after = compute_digests(path)
     assert {file: digests_after[file] for file in before} == before
     assert len(ScanFolder.load(path).committed_rows()) == 6
-    validated = rig.here("validate", path)
+    validated = rig.run_here("validate", path)
     assert (validated.status, validated.out, validated.err) == (0, f"{path}: whole\n", "")
     started = [(e.row.index, e.take) for e in read_events(path / "events.msgpack").events if isinstance(e, RowStarted)]
     assert len(set(started)) == len(started), "a take was used twice"
@@ -46,12 +46,12 @@ def test_interrupted(rig, times):
         scan.interrupt()
     ended = scan.wait(30)
     path = rig.folder / "scan"
-    rows_to_come = 6 - rig.committed()
+    rows_to_come = 6 - rig.count_committed_rows()
     assert ended.status == 6
     assert f"{rows_to_come} of 6 rows are missing" in ended.message
     assert f"polysight resume {path}" in ended.message
     assert 3 - times <= 6 - rows_to_come < 6
     assert times == 2 or not list(path.glob("raw/*/*.part")), "the running row was ended, not cut"
     digests_before = compute_digests(path)
-    assert rig.polysight("resume", path, "--no-process").status == 0
+    assert rig.run_polysight("resume", path, "--no-process").status == 0
     check_whole(rig, digests_before)

@@ -286,7 +286,7 @@ def test_products_of_a_killed_scan(killed_rig: Killed):
     assert resumed.status == NO_RESULT, resumed.err  # one plate only: all rows are there, and no patch is named
     out = killed_rig.rig.folder / "products"
     with skip_rendering():
-        processed = killed_rig.rig.here("process", killed_rig.rig.folder / "undisturbed", "--out", out, *METAL)
+        processed = killed_rig.rig.run_here("process", killed_rig.rig.folder / "undisturbed", "--out", out, *METAL)
     assert processed.status == NO_RESULT, processed.err
     with np.load(folder / "products" / "image.npz") as live, np.load(out / "image.npz") as undisturbed:
         assert live.files == undisturbed.files

@@ -99,12 +99,12 @@ def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[
 def test_a_scan_is_planned_started_and_shown(lab):
     lab.open("/new")
     lab.browser.wait("document.querySelector('.time')", "the plan")
-    duration = lab.browser.value("document.querySelector('.time').innerText")
+    duration = lab.browser.evaluate("document.querySelector('.time').innerText")
     lab.fill(rows=5)
     lab.browser.wait(f"document.querySelector('.time')?.innerText != {json.dumps(duration)}", "the plan of five rows")
     lab.fill(columns=1999)
     lab.browser.wait("document.getElementById('start').disabled", "that too long rows are refused")
-    assert "travel" in lab.browser.text("forecast")
+    assert "travel" in lab.browser.read_text("forecast")
     folder = lab.start("first", rows=5, notes="the first one", tags="new, oak")
     lab.browser.wait("document.getElementById('count')?.innerText == '5 of 5 rows'", "all rows")
     lab.click("to-result")
@@ -114,7 +114,7 @@ def test_a_scan_is_planned_started_and_shown(lab):
     lab.open("/")
     # A card has no text before it is painted.
     lab.browser.wait("document.querySelector('#list li')?.innerText", "the card of the scan")
-    list_text = lab.browser.text("list")
+    list_text = lab.browser.read_text("list")
     assert "first" in list_text
     assert "the first one" in list_text
     assert "oak" in list_text
@@ -139,9 +139,9 @@ def test_a_scan_pauses_continues_stops_and_is_resumed(lab):
     lab.click("resume")
     lab.wait_rows(folder, stopped + 1)
     lab.click("abort")
-    lab.browser.value("document.querySelector('#confirm button[value=yes]').click()")
+    lab.browser.evaluate("document.querySelector('#confirm button[value=yes]').click()")
     lab.wait_headline("Aborted on request")
-    assert "the page" in lab.browser.text("detail")
+    assert "the page" in lab.browser.read_text("detail")
     lab.wait_end(folder)
 
 
@@ -203,7 +203,7 @@ def test_a_scan_that_cannot_begin_says_why(lab):
     lab.rig.wait_for(lambda: not _program(folder).running, "the end of the program")
     assert _program(folder).status not in (0, None)
     lab.wait_headline("The scan could not start")
-    assert "did not answer" in lab.browser.text("detail")
+    assert "did not answer" in lab.browser.read_text("detail")
     lab.rig.start_pi()
     lab.open("/")
     lab.browser.wait("/failed[^]*did not answer/.test(document.getElementById('list').innerText)", "state and reason")

@@ -50,16 +50,18 @@ def test_rig_file(bench, program):
 
 
 def test_files_that_are_not_there(bench):
-    check_refusal(bench.here("scan", "--out", "s"), "instrument.toml: no such file", status=2)
+    check_refusal(bench.run_here("scan", "--out", "s"), "instrument.toml: no such file", status=2)
     check_refusal(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
     check_refusal(
-        bench.polysight("simulate", "no.toml", "--config", RIG_FILE, "--out", "d"), "no.toml: no such file", status=2
+        bench.run_polysight("simulate", "no.toml", "--config", RIG_FILE, "--out", "d"),
+        "no.toml: no such file",
+        status=2,
     )
     reproduce = ("reproduce", "--config", "no.toml", "--out", "r", "table1")
-    check_refusal(bench.here(*reproduce), "no.toml: no such file", status=2)
-    check_refusal(bench.here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
-    check_refusal(bench.here("inspect", "no.bin"), "no.bin", status=3)
-    check_refusal(bench.here("inspect", "no.pcap"), "no.pcap", status=3)
+    check_refusal(bench.run_here(*reproduce), "no.toml: no such file", status=2)
+    check_refusal(bench.run_here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
+    check_refusal(bench.run_here("inspect", "no.bin"), "no.bin", status=3)
+    check_refusal(bench.run_here("inspect", "no.pcap"), "no.pcap", status=3)
 
 
 @pytest.mark.parametrize(
@@ -82,11 +84,11 @@ def test_scene_file(bench, old, new, words):
     (last / ".polysight-demo").touch()
     (last / "report.html").touch()
     rig = ("--config", RIG_FILE)
-    check_refusal(bench.here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
+    check_refusal(bench.run_here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
     assert (last / "report.html").exists()
-    check_refusal(bench.polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
+    check_refusal(bench.run_polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
     if old:
-        check_refusal(bench.here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
+        check_refusal(bench.run_here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
     assert {p.name for p in bench.folder.iterdir() if p.is_dir()} == {"scenes", "d"}
 
 
@@ -94,8 +96,8 @@ def test_rig_file_of_a_training(bench):
     (bench.folder / "scenes").mkdir()
     (bench.folder / "scenes" / "a.toml").write_text(SCENE)
     train = ("train", "--simulate", "scenes")
-    check_refusal(bench.here(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
-    check_refusal(bench.here(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
+    check_refusal(bench.run_here(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
+    check_refusal(bench.run_here(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
 
 
 # --- recorded data ----------------------------------------------------------------------------------------------------
@@ -125,23 +127,23 @@ def test_a_folder_that_is_not_a_scan_is_refused(bench, command):
     (bench.folder / "other" / "notes.txt").write_text("not a scan")
     folders = ("missing", "empty", "other", "other/notes.txt")
     for name in folders if command == "validate" else ("missing", "other"):
-        check_refusal(bench.here(command, name, *out), name, status=3)
+        check_refusal(bench.run_here(command, name, *out), name, status=3)
     assert not (bench.folder / "out").exists()
 
 
 def test_scan_without_a_row(bench, scan):
     path = scan / "manifest.jsonl"
     path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
-    check_refusal(bench.here("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
+    check_refusal(bench.run_here("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
 
 
 def test_library(bench, scan):
     process = ("process", scan, "--out", "out", "--library")
     (bench.folder / "junk.npz").write_text("no library")
     for name in ("no.npz", "junk.npz", "scan"):
-        check_refusal(bench.here(*process, name), name, "polysight train", status=3)
+        check_refusal(bench.run_here(*process, name), name, "polysight train", status=3)
     assert not (bench.folder / "out").exists(), "found out before anything is processed"
-    check_refusal(bench.here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
+    check_refusal(bench.run_here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
 
 
 def test_out_is_taken(bench, scan):
@@ -149,14 +151,14 @@ def test_out_is_taken(bench, scan):
     own_folder.mkdir()
     (own_folder / "thesis.tex").write_text("precious")
     for command in (["image", scan], ["demo", "--config", RIG_FILE], ["scan", "--config", RIG_FILE]):
-        check_refusal(bench.here(*command, "--out", own_folder), str(own_folder), "--out", status=2)
+        check_refusal(bench.run_here(*command, "--out", own_folder), str(own_folder), "--out", status=2)
     for command in (["image", scan], ["demo", "--config", RIG_FILE]):
-        check_refusal(bench.here(*command, "--out", own_folder / "thesis.tex"), "thesis.tex", "--out", status=2)
-    check_refusal(bench.here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
+        check_refusal(bench.run_here(*command, "--out", own_folder / "thesis.tex"), "thesis.tex", "--out", status=2)
+    check_refusal(bench.run_here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
     assert (own_folder / "thesis.tex").read_text() == "precious"
     assert list(own_folder.iterdir()) == [own_folder / "thesis.tex"]
-    assert bench.here("image", scan, "--out", "out").status == 0
-    assert bench.here("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
+    assert bench.run_here("image", scan, "--out", "out").status == 0
+    assert bench.run_here("image", scan, "--out", "out").status == 0, "earlier products may be replaced"
 
 
 # --- the Pi's side ----------------------------------------------------------------------------------------------------

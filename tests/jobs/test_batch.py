@@ -131,10 +131,10 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
         assert not batch.is_finished(job(**change)), change
     (folder / "RH").mkdir()
     for path in (library, rig, folder / "RH" / "0_0.bin"):
-        state_before = path.read_bytes() if path.exists() else b""
+        earlier_content = path.read_bytes() if path.exists() else b""
         path.write_bytes(b"2")
         assert not batch.is_finished(job()), path
-        path.write_bytes(state_before)
+        path.write_bytes(earlier_content)
     (folder / "RH" / "0_0.bin").unlink()
     assert batch.is_finished(job())
     (tmp_path / "out" / "a" / "image.npz").unlink()
@@ -162,15 +162,15 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     for name in ("manifest.jsonl", "raw/RH/0000.bin", "raw/RV/0001.idx", "truth.json"):
         file = folder / name
         file.parent.mkdir(exist_ok=True)
-        state_before = file.read_bytes() if file.exists() else None
+        earlier_content = file.read_bytes() if file.exists() else None
         times = file.stat().st_mtime_ns if file.exists() else 0
         with file.open("a") as appended:
             appended.write("\n")
         assert not done(), name
-        if state_before is None:
+        if earlier_content is None:
             file.unlink()
         else:
-            file.write_bytes(state_before)
+            file.write_bytes(earlier_content)
             os.utime(file, ns=(times, times))
         assert done(), name
     drop(ScanFolder.load(folder), read_raw_digests(folder), tmp_path / "out" / "scan")

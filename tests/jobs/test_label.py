@@ -125,11 +125,11 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert "the name pet" in capsys.readouterr().out
     assert label(products, Edits(), ask=script_answers("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
     assert load_boxes(products).metal == "glass"
-    state_before = (products / "labels.json").read_bytes()
+    labels_before = (products / "labels.json").read_bytes()
     for answers, code in ((["no"], ErrorCode.VALUE_INVALID), (["yes", "copper"], ErrorCode.KEY_MISSING)):
         with expect_refusal(code):
             label(products, Edits(), ask=script_answers(*answers)[0])
-    assert (products / "labels.json").read_bytes() == state_before
+    assert (products / "labels.json").read_bytes() == labels_before
 
 
 def test_without_a_terminal_patches_are_listed(products, capsys):

@@ -50,10 +50,10 @@ CONFLICT = ErrorCode.VALUES_CONFLICT
     ],
 )
 def test_boxes_and_names_that_cannot_be_used_for_training_are_refused(boxes, more, code, values):
-    with expect_refusal(code, *values) as e:
+    with expect_refusal(code, *values) as refusal:
         check_boxes(boxes, **more)
-    assert e.value.why
-    assert e.value.remedy
+    assert refusal.value.why
+    assert refusal.value.remedy
 
 
 def test_boxes_may_touch_and_reach_the_edge_of_the_image():
@@ -106,12 +106,13 @@ def test_label_files_are_read_back_and_pixels_become_millimetres(tmp_path):
     assert materials.read_labels(path) == labels
     assert "\u6a61\u6728" in path.read_text(encoding="utf-8")
     path.write_text(json.dumps({"labels": {"copper": [5, 20, 20, 30]}}))  # as earlier releases wrote them
-    old = materials.read_labels(path)
-    assert (old.unit, old.by_hand, old.metal) == ("pixel", False, None)
-    assert old.is_metal("copper")
-    assert old.convert_to_mm(X_M, Y_M).boxes["copper"] == pytest.approx(COPPER)
+    labels_of_pixels = materials.read_labels(path)
+    assert (labels_of_pixels.unit, labels_of_pixels.by_hand, labels_of_pixels.metal) == ("pixel", False, None)
+    assert labels_of_pixels.is_metal("copper")
+    assert labels_of_pixels.convert_to_mm(X_M, Y_M).boxes["copper"] == pytest.approx(COPPER)
     assert (
-        old.patches(X_M, Y_M)[0].patches[0].mask.sum() == old.convert_to_mm(X_M, Y_M).patches(X_M, Y_M)[0].labels.sum()
+        labels_of_pixels.patches(X_M, Y_M)[0].patches[0].mask.sum()
+        == labels_of_pixels.convert_to_mm(X_M, Y_M).patches(X_M, Y_M)[0].labels.sum()
     )
 
 
@@ -130,8 +131,8 @@ def test_boxes_by_hand_are_judged_before_a_scan_is_processed_with_them():
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "copper", "oak"):
         convert_boxes_to_patches(DEFAULT, Inputs(overlapping), X_M, Y_M)
     labels = materials.Labels({"tin": COPPER, "oak": OAK}, "mm", "tin", by_hand=True)
-    drawn = convert_boxes_to_patches(DEFAULT, Inputs(labels), X_M, Y_M)
-    assert (drawn.metal, drawn.names) == (1, {1: "tin", 2: "oak"})
+    patches = convert_boxes_to_patches(DEFAULT, Inputs(labels), X_M, Y_M)
+    assert (patches.metal, patches.names) == (1, {1: "tin", 2: "oak"})
 
 
 def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
@@ -139,18 +140,18 @@ def test_libraries_keep_the_specimen_and_old_files_have_none(tmp_path):
     entry = materials.Entry("oak", "a", ones, ones, np.ones(3, np.complex64), 55.0, simulated=False, specimen="board 7")
     materials.Library((entry,)).save(tmp_path / "l.npz")
     assert materials.Library.load(tmp_path / "l.npz").entries[0].specimen == "board 7"
-    with np.load(tmp_path / "l.npz") as z:
-        content = dict(z)
+    with np.load(tmp_path / "l.npz") as archive:
+        content = dict(archive)
     meta = json.loads(content["meta"].tobytes())
     del meta["entries"][0]["specimen"]
     np.savez(tmp_path / "old.npz", **(content | {"meta": np.frombuffer(json.dumps(meta).encode(), np.uint8)}))
     assert materials.Library.load(tmp_path / "old.npz").entries[0].specimen is None
 
 
-@pytest.mark.parametrize("other", [(0.0, -20.0, 20.0, 20.0), (-20.0, 5.0, 20.0, 20.0), (5.0, 5.0, 20.0, 20.0)])
-def test_boxes_next_to_or_above_each_other_do_not_overlap(other):
+@pytest.mark.parametrize("oak", [(0.0, -20.0, 20.0, 20.0), (-20.0, 5.0, 20.0, 20.0), (5.0, 5.0, 20.0, 20.0)])
+def test_boxes_next_to_or_above_each_other_do_not_overlap(oak):
     copper = (-20.0, -20.0, 0.0, 0.0)
-    assert set(check_boxes({"copper": copper, "oak": other}).boxes) == {"copper", "oak"}
-    reaching = (min(other[0], -0.5), min(other[1], -0.5), *other[2:])
+    assert set(check_boxes({"copper": copper, "oak": oak}).boxes) == {"copper", "oak"}
+    overlapping_oak = (min(oak[0], -0.5), min(oak[1], -0.5), *oak[2:])
     with expect_refusal(CONFLICT, "overlap"):
-        check_boxes({"copper": copper, "oak": reaching})
+        check_boxes({"copper": copper, "oak": overlapping_oak})

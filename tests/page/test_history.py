@@ -148,7 +148,7 @@ def test_resumed_is_not_ended(finished):
 
 def test_facts_of_newer_releases_are_passed_over(begun):
     history, _ = begun
-    state_before = dict(vars(history))
+    values_before = dict(vars(history))
     for name in ("takes", "boards", "rows", "ended", "something_new"):
         add_fact(history, {"fact": name})
-    assert vars(history) == state_before
+    assert vars(history) == values_before

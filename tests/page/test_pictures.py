@@ -34,8 +34,8 @@ def images() -> Images:
 def test_smallest_y_is_at_the_bottom(images):
     picture = decode_pixels(draw(images)["h_amplitude"].png)
     assert picture.shape == (NY, NX, 4)
-    light = picture[..., :3].sum(axis=-1)
-    assert np.unravel_index(light.argmax(), light.shape) == (NY - 1, NX - 1)
+    brightness = picture[..., :3].sum(axis=-1)
+    assert np.unravel_index(brightness.argmax(), brightness.shape) == (NY - 1, NX - 1)
 
 
 def test_what_no_row_has_lit_is_transparent(images):
@@ -53,8 +53,8 @@ def test_nothing_lit_is_drawn_all_the_same(images):
 
 def test_phase_is_cyclic_and_comes_round(images):
     angles = np.linspace(-np.pi, np.pi, NX, dtype=np.float32)
-    turned = np.tile(np.exp(1j * angles).astype(np.complex64), (NY, 1))
-    row = decode_pixels(draw(replace(images, h=turned))["h_phase"].png)[0, :, :3]
+    rotated = np.tile(np.exp(1j * angles).astype(np.complex64), (NY, 1))
+    row = decode_pixels(draw(replace(images, h=rotated))["h_phase"].png)[0, :, :3]
     assert np.abs(row[0] - row[-1]).max() < 0.02
     assert np.abs(row[0] - row[NX // 2]).max() > 0.3
     ends = decode_pixels(colour_bar(PHASE_COLOURS))[0]
@@ -85,13 +85,13 @@ def test_phase_of_p_is_the_difference(images):
 @pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
 def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
     chirp = load_published_rig().chirp
-    f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
-    echo = 1 + 0.3 * np.exp(2j * np.pi * f * path_m / SPEED_OF_LIGHT_M_S)
+    sweep_hz = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
+    echo = 1 + 0.3 * np.exp(2j * np.pi * sweep_hz * path_m / SPEED_OF_LIGHT_M_S)
     samples = np.tile(echo.astype(np.complex64), (4, 5, 1))
     zeros = np.zeros(5)
     row = SyncedRow(
         samples=samples,
-        sweep_hz=f,
+        sweep_hz=sweep_hz,
         valid=np.ones(5, bool),
         chirps=np.ones(5, int),
         direct_hz=zeros,
@@ -101,8 +101,8 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
     level = compute_range_profile_db(row, chirp, distances_m)
     assert abs(distances_m[level.argmax()]) < 0.01
     assert level.max() == pytest.approx(0.0, abs=0.05)
-    beyond = np.where(np.abs(distances_m) < 0.2, -200.0, level)
-    assert distances_m[beyond.argmax()] == pytest.approx(path_m, abs=0.01)
-    assert beyond.max() == pytest.approx(20 * np.log10(0.3), abs=0.5)
-    none = replace(row, valid=np.zeros(5, bool))
-    assert np.ptp(compute_range_profile_db(none, chirp, distances_m)) == 0
+    level_without_direct_path = np.where(np.abs(distances_m) < 0.2, -200.0, level)
+    assert distances_m[level_without_direct_path.argmax()] == pytest.approx(path_m, abs=0.01)
+    assert level_without_direct_path.max() == pytest.approx(20 * np.log10(0.3), abs=0.5)
+    without_positions = replace(row, valid=np.zeros(5, bool))
+    assert np.ptp(compute_range_profile_db(without_positions, chirp, distances_m)) == 0

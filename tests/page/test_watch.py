@@ -73,7 +73,7 @@ def test_a_finished_folder_is_shown_unchanged(finished, truth, watching):
 def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
     assert answer(watch)["scan"] is None
-    growing.live()
+    growing.touch_alive()
     growing.grow_until("scan_started")
     watch.wait_for(lambda s: s["scan"] is not None)
     assert answer(watch)["scan"]["marks"] == "..."
@@ -98,7 +98,7 @@ def test_a_scan_that_becomes_silent_is_reported_as_ended(growing, watching):
     growing.grow_until("row_committed")
 
     def is_alive() -> bool:
-        growing.live()
+        growing.touch_alive()
         state = answer(watch)
         return state["status"]["level"] == "good" and state["running"]
 
@@ -115,7 +115,7 @@ def test_a_killed_program_is_reported_immediately_however_long_its_timeout_is(gr
     growing.grow_until("row_committed")
     program = subprocess.Popen(["sleep", "600"])
     life = SignOfLife(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
-    growing.live()
+    growing.touch_alive()
     (growing.path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(msgspec.json.encode(life))
     watch = watching(growing.path, lapse_s=1e6)
     watch.wait_for(lambda s: s["running"])
@@ -168,14 +168,14 @@ def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(finished, folder)
 
-    def content():
+    def read_file_times():
         return {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.rglob("*"))}
 
-    state_before = content()
+    content_before = read_file_times()
     watch = watching(folder, control=True)
     watch.wait_for(shows(3))
     watch.close()
-    assert content() == state_before
+    assert read_file_times() == content_before
 
 
 def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
@@ -202,20 +202,20 @@ def test_any_pieces_give_the_whole(finished, tmp_path_factory, name, tail):
 
     @settings(max_examples=20)
     @given(CUTS)
-    def pieces(cuts: list[float]) -> None:
+    def check_pieces(cuts: list[float]) -> None:
         path = tmp_path_factory.mktemp("pieces") / name
         tailing = tail(path)
         collected = []
         ends = sorted({int(c * len(raw)) for c in cuts} | {len(raw)})
-        for state_before, end in zip([0, *ends], ends, strict=False):
+        for start, end in zip([0, *ends], ends, strict=False):
             with path.open("ab") as f:
-                f.write(raw[state_before:end])
+                f.write(raw[start:end])
             collected += tailing.look()
             assert collected == all_facts[: len(collected)]
         assert collected == all_facts
         assert tailing.look() == []
 
-    pieces()
+    check_pieces()
 
 
 def test_another_file_in_its_place_is_read_from_the_beginning(finished, tmp_path):
@@ -281,6 +281,6 @@ def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
     assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan
     growing.grow_until("scan_ended")
     watch.wait_for(lambda s: s["verdict"] is not None)
-    answer = json.loads(watch.state.data)["verdict"]
-    assert answer["level"] == "care"
-    assert [{key: r[key] for key in REASON} for r in answer["reasons"]] == [REASON]
+    verdict = json.loads(watch.state.data)["verdict"]
+    assert verdict["level"] == "care"
+    assert [{key: r[key] for key in REASON} for r in verdict["reasons"]] == [REASON]

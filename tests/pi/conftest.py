@@ -121,7 +121,7 @@ def pi(instrument: Instrument, stage: FakeStage, hub: Path) -> Iterator[Running]
 @pytest.fixture
 def host(pi: Running) -> HostSide:
     """The host of `pi`: a run is begun and the stage is homed."""
-    pi.host.must_accept(pi.host.begin())
+    pi.host.must_accept(pi.host.make_begin())
     pi.host.home()
     return pi.host
 
@@ -131,5 +131,5 @@ def host_in_row(host: HostSide, stage: FakeStage) -> HostSide:
     """The same during row 0; the stage stops after its second point until `stage.stays_after` changes."""
     stage.stays_after = 2
     host.start_row()
-    host.wait(m.Capture)
+    host.wait_for_event(m.Capture)
     return host

@@ -422,12 +422,12 @@ def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch
     """With simulated wires; a rig without a return wire reports that."""
     monkeypatch.setattr(pi_lines, "SIMULATED_LOOK_BACK_S", 0.2)
     with closing(WireClient(hub)) as cutter:
-        pi.host.must_accept(pi.host.begin())
+        pi.host.must_accept(pi.host.make_begin())
         pi.host.home()
-        assert pi.host.row(0).pulses_seen
+        assert pi.host.run_row(0).pulses_seen
         cutter._socket.sendall(f"X {instrument.pi.pulses_in} 1\n".encode())
         assert cutter._read_line(HANG_S) == "K"
-        row_finished = pi.host.row(1)
+        row_finished = pi.host.run_row(1)
         assert (row_finished.fault, row_finished.pulses, row_finished.pulses_seen) == (PiFault.PULSES_UNSEEN, 0, True)
         assert all(c.pulses_seen for c in pi.host.list_events(m.Capture))
 
@@ -436,9 +436,9 @@ def test_a_row_afterwards_is_complete_and_during_a_run_no_pulse_is_sent(pi, inst
     pulse = m.Pulse(pulses=5, period_us=1500.0, width_us=1.0)
     assert not pi.host.ask(m.Hello()).in_run
     assert pi.host.ask(pulse).pulses == 5
-    pi.host.must_accept(pi.host.begin())
+    pi.host.must_accept(pi.host.make_begin())
     assert pi.host.ask(m.Hello()).in_run
     assert pi.host.must_refuse(pulse) == PiFault.NOT_READY
     pi.host.home()
-    row_finished = pi.host.row(0)
+    row_finished = pi.host.run_row(0)
     assert (row_finished.status, row_finished.pulses) == ("done", instrument.grid.columns * instrument.burst.pulses)

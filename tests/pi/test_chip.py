@@ -70,10 +70,10 @@ def in_row(start, stage, hub, wires):
     def in_row(rig, *faults):
         program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, faults=faults, wire_time=True))
         stage.stays_after = 0
-        host.must_accept(host.begin())
+        host.must_accept(host.make_begin())
         host.home()
         host.start_row()
-        host.wait(m.RowStarted)
+        host.wait_for_event(m.RowStarted)
         wires.drive(*make_edge())
         return program, host
 
@@ -92,11 +92,11 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
     rig = replace(rig, stage=replace(rig.stage, speed_mm_s=2.0))
     program, host = start(rig, **gpio.environment(rig.pi.gpio_chip, hub, wire_time=wire_time))
     assert host.ask(m.Hello()).backend == "gpiod"
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     host.home()
-    report = host.row(0)
+    report = host.run_row(0)
     captures = [c for c in host.list_events(m.Capture) if c.pulses]
-    wires.until(lambda: len(wires.rises(SYNC)) == report.pulses)
+    wires.wait_until(lambda: len(wires.list_rises(SYNC)) == report.pulses)
     assert sum(c.pulses for c in captures) == report.pulses
     if wire_time or report.status == "done":
         assert (report.points, report.edges, report.bursts, report.pulses) == (POINTS, POINTS, POINTS, 4 * POINTS)
@@ -106,7 +106,7 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
         assert report.fault in busy, report.reason
     memory = Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
     assert int(memory) < 60_000, f"more than 60 MB: {memory} KB"
-    rises = wires.rises(SYNC)
+    rises = wires.list_rises(SYNC)
     for c in captures:
         burst = rises[: c.pulses]
         rises = rises[c.pulses :]
@@ -116,29 +116,29 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
         assert all(b - a >= 300_000 for a, b in pairwise(burst)), "never closer than the radar allows"
     status, _, err = program.end()
     assert status == 0, err
-    wires.until(lambda: wires.level(SYNC) == 0)
+    wires.wait_until(lambda: wires.read_level(SYNC) == 0)
 
 
 def test_an_edge_during_a_burst_ends_the_row_alone(long_bursts, in_row, wires):
     _, host = in_row(long_bursts)
     wires.drive(*make_edge(1_001_000))
-    report = host.wait(m.RowFinished)
+    report = host.wait_for_event(m.RowFinished)
     assert (report.status, report.fault, report.bursts) == ("fault", PiFault.EDGE_DURING_BURST, 1), report.reason
     assert host.list_events(m.Fault)[-1].number == PiFault.EDGE_DURING_BURST
-    host.until_state("ready")
+    host.wait_for_state("ready")
 
 
 def test_a_chip_that_vanishes_is_fault_107(long_bursts, in_row, wires):
     program, host = in_row(long_bursts)
-    host.wait(m.Capture)
+    host.wait_for_event(m.Capture)
     program.popen.send_signal(gpio.VANISH_SIGNAL)
-    report = host.wait(m.RowFinished)
+    report = host.wait_for_event(m.RowFinished)
     assert (report.status, report.fault) == ("fault", PiFault.TRIGGER_LINE_LOST)
-    assert "No such device" in host.until_state("fault").reason
+    assert "No such device" in host.wait_for_state("fault").reason
     assert host.must_refuse(m.Home()) == PiFault.TRIGGER_LINE_LOST
     ended, _, err = program.end()
     assert ended == 0, err
-    wires.until(lambda: wires.level(SYNC) == 0)
+    wires.wait_until(lambda: wires.read_level(SYNC) == 0)
 
 
 def test_a_line_in_use_ends_the_program_with_fault_and_remedy(rig, write_config, stage, hub):
@@ -153,11 +153,11 @@ def test_a_line_in_use_ends_the_program_with_fault_and_remedy(rig, write_config,
 def test_outputs_are_low_after_a_signal_inside_a_pulse(rig, in_row, wires, number):
     """The call that sets the line high does not return, so that the signal comes while the line is high."""
     program, _ = in_row(rig, "stuck")
-    wires.until(lambda: wires.level(SYNC) == 1)
+    wires.wait_until(lambda: wires.read_level(SYNC) == 1)
     status, _, err = program.end(number)
     assert status == (0 if number == signal.SIGTERM else -signal.SIGKILL), err
-    wires.until(lambda: wires.level(SYNC) == 0)
-    assert len(wires.rises(SYNC)) == 1
+    wires.wait_until(lambda: wires.read_level(SYNC) == 0)
+    assert len(wires.list_rises(SYNC)) == 1
 
 
 CHIP_PROGRAM = """
@@ -232,7 +232,7 @@ def start_homed(spi_rig, start):
             spi_rig.pi.gpio_chip, hub, wire_time=wire_time, spi=spi_rig.pi.spi_device, **settings
         )
         program, host = start(spi_rig, **environment)
-        host.must_accept(host.begin())
+        host.must_accept(host.make_begin())
         host.home()
         return program, host
 
@@ -250,13 +250,13 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
     program, host = start_homed(hub, core_hz=f"250e6,{real_hz:g}")
     rate = 250e6 / real_hz
     assert host.ask(m.Hello()).backend == "spi"
-    report = host.row(0)
+    report = host.run_row(0)
     assert (report.status, report.timed_by) == ("done", "spi"), report.reason
     status, _, err = program.end()
     assert status == 0, err
     n = spi_rig.burst.pulses
     period_ns = spi_rig.burst.period_us * 1e3
-    wires.until(lambda: len([e for e in wires.edges if e.line == MOSI]) == 2 * n * spi_rig.grid.columns)
+    wires.wait_until(lambda: len([e for e in wires.edges if e.line == MOSI]) == 2 * n * spi_rig.grid.columns)
     edges = [e for e in wires.edges if e.line == MOSI]
     rises = edges[::2]
     falls = edges[1::2]
@@ -275,10 +275,10 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
 def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(start_homed, hub):
     """A run whose bursts exceed spidev's `bufsiz` is refused immediately; the next one runs."""
     _, host = start_homed(hub, bufsiz="640")
-    refused = host.ask(msgspec.structs.replace(host.begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
+    refused = host.ask(msgspec.structs.replace(host.make_begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
     assert isinstance(refused, m.Refused)
     assert (refused.number, "bufsiz=" in refused.remedy) == (PiFault.BAD_REQUEST, True)
-    assert host.row(0).status == "done"
+    assert host.run_row(0).status == "done"
 
 
 @pytest.mark.slow
@@ -287,13 +287,13 @@ def test_a_killed_program_leaves_the_line_low(spi_rig, start_homed, hub, wires, 
     stage.skip = set(range(spi_rig.grid.columns))
     program, host = start_homed(hub, wire_time=False)
     host.start_row()
-    host.wait(m.RowStarted)
+    host.wait_for_event(m.RowStarted)
     wires.drive(WireEdge(1000, TRIGGER, 1), WireEdge(21_000, TRIGGER, 0))
-    wires.until(lambda: bool(wires.rises(MOSI)))
+    wires.wait_until(lambda: bool(wires.list_rises(MOSI)))
     program.popen.kill()
     program.popen.wait()
-    wires.until(lambda: len(wires.rises(MOSI)) == spi_rig.burst.pulses)
-    wires.until(lambda: wires.level(MOSI) == 0)
+    wires.wait_until(lambda: len(wires.list_rises(MOSI)) == spi_rig.burst.pulses)
+    wires.wait_until(lambda: wires.read_level(MOSI) == 0)
 
 
 @pytest.mark.slow
@@ -314,7 +314,7 @@ def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_
     small = read_findings(longer, bufsiz="512")
     assert "512 bytes" in small["SYNC_IN line 10"]["found"]
     assert "options spidev bufsiz=4096" in small["pulse width"]["remedy"]
-    assert not wires.rises(MOSI)
+    assert not wires.list_rises(MOSI)
 
 
 PR_CAPBSET_DROP = 24

@@ -34,14 +34,14 @@ def command(capsys):
 
 def test_sigterm_ends_the_row_and_the_program(instrument, start, hub, stage):
     program, host = start(instrument, "--wires", hub)
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     host.home()
-    assert host.row(0).status == "done"
+    assert host.run_row(0).status == "done"
     stage.stays_after = 2
     host.start_row(1)
-    host.wait(m.Capture, lambda e: e.row_index == 1)
+    host.wait_for_event(m.Capture, lambda e: e.row_index == 1)
     assert program.end() == (0, "", "")
-    last = host.wait(m.RowFinished)
+    last = host.wait_for_event(m.RowFinished)
     assert (last.row_index, last.status) == (1, "aborted")
     assert not host.list_events(m.RunStopped)
 

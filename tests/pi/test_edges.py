@@ -132,9 +132,9 @@ def give(bench: Bench, what: Any, t_ns: int) -> None:
     elif isinstance(what, str):
         bench.machine.command(what)
     elif what.kind == "done":
-        bench.stage_says(msgspec.structs.replace(what, sequence=bench.stage.number))
+        bench.send_reply(msgspec.structs.replace(what, sequence=bench.stage.number))
     else:
-        bench.stage_says(what)
+        bench.send_reply(what)
 
 
 def replay(recorder: Recorder, edges_ns: list[int]) -> m.RowFinished:
@@ -147,8 +147,8 @@ def replay(recorder: Recorder, edges_ns: list[int]) -> m.RowFinished:
             break
         give(bench, happening, t_ns)
     if bench.machine.state in ("running", "held", "stopping"):
-        bench.stage_says(Reply("alarm", number=StageError.STOPPED))
-    bench.later(2.0)
+        bench.send_reply(Reply("alarm", number=StageError.STOPPED))
+    bench.let_time_pass(2.0)
     return bench.list_events(m.RowFinished)[-1]
 
 

@@ -135,9 +135,9 @@ def test_nan_of_single_precision_is_refused_too():
 
 def test_a_folder_in_the_journals_place_is_refused(pi, instrument):
     (Path(instrument.pi.journal_dir) / "folder.journal").mkdir()
-    for command in (m.Replay(scan_id="folder", from_seq=1), pi.host.begin("folder")):
+    for command in (m.Replay(scan_id="folder", from_seq=1), pi.host.make_begin("folder")):
         assert pi.host.must_refuse(command)
-    assert pi.host.must_accept(pi.host.begin()).state == "idle"
+    assert pi.host.must_accept(pi.host.make_begin()).state == "idle"
 
 
 def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
@@ -157,11 +157,11 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     host: HostSide = pi.host
     rng = random.Random(amount)
     wires = WiresLog(hub, *instrument.pi.sync_out)
-    host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
+    host.must_accept(host.make_begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")
     valid = [
         m.Hello(), m.Status(), ALIVE, m.Home(), JOG, RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
-        host.begin("other"), host.begin(),
+        host.make_begin("other"), host.make_begin(),
     ]  # fmt: skip
     sent = taken = bytes_before = 0
     stage.pace_s = 0.05
@@ -178,17 +178,17 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
                 assert (event.status, event.pulses) == ("done", pulses), event
                 taken += 1
                 # A Pi in fault would refuse every row.
-                host.until_state("ready", "fault")
+                host.wait_for_state("ready", "fault")
                 host.start_row(take=taken + 1, owner="mine")
             host.must_accept(m.Alive(scan_id="scan", owner="mine"))
     assert read_resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
     host.must_accept(m.Abort(owner="mine"))
-    host.until_state("ready")
+    host.wait_for_state("ready")
     wires.close()
     n = instrument.burst.pulses
     period_ns = round(instrument.burst.period_us * 1e3)
-    rises = wires.rises(instrument.pi.sync_out[0])
+    rises = wires.list_rises(instrument.pi.sync_out[0])
     full_bursts = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
     assert len(full_bursts) >= taken * instrument.grid.columns
     assert all(t - b[0] == k * period_ns for b in full_bursts for k, t in enumerate(b))
@@ -207,7 +207,7 @@ def test_an_impossible_position_is_ignored(pi, stage, sign):
     for alarm in (-HUGE, -1, 1000, HUGE):
         fields = {"state": "idle", "x": stage.x, "y": stage.y, "points": HUGE, "alarm": alarm}
         stage.say(Reply("status", fields={k: str(v) for k, v in fields.items()}))
-    status = pi.host.wait(m.StageStatus, lambda e: e.points == HUGE)
+    status = pi.host.wait_for_event(m.StageStatus, lambda e: e.points == HUGE)
     assert (status.x_mm, status.y_mm) == (0.0, 0.0)
     assert 0 <= status.alarm < 1000
     assert pi.host.ask(m.Status()).x_mm == 0.0
@@ -215,16 +215,16 @@ def test_an_impossible_position_is_ignored(pi, stage, sign):
 
 def test_impossible_lost_steps_and_points_spoil_no_journal(pi, stage):
     stage.lost = (HUGE, -HUGE)
-    pi.host.must_accept(pi.host.begin())
+    pi.host.must_accept(pi.host.make_begin())
     pi.host.home()
     status = pi.host.ask(m.Status())
     assert (status.lost_x_mm, status.lost_y_mm) == (1e6, -1e6)
     stage.stays_after = 2
     pi.host.start_row()
-    pi.host.wait(m.Capture)
+    pi.host.wait_for_event(m.Capture)
     row = stage.seen[-1]
     stage.say(Reply("done", row.sequence, fields={"points": str(HUGE), "pulses": "0", "x": str(HUGE), "y": "0"}))
-    row_finished = pi.host.wait(m.RowFinished)
+    row_finished = pi.host.wait_for_event(m.RowFinished)
     assert (row_finished.status, row_finished.points) == ("fault", HUGE)
     assert pi.host.replay()[-1].seq >= row_finished.seq
 
@@ -311,7 +311,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     """The next client is served by the same process with the same run."""
     endpoint, kind, more_bytes = ATTACKS[attack]
     program, host = start(instrument, "--wires", hub)
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     host.home()
     pid = program.popen.pid
     # As the program's own: with its memory locked it may hold more than the least limit from the start.
@@ -354,14 +354,14 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     assert 0 < sent < ENOUGH_BYTES
     assert highest[0] < HIGHEST_BYTES
     # Events were cut off, too: they come again
-    host.wait(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)
+    host.wait_for_event(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)
     # The remaining messages may cause another cut of the connections, with a command or an event.
     host.limit_s = 5.0
     takes = itertools.count(1)
 
     def is_done() -> bool:
         with suppress(AssertionError):
-            return host.row(0, next(takes)).status == "done"
+            return host.run_row(0, next(takes)).status == "done"
         return False
 
     wait_for(is_done, "a row", 120.0)

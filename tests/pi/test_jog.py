@@ -21,7 +21,7 @@ from polysight_shared.errors import ErrorCode
 def rig(pi, instrument):
     """The rig as its host sees it, with the stage homed."""
     pi.host.must_accept(m.Home())
-    pi.host.until_state("homed")
+    pi.host.wait_for_state("homed")
     server = pi.service.server
     addresses = msgspec.structs.replace(
         instrument.pi, command_address=server.command_address, event_address=server.event_address
@@ -53,7 +53,7 @@ def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):
     stage.pace_s = 60.0
 
     def abort_later() -> None:
-        pi.host.until_state("jogging")
+        pi.host.wait_for_state("jogging")
         jog = pi.service.executor._machine.jog
         begun_s = jog.alive_s
         wait_for(lambda: jog.alive_s > begun_s + 3 * jog.timeout_s, "heartbeats of the jog")
@@ -64,14 +64,14 @@ def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):
     with expect_refusal(ErrorCode.STAGE_NOT_READY, "aborted"):
         client.jog("x", 10.0, 20.0)
     person.join()
-    assert pi.host.wait(m.Jogged).status == "aborted"
+    assert pi.host.wait_for_event(m.Jogged).status == "aborted"
 
 
 def test_an_interrupted_jog_is_stopped(client, pi, stage):
     stage.pace_s = 60.0
 
     def interrupt_later() -> None:
-        pi.host.until_state("jogging")
+        pi.host.wait_for_state("jogging")
         os.kill(os.getpid(), signal.SIGINT)
 
     operator = threading.Thread(target=interrupt_later)
@@ -79,5 +79,5 @@ def test_an_interrupted_jog_is_stopped(client, pi, stage):
     with pytest.raises(KeyboardInterrupt):
         client.jog("x", 10.0, 20.0)
     operator.join()
-    ended = pi.host.wait(m.Jogged)
+    ended = pi.host.wait_for_event(m.Jogged)
     assert (ended.status, ended.reason) == ("aborted", "stopped by its operator")

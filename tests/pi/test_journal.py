@@ -277,17 +277,17 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     monkeypatch.setattr(journal_module.os, "pwrite", full)
     # The row would be done before a slow disk says that it is full.
     stage.stays_after = 4
-    fault = host.wait(m.Fault)
-    row_finished = host.wait(m.RowFinished)
+    fault = host.wait_for_event(m.Fault)
+    row_finished = host.wait_for_event(m.RowFinished)
     stage.stays_after = None
     monkeypatch.undo()
     assert fault.number == row_finished.fault == PiFault.JOURNAL_FULL
     assert row_finished.status == "fault"
-    assert host.until_state("fault").fault == PiFault.JOURNAL_FULL
+    assert host.wait_for_state("fault").fault == PiFault.JOURNAL_FULL
     last = host.ask(m.Hello()).last_seq
     assert fault.seq == row_finished.seq == last >= good
     host.home()
-    assert host.row(0, take=2).status == "done"
+    assert host.run_row(0, take=2).status == "done"
     replayed = host.replay()
     assert [e.seq for e in replayed] == list(range(1, len(replayed) + 1))
 
@@ -303,13 +303,13 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
         monkeypatch.undo()
         assert host.ask(m.Status()).fault == PiFault.JOURNAL_FULL
 
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     host.must_accept(stop)
-    check_is_refused_when_full(host.begin(last_seq=2))
+    check_is_refused_when_full(host.make_begin(last_seq=2))
     assert not host.ask(m.Hello()).in_run
     host.must_accept(m.Home())
-    host.until_state("homed")
-    host.must_accept(host.begin())
+    host.wait_for_state("homed")
+    host.must_accept(host.make_begin())
     check_is_refused_when_full(stop)
     assert host.ask(m.Hello()).in_run
     host.must_accept(stop)
@@ -320,7 +320,7 @@ def test_the_pis_client_prints_each_event_once_even_after_a_lost_journal(pi, ins
     host = pi.host
     stop = m.EndRun(scan_id="scan", exit_status="success")
     for seq in (0, 5000):
-        host.must_accept(host.begin(last_seq=seq))
+        host.must_accept(host.make_begin(last_seq=seq))
         host.must_accept(stop)
     pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
     printed = replay_events(msgspec.structs.replace(instrument, pi=pi_settings), "scan", 1)

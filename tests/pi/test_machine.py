@@ -41,11 +41,11 @@ def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
     if motion == "homing":
         bench.machine.command("Home")
         bench.run_posted()
-        bench.stage_says(Reply("ok", bench.stage.number))
+        bench.send_reply(Reply("ok", bench.stage.number))
     else:
         bench.start()
     for _ in range(2 * STATUS_PER_HEARTBEAT * 2):  # of two seconds
-        bench.status(0, state="idle")
+        bench.send_status(0, state="idle")
     assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
     assert not bench.machine.homed
 
@@ -56,9 +56,9 @@ def test_a_row_that_does_not_end_is_given_up_after_half_a_minute_and_three_times
         bench = Bench().begin_and_home()
         limit_s = 30 + 3 * estimate_row_duration_s(row, bench.stage.config, 20.0)
         bench.start(row)
-        bench.later(limit_s - 0.1)
+        bench.let_time_pass(limit_s - 0.1)
         assert bench.machine.state == "running"
-        bench.later(0.2)
+        bench.let_time_pass(0.2)
         assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
 
 
@@ -67,9 +67,9 @@ def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
     bench = Bench().begin_and_home()
     bench.machine.command("Home")
     bench.run_posted()
-    bench.stage_says(Reply("ok", bench.stage.number))
+    bench.send_reply(Reply("ok", bench.stage.number))
     x, y = map(str, place)
-    bench.stage_says(Reply("done", bench.stage.number, fields={"x": x, "y": y}))
+    bench.send_reply(Reply("done", bench.stage.number, fields={"x": x, "y": y}))
     assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.POSITION)
     assert not bench.machine.homed
 
@@ -77,11 +77,11 @@ def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
 def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
     bench = Bench().begin_and_home()
     bench.start()
-    bench.edge()
-    bench.edge()
-    bench.row_done()
+    bench.send_edge()
+    bench.send_edge()
+    bench.end_row()
     assert bench.machine.state == "done"
-    bench.later(2.0)
+    bench.let_time_pass(2.0)
     finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
     assert bench.machine.state == "ready"
@@ -93,8 +93,8 @@ def test_a_row_that_ends_elsewhere_is_not_counted(dx, dy):
     bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
-        bench.edge()
-    bench.row_done(dx, dy)
+        bench.send_edge()
+    bench.end_row(dx, dy)
     finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POSITION)
     assert bench.machine.state == "idle", "its position is not known"
@@ -108,7 +108,7 @@ def test_stop_does_not_wait_for_the_burst_under_way(event, monkeypatch):
     """A call that sets a line may hang, and with it every thread that waits for the burst's end."""
     bench = Bench().begin_and_home()
     bench.start()
-    bench.edge()
+    bench.send_edge()
     sent: list[Immediate] = []
     disarm = bench.loop.disarm
 
@@ -126,8 +126,8 @@ def test_a_row_whose_stage_counts_other_trigger_pulses_is_not_counted(extra_puls
     bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
-        bench.edge()
-    bench.row_done(extra_pulses=extra_pulses)
+        bench.send_edge()
+    bench.end_row(extra_pulses=extra_pulses)
     finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
 
@@ -141,15 +141,15 @@ def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms
     bench.start()
     bench.machine.command("Hold") if held else None
     for _ in range(beats):
-        bench.later(heartbeat_ms / 1e3)
+        bench.let_time_pass(heartbeat_ms / 1e3)
         bench.machine.note_host_alive()
     assert bench.armed, "a host that is heard is not lost"
     last = bench.t
     while bench.armed:
-        bench.later(0.001)
+        bench.let_time_pass(0.001)
     assert bench.t - last <= SAFE_WITHIN_S
     assert bench.stage.sent[-1] == Immediate.STOP
-    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    bench.send_reply(Reply("alarm", number=StageError.STOPPED))
     finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.HOST_LOST)
     assert (bench.machine.state, bench.machine.fault) == ("ready", PiFault.HOST_LOST)
@@ -160,15 +160,15 @@ def test_a_host_that_falls_silent_ends_its_homing():
     bench.machine.command("BeginRun", 100)
     bench.machine.command("Home")
     bench.run_posted()
-    bench.stage_says(Reply("ok", bench.stage.number))
-    bench.later(SAFE_WITHIN_S)
+    bench.send_reply(Reply("ok", bench.stage.number))
+    bench.let_time_pass(SAFE_WITHIN_S)
     assert bench.stage.sent == [Immediate.STOP]
     assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.HOST_LOST)
-    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    bench.send_reply(Reply("alarm", number=StageError.STOPPED))
     bench.machine.command("Home")
     bench.run_posted()
-    bench.stage_says(Reply("ok", bench.stage.number))
-    bench.later(200.0)
+    bench.send_reply(Reply("ok", bench.stage.number))
+    bench.let_time_pass(200.0)
     assert bench.machine.state == "homing", "a person at the Pi homes without a host"
 
 
@@ -178,18 +178,18 @@ def test_a_held_row_continues_when_the_stage_rests():
     bench.start()
     bench.machine.command("Hold")
     bench.machine.command("Resume")
-    bench.status(0)
+    bench.send_status(0)
     assert bench.stage.sent == [Immediate.HOLD]
-    bench.status(0, state="hold", x=70_000)
+    bench.send_status(0, state="hold", x=70_000)
     assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME]
-    bench.status(0, state="hold", x=70_000)
+    bench.send_status(0, state="hold", x=70_000)
     assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME], "once"
 
 
 def test_a_host_without_a_heartbeat_is_not_watched():
     bench = Bench().begin_and_home()
     bench.start()
-    bench.later(20.0)
+    bench.let_time_pass(20.0)
     assert bench.armed
 
 
@@ -242,13 +242,13 @@ def test_a_lost_trigger_line_stops_every_motion_immediately(lasting):
     assert LOOK_UP_S <= SAFE_WITHIN_S / 2
     bench = Bench().begin_and_home()
     bench.start()
-    bench.edge()
+    bench.send_edge()
     job = None if lasting else bench.machine.row.job  # type: ignore[union-attr]
     number = PiFault.TRIGGER_LINE_LOST if lasting else PiFault.EDGE_LOST
     bench.machine.on_loop_fault(LoopFault(job, number, "gone"))
     assert not bench.armed
     assert bench.stage.sent == [Immediate.STOP]
-    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    bench.send_reply(Reply("alarm", number=StageError.STOPPED))
     assert bench.list_events(m.RowFinished)[-1].fault == number
     assert bench.machine.state == ("fault" if lasting else "ready")
     if lasting:
@@ -261,12 +261,12 @@ def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
     assert 3 * 0.5 / STATUS_PER_HEARTBEAT <= SAFE_WITHIN_S
     bench = Bench().begin_and_home()
     bench.start()
-    bench.status(0)
-    bench.edge()
-    bench.status(1)
-    bench.status(2)
+    bench.send_status(0)
+    bench.send_edge()
+    bench.send_status(1)
+    bench.send_status(2)
     assert bench.armed
-    bench.status(3)
+    bench.send_status(3)
     assert not bench.armed
     assert bench.machine.fault == PiFault.TRIGGER_LINE_LOST
     assert bench.stage.sent == [Immediate.STOP]
@@ -303,13 +303,13 @@ JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=10.0, speed_mm_s=20.0, heartbeat_
 def test_a_jog_without_its_host_stops_in_time_and_keeps_the_position():
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
-    bench.later(0.3)
+    bench.let_time_pass(0.3)
     assert bench.machine.note_jog_alive("")
-    bench.later(0.39)
+    bench.let_time_pass(0.39)
     assert not bench.stage.sent
-    bench.later(0.02)
+    bench.let_time_pass(0.02)
     assert bench.stage.sent == [Immediate.STOP]
-    bench.stage_says(Reply("alarm", number=StageError.STOPPED))
+    bench.send_reply(Reply("alarm", number=StageError.STOPPED))
     ended = bench.list_events(m.Jogged)[-1]
     assert (ended.status, ended.fault, bench.machine.state) == ("fault", PiFault.HOST_LOST, "ready")
 
@@ -318,7 +318,7 @@ def test_a_stage_that_does_not_stop_its_jog_is_lost():
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
     bench.machine.command("Abort", "requested")
-    bench.later(3.1)
+    bench.let_time_pass(3.1)
     assert (bench.machine.state, bench.machine.homed) == ("fault", False)
     assert bench.list_events(m.Jogged)[-1].status == "aborted"
 
@@ -336,7 +336,7 @@ def test_the_end_of_the_program_stops_a_jog_and_reports_it():
 def test_a_jog_that_ends_elsewhere_loses_the_position(x, y):
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
-    bench.stage_says(Reply("done", bench.stage.number, fields={"x": str(x), "y": str(y)}))
+    bench.send_reply(Reply("done", bench.stage.number, fields={"x": str(x), "y": str(y)}))
     assert (bench.machine.state, bench.machine.fault, bench.machine.homed) == ("fault", PiFault.POSITION, False)
 
 
@@ -349,19 +349,19 @@ ACTIONS: dict[str, Callable[[Bench], object]] = {
     "hold": lambda b: b.machine.command("Hold"),
     "resume": lambda b: b.machine.command("Resume"),
     "abort": lambda b: b.machine.command("Abort", "requested"),
-    "edge": lambda b: b.edge(),
-    "status": lambda b: b.status(len(b.list_events(m.Capture))),
-    "ok": lambda b: b.stage_says(Reply("ok", b.stage.number)),
-    "done": lambda b: b.row_done(),
-    "stopped": lambda b: b.stage_says(Reply("alarm", number=StageError.STOPPED)),
-    "limit": lambda b: b.stage_says(Reply("alarm", number=StageError.LIMIT_SWITCH)),
-    "banner": lambda b: b.stage_says(Reply("banner")),
+    "edge": lambda b: b.send_edge(),
+    "status": lambda b: b.send_status(len(b.list_events(m.Capture))),
+    "ok": lambda b: b.send_reply(Reply("ok", b.stage.number)),
+    "done": lambda b: b.end_row(),
+    "stopped": lambda b: b.send_reply(Reply("alarm", number=StageError.STOPPED)),
+    "limit": lambda b: b.send_reply(Reply("alarm", number=StageError.LIMIT_SWITCH)),
+    "banner": lambda b: b.send_reply(Reply("banner")),
     "lines gone": lambda b: b.machine.on_loop_fault(LoopFault(None, PiFault.TRIGGER_LINE_LOST, "gone")),
     "edge lost": lambda b: (
         b.machine.row and b.machine.on_loop_fault(LoopFault(b.machine.row.job, PiFault.EDGE_LOST, "lost"))
     ),
     "stage lost": lambda b: b.machine.handle_event("stage lost", PiFault.STAGE_LOST, "silent"),
-    "time": lambda b: b.later(0.45),
+    "time": lambda b: b.let_time_pass(0.45),
 }
 
 
@@ -390,7 +390,7 @@ def test_any_order_of_events(start, actions):
     if machine.row is not None:
         # A held row waits for a person
         machine.handle_event("Resume")
-        bench.later(400.0)
+        bench.let_time_pass(400.0)
         assert machine.row is None, "every row ends"
 
 

@@ -64,7 +64,7 @@ class Bench:
         self.executor = Executor(stage, loop, self.journal_thread)
         self.executor._machine._clock = lambda: self.t
 
-    def turn(self, *items: Any) -> None:
+    def run_turn(self, *items: Any) -> None:
         for item in items:
             self.executor.post(item)
         # A command that the journal answers
@@ -76,19 +76,19 @@ class Bench:
     def ask(self, command: m.AnyCommand) -> Any:
         replies: list[m.AnyReply] = []
         assert self.executor.submit(command, replies.append)
-        self.turn()
+        self.run_turn()
         return replies[0] if replies else None
 
-    def begin(self, scan_id: str = "s", heartbeat_s: float = HEARTBEAT_S) -> Any:
+    def begin_run(self, scan_id: str = "s", heartbeat_s: float = HEARTBEAT_S) -> Any:
         heartbeat_ms = round(heartbeat_s * 1e3)
         burst = {"pulses": 4, "period_us": 1500.0, "width_us": 1.0, "speed_mm_s": 20.0}
         plan = RasterPlan(40, 2, 2.0, 2.0)
         return self.ask(m.BeginRun(scan_id=scan_id, plan=plan, heartbeat_ms=heartbeat_ms, **burst))
 
-    def ready(self) -> Bench:
-        assert isinstance(self.begin(), m.Accepted)
+    def make_ready(self) -> Bench:
+        assert isinstance(self.begin_run(), m.Accepted)
         self.ask(m.Home())
-        self.turn(Reply("ok", self.stage.number), Reply("done", self.stage.number))
+        self.run_turn(Reply("ok", self.stage.number), Reply("done", self.stage.number))
         assert self.executor.status.state == "ready"
         return self
 
@@ -112,27 +112,27 @@ def bench(tmp_path):
 
 def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
     """A line to the stage is sent again: nothing else is executed meanwhile, so that no `Alive` can be sent."""
-    bench.ready()
+    bench.make_ready()
     bench.stage.row_takes_s = LIMIT_S + 0.15
     assert isinstance(bench.run_row(), m.Accepted)
-    bench.turn()
+    bench.run_turn()
     assert (bench.state, bench.list_events(m.Fault)) == ("running", [])
     bench.t += LIMIT_S + 0.001
-    bench.turn()
+    bench.run_turn()
     assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST, "from then on it is watched"
 
 
-@given(every_s=st.floats(0.01, 0.2), which=st.sampled_from(["events", "another's"]))
+@given(every_s=st.floats(0.01, 0.2), client=st.sampled_from(["events", "another's"]))
 @settings(max_examples=20, deadline=None)
-def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory, every_s, which):
+def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory, every_s, client):
     bench = Bench(tmp_path_factory.mktemp("j"))
-    bench.ready()
+    bench.make_ready()
     bench.run_row()
     last = bench.t
     while not bench.list_events(m.Fault):
         assert bench.t - last <= LIMIT_S + 2 * every_s
         bench.t += every_s
-        if which == "events":
+        if client == "events":
             bench.ask(m.Replay(scan_id="s", from_seq=1))
         else:
             bench.ask(m.RunRow(scan_id="another", row_index=0, take=1))
@@ -142,34 +142,34 @@ def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory
 
 
 def test_another_machine_does_not_take_a_pi_whose_host_lives(bench):
-    bench.ready()
+    bench.make_ready()
     bench.t += HEARTBEAT_S
-    refused = bench.begin("other")
-    assert (refused.number, bool(refused.remedy)) == (PiFault.NOT_READY, True)
+    refusal = bench.begin_run("other")
+    assert (refusal.number, bool(refusal.remedy)) == (PiFault.NOT_READY, True)
     assert (bench.state, bench.executor.status.scan_id) == ("ready", "s"), "nothing has changed"
-    assert isinstance(bench.begin("s"), m.Accepted), "its own host may begin again"
+    assert isinstance(bench.begin_run("s"), m.Accepted), "its own host may begin again"
     bench.t += LIMIT_S
-    assert isinstance(bench.begin("other"), m.Accepted), "a host that died keeps nobody out"
+    assert isinstance(bench.begin_run("other"), m.Accepted), "a host that died keeps nobody out"
 
 
 def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
-    bench.ready()
+    bench.make_ready()
     for _ in range(60):
         # Each adds an event
-        bench.begin()
+        bench.begin_run()
     assert len(bench.ask(m.Replay(scan_id="s", from_seq=1)).events) == 61
     bench.run_row()
-    paged: list[int] = []
-    while (reply := bench.ask(m.Replay(scan_id="s", from_seq=len(paged) + 1))).events:
+    numbers: list[int] = []
+    while (reply := bench.ask(m.Replay(scan_id="s", from_seq=len(numbers) + 1))).events:
         assert len(reply.events) <= REPLAYED_IN_A_ROW
-        paged += [e.seq for e in reply.events]
-    assert paged == list(range(1, reply.last_seq + 1)), "who pages gets them all"
-    elsewhere = bench.ask(m.Replay(scan_id="earlier", from_seq=1))
-    assert elsewhere.number == PiFault.NOT_READY
+        numbers += [e.seq for e in reply.events]
+    assert numbers == list(range(1, reply.last_seq + 1)), "who pages gets them all"
+    refusal = bench.ask(m.Replay(scan_id="earlier", from_seq=1))
+    assert refusal.number == PiFault.NOT_READY
     bench.t += LIMIT_S
-    bench.turn()
-    bench.turn(Reply("alarm", number=15))
-    bench.turn()
+    bench.run_turn()
+    bench.run_turn(Reply("alarm", number=15))
+    bench.run_turn()
     assert bench.state == "ready"
     assert len(bench.ask(m.Replay(scan_id="s", from_seq=1)).events) > REPLAYED_IN_A_ROW
     assert bench.ask(m.Replay(scan_id="earlier", from_seq=1)).last_seq == 0
@@ -179,26 +179,26 @@ def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
 def owner_in_row(pi, stage):
     """The host that owns the run, during row 0; the stage stops after its second point."""
     host = pi.host
-    host.must_accept(host.begin(owner="mine", heartbeat_ms=10_000))
+    host.must_accept(host.make_begin(owner="mine", heartbeat_ms=10_000))
     host.home("mine")
     stage.stays_after = 2
     host.start_row(owner="mine")
-    host.wait(m.Capture)
+    host.wait_for_event(m.Capture)
     return host
 
 
 @pytest.fixture
 def hang(pi):
     """Lets the executor hang, until the returned event is set."""
-    hangs = threading.Event()
+    is_hanging = threading.Event()
     released = threading.Event()
 
-    def hang():
-        pi.service.executor.post(lambda: (hangs.set(), released.wait(HANG_S)))
-        assert hangs.wait(HANG_S)
+    def hang_executor():
+        pi.service.executor.post(lambda: (is_hanging.set(), released.wait(HANG_S)))
+        assert is_hanging.wait(HANG_S)
         return released
 
-    yield hang
+    yield hang_executor
     released.set()
 
 
@@ -211,9 +211,9 @@ def test_only_the_owner_commands_a_run(owner_in_row, stage):
             m.RunRow(scan_id="scan", row_index=1, take=1, owner=owner), m.Home(owner=owner),
         ):  # fmt: skip
             assert host.must_refuse(command) == PiFault.NOT_OWNER, command
-        assert host.must_refuse(host.begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
+        assert host.must_refuse(host.make_begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
     stage.stays_after = None
-    assert host.wait(m.RowFinished).status == "done"
+    assert host.wait_for_event(m.RowFinished).status == "done"
     assert host.must_refuse(m.Home(owner="other")) == PiFault.NOT_OWNER, "between two rows as well"
     host.must_accept(m.EndRun(scan_id="scan", exit_status="success", owner="mine"))
 
@@ -221,19 +221,19 @@ def test_only_the_owner_commands_a_run(owner_in_row, stage):
 def test_an_old_row_does_not_move_the_stage_again(host, stage):
     """A late copy of a command, or one of a confused program: takes of a row only increase."""
     for row, take in ((1, 1), (2, 1), (1, 2), (1, 4)):
-        assert host.row(row, take).status == "done"
+        assert host.run_row(row, take).status == "done"
     for row, take in ((1, 1), (1, 2), (1, 3), (2, 1)):
-        old = m.RunRow(scan_id="scan", row_index=row, take=take)
-        assert host.must_refuse(old) == PiFault.BAD_REQUEST
+        earlier_row = m.RunRow(scan_id="scan", row_index=row, take=take)
+        assert host.must_refuse(earlier_row) == PiFault.BAD_REQUEST
     # Repeated: it was the last one
     host.must_accept(m.RunRow(scan_id="scan", row_index=1, take=4))
     assert stage.rows_run == 4
     assert sum(isinstance(e, m.RowStarted) for e in host.replay()) == 4
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=1, take=4)) == PiFault.BAD_REQUEST, (
         "the scan is the same"
     )
-    assert host.row(1, 5).status == "done"
+    assert host.run_row(1, 5).status == "done"
 
 
 def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
@@ -241,12 +241,12 @@ def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
     rig = set_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:
-            running.host.must_accept(running.host.begin())
+            running.host.must_accept(running.host.make_begin())
             running.host.home()
             if first_take > 1:
-                old = m.RunRow(scan_id="scan", row_index=0, take=first_take - 1)
-                assert running.host.must_refuse(old) == PiFault.BAD_REQUEST
-            assert running.host.row(0, first_take).status == "done"
+                earlier_row = m.RunRow(scan_id="scan", row_index=0, take=first_take - 1)
+                assert running.host.must_refuse(earlier_row) == PiFault.BAD_REQUEST
+            assert running.host.run_row(0, first_take).status == "done"
 
 
 def make_jog(from_mm: float, distance_mm: float, axis: m.Axis = "x", **changes) -> m.Jog:
@@ -256,18 +256,18 @@ def make_jog(from_mm: float, distance_mm: float, axis: m.Axis = "x", **changes) 
 
 def test_a_jog_moves_once_and_within_its_limits(host, stage):
     host.must_accept(make_jog(0, 10))
-    assert host.wait(m.Jogged).end_mm == 10.0
-    host.until_state("ready")
+    assert host.wait_for_event(m.Jogged).end_mm == 10.0
+    host.wait_for_state("ready")
     host.must_accept(make_jog(0, 10))
     assert [c.args[0] for c in stage.seen if c.verb == "MOVE"] == [2000], "sent again, moved once"
-    for wrong in (
+    for invalid_jog in (
         make_jog(0, 20), make_jog(10, -10.1), make_jog(10, 100, "y"), make_jog(10, 0), make_jog(10, 5, speed_mm_s=1e5),
         make_jog(10, 5, speed_mm_s=5e-324), make_jog(10, 100, speed_mm_s=1),
     ):  # fmt: skip
-        assert host.must_refuse(wrong) == PiFault.BAD_REQUEST, wrong
+        assert host.must_refuse(invalid_jog) == PiFault.BAD_REQUEST, invalid_jog
     assert sum(c.verb == "MOVE" for c in stage.seen) == 1
     assert any(isinstance(e, m.Jogged) for e in host.replay())
-    assert host.row(0).status == "done"
+    assert host.run_row(0).status == "done"
 
 
 def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_in_row, stage):
@@ -275,7 +275,7 @@ def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_i
     assert host.must_refuse(make_jog(0, 10, owner="mine")) == PiFault.NOT_READY
     assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
     stage.stays_after = None
-    host.wait(m.RowFinished)
+    host.wait_for_event(m.RowFinished)
     assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
 
 
@@ -283,20 +283,20 @@ def test_a_jog_outside_of_a_run_is_watched_and_aborted(pi, stage):
     host = pi.host
     assert host.must_refuse(make_jog(0, 10)) == PiFault.NOT_READY, "not homed"
     host.must_accept(m.Home())
-    host.until_state("homed")
+    host.wait_for_state("homed")
     stage.pace_s = 60.0
     host.must_accept(make_jog(0, 10, owner="page"))
     host.must_accept(m.Alive(scan_id="", owner="page"))
     assert host.must_refuse(m.Alive(scan_id="", owner="other")) == PiFault.NOT_READY
     assert host.must_refuse(make_jog(0, 20)) == PiFault.NOT_READY
     host.must_accept(m.Abort(owner="page"))
-    assert host.wait(m.Jogged).status == "aborted"
-    host.until_state("homed")
+    assert host.wait_for_event(m.Jogged).status == "aborted"
+    host.wait_for_state("homed")
 
 
 def test_a_host_of_an_older_release_homes_in_its_own_run(pi):
     """A host of an older release sends no owner in `Home`."""
-    pi.host.must_accept(pi.host.begin(owner="mine", heartbeat_ms=10_000, owns_home=False))
+    pi.host.must_accept(pi.host.make_begin(owner="mine", heartbeat_ms=10_000, owns_home=False))
     pi.host.home()
 
 
@@ -308,8 +308,8 @@ def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):
     assert take_over(second_host, "hold") == "held"
     assert take_over(second_host, "resume") == "running"
     take_over(second_host, "abort")
-    assert owner_in_row.wait(m.RowFinished).status == "aborted"
-    owner_in_row.until_state("ready")
+    assert owner_in_row.wait_for_event(m.RowFinished).status == "aborted"
+    owner_in_row.wait_for_state("ready")
     assert take_over(second_host, "end") == "homed"
 
 
@@ -331,8 +331,8 @@ def test_the_commands_on_the_pi_wait_for_a_service_that_answers_late(rig):
 
 def test_a_run_without_a_heartbeat_can_be_replaced(pi):
     host = pi.host
-    host.must_accept(host.begin(owner="mine"))
-    host.must_accept(host.begin(owner="another"))
+    host.must_accept(host.make_begin(owner="mine"))
+    host.must_accept(host.make_begin(owner="another"))
     assert host.must_refuse(m.Abort(owner="mine")) == PiFault.NOT_OWNER
     host.must_accept(m.Abort(owner="another"))
 
@@ -343,13 +343,13 @@ def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
     monkeypatch.setattr("polysight_pi.service.HUNG_S", 0.5)
     monkeypatch.setattr(executors, "TURN_S", 0.05)
 
-    def until(kind):
+    def ask_until(kind):
         replies = []
         wait_for(lambda: isinstance(replies.append(host.ask(m.Status())) or replies[-1], kind), kind.__name__)
         return replies[-1]
 
     released = hang()
-    assert until(m.Refused).number == PiFault.PROGRAM
+    assert ask_until(m.Refused).number == PiFault.PROGRAM
 
     def is_silent() -> bool:
         if not host.subscriber.poll(300):
@@ -360,7 +360,7 @@ def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
 
     wait_for(is_silent, "no heartbeat while it hangs")
     released.set()
-    until(m.StatusReply)
+    ask_until(m.StatusReply)
 
 
 def test_a_command_that_fails_in_the_program_is_a_refusal(pi, monkeypatch, capfd):

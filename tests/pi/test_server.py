@@ -26,7 +26,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     assert (hello.backend, hello.firmware, hello.state) == ("wires", "fake", "ready")
     assert hello.stage == instrument.stage.placement_settings
     assert hello.t_unix_ns > 1_600_000_000 * 10**9
-    row_finished = host.row(1)
+    row_finished = host.run_row(1)
     burst = instrument.burst
     n = instrument.grid.columns
     assert (row_finished.status, row_finished.points, row_finished.edges, row_finished.bursts) == ("done", n, n, n)
@@ -58,14 +58,14 @@ def test_only_pins_count_as_hardware():
 def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
     rig = msgspec.structs.replace(instrument, stage=msgspec.structs.replace(instrument.stage, heartbeat_ms=1000))
     with closing(Running(set_stage_port(rig, stage.port), hub)) as pi:
-        pi.host.must_accept(pi.host.begin())
+        pi.host.must_accept(pi.host.make_begin())
         pi.host.home()
         stage.stays_after = 2
         pi.host.start_row()
-        pi.host.wait(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
-        pi.host.wait(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
+        pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
+        pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
         stage.stays_after = None
-        pi.host.wait(m.RowFinished)
+        pi.host.wait_for_event(m.RowFinished)
     row = next(c for c in stage.seen if c.verb == "ROW")
     # 200 steps/mm; half of eight columns 2 mm apart, and the first of four rows.
     half = 3.5 * 2 * 200
@@ -86,16 +86,16 @@ def test_homing_reports_lost_steps(host, stage):
 
 
 def test_repeated_requests_act_once(host, stage):
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     stage.stays_after = 2
     assert host.must_accept(RUN_0).state == "running"
     assert host.must_accept(RUN_0).state == "running"
     stage.stays_after = None
-    host.wait(m.RowFinished)
-    host.until_state("ready")
+    host.wait_for_event(m.RowFinished)
+    host.wait_for_state("ready")
     assert host.must_accept(RUN_0).state == "ready"
     assert stage.rows_run == 1
-    assert host.row(0, take=2).status == "done"
+    assert host.run_row(0, take=2).status == "done"
     assert stage.rows_run == 2
     end = m.EndRun(scan_id="scan", exit_status="success")
     host.must_accept(end)
@@ -105,20 +105,20 @@ def test_repeated_requests_act_once(host, stage):
 
 def test_refusals_have_their_number(pi):
     host = pi.host
-    plan = host.begin().plan
+    plan = host.make_begin().plan
     replace = msgspec.structs.replace
     # No run has begun.
     assert host.must_refuse(RUN_0) == PiFault.NOT_READY
-    assert host.must_refuse(host.begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
-    assert host.must_refuse(host.begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
+    assert host.must_refuse(host.make_begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
+    assert host.must_refuse(host.make_begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
     for wrong in (
         {"speed_mm_s": 1000.0}, {"speed_mm_s": 5e-324}, {"speed_mm_s": 0.1},
         {"pulses": 100}, {"plan": replace(plan, columns=402)},
         {"plan": replace(plan, step_x_mm=2.0011)},
     ):  # fmt: skip
-        assert host.must_refuse(host.begin(**wrong)) == PiFault.BAD_REQUEST
-    host.must_accept(host.begin())
-    assert host.must_refuse(host.begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
+        assert host.must_refuse(host.make_begin(**wrong)) == PiFault.BAD_REQUEST
+    host.must_accept(host.make_begin())
+    assert host.must_refuse(host.make_begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
     # The stage is not homed.
     assert host.must_refuse(RUN_0) == PiFault.NOT_READY
     host.home()
@@ -137,73 +137,73 @@ def test_hold_and_resume_lose_nothing(host_in_row, stage):
     assert host.ask(m.Status()).row_index == 0
     assert host.must_accept(m.Resume()).state == "running"
     stage.stays_after = None
-    assert host.wait(m.RowFinished).status == "done"
+    assert host.wait_for_event(m.RowFinished).status == "done"
     assert stage.bytes_seen.count(Immediate.HOLD) == 1
 
 
 def test_abort_ends_the_row_and_the_next_one_runs_without_homing(host_in_row, stage):
     host = host_in_row
     host.must_accept(m.Abort(reason="enough"))
-    row_finished = host.wait(m.RowFinished)
+    row_finished = host.wait_for_event(m.RowFinished)
     assert (row_finished.status, row_finished.fault, row_finished.reason) == ("aborted", PiFault.ABORTED, "enough")
     assert row_finished.bursts == len(host.list_events(m.Capture)) < 8
-    host.until_state("ready")
+    host.wait_for_state("ready")
     stage.stays_after = None
-    assert host.row(0, take=2).status == "done"
+    assert host.run_row(0, take=2).status == "done"
     assert sum(c.verb == "HOME" for c in stage.seen) == 1
 
 
 def test_a_new_host_aborts_the_row_of_the_dead_one(host_in_row, stage):
     host = host_in_row
-    assert host.must_accept(host.begin()).state == "ready"
-    started = host.wait(m.RunStarted, lambda e: e.resumed)
+    assert host.must_accept(host.make_begin()).state == "ready"
+    started = host.wait_for_event(m.RunStarted, lambda e: e.resumed)
     event_before = host.journalled[-2]
     assert isinstance(event_before, m.RowFinished)
     assert (event_before.status, started.seq) == ("aborted", event_before.seq + 1)
     stage.stays_after = None
-    assert host.row(0, take=2).status == "done"
+    assert host.run_row(0, take=2).status == "done"
 
 
 def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     stage.alarm_at = {3: StageError.LIMIT_SWITCH}
-    row_finished = host.row(0)
+    row_finished = host.run_row(0)
     assert (row_finished.status, row_finished.fault) == ("fault", PiFault.STAGE_ALARM)
     # Edges still under way at the alarm are not answered
     assert row_finished.bursts == len(host.list_events(m.Capture)) <= 3
-    assert not host.until_state("fault").homed
+    assert not host.wait_for_state("fault").homed
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
     host.home()
-    assert host.row(0, take=2).status == "done"
+    assert host.run_row(0, take=2).status == "done"
 
 
 def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     """With heartbeats the row runs longer than the timeout; without them it ends with fault 108."""
     host = pi.host
-    host.must_accept(host.begin(heartbeat_ms=100))
+    host.must_accept(host.make_begin(heartbeat_ms=100))
     host.home()
     stage.stays_after = 2
     pi_settings = msgspec.structs.replace(instrument.pi, command_address=pi.service.server.command_address)
     beats = HostHeartbeat(host.context, msgspec.structs.replace(instrument, pi=pi_settings), "scan", 0.05)
     host.start_row()
-    host.wait(m.Capture)
+    host.wait_for_event(m.Capture)
     # Three times the allowed silence in a row
     pi.clock.sleep(1.2)
     assert host.ask(m.Status()).state == "running"
     beats.stop()
-    row_finished = host.wait(m.RowFinished)
+    row_finished = host.wait_for_event(m.RowFinished)
     assert (row_finished.status, row_finished.fault) == ("fault", PiFault.HOST_LOST), row_finished.reason
     assert Immediate.STOP in stage.bytes_seen
-    assert host.until_state("ready").fault == PiFault.HOST_LOST
+    assert host.wait_for_state("ready").fault == PiFault.HOST_LOST
     stage.stays_after = None
-    host.must_accept(host.begin())
-    assert host.row(0, take=2).status == "done"
+    host.must_accept(host.make_begin())
+    assert host.run_row(0, take=2).status == "done"
 
 
 def test_a_heartbeat_counts_for_its_run_alone(pi):
     host = pi.host
     alive = m.Alive(scan_id="scan")
     assert host.must_refuse(alive) == PiFault.NOT_READY
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     assert host.must_accept(alive).state == "idle"
     assert host.must_refuse(m.Alive(scan_id="another")) == PiFault.NOT_READY
     host.must_accept(m.EndRun(scan_id="scan", exit_status="success"))
@@ -212,23 +212,23 @@ def test_a_heartbeat_counts_for_its_run_alone(pi):
 
 def test_lost_and_damaged_lines_do_not_matter(pi, stage):
     host = pi.host
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     stage.damage = 2
     host.home()
     stage.lose = stage.lose_end = 1
-    row_finished = host.row(0)
+    row_finished = host.run_row(0)
     assert row_finished.status == "done", row_finished.reason
     assert stage.rows_run == 1
 
 
 def test_replay_from_any_sequence(host):
-    host.row(0)
+    host.run_row(0)
     everything = host.journalled
     for first in range(1, len(everything) + 1):
         assert host.replay(from_seq=first) == everything[first - 1 :]
         assert host.replay(from_seq=first, limit=2) == everything[first - 1 : first + 1]
     assert host.replay("unknown") == []
-    beat = host.wait(m.Heartbeat, lambda e: e.seq == everything[-1].seq)
+    beat = host.wait_for_event(m.Heartbeat, lambda e: e.seq == everything[-1].seq)
     assert (beat.scan_id, beat.state) == ("scan", "ready")
 
 

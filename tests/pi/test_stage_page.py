@@ -29,7 +29,7 @@ def view(pi, instrument, write_config, tmp_path) -> Iterator[Served]:
 
 def home(view: Served, pi) -> None:
     assert post(view, "/api/stage/home")[0] == 200
-    pi.host.until_state("homed")
+    pi.host.wait_for_state("homed")
 
 
 def list_moves(stage) -> list[object]:
@@ -62,14 +62,14 @@ def test_a_jog_is_stopped_by_another_request_and_a_second_one_waits(view, pi, st
         target=lambda: answers.append(post(view, "/api/stage/jog", {"axis": "x", "distance_mm": 10.0}))
     )
     jog.start()
-    pi.host.until_state("jogging")
+    pi.host.wait_for_state("jogging")
     assert post(view, "/api/stage/jog", {"axis": "y", "distance_mm": 1.0})[1]["code"] == "busy"
     assert post(view, "/api/stage/stop")[0] == 200
     jog.join()
     ((status, answer),) = answers
     assert status == 409
     assert "stopped" in answer["what"]
-    assert pi.host.wait(m.Jogged).status == "aborted"
+    assert pi.host.wait_for_event(m.Jogged).status == "aborted"
     assert len(list_moves(stage)) == 1
 
 
@@ -78,24 +78,24 @@ def test_the_stage_is_homed_and_jogged_between_its_limits(browser: Browser, view
     travel_mm = instrument.stage.travel_x_mm
     browser.visit(f"{view.address}/new#token={TOKEN}", size)
     browser.wait("document.querySelector('.time')", "the plan")
-    browser.value("document.querySelector('#stage > summary').click()")
+    browser.evaluate("document.querySelector('#stage > summary').click()")
     stage_text = "document.getElementById('stage-told').textContent"
     browser.wait(f"{stage_text}.startsWith('Not homed')", "the state")
     enabled = "[...document.querySelectorAll('#axes button:enabled')].map((b) => b.getAttribute('aria-label')).join()"
-    assert browser.value(enabled) == ""
+    assert browser.evaluate(enabled) == ""
 
-    browser.value("document.getElementById('stage-home').click()")
+    browser.evaluate("document.getElementById('stage-home').click()")
     forward = ",".join(f"Move {axis} by {step} mm" for axis in "xy" for step in (1, 10, 100))
     # The stage is at the corner: it cannot move further back.
     browser.wait(f"{enabled} == '{forward}'", "buttons that lead within the limits")
-    browser.value("document.querySelector('[aria-label=\"Move x by 10 mm\"]').click()")
+    browser.evaluate("document.querySelector('[aria-label=\"Move x by 10 mm\"]').click()")
     place = "document.getElementById('axes').innerText"
     browser.wait(f"{place}.includes('x 10.0 mm') && {stage_text} == 'At rest.'", "the end of the jog")
-    assert f"limits 0 and {travel_mm:g} mm" in browser.value(place)
+    assert f"limits 0 and {travel_mm:g} mm" in browser.evaluate(place)
     browser.wait(f"{enabled}.includes('Move x by -10 mm')", "the way back")
-    assert "Move x by -100 mm" not in browser.value(enabled)
+    assert "Move x by -100 mm" not in browser.evaluate(enabled)
 
-    browser.screenshot(tmp_path / "stage.png")
+    browser.save_screenshot(tmp_path / "stage.png")
     browser.check_whole(view.address)
     axe = find_axe()
     if axe is not None:
@@ -114,6 +114,6 @@ def test_a_pi_that_does_not_answer_is_reported_and_can_be_asked_again(
     with serve_folder(tmp_path / "scans", TOKEN, config=config) as view:
         browser.visit(f"{view.address}/new#token={TOKEN}", PHONE)
         browser.wait("document.querySelector('.time')", "the plan")
-        browser.value("document.querySelector('#stage > summary').click()")
+        browser.evaluate("document.querySelector('#stage > summary').click()")
         browser.wait("document.getElementById('stage-told').textContent.includes('did not answer')", "the error")
-        assert not browser.value("document.getElementById('stage-home').disabled")
+        assert not browser.evaluate("document.getElementById('stage-home').disabled")

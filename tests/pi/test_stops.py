@@ -70,7 +70,7 @@ def disk(monkeypatch) -> Iterator[FrozenDisk]:
 @pytest.fixture
 def owned_run(pi, stage):
     """A begun run with an owner; the stage is homed, and stops in a row after its second point."""
-    pi.host.must_accept(pi.host.begin(owner=OWNER))
+    pi.host.must_accept(pi.host.make_begin(owner=OWNER))
     pi.host.home(OWNER)
     stage.stays_after = 2
     return pi.host
@@ -82,7 +82,7 @@ def stop_is_sent(stage) -> bool:
 
 def test_abort_stops_and_is_answered_while_the_disk_hangs(owned_run, stage, disk):
     owned_run.start_row(owner=OWNER)
-    owned_run.wait(m.Capture)
+    owned_run.wait_for_event(m.Capture)
     events_before = len(owned_run.journalled)
     disk.freeze()
     stage.stays_after = 4
@@ -90,10 +90,10 @@ def test_abort_stops_and_is_answered_while_the_disk_hangs(owned_run, stage, disk
     stage.bytes_seen.clear()
     owned_run.must_accept(m.Abort(owner=OWNER))
     wait_for(lambda: stop_is_sent(stage), "STOP")
-    owned_run.until_state("ready")
+    owned_run.wait_for_state("ready")
     assert not owned_run.list_events(m.RowFinished), "what is not journalled is not published"
     disk.thaw()
-    assert owned_run.wait(m.RowFinished).status == "aborted"
+    assert owned_run.wait_for_event(m.RowFinished).status == "aborted"
     assert [e.seq for e in owned_run.replay()] == list(range(1, owned_run.journalled[-1].seq + 1))
     assert len(owned_run.journalled) > events_before
 
@@ -103,7 +103,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     """A lost host is handled as always. With a living host the disk ends the row, and the watchdog expires."""
     monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
     host = pi.host
-    host.must_accept(host.begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
+    host.must_accept(host.make_begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
     host.home(OWNER)
     stage.stays_after = 2
     pi.clock.stands = True
@@ -113,7 +113,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     pi.clock.stands = False
     wait_for(lambda: stop_is_sent(stage), "STOP")
     number = PiFault.PROGRAM_LATE if beats else PiFault.HOST_LOST
-    assert host.until_state("ready").fault == number
+    assert host.wait_for_state("ready").fault == number
     fed: list[bool] = []
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: fed.append(True))
     wait_for(lambda: pi.service._find_late() != "", "that the journal is late")
@@ -121,7 +121,7 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     pi.clock.sleep(3 * executors.TURN_S)
     assert not fed, "the watchdog is fed for each part or not at all"
     disk.thaw()
-    assert host.wait(m.RowFinished).fault == number
+    assert host.wait_for_event(m.RowFinished).fault == number
     wait_for(lambda: bool(fed), "that the watchdog is fed again")
 
 
@@ -132,7 +132,7 @@ def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
     with closing(Running(set_stage_port(rig, stage.port), hub)) as pi:
         # Without a stage there are no statuses to send either
         stage.unplug()
-        pi.host.until_state("fault")
+        pi.host.wait_for_state("fault")
         pi.clock.sleep(LATE_S)
         wait_for(lambda: pi.service.server.find_late(LATE_S) == "", "that each socket is served")
 
@@ -154,7 +154,7 @@ def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, m
 def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
     """For the host a run begins, a row starts and a run ends only when that is on the disk."""
     host = pi.host
-    commands: list[Any] = [host.begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
+    commands: list[Any] = [host.make_begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
     commands.append(m.EndRun(scan_id="scan", exit_status="success"))
     for command in commands:
         disk.freeze()
@@ -171,7 +171,7 @@ def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
         if isinstance(command, m.BeginRun):
             host.home()
         elif isinstance(command, m.RunRow):
-            host.wait(m.RowFinished)
+            host.wait_for_event(m.RowFinished)
 
 
 @pytest.mark.usefixtures("host")
@@ -206,11 +206,11 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     """Status requests of the polling thread are not a sign of life of the executor."""
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     host.home()
     stage.stays_after = 2
     host.start_row()
-    host.wait(m.Capture)
+    host.wait_for_event(m.Capture)
     go_on = threading.Event()
     pi.service.executor.post(lambda: go_on.wait(HANG_S))
     wait_for(lambda: stop_is_sent(stage), "STOP")
@@ -218,7 +218,7 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     pi.clock.sleep(LATE_S)
     assert stage.bytes_seen.count(Immediate.STATUS) == status_requests, "its own heartbeat stops it as well"
     go_on.set()
-    assert host.wait(m.RowFinished).fault == PiFault.STAGE_LOST
+    assert host.wait_for_event(m.RowFinished).fault == PiFault.STAGE_LOST
 
 
 @pytest.mark.parametrize("which", ["command", "event"])
@@ -227,17 +227,17 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     server = pi.service.server
     host = pi.host
     go_on = threading.Event()
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     host.home()
     stage.stays_after = 2
     host.start_row()
-    host.wait(m.Capture)
+    host.wait_for_event(m.Capture)
     busy = "_send_replies" if which == "command" else "_publish_heartbeat"
     real = getattr(server, busy)
     monkeypatch.setattr(server, busy, lambda *a: (go_on.wait(HANG_S), real(*a))[1])
     wait_for(lambda: stop_is_sent(stage), "STOP")
     go_on.set()
-    row_finished = host.wait(m.RowFinished)
+    row_finished = host.wait_for_event(m.RowFinished)
     assert (row_finished.fault, which in row_finished.reason) == (PiFault.PROGRAM_LATE, True)
 
 
@@ -263,7 +263,7 @@ def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, req
     """libzmq cleans up after them inside the publisher's next send, which then lasts long."""
     is_campaign = request.config.getoption("--long")
     program, host = start(instrument, "--wires", hub)
-    host.must_accept(host.begin(owner=OWNER))
+    host.must_accept(host.make_begin(owner=OWNER))
     arguments = [program.events[1], "1000" if is_campaign else "100", "1"]
     longest_s = 0.0
     with subprocess.Popen([sys.executable, "-c", LEAVE, *arguments]) as leaving:
@@ -295,12 +295,12 @@ def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, reques
     heartbeat_ms = 90
     stage.pace_s = 0.02
     stage.stays_after = instrument.grid.columns
-    host.must_accept(host.begin(owner=OWNER, heartbeat_ms=heartbeat_ms))
+    host.must_accept(host.make_begin(owner=OWNER, heartbeat_ms=heartbeat_ms))
     host.home(OWNER)
     for take in range(1, moments + 1):
         stage.bytes_seen.clear()
         aborts = rng.random() < 0.5
-        host.must_accept(host.begin(owner=OWNER, heartbeat_ms=0 if aborts else heartbeat_ms))
+        host.must_accept(host.make_begin(owner=OWNER, heartbeat_ms=0 if aborts else heartbeat_ms))
         freeze_before = rng.random() < 0.3
         if freeze_before:
             disk.freeze()
@@ -323,7 +323,7 @@ def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, reques
         else:
             time.sleep(rng.uniform(0.0, 0.05))
         disk.thaw()
-        host.until_state("ready")
+        host.wait_for_state("ready")
     record_testsuite_property("longest_time_to_stop_ms", longest_s * 1e3)
     if request.config.getoption("--long"):
         assert longest_s < SAFE_WITHIN_S

@@ -47,7 +47,7 @@ def home(host: HostSide) -> None:
     """Home the stage; once more if the Pi calls it lost, because a busy computer delays the connection for a second."""
     for _ in range(TRIES):
         host.must_accept(m.Home())
-        if host.until_state("homed", "ready", "fault").state != "fault":
+        if host.wait_for_state("homed", "ready", "fault").state != "fault":
             return
     raise AssertionError(host.ask(m.Status()))
 
@@ -193,9 +193,9 @@ def test_a_line_whose_program_is_killed_becomes_an_input(bench: InstalledPi):
 
 def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_host: HostSide):
     """kill -9 in the middle of a row: the stage stops by itself, and no published event is lost."""
-    homed_host.must_accept(homed_host.begin("killed"))
+    homed_host.must_accept(homed_host.make_begin("killed"))
     homed_host.must_accept(m.RunRow(scan_id="killed", row_index=0, take=1))
-    homed_host.wait(m.RowStarted)
+    homed_host.wait_for_event(m.RowStarted)
     in_row_mm_s = pi.rig.stage.speed_mm_s
     pi.box.wait(lambda: pi.uno.speed_mm_s == pytest.approx(in_row_mm_s, rel=0.01), "the row is under way")
     killed = service_pid(pi)
@@ -275,9 +275,9 @@ def test_update_and_roll_back(pi: InstalledPi):
 
 def test_a_power_cut_in_a_row_loses_no_event_that_was_sent(pi: InstalledPi, homed_host: HostSide):
     """After a power cut the Pi starts by itself, with its keys, ready to be homed."""
-    homed_host.must_accept(homed_host.begin("cut"))
+    homed_host.must_accept(homed_host.make_begin("cut"))
     homed_host.must_accept(m.RunRow(scan_id="cut", row_index=0, take=1))
-    homed_host.wait(m.RowStarted)
+    homed_host.wait_for_event(m.RowStarted)
     pi.box.cut_power()
     pi.until_ready()
     print_figure(f"power cut: logged in again after {pi.box.boot_s:.0f} s")

@@ -20,9 +20,9 @@ OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
 
 
-def make_plate(x_mm: float, y_mm: float = 0.0, side_mm: float = 45.0, **more: Any) -> dict[str, Any]:
-    kind = {"permittivity": [4.0, 0.4]} | more
-    return {"name": f"plate at {x_mm:g}, {y_mm:g}", "centre_mm": [x_mm, y_mm], "size_mm": [side_mm, side_mm], **kind}
+def make_plate(x_mm: float, y_mm: float = 0.0, side_mm: float = 45.0, **material: Any) -> dict[str, Any]:
+    values = {"permittivity": [4.0, 0.4]} | material
+    return {"name": f"plate at {x_mm:g}, {y_mm:g}", "centre_mm": [x_mm, y_mm], "size_mm": [side_mm, side_mm], **values}
 
 
 def list_topics(tmp_path: Path, *plates: dict[str, Any], grid: dict[str, Any] = GRID) -> list[str]:

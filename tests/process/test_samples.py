@@ -147,10 +147,10 @@ def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
 
 
 def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
-    state_before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
+    samples_before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
     process_scan(kept, depth_mm=300.0)
     process_scan(kept, depth_range_mm=50.0)
-    assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == state_before
+    assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == samples_before
 
 
 @pytest.mark.parametrize("what", ["record", "torn line", "line", "head", "array gone", "array short"])

@@ -99,10 +99,10 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
     corrected = correct_tilt(images, masks, rises)
     h_turned, ratio_turned = _turn_polarisation()
     truth = _compute_ratios(level.h, level.v, masks) * ratio_turned
-    state_before = np.abs(_compute_ratios(images.h, images.v, masks) / truth - 1)
-    state_after = np.abs(_compute_ratios(corrected.h, corrected.v, masks) / truth - 1)
-    assert state_before.max() > 0.02
-    assert state_after.max() < 0.02  # the turn is a first order in the rise
+    error_before = np.abs(_compute_ratios(images.h, images.v, masks) / truth - 1)
+    error_after = np.abs(_compute_ratios(corrected.h, corrected.v, masks) / truth - 1)
+    assert error_before.max() > 0.02
+    assert error_after.max() < 0.02  # the turn is a first order in the rise
     brightness = [np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks] / np.abs(h_turned)
     across = [i for i, (x, _) in enumerate(TILTS_DEG) if x == 0]
     assert np.array(brightness)[across] == pytest.approx(1, abs=0.015)

@@ -80,16 +80,16 @@ def test_labels_among_the_products_that_they_replace(made_folder):
 )
 def test_an_invalid_input_changes_nothing(made_folder, option, path, value, capsys):
     write_boxes(made_folder, {"far": [4000, 0, 4010, 10]})
-    state_before = read_contents(made_folder)
+    contents_before = read_contents(made_folder)
     assert process(made_folder, option, made_folder / path) == 3
     assert value in capsys.readouterr().err
-    assert read_contents(made_folder) == state_before
+    assert read_contents(made_folder) == contents_before
 
 
 def test_a_report_is_not_replaced_by_images_without_one(made_folder, capsys):
-    state_before = read_contents(made_folder / "out")
+    contents_before = read_contents(made_folder / "out")
     assert process(made_folder, "--metal", "900,900,10,10") == 3
-    assert read_contents(made_folder / "out") == state_before
+    assert read_contents(made_folder / "out") == contents_before
     shutil.rmtree(made_folder / "out")
     assert process(made_folder, "--metal", "900,900,10,10") == 3
     assert str(made_folder / "out" / "image.npz") in capsys.readouterr().err.splitlines()[-1]
@@ -98,14 +98,14 @@ def test_a_report_is_not_replaced_by_images_without_one(made_folder, capsys):
 
 def test_products_whose_raw_rows_were_dropped_stay(made_folder, capsys):
     assert main(["drop-raw", str(made_folder / "scan"), "--products", str(made_folder / "out"), "--yes"]) == 0
-    state_before = read_contents(made_folder / "out")
+    contents_before = read_contents(made_folder / "out")
     other_scan = simulate(
         load_published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made_folder / "other"
     )
     for command in ("process", "image"):
         assert main([command, str(other_scan), "--out", str(made_folder / "out")]) == 2
         assert ScanFolder.load(made_folder / "scan").scan_id in capsys.readouterr().err
-    assert read_contents(made_folder / "out") == state_before
+    assert read_contents(made_folder / "out") == contents_before
 
 
 @pytest.fixture

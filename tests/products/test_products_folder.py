@@ -144,10 +144,10 @@ def test_a_folder_that_must_not_be_replaced_is_refused(out, monkeypatch):
 
 def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
     write_json(out / "quality.json", {"raw_dropped": {"scan_id": "first", "dropped_utc": "2026-01-02T03:04:05"}})
-    state_before = read(out)
+    contents_before = read(out)
     with expect_refusal(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), replace_products(out, "second"):
         pytest.fail("it began")
-    assert read(out) == state_before
+    assert read(out) == contents_before
     with replace_products(out, "first") as new:  # from a copy that has its raw rows
         write(new, NEW)
     assert read(out) == NEW

@@ -255,14 +255,14 @@ IMAGE = check_image(make_image(), "image.bin")
 @pytest.mark.parametrize(("flash", "commands", "step"), [(make_image(), 25, 1), (b"", 60, 7)], ids=["flash", "RAM"])
 def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, commands, step):
     """The restart replaces each answer of a bring-up and an arming: it is the cause, not the rig file or the image."""
-    for state_after in range(1, commands + 1, step):
+    for command_of_restart in range(1, commands + 1, step):
         board = simulated.RadarBoard(lambda: clock.time, flash=flash)
-        words = Restarts(board, clock, state_after)
+        words = Restarts(board, clock, command_of_restart)
         radar = RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE)
         began = clock.time
         with expect_refusal(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
-        assert clock.time - began < 8.0, state_after
+        assert clock.time - began < 8.0, command_of_restart
         assert radar.state is State.FAULT
         radar.arm(FRAMES)
         assert radar.state is State.ARMED

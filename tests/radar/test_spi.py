@@ -63,12 +63,12 @@ def test_every_read_starts_with_the_ready_word(link, sent):
 
 @pytest.mark.parametrize("fault", [Fault.BAD_CRC, Fault.BAD_CHECKSUM, Fault.LOST_INTERRUPT, Fault.NO_ANSWER])
 def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sent, fault):
-    state_before = list(board.executed)
+    executed_before = list(board.executed)
     board.inject(fault)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in decode_commands(sent)] == [(2, False), (2, True)]
     # Executed once
-    assert board.executed == [*state_before, LOW_POWER_OFF.ID]
+    assert board.executed == [*executed_before, LOW_POWER_OFF.ID]
     assert "sent 2 times" in link.warnings[-1]
     link.call(LOW_POWER_OFF)
     assert decode_commands(sent)[-1].sequence == 3

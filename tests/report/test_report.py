@@ -137,9 +137,9 @@ def test_a_phone_shows_the_result_before_anything_is_opened(page, browser):
     """Two screens of verdict and picture, then the names: not the images, tables and settings."""
     browser.visit((page[0] / "report.html").as_uri(), PHONE)
     browser.wait("document.readyState == 'complete'", "the report")
-    assert browser.value("document.documentElement.scrollHeight") <= 4000
-    assert browser.value("document.documentElement.scrollWidth") == PHONE[0]
-    assert browser.value("document.querySelectorAll('details[open]').length") == 0
+    assert browser.evaluate("document.documentElement.scrollHeight") <= 4000
+    assert browser.evaluate("document.documentElement.scrollWidth") == PHONE[0]
+    assert browser.evaluate("document.querySelectorAll('details[open]').length") == 0
 
 
 def test_a_phone_shows_nine_patches_and_many_reasons_in_as_much(scan, browser, tmp_path):
@@ -158,8 +158,8 @@ def test_a_phone_shows_nine_patches_and_many_reasons_in_as_much(scan, browser, t
     write_report(tmp_path, busy)
     browser.visit((tmp_path / "report.html").as_uri(), PHONE)
     browser.wait("document.readyState == 'complete'", "the report")
-    assert browser.value("document.querySelectorAll('ol > li').length") == 7
-    assert browser.value("document.documentElement.scrollHeight") <= 4000
+    assert browser.evaluate("document.querySelectorAll('ol > li').length") == 7
+    assert browser.evaluate("document.documentElement.scrollHeight") <= 4000
 
 
 def test_nothing_is_loaded_from_elsewhere(page):

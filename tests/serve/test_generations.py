@@ -33,17 +33,17 @@ def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_p
         browser.visit(f"{view.address}/scan?scan=one#token={TOKEN}", DESK)
         browser.wait("document.querySelector('#scale img')", "the first image")
         # The range of |P| follows from the patches; that of |H| is the same for all scans relative to metal.
-        amplitudes = json.dumps(browser.value("document.getElementById('scale').innerText"))
+        amplitudes = json.dumps(browser.evaluate("document.getElementById('scale').innerText"))
         browser.click("#maps button[value=p_amplitude]")
         browser.wait(f"document.getElementById('scale').innerText !== {amplitudes}", "the image of P")
-        parts = browser.value(PARTS)
+        parts = browser.evaluate(PARTS)
         complete_states = [parts]
-        browser.value("document.querySelector('canvas.imageview').focus()")
+        browser.evaluate("document.querySelector('canvas.imageview').focus()")
         for key, code in (("ArrowRight", 39), ("Enter", 13)):
             browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=key, windowsVirtualKeyCode=code)
         browser.wait("document.getElementById('probe-facts').innerText", "the place")
-        complete_states.append(browser.value(PARTS))
-        browser.value(RECORD)
+        complete_states.append(browser.evaluate(PARTS))
+        browser.evaluate(RECORD)
 
         for run in range(1, runs + 1):
             level, seed = GENERATIONS[run % 2]
@@ -51,10 +51,10 @@ def test_a_page_never_shows_a_mixture_of_two_generations(browser: Browser, tmp_p
                 write_judged_products(new, level, seed=seed)
             scale_text = json.dumps(parts[3])
             browser.wait(f"document.getElementById('scale').innerText !== {scale_text}", f"generation {run}")
-            parts = browser.value(PARTS)
+            parts = browser.evaluate(PARTS)
             if parts not in complete_states:
                 complete_states.append(parts)
-        seen_states = [json.loads(text) for text in browser.value("[...window.seen]")]
+        seen_states = [json.loads(text) for text in browser.evaluate("[...window.seen]")]
         # The two generations, the first with and without a place that is probed.
         assert len(complete_states) == 3
         differing = zip(complete_states[0][:4], complete_states[2][:4], strict=True)

@@ -53,7 +53,7 @@ def test_other_host_names_are_refused(scans):
 def test_other_sites_may_not_ask(scans):
     own_origin = "http://127.0.0.1"
     with serve_folder(scans, TOKEN) as view:
-        state_before = compute_digest(scans)
+        digest_before = compute_digest(scans)
         for origin in ("https://evil.example", "null", own_origin, f"{own_origin}:1", f"https://127.0.0.1:{view.port}"):
             status, reported = post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=origin)
             assert (status, reported["code"]) == (403, ErrorCode.ORIGIN_FOREIGN), origin
@@ -67,7 +67,7 @@ def test_other_sites_may_not_ask(scans):
             assert not [name for name in headers if name.startswith("access-control")]
             assert "default-src 'self'" in headers["content-security-policy"]
             assert "unsafe" not in headers["content-security-policy"]
-        assert compute_digest(scans) == state_before
+        assert compute_digest(scans) == digest_before
         assert post(view, "/api/notes?scan=one", {"notes": "mine"}, Origin=f"{own_origin}:{view.port}")[0] == 200
 
 
@@ -118,7 +118,7 @@ def test_beyond_loopback_reading_needs_the_token_too(scans):
 
 def test_large_bodies_are_refused_and_nothing_is_kept(scans):
     with serve_folder(scans, TOKEN) as view:
-        state_before = compute_digest(scans)
+        digest_before = compute_digest(scans)
         large = b"x" * (guard.BODY_BYTES + 1)
         status, _, _ = ask(view, "/api/notes?scan=one", "POST", large, **{TOKEN_HEADER: TOKEN})
         assert status == 413
@@ -131,7 +131,7 @@ def test_large_bodies_are_refused_and_nothing_is_kept(scans):
         for size in (17_000, 70_000, 1 << 20):
             answer = send_raw(view, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * size + b"\r\n\r\n")[:40]
             assert b" 400 " in answer or b" 431 " in answer or answer == b""
-        assert compute_digest(scans) == state_before
+        assert compute_digest(scans) == digest_before
 
 
 def test_open_connections_and_unread_answers_lock_no_client_out(scans):
@@ -242,7 +242,7 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
     from urllib.parse import quote
 
     with serve_folder(scans, TOKEN) as view:
-        state_before = compute_digest(tmp_path)
+        digest_before = compute_digest(tmp_path)
         for name in NAMES:
             quoted_name = quote(name, safe="")
             for description in READ:
@@ -257,7 +257,7 @@ def test_no_name_leads_out_of_the_folder(scans, tmp_path):
                 )
         for name in ("../secret.txt", "..%2f..%2fmanifest.jsonl", "manifest.jsonl", "figures", "%00"):
             assert ask(view, f"/api/file/{name}?scan=one")[0] in (400, 404)
-        assert compute_digest(tmp_path) == state_before
+        assert compute_digest(tmp_path) == digest_before
 
 
 def test_a_link_among_products_is_not_served(scans, tmp_path):
@@ -330,7 +330,7 @@ def list_hostile_requests(port: int) -> list[bytes]:
 @pytest.mark.slow
 def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans, tmp_path):
     with serve_folder(scans, TOKEN) as view:
-        state_before = compute_digest(tmp_path)
+        digest_before = compute_digest(tmp_path)
         requests = list(islice(cycle(list_hostile_requests(view.port)), 1000))
         open_sockets: list[socket.socket] = []
 
@@ -350,7 +350,7 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans
             time.sleep(0.01)
         for s in open_sockets:
             s.close()
-        assert compute_digest(tmp_path) == state_before
+        assert compute_digest(tmp_path) == digest_before
         assert post(view, "/api/notes?scan=one", {"notes": "the operator's", "tags": ["a"]})[0] == 200
         assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"
 

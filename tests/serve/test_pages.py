@@ -77,7 +77,7 @@ class Page:
 
     def drag(self, x0: float, y0: float, x1: float, y1: float) -> None:
         """Draw over the image, from one place in mm to another."""
-        points = self.browser.value(
+        points = self.browser.evaluate(
             "(() => { const c = document.querySelector('canvas.imageview'); c.scrollIntoView({block: 'center'});"
             " const b = c.getBoundingClientRect(), w = b.width - 62, h = b.height - 46;"
             " const e = window.extent; const at = (x, y) => [b.left + 46 + (x - e[0]) / (e[1] - e[0]) * w,"
@@ -186,25 +186,27 @@ def test_every_page_fits_can_be_read_and_has_the_abort_of_the_running_scan(page,
     with open_control(scans / "two"):
         page.open(path, PHONE)
         for size in (PHONE, DESK):
-            browser.size(*size)
+            browser.set_size(*size)
             browser.wait(f"innerWidth == {size[0]}", "the other size")
             browser.wait("document.querySelector('#running button.danger')?.checkVisibility()", "the abort")
             # There is no Pi: the page reports it, and the console shows the refused request.
             browser.errors[:] = [error for error in browser.errors if not error.endswith("/api/stage/look")]
             page.check_whole()
             # A table's last columns, too.
-            assert browser.value("[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)")
-            assert browser.value("document.querySelectorAll('h1').length") == 1
+            assert browser.evaluate(
+                "[...document.querySelectorAll('.wide')].every((t) => t.scrollWidth <= t.clientWidth)"
+            )
+            assert browser.evaluate("document.querySelectorAll('h1').length") == 1
             if size == PHONE:
                 for button in ("#label-open", "#process-open", "#layers-open"):
-                    browser.value(f"document.querySelector('{button}')?.click()")
-            browser.value("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+                    browser.evaluate(f"document.querySelector('{button}')?.click()")
+            browser.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
             # WCAG AA. A scheme changes colours alone, so that axe reads the page in one of them.
-            assert browser.value(NAMELESS) == []
+            assert browser.evaluate(NAMELESS) == []
             assert axe is None or browser.find_violations(axe) == []
             for scheme in ("light", "dark"):
                 browser.set_scheme(scheme)
-                assert browser.value(CONTRAST) == []
+                assert browser.evaluate(CONTRAST) == []
 
 
 def test_axe_finds_nothing_in_a_report(page, scans):
@@ -212,7 +214,7 @@ def test_axe_finds_nothing_in_a_report(page, scans):
     page.browser.visit((scans / "one" / "products" / "report.html").as_uri(), DESK)
     page.browser.wait("document.querySelector('details')", "the report")
     for size in (DESK, PHONE):
-        page.browser.size(*size)
+        page.browser.set_size(*size)
         assert axe is None or page.browser.find_violations(axe) == []
 
 
@@ -222,14 +224,14 @@ def test_the_points_of_surfaces_turn_and_are_coloured(page):
     page.browser.wait(
         "document.getElementById('scale').innerText.includes('2.50 (dark) to 3.50 (bright)')", "the scale"
     )
-    drawn = [page.browser.value(picture)]
-    page.browser.value("document.getElementById('points').focus()")
+    drawn = [page.browser.evaluate(picture)]
+    page.browser.evaluate("document.getElementById('points').focus()")
     page.press("ArrowRight")
-    drawn.append(page.browser.value(picture))
-    page.browser.value("document.getElementById('colour').value = 'incidence_deg'")
-    page.browser.value("document.getElementById('colour').dispatchEvent(new Event('change'))")
+    drawn.append(page.browser.evaluate(picture))
+    page.browser.evaluate("document.getElementById('colour').value = 'incidence_deg'")
+    page.browser.evaluate("document.getElementById('colour').dispatchEvent(new Event('change'))")
     page.browser.wait("document.getElementById('scale').innerText.includes('55.00')", "the other scale")
-    drawn.append(page.browser.value(picture))
+    drawn.append(page.browser.evaluate(picture))
     assert len(set(drawn)) == len(drawn)
     page.check_whole()
 
@@ -240,20 +242,20 @@ def test_surfaces_without_permittivity_begin_with_a_figure_that_they_have(page, 
     page.browser.wait("document.getElementById('scale').innerText.includes('incidence')", "the scale")
     page.open("/surface?scan=two")
     page.browser.wait("document.getElementById('told').innerText.includes('no surfaces were measured')", "the reason")
-    assert "polysight surface" in page.browser.text("told")
+    assert "polysight surface" in page.browser.read_text("told")
     # The browser itself reports the missing file.
     page.browser.errors.clear()
 
 
 def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):
     page.open("/check")
-    assert "1 good" in page.browser.text("told")
-    assert "1 action" in page.browser.text("told")
-    assert f"± {WARNING_SIGMAS} standard deviations" in page.browser.text("limits")
+    assert "1 good" in page.browser.read_text("told")
+    assert "1 action" in page.browser.read_text("told")
+    assert f"± {WARNING_SIGMAS} standard deviations" in page.browser.read_text("limits")
     for name in KNOWN_PERMITTIVITY:
         measured = polysight.check(scans / name)["permittivity"].item().real
         # The tick's place gives the scale of the axis.
-        drawn = page.browser.value(
+        drawn = page.browser.evaluate(
             "(() => { const t = [...document.querySelectorAll('#real text[text-anchor=end]')].slice(0, 2)"
             ".map((n) => [+n.textContent, +n.getAttribute('y') - 4]);"
             f" const c = document.querySelector('#real a[href$=\"{name}\"] circle');"
@@ -261,9 +263,9 @@ def test_the_control_chart_has_a_link_to_each_scan_at_its_place(page, scans):
             " return t[0][0] + slope * (c.getAttribute('cy') - t[0][1]); })()"
         )
         assert drawn == pytest.approx(measured, abs=1e-6), name
-    levels = page.browser.value("[...document.querySelectorAll('#real a')].map((n) => n.dataset.level)")
+    levels = page.browser.evaluate("[...document.querySelectorAll('#real a')].map((n) => n.dataset.level)")
     assert levels == ["good", "bad"]
-    page.browser.value("document.querySelector('#real a').dispatchEvent(new MouseEvent('click', { bubbles: true }))")
+    page.browser.evaluate("document.querySelector('#real a').dispatchEvent(new MouseEvent('click', { bubbles: true }))")
     page.browser.wait("location.pathname == '/scan'", "the scan's page")
 
 
@@ -274,7 +276,7 @@ def test_the_control_chart_names_missing_data_and_follows_new_products(page, sca
     # Without the condition of PAGES: one of the scans has no plate.
     page.open("/check?")
     page.browser.wait("document.getElementById('told').innerText.includes('1 missing')", "the level")
-    assert "no patch at x 200" in page.browser.text("rows")
+    assert "no patch at x 200" in page.browser.read_text("rows")
     shutil.rmtree(scans / "one" / "products")
     page.open("/check?plate=none")
     page.browser.wait("document.getElementById('told').innerText.includes('No processed scan')", "the advice")
@@ -294,7 +296,7 @@ def test_the_new_page_lists_the_checks_as_the_doctor_prints_them(page, scans):
     (folder / "doctor.log").write_text("".join(map(_format_finding, findings)) + "1 ok\n", encoding="utf-8")
     page.open("/new")
     page.browser.wait("document.querySelectorAll('#findings li').length == 4", "the findings")
-    shown_findings = page.browser.value(
+    shown_findings = page.browser.evaluate(
         "[...document.querySelectorAll('#findings li')].map((n) => [n.querySelector('b').textContent,"
         " n.querySelector('b').parentNode.textContent, n.querySelectorAll('.more').length])"
     )
@@ -337,7 +339,7 @@ def test_long_names_and_tags_fit(page, scans):
         else:
             ready = PAGES.get(path)
         page.browser.wait(ready or PAGES["/scan?scan=one"], path)
-        assert page.browser.value("document.documentElement.scrollWidth - innerWidth") <= 0, path
+        assert page.browser.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, path
 
 
 def test_a_scan_that_is_not_there_shows_the_error_alone(page):
@@ -345,17 +347,19 @@ def test_a_scan_that_is_not_there_shows_the_error_alone(page):
     page.open("/scan?scan=nowhere")
     page.browser.wait("document.getElementById('told').innerText.includes('nowhere')", "the error")
     sections = "[...document.querySelectorAll('main section, #side')].filter(s => s.checkVisibility()).map(s => s.id)"
-    assert page.browser.value(sections) == ["head"]
-    assert not page.browser.value("[...document.querySelectorAll('#links > *')].some(link => link.checkVisibility())")
-    assert "choose a scan from the list" in page.browser.text("told")
+    assert page.browser.evaluate(sections) == ["head"]
+    assert not page.browser.evaluate(
+        "[...document.querySelectorAll('#links > *')].some(link => link.checkVisibility())"
+    )
+    assert "choose a scan from the list" in page.browser.read_text("told")
 
 
 def test_a_scan_that_is_not_there_is_not_taken_for_a_server_that_is_not_there(page):
     page.open("/watch?scan=nowhere")
     page.browser.wait("document.title.length > 9 && document.body.classList.contains('lost')", "the status")
-    assert page.browser.text("headline") == "No scan of this name"
-    assert "nowhere" in page.browser.text("detail")
-    assert "choose a scan from the list" in page.browser.text("do")
+    assert page.browser.read_text("headline") == "No scan of this name"
+    assert "nowhere" in page.browser.read_text("detail")
+    assert "choose a scan from the list" in page.browser.read_text("do")
 
 
 def test_the_list_is_searched_and_two_are_compared(page):
@@ -365,7 +369,7 @@ def test_the_list_is_searched_and_two_are_compared(page):
     page.browser.fill("#find", "")
     page.browser.wait("document.querySelectorAll('#list li').length == 2", "all of them")
     for k in (0, 1):
-        page.browser.value(f"document.querySelectorAll('#list input')[{k}].click()")
+        page.browser.evaluate(f"document.querySelectorAll('#list input')[{k}].click()")
     page.browser.click("#compare")
     page.browser.wait(
         "location.pathname == '/compare' && document.querySelector('#rows tr')",
@@ -375,26 +379,26 @@ def test_the_list_is_searched_and_two_are_compared(page):
         page.browser.click(f"button[value={mode}]")
         page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", mode)
         page.check_whole()
-    assert "% of" in page.browser.text("share")
+    assert "% of" in page.browser.read_text("share")
 
 
 def test_a_place_is_probed_by_keyboard_alone(page):
     page.open("/scan?scan=one")
     for _ in range(60):
-        if page.browser.value("document.activeElement?.className == 'imageview'"):
+        if page.browser.evaluate("document.activeElement?.className == 'imageview'"):
             break
         page.press("Tab")
-    assert page.browser.value("document.activeElement.className") == "imageview"
+    assert page.browser.evaluate("document.activeElement.className") == "imageview"
     for _ in range(int(PET["centre_mm"][0] / 2)):
         page.press("ArrowRight")
     for _ in range(int(-PET["centre_mm"][1] / 2)):
         page.press("ArrowDown")
     page.press("Enter")
     page.browser.wait("document.querySelectorAll('#probe-facts dt').length > 5", "the probe")
-    shown_text = page.browser.text("probe-facts")
+    shown_text = page.browser.read_text("probe-facts")
     assert "± " in shown_text
     assert "PET" in shown_text
-    assert page.browser.value("document.querySelectorAll('#profile path').length") == 2
+    assert page.browser.evaluate("document.querySelectorAll('#profile path').length") == 2
     page.press("+", "+")
     page.browser.wait("document.querySelector('tr.here')", "its row in the table")
     page.check_whole()
@@ -413,11 +417,11 @@ def test_what_is_named_to_harm_is_shown_as_text(page, scans):
     shutil.move(scans / "two", scans / "<b onclick=x>two")
     page.open("/")
     page.check_whole()
-    assert evil in page.browser.text("list")
+    assert evil in page.browser.read_text("list")
     page.open("/scan?scan=one")
     page.check_whole()
-    assert page.browser.value("document.querySelectorAll('[onerror], [onclick]').length") == 0
-    assert "broken" not in page.browser.value("document.title")
+    assert page.browser.evaluate("document.querySelectorAll('[onerror], [onclick]').length") == 0
+    assert "broken" not in page.browser.evaluate("document.title")
     page.open("/compare?a=one&b=%3Cb+onclick%3Dx%3Etwo")
     page.browser.wait("document.querySelector('#rows tr')", "the comparison")
     page.check_whole()
@@ -445,7 +449,7 @@ def test_a_plan_is_repeated_and_waits_in_the_queue(page, scans, monkeypatch):
         )
         # Start is on the first screen of a phone.
         start = "document.getElementById('start').getBoundingClientRect()"
-        assert reloaded_page.browser.value(f"{start}.bottom <= innerHeight && {start}.top > 0")
+        assert reloaded_page.browser.evaluate(f"{start}.bottom <= innerHeight && {start}.top > 0")
         reloaded_page.browser.fill("#name", "over-night")
         reloaded_page.browser.click("#enqueue")
         reloaded_page.browser.wait("document.querySelectorAll('#waiting li').length == 1", "that it waits")
@@ -458,17 +462,17 @@ def test_a_wrong_number_is_reported_with_the_labels_of_the_page(page):
     page.open("/new")
     page.browser.fill("#columns", "0")
     page.browser.wait("document.getElementById('plan-wrong')?.innerText.length > 0", "the refusal")
-    shown_text = page.browser.text("plan-wrong")
+    shown_text = page.browser.read_text("plan-wrong")
     assert "Positions in a row" in shown_text
     assert "columns" not in shown_text
-    assert page.browser.value("document.getElementById('start').disabled")
+    assert page.browser.evaluate("document.getElementById('start').disabled")
     page.browser.fill("#columns", "900")
     page.browser.wait("document.getElementById('plan-wrong')?.innerText.includes('900')", "the refusal")
-    shown_text = page.browser.text("plan-wrong")
+    shown_text = page.browser.read_text("plan-wrong")
     assert "does not fit the stage" in shown_text
     assert not re.search(r"\w_\w|stage\.|grid\.|changed|rule of its format", shown_text), shown_text
     wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map((field) => field.id).join()"
-    assert page.browser.value(wrong) == "columns,step_x_mm,speed_mm_s"
+    assert page.browser.evaluate(wrong) == "columns,step_x_mm,speed_mm_s"
     # The refused requests
     page.browser.errors.clear()
 
@@ -491,14 +495,16 @@ def test_a_scan_that_was_stopped_on_request_has_not_failed(page, scans):
 
 def test_metal_is_drawn_for_processing_again(page):
     page.open("/scan?scan=one")
-    extent = page.browser.value("fetch('/api/result?scan=one').then(r => r.json()).then(r => r.extent_mm)")
-    page.browser.value(f"window.extent = {json.dumps(extent)}")
+    extent = page.browser.evaluate("fetch('/api/result?scan=one').then(r => r.json()).then(r => r.extent_mm)")
+    page.browser.evaluate(f"window.extent = {json.dumps(extent)}")
     page.browser.click("#process-open")
     page.browser.click("#draw-metal")
     x, y = COPPER["centre_mm"]
     page.drag(x - 12, y - 12, x + 12, y + 12)
     page.browser.wait("/mm$/.test(document.getElementById('draw-metal').innerText)", "the box")
-    sides = page.browser.text("draw-metal").partition(": ")[2].replace("\u2212", "-").removesuffix(" mm").split(", ")
+    sides = (
+        page.browser.read_text("draw-metal").partition(": ")[2].replace("\u2212", "-").removesuffix(" mm").split(", ")
+    )
     assert [float(side) for side in sides] == pytest.approx([x - 12, y - 12, x + 12, y + 12], abs=1.5)
     page.check_whole()
 
@@ -506,11 +512,11 @@ def test_metal_is_drawn_for_processing_again(page):
 def test_the_page_follows_products_that_another_program_has_made(page, scans):
     page.open("/scan?scan=one")
     judged = "document.getElementById('badges').innerText"
-    assert "no result" not in page.browser.value(judged)
+    assert "no result" not in page.browser.evaluate(judged)
     shutil.move(scans / "one" / "products", scans / "old")
     write_judged_products(scans / "one" / "products", "none")
     page.browser.wait(f"{judged}.includes('no result')", "the new verdict")
-    assert REASON["what"] in page.browser.text("reasons")
+    assert REASON["what"] in page.browser.read_text("reasons")
     page.browser.errors.clear()
 
 
@@ -537,7 +543,7 @@ def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, s
     page.browser.wait("document.getElementById('notes-told').innerText.includes('token')", "the refusal")
     assert read_notes(scans / "one").notes == ""
     page.browser.fill("#token-field", f"http://127.0.0.1/#token={TOKEN}")
-    page.browser.value("document.querySelector('#token-bar button').click()")
+    page.browser.evaluate("document.querySelector('#token-bar button').click()")
     page.browser.wait(
         "!document.getElementById('token-bar') && document.getElementById('name')?.innerText", "the page again"
     )
@@ -554,7 +560,7 @@ def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
             page.check_whole()
             buttons = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
             asking = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
-            assert not asking & set(browser.value(buttons))
+            assert not asking & set(browser.evaluate(buttons))
 
 
 def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, scans):
@@ -563,7 +569,7 @@ def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, sc
         page = Page(browser, view)
         page.open("/", token="of another server")
         page.open("/", token="")
-        assert browser.value("localStorage.length") == 0
+        assert browser.evaluate("localStorage.length") == 0
         page.check_whole()
 
 
@@ -576,7 +582,7 @@ def test_advice_for_a_terminal_is_in_the_words_of_the_page(page):
         texts += re.findall(r'"([^"\n]*--[a-z][^"\n]*)"', re.sub(r"\{[^}]*\}", "5", source))
     assert len(texts) > 9
     page.open("/")
-    shown_texts = page.browser.value(
+    shown_texts = page.browser.evaluate(
         "import('/common.js').then((common) => "
         f"{json.dumps(texts)}.map((text) => common.rich(text).map((node) => node.textContent).join('')))"
     )
@@ -589,15 +595,15 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     for name in ("one", "two"):
         page.open(f"/scan?scan={name}")
         page.browser.wait("document.querySelector('#scale img')?.naturalWidth > 1", "the image")
-        extent = page.browser.value(f"fetch('/api/result?scan={name}').then(r => r.json()).then(r => r.extent_mm)")
-        page.browser.value(f"window.extent = {json.dumps(extent)}")
+        extent = page.browser.evaluate(f"fetch('/api/result?scan={name}').then(r => r.json()).then(r => r.extent_mm)")
+        page.browser.evaluate(f"window.extent = {json.dumps(extent)}")
         page.browser.click("#label-open")
         for k, (plate, called) in enumerate(((COPPER, "copper"), (PET, "my plastic"))):
             x, y = plate["centre_mm"]
             page.drag(x - 12, y - 12, x + 12, y + 12)
             page.browser.wait(f"document.querySelectorAll('#boxes li').length == {k + 1}", "the box")
             page.browser.fill("#boxes li:last-child input", called)
-        page.browser.value("document.querySelector('#boxes input[type=radio]').click()")
+        page.browser.evaluate("document.querySelector('#boxes input[type=radio]').click()")
         page.browser.click("#save-labels")
         page.browser.wait(
             "document.getElementById('label-told').innerText.startsWith('Saved')",
@@ -612,8 +618,8 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
         f"{offered_names}.join() == 'copper,my plastic'", "names of the first scan, offered in the second"
     )
     page.open("/")
-    assert page.browser.text("list").count("labelled: copper, my plastic") == 2
-    page.browser.value("document.querySelectorAll('#list input').forEach(i => i.click())")
+    assert page.browser.read_text("list").count("labelled: copper, my plastic") == 2
+    page.browser.evaluate("document.querySelectorAll('#list input').forEach(i => i.click())")
     page.browser.click("#train-open")
     page.browser.fill("#train-name", "mine")
     page.browser.click("#train button")
@@ -624,7 +630,7 @@ def test_boxes_are_drawn_saved_processed_and_learnt(page, scans):
     assert Library.load(scans / "libraries" / "mine.npz").names == ("copper", "my plastic")
     page.open("/scan?scan=one")
     page.browser.click("#process-open")
-    page.browser.value("document.getElementById('library').value = 'mine'")
+    page.browser.evaluate("document.getElementById('library').value = 'mine'")
     page.browser.click("#process button:not([type=button])")
     page.browser.wait("document.getElementById('rows').innerText.includes('my plastic')", "the new name")
     program = find_program(scans / "one", "process")

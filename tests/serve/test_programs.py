@@ -168,12 +168,12 @@ def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refus
 
 def test_files_that_a_page_leaves_in_a_scan_folder_are_not_a_fault(finished, tmp_path):
     shutil.copytree(finished, tmp_path / "one")
-    state_before = validate(tmp_path / "one")
+    findings_before = validate(tmp_path / "one")
     (tmp_path / "one" / PROGRAM_FOLDER).mkdir()
     (tmp_path / "one" / PROGRAM_FOLDER / "scan.log").touch()
     (tmp_path / "one" / "operator.json").write_text('{"notes": "", "tags": []}')
     (tmp_path / "one" / "export").mkdir()
-    assert validate(tmp_path / "one") == state_before
+    assert validate(tmp_path / "one") == findings_before
 
 
 @pytest.mark.parametrize("name", ["", "scan.log", "scan.json", "scan.status"])

@@ -99,7 +99,7 @@ def test_the_page_needs_nothing_from_elsewhere():
 
 def test_a_page_that_never_reads_delays_no_other_client(growing, watching):
     watch = watching(growing.path, lapse_s=1e6)
-    growing.live()
+    growing.touch_alive()
     with serve_view(watch) as view:
         deaf = []
         for _ in range(8):

@@ -93,9 +93,9 @@ def test_notes_and_names_of_an_unreachable_folder_delay_no_client(dead, view):
 
 def test_a_list_shows_a_folder_that_does_not_answer_and_what_it_knew_of_it(dead, root):
     scan_list = Scans(root)
-    state_before = scan_list.list()
+    scans_before = scan_list.list()
     dead.stop(scans, "is_scan")
-    assert [s.name for s in scan_list.list()] == [s.name for s in state_before]
+    assert [s.name for s in scan_list.list()] == [s.name for s in scans_before]
     assert {s.name: s.state for s in scan_list.list()}["dead"] == "silent"
     listed = Scans(root)
     threads = threading.active_count()

@@ -95,16 +95,16 @@ def test_every_state_shows_the_text_of_the_table(browser: Browser, still, size, 
             f" && document.getElementById('status')?.dataset.level == {state.level!r}",
             f"{key}, version {version}",
         )
-        pressed = browser.value("[...document.getElementById('buttons').children].map(b => b.id).join()")
+        pressed = browser.evaluate("[...document.getElementById('buttons').children].map(b => b.id).join()")
         assert set(filter(None, pressed.split(","))) == set(state.press), key
-        page_text = browser.value("document.body.innerText")
+        page_text = browser.evaluate("document.body.innerText")
         assert not [phrase for phrase in state.never if phrase.casefold() in page_text.casefold()], (key, page_text)
-        assert browser.value("document.documentElement.scrollWidth <= innerWidth"), key
+        assert browser.evaluate("document.documentElement.scrollWidth <= innerWidth"), key
         if state.do:
-            assert browser.text("do"), key
+            assert browser.read_text("do"), key
         if key.startswith("result_"):
-            assert browser.text("result-level") == LEVELS[key.removeprefix("result_")], key
-            assert all(part in browser.text("reasons") for part in REASON.values()), key
+            assert browser.read_text("result-level") == LEVELS[key.removeprefix("result_")], key
+            assert all(part in browser.read_text("reasons") for part in REASON.values()), key
         assert axe is None or browser.find_violations(axe) == [], key
     assert browser.errors == []
 
@@ -124,7 +124,7 @@ def test_advice_next_to_try_again_ends_with_the_button(browser: Browser, still, 
     browser.visit(f"{view.address}/watch#token={TOKEN}", DESK)
     watch.show("start_failed", do=advice)
     browser.wait("document.getElementById('again')", "the button")
-    assert browser.text("do") == shown
+    assert browser.read_text("do") == shown
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])

@@ -30,18 +30,18 @@ def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size
     with serve_view(watch) as view:
         open_page(browser, view, size)
         browser.wait(f"{PICTURES}.length == 6 && {PICTURES}.every(i => i.naturalWidth == 12)", "six pictures")
-        assert browser.text("headline") == "The scan is finished"
-        assert browser.text("count") == "3 of 3 rows"
-        assert "✓ whole" in browser.text("board-table")
-        assert browser.text("p_note") == "not referenced to metal: not processed"
-        assert "direct path" in browser.text("profile") or browser.value(
+        assert browser.read_text("headline") == "The scan is finished"
+        assert browser.read_text("count") == "3 of 3 rows"
+        assert "✓ whole" in browser.read_text("board-table")
+        assert browser.read_text("p_note") == "not referenced to metal: not processed"
+        assert "direct path" in browser.read_text("profile") or browser.evaluate(
             "document.getElementById('profile').textContent.includes('direct path')"
         )
-        assert browser.value("document.querySelectorAll('#sync path').length") == 2
-        assert browser.value("getComputedStyle(document.getElementById('buttons')).display") == "none"
+        assert browser.evaluate("document.querySelectorAll('#sync path').length") == 2
+        assert browser.evaluate("getComputedStyle(document.getElementById('buttons')).display") == "none"
         # The headline is on the first screen.
-        assert browser.value("document.getElementById('progress').getBoundingClientRect().bottom < innerHeight / 2")
-        browser.screenshot(tmp_path / "page.png")
+        assert browser.evaluate("document.getElementById('progress').getBoundingClientRect().bottom < innerHeight / 2")
+        browser.save_screenshot(tmp_path / "page.png")
         assert (tmp_path / "page.png").stat().st_size > 20_000
         browser.check_whole(view.address)
 
@@ -50,8 +50,8 @@ def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watc
     watch = watching(growing.path, lapse_s=1e6)
     with serve_view(watch) as view:
         open_page(browser, view)
-        assert browser.text("headline") == "No scan here yet"
-        growing.live()
+        assert browser.read_text("headline") == "No scan here yet"
+        growing.touch_alive()
         for row in range(3):
             growing.grow_until("row_committed")
             browser.wait(f"document.getElementById('count').innerText == '{row + 1} of 3 rows'", "the row's count")
@@ -65,13 +65,13 @@ def test_buttons_reach_the_scan(browser, growing, watching):
     with open_control(growing.path) as stop, serve_view(watching(growing.path, control=True), TOKEN) as view:
         open_page(browser, view, token=TOKEN)
         browser.click("#pause")
-        assert TOKEN not in browser.value("location.href")
+        assert TOKEN not in browser.evaluate("location.href")
         wait_for(lambda: stop.paused, "the pause")
         browser.wait("document.getElementById('headline').innerText == 'Pausing after this row'", "that it is said")
         browser.click("#continue")
         wait_for(lambda: not stop.paused, "the end of the pause")
         browser.click("#abort")
-        assert browser.value("document.getElementById('confirm').open")
+        assert browser.evaluate("document.getElementById('confirm').open")
         browser.click("#confirm button[value=no]")
         browser.wait("!document.getElementById('confirm').open", "the question is gone")
         assert not stop.after_row
@@ -89,7 +89,7 @@ def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished, watch
     with serve_view(watch, host=host, port=int(port)) as view:
         open_page(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
-    assert browser.text("headline") == STATES["offline"].headline
+    assert browser.read_text("headline") == STATES["offline"].headline
     # Some of its attempts to reconnect fail
     time.sleep(0.5)
     with serve_view(watch, host=host, port=int(port)):

@@ -27,12 +27,12 @@ def send_all(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH")
     network = NetworkFaults(faults, seed, board, Counter())
     data = make_packets(sum(sizes))
     first = 0
-    out = []
+    received = []
     for size in sizes:
-        out += [r.tobytes() for part in network.transmit(data[first : first + size]) for r in part]
+        received += [r.tobytes() for part in network.transmit(data[first : first + size]) for r in part]
         first += size
     assert (data == make_packets(sum(sizes))).all(), "what was sent stays as it was"
-    return out + [r.tobytes() for part in network.drain() for r in part]
+    return received + [r.tobytes() for part in network.drain() for r in part]
 
 
 @given(st.lists(st.integers(0, 60), min_size=1, max_size=4), st.integers(0, 99))
@@ -80,8 +80,8 @@ def test_overflow_takes_the_second_half_of_single_frames() -> None:
 
 def test_a_corrupt_packet_has_one_bit_of_its_payload_turned() -> None:
     for clean, corrupt in zip(make_packets(60), send_all(Faults(corrupt=1.0), [60]), strict=True):
-        turned = np.bitwise_xor(clean, np.frombuffer(corrupt, np.uint8))
-        assert np.unpackbits(turned).sum() == np.unpackbits(turned[10:]).sum() == 1
+        flipped_bits = np.bitwise_xor(clean, np.frombuffer(corrupt, np.uint8))
+        assert np.unpackbits(flipped_bits).sum() == np.unpackbits(flipped_bits[10:]).sum() == 1
 
 
 def test_missed_pulses_are_those_named() -> None:

@@ -79,16 +79,16 @@ def test_a_rough_plate_is_the_same_in_both() -> None:
 def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
     rig, _ = make_scene_and_rig()
     board = rig.receivers[0]
-    f = np.array([78.5e9])
-    cos = np.cos(np.radians(incidence_deg(rig, board)))
-    flat = field_exact(rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.0}])[1], board, np.zeros((1, 2)), f)[
-        0, 0
-    ]
-    high = field_exact(rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), f)[
-        0, 0
-    ]
+    frequency_hz = np.array([78.5e9])
+    cos_theta = np.cos(np.radians(incidence_deg(rig, board)))
+    field_at_plane = field_exact(
+        rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.0}])[1], board, np.zeros((1, 2)), frequency_hz
+    )[0, 0]
+    field_raised = field_exact(
+        rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), frequency_hz
+    )[0, 0]
     # Positive is farther: later
-    assert np.angle(high / flat) == pytest.approx(2 * WAVE * cos * 0.2e-3, abs=0.01)
+    assert np.angle(field_raised / field_at_plane) == pytest.approx(2 * WAVE * cos_theta * 0.2e-3, abs=0.01)
 
 
 def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_rig() -> None:
@@ -97,10 +97,12 @@ def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_
     nearer, distant = make_scene_and_rig(plates=[PLATE], object_distance_mm=500.5)
     board = rig.receivers[0]
     offsets = np.array([[0.01, -0.02], [0.04, 0.03]])
-    f = np.array([77e9, 80e9])
-    field = field_exact(rig, shifted, board, offsets, f)
+    frequencies_hz = np.array([77e9, 80e9])
+    field = field_exact(rig, shifted, board, offsets, frequencies_hz)
     # The image centre does not depend on the distance: both boards' antennas lie at z = 0.
-    assert np.abs(field - field_exact(nearer, distant, board, offsets, f)).max() < 1e-3 * np.abs(field).max()
+    assert (
+        np.abs(field - field_exact(nearer, distant, board, offsets, frequencies_hz)).max() < 1e-3 * np.abs(field).max()
+    )
 
 
 def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:

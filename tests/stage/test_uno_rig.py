@@ -40,7 +40,7 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         rig_options = ("--dir", tmp_path / "rig", "--with-pi", "--uno", "--time-scale", "2")
         simulated = bench.start(*SIMULATED_RIG, "--config", config, "--scene", scene, *rig_options)
         options = ("--out", tmp_path / "scan", "--no-process")
-        ended = bench.polysight("scan", "--config", simulated.wait_ready(), *options, limit_s=LIMIT_S)
+        ended = bench.run_polysight("scan", "--config", simulated.wait_ready(), *options, limit_s=LIMIT_S)
         assert ended.status == 0, ended.err
     # The same scan without a stage, at the plan's positions
     simulate(rig, load_scene(scene), tmp_path / "ideal")

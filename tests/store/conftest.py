@@ -16,14 +16,14 @@ T = TypeVar("T")
 def sample(request: pytest.FixtureRequest) -> Callable[[Sequence[T], int], list[T]]:
     """`sample(cases, n)`: the first, the last and some n others, the same in every run; with --long up to 2000."""
 
-    def draw(cases: Sequence[T], n: int) -> list[T]:
+    def draw_sample(cases: Sequence[T], n: int) -> list[T]:
         n = 2000 if request.config.getoption("--long") else n
         if len(cases) <= n:
             return list(cases)
         chosen = random.Random(request.node.name).sample(range(len(cases)), n)
         return [cases[i] for i in sorted({0, len(cases) - 1, *chosen})]
 
-    return draw
+    return draw_sample
 
 
 @pytest.fixture(scope="session")

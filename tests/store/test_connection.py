@@ -125,7 +125,7 @@ def test_new_connection_settings_hold_from_then_on(undisturbed_scan, tmp_path):
 
 def test_another_rig_is_refused_before_anything_is_written(undisturbed_scan, tmp_path, capsys):
     small = undisturbed_scan.copy(tmp_path / "other")
-    state_before = (small.path / "manifest.jsonl").read_bytes()
+    manifest_before = (small.path / "manifest.jsonl").read_bytes()
     table = to_builtins(move_rig(ScanFolder.load(small.path).instrument))
     table["grid"] |= {"columns": 5}
     table["chirp"] |= {"samples": table["chirp"]["samples"] - 1}
@@ -135,4 +135,4 @@ def test_another_rig_is_refused_before_anything_is_written(undisturbed_scan, tmp
     assert "grid.columns is 3 in the scan and 5 there" in messages
     assert "chirp.samples" in messages
     assert "pi." not in messages.partition("why:")[0]
-    assert (small.path / "manifest.jsonl").read_bytes() == state_before
+    assert (small.path / "manifest.jsonl").read_bytes() == manifest_before

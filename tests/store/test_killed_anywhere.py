@@ -45,11 +45,11 @@ def run_until_fault(scan: SmallScan, disk: FaultyDisk) -> bool:
 
 def assert_that_it_resumes(scan: SmallScan, undisturbed_scan, where: str) -> None:
     """Resume the scan: it must end like an undisturbed one, with at most one row retaken."""
-    state_before = scan.rows() if scan.begun else {}
+    committed_rows = scan.rows() if scan.begun else {}
     assert scan.run().exit_status == "success", where
     assert validate(scan.path) == [], where
     assert scan.rows() == undisturbed_scan.digests, where
-    assert {name: undisturbed_scan.digests[name] for name in state_before} == state_before, where
+    assert {name: undisturbed_scan.digests[name] for name in committed_rows} == committed_rows, where
     assert len(list_retaken_rows(scan.path)) <= 1, where
 
 

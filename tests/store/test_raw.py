@@ -114,7 +114,7 @@ def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
 
 @pytest.mark.parametrize("what", ["image only", "being made", "being processed", "sample", "no samples", "settings"])
 def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what):
-    state_before = list_payloads(scan)
+    payloads_before = list_payloads(scan)
     samples = scan / "samples"
     with ExitStack() as other_items:
         code = ErrorCode.BUSY
@@ -143,7 +143,7 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
             named = "samples.json"
         with expect_refusal(code, named):
             drop_raw(scan, None, yes=True)
-    assert list_payloads(scan) == state_before
+    assert list_payloads(scan) == payloads_before
     assert not load_facts(scan, "raw_dropped")
 
 
@@ -164,17 +164,17 @@ def test_a_damaged_sample_of_a_dropped_row_is_named_and_costs_this_row(scan, tmp
     assert "rows 2 are left out" in caplog.text
     coverage = json.loads((tmp_path / "less" / "quality.json").read_text())["coverage"]
     assert coverage["rows_absent"] == [2]
-    state_before = read_contents(scan / "products")
+    contents_before = read_contents(scan / "products")
     with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "products"):
         process(scan, scan / "products")
-    assert read_contents(scan / "products") == state_before
+    assert read_contents(scan / "products") == contents_before
     (scan / "samples" / "rows.jsonl").unlink()
     with expect_refusal(ErrorCode.NO_DATA, ROWS):
         process(scan, scan / "products")
 
 
 def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypatch, capsys):
-    state_before = list_payloads(scan)
+    payloads_before = list_payloads(scan)
     for typed in ("", "yes\n"):
         monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
         with pytest.raises(ConfigError):
@@ -196,7 +196,7 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     (scan / "products" / "image.npz").write_bytes(b"half of it")
     with expect_refusal(ErrorCode.FILE_DAMAGED):
         drop_raw(scan, None, yes=True)
-    assert list_payloads(scan) == state_before
+    assert list_payloads(scan) == payloads_before
     assert not load_facts(scan, "raw_dropped")
 
 

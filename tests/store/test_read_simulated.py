@@ -48,7 +48,7 @@ def test_both_layouts_read_alike(tmp_path: Path, loss: float, zero_filling: bool
     assert authors_source.instrument.chirp == own_source.instrument.chirp
     for row in own_source.rows():
         for board in ("RH", "RV"):
-            a = own_source.read_row(board, row)
-            b = authors_source.read_row(board, row)
-            assert np.array_equal(a.payload, b.payload)
-            assert a.missing == b.missing
+            own_row = own_source.read_row(board, row)
+            authors_row = authors_source.read_row(board, row)
+            assert np.array_equal(own_row.payload, authors_row.payload)
+            assert own_row.missing == authors_row.missing

@@ -30,10 +30,10 @@ def scan_with(folder: Path, lost: int | Collection[int], wrong: bool = False) ->
     size = rig.row_bytes
     frame = rig.frame_bytes
     record = Record.make(size, 5000, 7)
-    state_before = Record.make(2000, 3000, 5)
+    earlier_record = Record.make(2000, 3000, 5)
     lost_packets = {lost} if isinstance(lost, int) else set(lost)
     received = [packet for k, packet in enumerate(record.packets) if k not in lost_packets]
-    packets = [state_before.packets[1], *received, record.packets[4]]
+    packets = [earlier_record.packets[1], *received, record.packets[4]]
     boards = {}
     with scan.writer() as writer:
         for board in rig.recorded:
@@ -72,9 +72,9 @@ def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None
 
 def test_rows_with_the_same_result_are_not_touched(tmp_path):
     scan, data = scan_with(tmp_path / "scan", lost=9)
-    state_before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
+    contents_before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
     assert [(r.changed, r.why_unchanged) for r in replace_rows(scan)] == [(False, "")] * 2
-    assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == state_before
+    assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == contents_before
     holds(scan, data, [(9 * 1456, 10 * 1456)])
 
 

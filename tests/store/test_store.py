@@ -75,9 +75,9 @@ def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_cont
         path.write_bytes(raw[:n])
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
-        state_after = manifest.read(path)
-        assert state_after.facts == [*map(parse_fact, some[:whole_lines]), ScanResumed()]
-        assert (state_after.torn, state_after.faults) == (False, [])
+        restored = manifest.read(path)
+        assert restored.facts == [*map(parse_fact, some[:whole_lines]), ScanResumed()]
+        assert (restored.torn, restored.faults) == (False, [])
 
 
 def test_two_writers_never_share_a_scan(tmp_path):

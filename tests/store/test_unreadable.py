@@ -105,12 +105,12 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_
         assert scan.acknowledged <= committed
         if scan.begun:
             assert list_errors(scan.path) == []
-        state_before = scan.rows() if scan.begun else {}
+        committed_rows = scan.rows() if scan.begun else {}
         # There is space again
         assert scan.run().exit_status == "success"
         assert validate(scan.path) == []
         assert scan.rows() == undisturbed_scan.digests
-        assert state_before.items() <= undisturbed_scan.digests.items()
+        assert committed_rows.items() <= undisturbed_scan.digests.items()
         shutil.rmtree(folder)
     assert failures > 5
 

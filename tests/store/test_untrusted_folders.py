@@ -165,12 +165,12 @@ def test_a_scan_with_a_link_out_of_it_is_refused_before_anything_is_read_or_writ
     target = victim
     if link.exists() and link.is_file():
         target = link.rename(victim / "theirs")
-    state_before = {p: p.read_bytes() for p in victim.iterdir()}
+    contents_before = {p: p.read_bytes() for p in victim.iterdir()}
     link.symlink_to(target)
     out = ["--out", str(tmp_path / "out")]
     for command in (["resume"], ["process", *out], ["drop-raw", "--yes"], ["validate", "--replace"], ["focus", *out]):
         assert main([command[0], str(scan.path), *command[1:]]) != 0
-    assert {p: p.read_bytes() for p in victim.iterdir()} == state_before
+    assert {p: p.read_bytes() for p in victim.iterdir()} == contents_before
 
 
 def test_links_within_a_scan_and_of_its_products_folder_are_allowed(scan, tmp_path):

@@ -158,11 +158,11 @@ class Bench:
         """Run a command to its end."""
         return self.start(*command, env=env).wait(limit_s)
 
-    def polysight(self, *arguments: str | Path, limit_s: float = LIMIT_S) -> Ended:
+    def run_polysight(self, *arguments: str | Path, limit_s: float = LIMIT_S) -> Ended:
         """Run a command of the host."""
         return self.run("polysight", *arguments, limit_s=limit_s)
 
-    def here(self, *arguments: str | Path) -> Ended:
+    def run_here(self, *arguments: str | Path) -> Ended:
         """Run a host command in this process, which saves a second for starting a program."""
         out = io.StringIO()
         err = io.StringIO()
@@ -180,7 +180,7 @@ class Bench:
         """Return when the condition holds, see :func:`wait_for`."""
         wait_for(condition, what)
 
-    def processes(self) -> dict[int, str]:
+    def list_processes(self) -> dict[int, str]:
         """Command lines of living processes that name this folder."""
         return list_processes_naming(str(self.folder))
 

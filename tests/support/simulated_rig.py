@@ -70,7 +70,7 @@ class Rig(Bench):
             nonlocal begun
             assert scan.process.poll() is None, f"the scan ended too early: {scan.err}"
             journal = sum(path.stat().st_size for path in self.folder.glob("rig/journal/*.journal"))
-            if self.committed() < rows or not any(self.folder.glob("scan/raw/*/*.part")):
+            if self.count_committed_rows() < rows or not any(self.folder.glob("scan/raw/*/*.part")):
                 begun = 0
             elif not begun:
                 begun = journal
@@ -78,7 +78,7 @@ class Rig(Bench):
 
         wait_for(is_received, f"row {rows} being received")
 
-    def committed(self) -> int:
+    def count_committed_rows(self) -> int:
         """Number of committed rows of the scan."""
         with suppress(PolysightError):  # not begun yet
             return len(ScanFolder.load(self.folder / "scan").committed_rows())
@@ -87,7 +87,7 @@ class Rig(Bench):
     def close(self) -> None:
         """End all processes of this rig; fail if one is left."""
         super().close()
-        remaining = self.processes()
+        remaining = self.list_processes()
         assert not remaining, remaining
 
 

@@ -33,8 +33,8 @@ def test_noise_is_amplified_at_most_fourfold(rig):
     f = np.linspace(-2e6, 2e6, 4001)
     model = high_pass(rig.chirp)
     assert np.abs(model.inverse(f)).max() <= 4 + 1e-9
-    strong = np.abs(model.response(f)) > 0.25
-    np.testing.assert_allclose((model.inverse(f) * model.response(f))[strong], 1, atol=1e-12)
+    is_strong = np.abs(model.response(f)) > 0.25
+    np.testing.assert_allclose((model.inverse(f) * model.response(f))[is_strong], 1, atol=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
@@ -62,10 +62,10 @@ def test_two_tones_are_restored_up_to_the_ends_of_the_record(rig):
     centre = 500e3
     tones = np.array([-15e3, 17e3])
     clean = np.exp(2j * np.pi * np.outer(tones, n * step)).sum(axis=0)
-    weak = (model.response(centre + tones)[:, None] * np.exp(2j * np.pi * np.outer(tones, n * step))).sum(axis=0)
+    filtered = (model.response(centre + tones)[:, None] * np.exp(2j * np.pi * np.outer(tones, n * step))).sum(axis=0)
     taps = Equaliser.from_model(model, chirp, 4).taps(np.array([[centre / chirp.sample_rate_hz]])).astype(np.complex64)
-    restored = apply_filter(weak[None, None, None].astype(np.complex64), taps)[0, 0, 0]
-    assert np.abs(weak - clean).max() > 0.3
+    restored = apply_filter(filtered[None, None, None].astype(np.complex64), taps)[0, 0, 0]
+    assert np.abs(filtered - clean).max() > 0.3
     np.testing.assert_allclose(restored[1:-1], clean[1:-1], atol=2e-3)
     np.testing.assert_allclose(restored, clean, atol=2e-2)
 

@@ -82,7 +82,7 @@ def home(host: HostSide) -> int:
     """Home the stage; return the number of attempts: the Pi stops it if a busy machine keeps its threads waiting."""
     for homings in range(1, HOMINGS + 1):
         host.must_accept(m.Home())
-        if host.until_state("ready", "fault").state == "ready":
+        if host.wait_for_state("ready", "fault").state == "ready":
             return homings
     raise AssertionError(host.ask(m.Status()))
 
@@ -95,12 +95,12 @@ def run_one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     uno = start(*python, "polysight_simulators.uno", *options)
     pi = start(*python, "polysight_pi", "run", "--config", str(config), "--stage-port", str(PORT))
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
-    host.must_accept(host.begin())
+    host.must_accept(host.make_begin())
     homings = home(host)
     # Earlier events are not part of the row
     list(chip.changes())
     host.must_accept(m.RunRow(scan_id="scan", row_index=0, take=1))
-    finished = host.wait(m.RowFinished, limit_s=LIMIT_S)
+    finished = host.wait_for_event(m.RowFinished, limit_s=LIMIT_S)
     captures = [e for e in host.events if isinstance(e, m.Capture)]
     pi.send_signal(signal.SIGTERM)
     status = pi.wait(LIMIT_S)

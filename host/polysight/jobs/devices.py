@@ -127,16 +127,18 @@ def _find_board(rig: Instrument, name: str, config: Path) -> Board:
         ) from None
 
 
-def _set_address(board: Board, at: str) -> Board:
+def _set_address(board: Board, present_address: str) -> Board:
     """Return the board with its card's present address, `ADDRESS` or `ADDRESS:PORT`. Raises ConfigError."""
-    address, _, port = at.partition(":")
+    address, _, port = present_address.partition(":")
     if port.isdigit():
         number = int(port)
     else:
         number = board.command_port
     if (port and not port.isdigit()) or not 1 <= number <= 65535:
         raise ConfigError(
-            f"--at {at!r} is not of the form ADDRESS:PORT", "a typing error", "e.g. --at 192.168.33.180:4096"
+            f"--at {present_address!r} is not of the form ADDRESS:PORT",
+            "a typing error",
+            "e.g. --at 192.168.33.180:4096",
         )
     return msgspec.structs.replace(board, card_address=address or board.card_address, command_port=number)
 
@@ -341,7 +343,7 @@ def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
     parts_sent = 0
     parts = 0
 
-    def progress(sent: int, total: int) -> None:
+    def show_progress(sent: int, total: int) -> None:
         nonlocal parts_sent, parts
         parts_sent = sent
         parts = total
@@ -350,7 +352,7 @@ def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
             sys.stderr.write("\n")
 
     try:
-        return board.write_flash(image, progress)
+        return board.write_flash(image, show_progress)
     except KeyboardInterrupt:
         command = f"`polysight radar firmware {board.name} {file} --flash`"
         if parts_sent < parts:

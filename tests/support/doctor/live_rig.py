@@ -56,7 +56,7 @@ class LiveRig:
     def instrument(self) -> Instrument:
         return load_instrument(self.config)
 
-    def variant(self, change: Callable[[dict], None]) -> Path:
+    def write_variant(self, change: Callable[[dict], None]) -> Path:
         """Write a changed rig file for the same rig."""
         table = to_builtins(self.instrument)
         change(table)
@@ -64,7 +64,7 @@ class LiveRig:
         path.write_text(tomli_w.dumps(table))
         return path
 
-    def doctor(
+    def run_doctor(
         self,
         config: Path | None = None,
         system: System = QUICK,
@@ -76,7 +76,7 @@ class LiveRig:
             return {f.where: f for f in run_checks(context)}
 
     @contextmanager
-    def pi(self) -> Iterator[PiClient]:
+    def connect_to_pi(self) -> Iterator[PiClient]:
         """Connect to the Pi."""
         context: zmq.Context = zmq.Context()
         try:
@@ -111,7 +111,7 @@ class LiveRig:
 
     def home(self) -> None:
         """Home the stage, which clears a fault."""
-        with self.pi() as pi:
+        with self.connect_to_pi() as pi:
             pi.home()
             wait_for(lambda: pi.status().state == "homed", "homed")
 

@@ -136,7 +136,7 @@ class Browser:
         elif event == "Network.requestWillBeSent":
             self.requests.append(what["request"]["url"])
 
-    def size(self, width: int, height: int, phone: bool) -> None:
+    def set_size(self, width: int, height: int, phone: bool) -> None:
         """The window's size in CSS pixels."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
@@ -152,7 +152,7 @@ class Browser:
 
     def visit(self, url: str, size: tuple[int, int, bool] = DESK) -> None:
         """Go to a page, and forget errors and requests of the previous one."""
-        self.size(*size)
+        self.set_size(*size)
         # A page that differs by its fragment only is not loaded again
         self.open("about:blank")
         self.wait("location.href == 'about:blank'", "an empty page")
@@ -166,7 +166,7 @@ class Browser:
 
     def fill(self, selector: str, text: str) -> None:
         """Type into a field, as a person does."""
-        self.value(
+        self.evaluate(
             f"(() => {{ const f = document.querySelector({json.dumps(selector)}); f.value = {json.dumps(text)};"
             " f.dispatchEvent(new Event('input', {bubbles: true})); })()"
         )
@@ -175,11 +175,11 @@ class Browser:
         """Press a button that is shown."""
         element = f"document.querySelector({json.dumps(selector)})"
         self.wait(f"{element}?.checkVisibility() && !{element}.disabled", f"that {selector} can be pressed")
-        self.value(f"{element}.click()")
+        self.evaluate(f"{element}.click()")
 
     def check_whole(self, address: str) -> None:
         """Check that nothing overflows sideways, there are no errors, and nothing was loaded from another address."""
-        assert self.value("document.documentElement.scrollWidth <= innerWidth")
+        assert self.evaluate("document.documentElement.scrollWidth <= innerWidth")
         assert self.errors == []
         assert all(url.startswith((address, "about:", "blob:")) for url in self.requests), self.requests
 
@@ -191,37 +191,37 @@ class Browser:
     def find_violations(self, axe: Path) -> list[list[str]]:
         """Rules of axe-core that the page breaks, each with the elements that break it."""
         # The checker is read once a page, and names no element by a selector: that takes longer than its rules.
-        if not self.value("'axe' in window"):
-            self.value(f"{axe.read_text(encoding='utf-8')}; 0")
-        return self.value(
+        if not self.evaluate("'axe' in window"):
+            self.evaluate(f"{axe.read_text(encoding='utf-8')}; 0")
+        return self.evaluate(
             "axe.run({resultTypes: ['violations'], selectors: false})"
             ".then(result => result.violations.map(v => [v.id, ...v.nodes.map(node => node.html)]))"
         )
 
-    def value(self, expression: str) -> Any:
+    def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression in the page."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def text(self, element: str) -> str:
+    def read_text(self, element: str) -> str:
         """Return the text of the element with this id."""
-        return self.value(f"document.getElementById('{element}')?.innerText ?? ''")
+        return self.evaluate(f"document.getElementById('{element}')?.innerText ?? ''")
 
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until an expression is true in the page."""
         deadline = read_idle_s() + limit_s
         while not self._true(expression):
-            assert read_idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.text('status')!r}"
+            assert read_idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.read_text('status')!r}"
             time.sleep(0.05)
 
     def _true(self, expression: str) -> bool:
         try:
-            return bool(self.value(f"Boolean({expression})"))
+            return bool(self.evaluate(f"Boolean({expression})"))
         except NavigatedError:
             return False
 
-    def screenshot(self, path: Path) -> None:
+    def save_screenshot(self, path: Path) -> None:
         """The whole page as PNG."""
         answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True)
         path.write_bytes(base64.b64decode(answer["data"]))

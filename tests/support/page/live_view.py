@@ -67,7 +67,7 @@ class GrowingScan:
         while self.grow() != fact:
             assert self._facts, f"no {fact} left"
 
-    def live(self) -> None:
+    def touch_alive(self) -> None:
         """Touch the scan's `alive` file."""
         (self.path / CONTROL_FOLDER).mkdir(exist_ok=True)
         (self.path / CONTROL_FOLDER / ALIVE_FILE).touch()

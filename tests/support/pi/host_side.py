@@ -79,7 +79,7 @@ class HostSide:
         self.instrument = instrument
         self.events: list[Any] = []
         # Once an event comes, the subscription has arrived.
-        self.wait(object)
+        self.wait_for_event(object)
 
     def ask(self, command: Any) -> Any:
         """The reply to a command, or to bytes."""
@@ -100,7 +100,7 @@ class HostSide:
         assert reply.remedy
         return reply.number
 
-    def begin(self, scan_id: str = "scan", **changes: Any) -> m.BeginRun:
+    def make_begin(self, scan_id: str = "scan", **changes: Any) -> m.BeginRun:
         """Return the command that begins a run of this rig, with other values for `changes`."""
         i = self.instrument
         fields: dict[str, Any] = {
@@ -116,9 +116,9 @@ class HostSide:
 
     def home(self, owner: str = "") -> None:
         self.must_accept(m.Home(owner=owner))
-        self.until_state("ready")
+        self.wait_for_state("ready")
 
-    def until_state(self, *states: str) -> m.StatusReply:
+    def wait_for_state(self, *states: str) -> m.StatusReply:
         """Wait until the Pi is in one of these states; return its status."""
         replies: list[Any] = []
 
@@ -130,7 +130,9 @@ class HostSide:
         wait_for(is_reached, f"a state of {states}", self.limit_s)
         return replies[-1]
 
-    def wait(self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None) -> Any:
+    def wait_for_event(
+        self, kind: type, where: Callable[[Any], bool] = lambda _: True, limit_s: float | None = None
+    ) -> Any:
         """The next event of a kind."""
         limit_s = self.limit_s if limit_s is None else limit_s
         deadline = read_idle_s() + limit_s
@@ -145,10 +147,10 @@ class HostSide:
     def start_row(self, row_index: int = 0, take: int = 1, owner: str = "") -> m.Accepted:
         return self.must_accept(m.RunRow(scan_id="scan", row_index=row_index, take=take, owner=owner))
 
-    def row(self, row_index: int, take: int = 1) -> m.RowFinished:
+    def run_row(self, row_index: int, take: int = 1) -> m.RowFinished:
         """Run a row to its end."""
         self.start_row(row_index, take)
-        return self.wait(m.RowFinished, lambda e: (e.row_index, e.take) == (row_index, take))
+        return self.wait_for_event(m.RowFinished, lambda e: (e.row_index, e.take) == (row_index, take))
 
     def list_events(self, *kinds: type) -> list[Any]:
         """Events of these kinds so far."""

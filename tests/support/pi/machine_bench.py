@@ -56,7 +56,7 @@ class Bench:
             else:
                 item()
 
-    def later(self, seconds: float) -> None:
+    def let_time_pass(self, seconds: float) -> None:
         """Advance the time in the executor's turns, until something is due or the time is over."""
         end = self.t + seconds
         while self.t < end:
@@ -70,32 +70,32 @@ class Bench:
         self.machine.command("BeginRun", 0)
         self.machine.command("Home")
         self.run_posted()
-        self.stage_says(Reply("ok", self.stage.number))
-        self.stage_says(Reply("done", self.stage.number))
+        self.send_reply(Reply("ok", self.stage.number))
+        self.send_reply(Reply("done", self.stage.number))
         assert self.machine.state == "ready"
         return self
 
     def start(self, row: Row = ROW, speed_mm_s: float = 20.0) -> None:
         self.row = row
         self.machine.command("RunRow", row, 1, SPEC, speed_mm_s)
-        self.stage_says(Reply("ok", self.stage.number))
+        self.send_reply(Reply("ok", self.stage.number))
 
-    def stage_says(self, reply: Reply) -> None:
+    def send_reply(self, reply: Reply) -> None:
         self.machine.on_stage(reply)
         self.run_posted()
 
-    def status(self, points: int, state: str = "row", x: int = 0, **times_ns: int) -> None:
+    def send_status(self, points: int, state: str = "row", x: int = 0, **times_ns: int) -> None:
         fields = {"state": state, "points": str(points), "x": str(x), "y": "0"}
-        self.stage_says(Reply("status", fields=fields, **times_ns))
+        self.send_reply(Reply("status", fields=fields, **times_ns))
 
-    def row_done(self, dx: int = 0, dy: int = 0, held: int = 0, extra_pulses: int = 0, **times_ns: int) -> None:
+    def end_row(self, dx: int = 0, dy: int = 0, held: int = 0, extra_pulses: int = 0, **times_ns: int) -> None:
         """The stage ends the row, this many steps from its end position, with so many additional trigger pulses."""
         x, y = RowMotion.plan(self.row, self.stage.config, 20.0).end
         fields = {"points": str(self.row.points), "pulses": str(self.row.points + extra_pulses)}
         fields |= {"x": str(x + dx), "y": str(y + dy), "held": str(held)}
-        self.stage_says(Reply("done", self.stage.number, fields=fields, **times_ns))
+        self.send_reply(Reply("done", self.stage.number, fields=fields, **times_ns))
 
-    def edge(self) -> None:
+    def send_edge(self) -> None:
         """Send the next edge at its right time."""
         self.give_edge(self.edge_ns + INTERVAL_NS)
 

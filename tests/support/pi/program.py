@@ -99,17 +99,17 @@ class WiresLog:
             if isinstance(message, WireEdge):
                 self.edges.append(message)
 
-    def rises(self, line: int) -> list[int]:
+    def list_rises(self, line: int) -> list[int]:
         return [e.t_ns for e in self.edges if e.line == line and e.value]
 
-    def level(self, line: int) -> int:
+    def read_level(self, line: int) -> int:
         """The last one seen; 0 before the first."""
         return next((e.value for e in reversed(self.edges) if e.line == line), 0)
 
     def drive(self, *edges: WireEdge) -> None:
         self._client.send(*edges)
 
-    def until(self, condition: Callable[[], bool]) -> None:
+    def wait_until(self, condition: Callable[[], bool]) -> None:
         wait_for(condition, "edges on the wires")
 
     def close(self) -> None:

@@ -53,7 +53,7 @@ class Samples:
             for board in radar.rig.recorded:
                 self._rows[board.name, row.index] = radar.chirps(board.name, x, y, row.index * len(x)).tobytes()
 
-    def of(self, board: str, row: int) -> bytes:
+    def get_payload(self, board: str, row: int) -> bytes:
         """Payload of one row."""
         return self._rows[board, row]
 
@@ -191,7 +191,7 @@ class SmallRig:
     def _end(self, name: str, segment: Segment) -> RowCapture:
         """Place and write the row of one board, as its receiver does."""
         row, take = self._row
-        data = self._samples.of(name, row)
+        data = self._samples.get_payload(name, row)
         log = PacketLog(len(data))
         evidence = Evidence(len(data), self._samples.instrument.frame_bytes, past=EarlierRecords.after_reset())
         for k, packet in enumerate(encode_packets(data, 1, 0)):

@@ -100,8 +100,8 @@ def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
     first = int(os.environ.get("MANGLED_FIRST", "0"))
     for seed in range(first, first + (5_000 if request.config.getoption("--long") else 125)):
         for troubles, take, sent in draw_takes(seed):
-            wrong = count_wrong_bytes(take, sent)
-            assert wrong == 0, (seed, troubles, wrong, take.whole, take.placed.reason)
+            wrong_bytes = count_wrong_bytes(take, sent)
+            assert wrong_bytes == 0, (seed, troubles, wrong_bytes, take.whole, take.placed.reason)
             if take.placed.located and take.frames and not take.frames.contradicted and "held" not in troubles:
                 is_right = take.placed_out == np.frombuffer(sent.data, dtype=np.uint8)
                 right += int(is_right.sum())

@@ -62,8 +62,8 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
         make_ready(pi, StopRequest(), lambda *_: None)
 
 
-@pytest.mark.parametrize(("state", "asked"), [("idle", 2), ("ready", 2), ("homing", 1)])
-def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
+@pytest.mark.parametrize(("state", "times_asked"), [("idle", 2), ("ready", 2), ("homing", 1)])
+def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, times_asked):
     """A stage that is still `ready` has not begun to home: its lost steps would be those of an earlier homing."""
     sent = []
     pi: Any = SimpleNamespace(_owner="",
@@ -71,7 +71,7 @@ def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, asked):
         status=lambda: SimpleNamespace(state=state),
     )  # fmt: skip
     PiClient.home(pi)
-    assert len(sent) == asked
+    assert len(sent) == times_asked
 
 
 def test_pi_and_host_have_the_same_homing_timeout():

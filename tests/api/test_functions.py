@@ -52,10 +52,10 @@ def test_reflection_coefficients_broadcast_by_name():
     assert complex(r_s.isel(frequency=1, material=1).sel(angle=55)) == pytest.approx(plain)
 
 
-@pytest.mark.parametrize("which", ["permittivities", "thicknesses"])
-def test_an_array_with_labels_is_one_medium(which):
+@pytest.mark.parametrize("function", ["permittivities", "thicknesses"])
+def test_an_array_with_labels_is_one_medium(function):
     """Its dimension is not a list of media, whether or not it stands in a list."""
-    if which == "permittivities":
+    if function == "permittivities":
         eps = xarray.DataArray([2.1 - 0.01j, 2.9 - 0.03j, 6 - 0.3j], dims="kind")
         thickness_m = 1e-3
     else:

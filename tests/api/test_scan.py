@@ -287,13 +287,13 @@ def test_nothing_is_written_unless_asked(folder, products, tmp_path, monkeypatch
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
-def assert_same_dataset(found: xarray.Dataset, expected: xarray.Dataset) -> None:
+def assert_same_dataset(dataset: xarray.Dataset, expected: xarray.Dataset) -> None:
     variables = sorted(map(str, expected.data_vars))
-    xarray.testing.assert_equal(found[variables], expected[variables])
+    xarray.testing.assert_equal(dataset[variables], expected[variables])
     for name, variable in expected.variables.items():
-        assert found[name].attrs == variable.attrs, name
+        assert dataset[name].attrs == variable.attrs, name
         if variable.dtype.kind in "cfib":
-            assert found[name].dtype == variable.dtype, name
+            assert dataset[name].dtype == variable.dtype, name
 
 
 def test_netcdf_keeps_every_value(products, tmp_path):
@@ -346,7 +346,7 @@ def test_a_scan_without_metal_lists_the_available_results(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "invalid_parameters",
     [
         {"library": "absent.npz"},
         {"library": polysight.Library(())},
@@ -354,9 +354,9 @@ def test_a_scan_without_metal_lists_the_available_results(tmp_path):
         {"metal_box_mm": (900.0, 900.0, 910.0, 910.0)},
     ],
 )
-def test_parameters_that_cannot_be_used_are_errors(folder, wrong):
+def test_parameters_that_cannot_be_used_are_errors(folder, invalid_parameters):
     with pytest.raises(PolysightError):
-        open_scan(folder, **wrong).materials()
+        open_scan(folder, **invalid_parameters).materials()
 
 
 def test_a_given_rig_is_reported_as_ignored_if_the_scan_folder_has_one(folder):

@@ -23,5 +23,5 @@ def test_distances_in_regions_and_angles_are_those_of_their_definitions():
     deviations = np.array([3 + 4j, 0.1j])
     covariances = np.array([np.eye(2), np.diag([1.0, 0.01])])
     assert squared_distances(deviations, covariances) == pytest.approx([25, 1])
-    turned = np.array([[0.0, np.sin(0.01), np.cos(0.01)]])
-    assert angles_deg(turned, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(np.degrees(0.01))
+    tilted = np.array([[0.0, np.sin(0.01), np.cos(0.01)]])
+    assert angles_deg(tilted, np.array([[0.0, 0.0, 1.0]])) == pytest.approx(np.degrees(0.01))

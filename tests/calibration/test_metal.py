@@ -86,13 +86,13 @@ def test_settings_that_cancel_may_change(metal, make_rig, change):
 
 
 def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_rig):
-    def rig(corner_khz):
+    def make_rig_with_filter(corner_khz):
         file = write_calibration(filter_file(corner_khz), metal.parent)
         return make_rig(calibration={"metal": str(metal), "hpf": str(file)})
 
-    assert load_checked_calibration(rig(179.0), True)
+    assert load_checked_calibration(make_rig_with_filter(179.0), True)
     with expect_refusal(ErrorCode.MISMATCH, "RV", 200):
-        load_checked_calibration(rig(200.0), True)
+        load_checked_calibration(make_rig_with_filter(200.0), True)
 
 
 def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
@@ -198,10 +198,10 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
     reference = load_calibration({"metal": banded_metal}).reference()
     expected = load_reference(plate, bands=BANDS)
     assert len(reference.bands) == len(expected.bands) == BANDS
-    for read, actual in zip((reference, *reference.bands), (expected, *expected.bands), strict=True):
+    for stored, computed in zip((reference, *reference.bands), (expected, *expected.bands), strict=True):
         for name in ("h", "v", "valid"):
-            np.testing.assert_array_equal(getattr(read, name), getattr(actual, name))
-        assert (read.spread, read.how) == (actual.spread, actual.how)
+            np.testing.assert_array_equal(getattr(stored, name), getattr(computed, name))
+        assert (stored.spread, stored.how) == (computed.spread, computed.how)
     pipeline = Pipeline(taken_with(banded_metal))
     assert len(load_metal_plane(pipeline, BANDS).bands) == BANDS
     assert load_metal_plane(pipeline) is not None

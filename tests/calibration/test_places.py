@@ -142,9 +142,9 @@ def test_an_undetermined_unknown_stays_near_the_rig_file(case, few_echoes):
 
 
 def test_another_target_is_refused(case, few_echoes):
-    wrong = [TargetPoint((20.0 * k, 31.0 * (k % 2))) for k in range(-1, 2)]
+    other_targets = [TargetPoint((20.0 * k, 31.0 * (k % 2))) for k in range(-1, 2)]
     with expect_refusal(ErrorCode.MISMATCH):
-        places_file(case[2], fit_places(few_echoes, case[2], wrong), 3, [])
+        places_file(case[2], fit_places(few_echoes, case[2], other_targets), 3, [])
 
 
 def test_a_target_needs_three_points(tmp_path):
@@ -157,5 +157,5 @@ def test_a_target_needs_three_points(tmp_path):
 def test_another_rig_files_places_are_taken_and_nothing_else(make_rig):
     scanned = make_rig(grid={"columns": 5})
     other_rig = make_rig(geometry={"object_distance_mm": 600.0})
-    taken = take_antenna_places(scanned, other_rig)
-    assert (taken.geometry, taken.grid) == (other_rig.geometry, scanned.grid)
+    rig_of_scan = take_antenna_places(scanned, other_rig)
+    assert (rig_of_scan.geometry, rig_of_scan.grid) == (other_rig.geometry, scanned.grid)

@@ -189,7 +189,7 @@ def test_the_card_decodes_the_settings_sent(net, ends, mac, ports):
 
 
 @pytest.mark.parametrize(
-    "given",
+    "addresses",
     [
         {"card_address": "192.168.33.30"},
         {"card_address": "192.168.34.180"},
@@ -208,12 +208,12 @@ def test_the_card_decodes_the_settings_sent(net, ends, mac, ports):
         {"data_port": 4096},
     ],
 )
-def test_a_card_that_could_not_be_reached_is_refused(given):
-    good = {"host_address": "192.168.33.30", "card_address": "192.168.33.180"}
-    EepromSettings(**good)
-    EepromSettings(**good, command_port=1025, data_port=65535)
+def test_a_card_that_could_not_be_reached_is_refused(addresses):
+    usable_addresses = {"host_address": "192.168.33.30", "card_address": "192.168.33.180"}
+    EepromSettings(**usable_addresses)
+    EepromSettings(**usable_addresses, command_port=1025, data_port=65535)
     with expect_refusal(ErrorCode.VALUE_INVALID):
-        EepromSettings(**(good | given))
+        EepromSettings(**(usable_addresses | addresses))
 
 
 def read_settings(client: CardClient) -> EepromSettings:

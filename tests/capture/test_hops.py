@@ -61,7 +61,7 @@ def test_an_interface_without_a_link_status_is_skipped(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("given", "hop", "says"),
+    ("kernel_files", "hop", "says"),
     [
         ({"routes": ""}, Hop.ROUTE, "no route"),
         ({"routes": GATEWAY}, Hop.ROUTE, "no route"),
@@ -73,8 +73,8 @@ def test_an_interface_without_a_link_status_is_skipped(tmp_path):
         ({"arp": None}, Hop.UNKNOWN, "the card is off"),
     ],
 )
-def test_every_hop_reads_differently(tmp_path, given, hop, says):
-    root = write_kernel_files(tmp_path, **given)
+def test_every_hop_reads_differently(tmp_path, kernel_files, hop, says):
+    root = write_kernel_files(tmp_path, **kernel_files)
     assert find_silent_hop(CARD, root) is hop
     error = explain_silent_card(BOARD, "it did not answer", root)
     assert (error.what, says in error.why) == ("it did not answer", True)
@@ -131,14 +131,14 @@ def test_unknown_hops_are_not_guessed(tmp_path):
     assert find_silent_hop("127.0.0.5", write_kernel_files(tmp_path, routes="")) is Hop.UNKNOWN
 
 
-def make_row(**given) -> RowCapture:
+def make_row(**fields_given) -> RowCapture:
     fields = dict.fromkeys((f.name for f in msgspec.structs.fields(RowCapture)), 0)
     fields |= {"counts": PacketCounts(), "losses": Losses()}
-    return RowCapture(**(fields | {"missing": [(0, 9)], "located": False, "reason": "no packet came"} | given))
+    return RowCapture(**(fields | {"missing": [(0, 9)], "located": False, "reason": "no packet came"} | fields_given))
 
 
 @pytest.mark.parametrize(
-    ("got", "says"),
+    ("received", "says"),
     [
         (None, "the radar is not streaming"),
         (make_row(), "the radar is not streaming"),
@@ -147,8 +147,8 @@ def make_row(**given) -> RowCapture:
         (make_row(card_status=int(Status.NO_HEADER)), "without a header"),
     ],
 )
-def test_a_radar_that_does_not_stream(got, says):
-    error = explain_silent_radar(BOARD, got)
+def test_a_radar_that_does_not_stream(received, says):
+    error = explain_silent_radar(BOARD, received)
     assert says in error.why
     assert "RH" in error.what
 

@@ -39,10 +39,10 @@ def draw_noise(size: int, seed: int) -> bytes:
     return np.random.default_rng(seed).integers(0, 256, size, dtype=np.uint8).tobytes()
 
 
-def send(card: socket.socket, board: Board, some: list[bytes]) -> None:
+def send(card: socket.socket, board: Board, packets: list[bytes]) -> None:
     """The packets fit in the receive buffer even if the receiver does not run meanwhile."""
-    assert len(some) <= usable_packets(1 << 20)
-    for packet in some:
+    assert len(packets) <= usable_packets(1 << 20)
+    for packet in packets:
         card.sendto(packet, (board.host_address, board.data_port))
 
 
@@ -59,14 +59,14 @@ def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
         for k, data in enumerate((first, second, third)):
             path = tmp_path / f"{k}.part"
             assert receiver.begin_row(k, 1, size, 4096, path, after_reset=k == 0) == 0
-            some = encode_packets(data, sequence + k * n, count + k * size)
+            packets = encode_packets(data, sequence + k * n, count + k * size)
             if k == 1:
                 # Head lost, reordered, duplicate
-                some = [*some[2:50], some[51], some[50], some[51], *some[52:]]
-                send(card, board, [*some, b"tiny"])
+                packets = [*packets[2:50], packets[51], packets[50], packets[51], *packets[52:]]
+                send(card, board, [*packets, b"tiny"])
                 wait_for(lambda: receiver.report().received == size - 2 * FULL, "packets")
             else:
-                send(card, board, some)
+                send(card, board, packets)
                 wait_for(lambda: receiver.poll().complete, "packets")
             row = receiver.end_row()
             assert (row.row, row.take, row.expected, row.located) == (k, 1, size, True)
@@ -227,10 +227,10 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         for receiver in (swamped, quiet):
             receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part", after_reset=True)
         os.kill(swamped.pid, signal.SIGSTOP)
-        some = encode_packets(draw_noise(2000 * FULL, 3), 1, 0)
-        for packet in some:
+        packets = encode_packets(draw_noise(2000 * FULL, 3), 1, 0)
+        for packet in packets:
             card.sendto(packet, (board.host_address, board.data_port))
-        for packet in some[:20]:
+        for packet in packets[:20]:
             card.sendto(packet, (other_board.host_address, other_board.data_port))
         os.kill(swamped.pid, signal.SIGCONT)
         wait_for(lambda: quiet.report().received == 20 * FULL, "packets")

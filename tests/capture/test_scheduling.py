@@ -37,10 +37,10 @@ def test_core_and_priority_are_reported(board):
 
 @pytest.mark.parametrize(("exclusive", "has_priority"), [(True, True), (True, False), (False, True), (False, False)])
 def test_a_shared_core_is_taken_with_priority_only(monkeypatch, exclusive, has_priority):
-    taken: list[set[int]] = []
-    monkeypatch.setattr(os, "sched_setaffinity", lambda _pid, cores: taken.append(cores))
+    cores_taken: list[set[int]] = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda _pid, cores: cores_taken.append(cores))
     assert take_core(1, exclusive, has_priority) == ((1, "") if exclusive or has_priority else (None, ""))
-    assert taken == ([{1}] if exclusive or has_priority else [])
+    assert cores_taken == ([{1}] if exclusive or has_priority else [])
 
 
 def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
@@ -54,8 +54,8 @@ def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
     assert "LimitRTPRIO=10" in desktop
     assert "LimitNICE=-10" in desktop
     assert f"net.core.rmem_max = {8 << 20}" in (tmp_path / "etc/sysctl.d/60-polysight.conf").read_text()
-    for bad in ([], ["a b"], ["ada; reboot"]):
-        process = subprocess.run(["sh", RIGHTS, *bad], env={**os.environ, "ROOT": str(tmp_path)}, check=False)
+    for arguments in ([], ["a b"], ["ada; reboot"]):
+        process = subprocess.run(["sh", RIGHTS, *arguments], env={**os.environ, "ROOT": str(tmp_path)}, check=False)
         assert process.returncode == 2
 
 

@@ -56,10 +56,10 @@ def test_a_packet_has_at_least_one_byte_and_at_most_1456():
     assert log.payload_bytes == 1457
     assert log.arrivals_ns.tolist() == [1, 2]
     assert log.payload[:1457].tolist() == [1] + 1456 * [2]
-    both = PacketLog(9000)
+    joined = PacketLog(9000)
     # Nine bytes are less than a header.
-    both.add(np.zeros((4, 12), np.uint8), np.array([10, 12, 9, 11]), np.array([5, 6, 7, 8]))
-    assert (both.malformed, both.sizes.tolist(), both.arrivals_ns.tolist()) == (2, [2, 1], [6, 8])
+    joined.add(np.zeros((4, 12), np.uint8), np.array([10, 12, 9, 11]), np.array([5, 6, 7, 8]))
+    assert (joined.malformed, joined.sizes.tolist(), joined.arrivals_ns.tolist()) == (2, [2, 1], [6, 8])
 
 
 @pytest.mark.parametrize(
@@ -101,14 +101,14 @@ def test_a_log_is_restored_from_its_arrays():
     log._heads[:3] = [[1, 2, 3, 4, 5, 6, 7, 8, 9, 10], [255] * 10, [0] * 10]
     assert log.sequences.tolist() == [0x04030201, 2**32 - 1, 0]
     assert log.byte_counts.tolist() == [0x0A0908070605, 2**48 - 1, 0]
-    again = PacketLog.restore(
+    restored = PacketLog.restore(
         expected=9000, sequences=log.sequences, byte_counts=log.byte_counts, sizes=log.sizes,
         times_ns=log.arrivals_ns, payload=log.payload,
     )  # fmt: skip
     for name in ("expected", "count", "kept", "payload_bytes", "last_is_short", "last_arrival_ns"):
-        assert getattr(again, name) == getattr(log, name)
+        assert getattr(restored, name) == getattr(log, name)
     for name in ("sequences", "byte_counts", "sizes", "arrivals_ns"):
-        assert getattr(again, name).tolist() == getattr(log, name).tolist()
+        assert getattr(restored, name).tolist() == getattr(log, name).tolist()
 
 
 def test_a_segment_holds_the_bytes_given(tmp_path):

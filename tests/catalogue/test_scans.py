@@ -81,8 +81,11 @@ def test_rows_are_counted_as_the_scan_folder_counts_them(root):
     """Taken again, withdrawn, torn and damaged lines included."""
     path = root / "done" / MANIFEST
     facts = load_facts(path)
-    again = [facts[5] | {"take": 2}, {"fact": "row_withdrawn", "row": facts[2]["row"], "take": 1, "reasons": ["x"]}]
-    lines = [manifest.encode_line(f) for f in [*facts, *again]]
+    facts_of_retake = [
+        facts[5] | {"take": 2},
+        {"fact": "row_withdrawn", "row": facts[2]["row"], "take": 1, "reasons": ["x"]},
+    ]
+    lines = [manifest.encode_line(f) for f in [*facts, *facts_of_retake]]
     lines[7] = lines[7].replace(b'"row":', b'"rov":')
     path.write_bytes(b"".join(lines) + b'{"fact":"row_committed","pulses":3,"row":999')
     summary = Scans(root).summary("done")
@@ -198,8 +201,8 @@ def test_a_damaged_or_foreign_index_changes_no_list(root, kept):
         index.write_bytes(content.replace(b'"version":1', b'"version":0').replace(b"finished", b"stopped"))
     else:
         index.write_bytes(content[: int(kept * len(content))])
-    again = Scans(root, index=index).list()
-    assert again == listed
+    second_list = Scans(root, index=index).list()
+    assert second_list == listed
     assert index.read_bytes() == content
 
 

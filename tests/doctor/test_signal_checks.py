@@ -106,9 +106,9 @@ def test_a_crystal_and_a_late_trigger_are_distinguished(ppm):
 @pytest.mark.parametrize("offset_hz", [2.6e6, -900e3])
 def test_the_start_times_of_aliased_direct_paths_lack_no_sample_rate(offset_hz):
     """RH alone is programmed beyond the band; a sample rate of IF is 55 ns."""
-    beyond = make_programmed_rig(offset_hz)
+    shifted_rig = make_programmed_rig(offset_hz)
     rig = make_programmed_rig()
-    rig = msgspec.structs.replace(rig, boards=[beyond.by_name("RH") if b.name == "RH" else b for b in rig.boards])
+    rig = msgspec.structs.replace(rig, boards=[shifted_rig.by_name("RH") if b.name == "RH" else b for b in rig.boards])
     finding = judge_skew(rig, {name: make_direct_signal(name, rig) for name in ("RH", "RV")})
     assert finding.level == "ok", finding
     assert finding.facts["later_ns"]["RH"] == pytest.approx(0.0, abs=2.5)

@@ -177,7 +177,7 @@ class Killed:
         """Kill, resume, compare. Returns the number of rows that each resume has retaken."""
         folder = self.rig.folder / f"scan-{kill.number}"
         self.strike(kill, folder)
-        again = []
+        retaken_rows = []
         for place in [*kill.resumes, None]:
             safe_before = check_committed_rows(folder, self.rows)
             ended = self.scan(folder, [place] if place else list_kinds(RESUME_PLACES)).wait()
@@ -186,14 +186,14 @@ class Killed:
                 self.check_died(ended.status, place, self.hits)
             self.note("resume", self.hits)
             assert safe_before.items() <= check_committed_rows(folder, self.rows).items(), kill
-            again.append(len(list_retaken_rows(folder)))
+            retaken_rows.append(len(list_retaken_rows(folder)))
         assert validate(folder) == [], kill
         assert compute_row_digests(folder) == self.rows, kill
         assert image(folder) == self.image, kill
-        assert max(again) <= 1, kill
+        assert max(retaken_rows) <= 1, kill
         started = [e for e in read_events(folder / "events.msgpack").events if isinstance(e, RowStarted)]
         assert len({(e.row.index, e.take) for e in started}) == len(started), "a take was used twice"
-        return again
+        return retaken_rows
 
 
 def list_kinds(places: Sequence[Place]) -> list[Place]:
@@ -258,9 +258,9 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 def test_killed(killed_rig: Killed, number: int, record_property):
     kill = Kill.draw(number)
-    again = killed_rig.check(kill)
-    record_property("kill", f"{kill}; rows retaken by each resume: {again}")
-    print(f"{kill}: rows retaken by each resume {again}")  # noqa: T201 - shown with -s
+    retaken_rows = killed_rig.check(kill)
+    record_property("kill", f"{kill}; rows retaken by each resume: {retaken_rows}")
+    print(f"{kill}: rows retaken by each resume {retaken_rows}")  # noqa: T201 - shown with -s
 
 
 def test_every_kind_of_place_is_reached(killed_rig: Killed):

@@ -168,13 +168,13 @@ def test_no_module_is_imported_past_the_front_of_its_room():
 def test_only_simulators_use_simulators():
     """Also at run time in a wheel: the demo starts them as programs."""
     files = [f for top in ("host", "papers", "pi_controller", "shared") for f in (ROOT / top).rglob("*.py")]
-    wrong = [
+    forbidden_imports = [
         f"{f.relative_to(ROOT)}:{line} {module}"
         for f in files
         for line, module in list_imports(f)
         if module.startswith("polysight_simulators")
     ]
-    assert wrong == []
+    assert forbidden_imports == []
 
 
 def test_worlds_know_nothing_of_ours():

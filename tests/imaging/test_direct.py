@@ -87,7 +87,7 @@ def test_backprojection_is_linear_and_works_with_one_frequency():
     [{"samples": np.zeros(3)}, {"frequencies_hz": [1.0]}, {"tx_m": np.zeros((2, 3))}, {"voxels_m": np.zeros(3)}],
 )
 def test_shapes_that_do_not_fit_are_refused(change):
-    good = {
+    valid_arguments = {
         "samples": np.zeros((3, 2)),
         "frequencies_hz": [1.0, 2.0],
         "tx_m": np.zeros((3, 3)),
@@ -95,6 +95,6 @@ def test_shapes_that_do_not_fit_are_refused(change):
         "voxels_m": np.zeros((4, 3)),
         "reference_m": np.zeros(3),
     }
-    assert backproject(**good).shape == (4,)
+    assert backproject(**valid_arguments).shape == (4,)
     with pytest.raises(ValueError, match=r"\["):
-        backproject(**{**good, **change})
+        backproject(**{**valid_arguments, **change})

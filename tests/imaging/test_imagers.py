@@ -105,22 +105,22 @@ def test_forward_models_agree(aperture):
 def test_a_common_phase_is_kept(aperture, make):
     a = aperture(15, 8, 4.0, 2.0, (12, 10), 2.0)
     samples = _draw_samples(a, np.random.default_rng(4))
-    turned = make(a).image((samples * np.exp(0.7j)).astype(np.complex64))
-    np.testing.assert_allclose(turned, make(a).image(samples) * np.exp(0.7j), atol=1e-6 * np.abs(turned).max())
+    rotated = make(a).image((samples * np.exp(0.7j)).astype(np.complex64))
+    np.testing.assert_allclose(rotated, make(a).image(samples) * np.exp(0.7j), atol=1e-6 * np.abs(rotated).max())
 
 
 def test_a_row_added_again_replaces_the_earlier_one_in_any_order(aperture):
     rng = np.random.default_rng(5)
     a = aperture(15, 6, 4.0, 4.0, (12, 10), 2.0)
     samples = _draw_samples(a, rng)
-    wrong = _draw_noise(rng, a.shape)
-    none = np.zeros(15, np.float32)
+    other_samples = _draw_noise(rng, a.shape)
+    zero_weights = np.zeros(15, np.float32)
     starts = a.offsets_m[:, 0, 0]
     imager = IncrementalImager(a)
     for r in rng.permutation(6):
-        imager.add_row(r, wrong[:, :, r], none, starts[r] + 1e-4)
-        imager.add_row(r, -wrong[:, :, r], none, starts[r] + 1e-4)
-        imager.add_row(r, samples[:, :, r], none, starts[r])
+        imager.add_row(r, other_samples[:, :, r], zero_weights, starts[r] + 1e-4)
+        imager.add_row(r, -other_samples[:, :, r], zero_weights, starts[r] + 1e-4)
+        imager.add_row(r, samples[:, :, r], zero_weights, starts[r])
     expected = SpectralImager(a).image(samples)
     assert np.abs(imager.image_of_sum(np.ones(4)) - expected).max() < 1e-5 * np.abs(expected).max()
 

@@ -44,8 +44,8 @@ def _find_peak(image, x_m, y_m):
     a = np.abs(image)
     iy, ix = np.unravel_index(np.argmax(a), a.shape)
 
-    def vertex(left, mid, right):
-        return 0.5 * (left - right) / (left - 2 * mid + right)
+    def vertex(before_peak, at_peak, after_peak):
+        return 0.5 * (before_peak - after_peak) / (before_peak - 2 * at_peak + after_peak)
 
     dx = vertex(*a[iy, ix - 1 : ix + 2])
     dy = vertex(*a[iy - 1 : iy + 2, ix])
@@ -271,16 +271,16 @@ def test_measured_offsets_of_rows_improve_the_focus(make_rig, points_rows):
     board = rig.receivers[0]
     point = np.array(specular_midpoint_m(rig, board))
     shifts = [1.2e-3 * (row.index % 2) for row in plan_raster(rig.grid)]
-    good = ImageBuilder(rig)
+    builder = ImageBuilder(rig)
     informed = ImageBuilder(rig)
     ignored = ImageBuilder(rig)
     for index, row in points_rows(rig, board, [point], [1.0]):
-        good.add_row(board.name, index, row)
+        builder.add_row(board.name, index, row)
     for index, row in points_rows(rig, board, [point], [1.0], shifts_m=shifts):
         ignored.add_row(board.name, index, row)
         planned = row_offsets_m(rig, plan_raster(rig.grid).row(index))
         informed.add_row(board.name, index, row, np.add(planned, [shifts[index], 0]))
-    want = good.finish().h_raw
+    want = builder.finish().h_raw
     error_known = np.abs(informed.finish().h_raw - want).max() / np.abs(want).max()
     error_ignored = np.abs(ignored.finish().h_raw - want).max() / np.abs(want).max()
     assert error_known < 0.01

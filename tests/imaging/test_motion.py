@@ -30,12 +30,12 @@ def average_over_burst(turns, rig):
 )
 def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
     """The law holds for any part of the phase change that burst alignment has removed."""
-    still = np.exp(2j * np.pi * turns * np.arange(COUNT))
+    samples_at_rest = np.exp(2j * np.pi * turns * np.arange(COUNT))
     average = average_over_burst(turns - centre, fast) * np.exp(2j * np.pi * centre * np.arange(COUNT))
     valid = np.ones(COUNT, bool)
     turn = np.full(COUNT, 2 * np.pi * centre)
     undone = undo_burst_motion(average, valid, turn, design_burst_filters(fast))
-    np.testing.assert_allclose(undone[MIDDLE], still[MIDDLE], atol=6e-3)
+    np.testing.assert_allclose(undone[MIDDLE], samples_at_rest[MIDDLE], atol=6e-3)
     assert turns == centre or abs(average[30]) < 1 - 1.2 * (turns - centre) ** 2
 
 

@@ -38,9 +38,9 @@ def test_without_the_direct_path_removal_the_error_is_below_1e_4_of_the_peak(rig
     finer = reduction(chirp, GATE, extra=30)
     pixels = np.linspace(*GATE, 200)
     x = np.exp(2j * np.pi * _sweep(chirp) * 0.36 / C)
-    few = np.exp(-2j * np.pi * np.outer(pixels, gate.frequencies_hz) / C) @ (gate.matrix @ x)
-    many = np.exp(-2j * np.pi * np.outer(pixels, finer.frequencies_hz) / C) @ (finer.matrix @ x)
-    assert np.abs(few - many).max() < 1e-4
+    from_few = np.exp(-2j * np.pi * np.outer(pixels, gate.frequencies_hz) / C) @ (gate.matrix @ x)
+    from_many = np.exp(-2j * np.pi * np.outer(pixels, finer.frequencies_hz) / C) @ (finer.matrix @ x)
+    assert np.abs(from_few - from_many).max() < 1e-4
 
 
 @given(st.floats(*GATE))

@@ -97,9 +97,9 @@ def scan(make_rig, points_rows):
     return make
 
 
-def image_error(found, whole):
-    factor = np.vdot(found.h_raw, whole.h_raw) / np.vdot(found.h_raw, found.h_raw)
-    return np.linalg.norm(factor * found.h_raw - whole.h_raw) / np.linalg.norm(whole.h_raw)
+def image_error(images, complete_images):
+    factor = np.vdot(images.h_raw, complete_images.h_raw) / np.vdot(images.h_raw, images.h_raw)
+    return np.linalg.norm(factor * images.h_raw - complete_images.h_raw) / np.linalg.norm(complete_images.h_raw)
 
 
 # Columns twice as far apart make no ghosts in this image, so that there is little to remove.

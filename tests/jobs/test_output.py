@@ -8,8 +8,8 @@ from polysight.jobs.output import count_steps, steps
 
 
 def test_every_step_is_named_before_it_begins(capsys):
-    answer = [(thing, capsys.readouterr().err) for thing in steps(["a", "b"], ["first", "second"])]
-    assert [thing for thing, _ in answer] == ["a", "b"]
+    answer = [(step, capsys.readouterr().err) for step in steps(["a", "b"], ["first", "second"])]
+    assert [step for step, _ in answer] == ["a", "b"]
     # What the step prints begins on a line of its own.
     assert answer[0][1] == "[1/2] first ...\n"
     assert answer[1][1] == "[1/2] first: 0 s\n[2/2] second ...\n"

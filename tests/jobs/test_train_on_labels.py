@@ -110,8 +110,8 @@ def test_labels_override_the_truth_and_drawn_specimens_are_distinguished(tmp_pat
     answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(load_training_scan(scan, RIG_FILE))]
     assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
     assert len({specimen for _, specimen, _ in answer}) == 2
-    again = simulate(load_published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
-    redrawn = {e.specimen for e in make_entries(load_training_scan(again, RIG_FILE))}
+    second_scan = simulate(load_published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
+    redrawn = {e.specimen for e in make_entries(load_training_scan(second_scan, RIG_FILE))}
     assert not redrawn & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")

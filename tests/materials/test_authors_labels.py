@@ -39,18 +39,18 @@ def test_boxes_give_the_materials_ratios_relative_to_metal(tmp_path, upside_down
         assert e.h.size == train.PUBLISHED_PIXELS
 
 
-@pytest.mark.parametrize("how", list(train.ORIENTATIONS))
-def test_the_right_reading_is_found_among_all(tmp_path, how):
+@pytest.mark.parametrize("orientation", list(train.ORIENTATIONS))
+def test_the_right_reading_is_found_among_all(tmp_path, orientation):
     scan = train.read_labelled_scan(write_scan(tmp_path))
     back = {
         "x to the right, y along the rows": lambda a: a,
         "y from the last row": lambda a: a[::-1],
         "x and y swapped": lambda a: a.T,
         "x and y swapped, y from the last row": lambda a: a[::-1].T,
-    }[how]
+    }[orientation]
     for name in ("sar_h", "sar_v"):
         np.save(tmp_path / scan.scan / f"{name}.npy", back(np.load(tmp_path / scan.scan / f"{name}.npy")))
-    assert train.image_orientation([train.read_labelled_scan(tmp_path / scan.scan)]) == how
+    assert train.image_orientation([train.read_labelled_scan(tmp_path / scan.scan)]) == orientation
 
 
 def test_a_scan_without_metal_and_damaged_files_are_named(tmp_path):

@@ -81,16 +81,16 @@ def test_older_names_of_numpy_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "thing",
+    "content",
     [
         np.arange(5), np.arange(5.0), [], ["values"], "text", 3, None, {}, np.zeros((), [("values", float)]),
         {"values": np.arange(5), "ref_values": 3}, make_content() | {"values": np.zeros(0)},
         make_content() | {"incident_angle": 10**400}, make_content() | {"incident_angle": []},
     ],
 )  # fmt: skip
-def test_a_pickle_of_something_else_is_not_a_material_file(tmp_path, thing):
+def test_a_pickle_of_something_else_is_not_a_material_file(tmp_path, content):
     path = tmp_path / "PET_55.pkl"
-    path.write_bytes(pickle.dumps(thing))
+    path.write_bytes(pickle.dumps(content))
     with expect_refusal(ErrorCode.FILE_FOREIGN, path):
         read_material(path)
 

@@ -129,10 +129,10 @@ def test_patches_match_by_place_alone(scans):
     second_scan = scans[1]
     reordered = replace(second_scan, patches=second_scan.patches[::-1])
     assert [m.label for m in match_patches([scans[0], reordered])] == [m.label for m in match_patches(scans)]
-    far = replace(
+    moved_scan = replace(
         second_scan, patches=tuple(replace(p, centre_mm=(p.centre_mm[0] + 300, 0.0)) for p in second_scan.patches)
     )
-    assert match_patches([scans[0], far]) == []
+    assert match_patches([scans[0], moved_scan]) == []
     without = replace(second_scan, patches=second_scan.patches[1:])
     assert len(match_patches([scans[0], without])) == 8
 

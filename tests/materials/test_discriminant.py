@@ -107,9 +107,11 @@ def test_a_material_that_was_never_learnt_is_unknown():
 def test_a_stranger_does_not_shift_the_others():
     model = ErrorDiscriminant().fit(draw_pixels(0))
     test = draw_pixels(5, scans=1)
-    strange = draw_pixels(6, scans=1, means=[[-1.5, -3.5, 1.5]] * 3)
+    unlike_samples = draw_pixels(6, scans=1, means=[[-1.5, -3.5, 1.5]] * 3)
     alone = model.by_scan(test.x, test.patches)
-    joint = model.by_scan(np.concatenate([test.x, strange.x]), np.concatenate([test.patches, strange.patches + 100]))
+    joint = model.by_scan(
+        np.concatenate([test.x, unlike_samples.x]), np.concatenate([test.patches, unlike_samples.patches + 100])
+    )
     assert joint.names[:5].tolist() == alone.names.tolist()
     assert (joint.distance[5:] > 1).all()
     assert joint.distance[:5] == pytest.approx(alone.distance, abs=1e-3)
@@ -133,9 +135,9 @@ def add_metal(samples, stray):
 
 def test_whether_a_patch_is_metal_does_not_depend_on_the_order_of_its_pixels():
     samples = add_metal(draw_pixels(8), 0)
-    turned = samples.take(np.arange(len(samples.x))[::-1])
+    reversed_samples = samples.take(np.arange(len(samples.x))[::-1])
     model = ErrorDiscriminant().fit(samples)
-    turned_model = ErrorDiscriminant().fit(turned)
+    turned_model = ErrorDiscriminant().fit(reversed_samples)
     np.testing.assert_allclose(model.scan, turned_model.scan, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(model.level, turned_model.level, rtol=1e-9, atol=1e-12)
     assert model.patch_level == pytest.approx(turned_model.patch_level)
@@ -148,9 +150,9 @@ def test_metal_with_a_stray_pixel_does_not_change_the_results_of_others(stray):
     test = add_metal(draw_pixels(9, scans=1), stray)
     without_metal = test.take(test.names != "metal")
     alone = model.by_scan(without_metal.x, without_metal.patches)
-    beside = model.by_scan(test.x, test.patches)
-    np.testing.assert_allclose(beside.distance[: len(alone.distance)], alone.distance, rtol=1e-9)
-    assert beside.names[-1] == "metal"
+    named_together = model.by_scan(test.x, test.patches)
+    np.testing.assert_allclose(named_together.distance[: len(alone.distance)], alone.distance, rtol=1e-9)
+    assert named_together.names[-1] == "metal"
 
 
 def test_two_angles_are_independent_and_separate_materials_better():
@@ -174,29 +176,29 @@ def add_lonely_material(samples, scans=1):
 @pytest.mark.parametrize("model", [DISCRIMINANT_MODEL, PAPER_MODEL])
 def test_a_material_of_one_scan_is_neither_right_nor_wrong(model):
     """The material cannot be learnt from other scans: the accuracy is that of the others, and a note names it."""
-    some = draw_pixels(12, scans=4, pixels=4)
-    without = score(some, model)
-    beside = score(add_lonely_material(some), model)
-    assert (without.not_judged, beside.not_judged) == ((), ("lonely",))
-    assert beside.pixels == pytest.approx(without.pixels, abs=0.02)
-    assert beside.patches == pytest.approx(without.patches, abs=0.02)
-    assert beside.names[0] == "lonely"
-    assert not beside.confusion[0].any()
-    assert beside.confusion[1:].sum(axis=1) == pytest.approx(1.0)
+    pixels = draw_pixels(12, scans=4, pixels=4)
+    score_without = score(pixels, model)
+    score_with = score(add_lonely_material(pixels), model)
+    assert (score_without.not_judged, score_with.not_judged) == ((), ("lonely",))
+    assert score_with.pixels == pytest.approx(score_without.pixels, abs=0.02)
+    assert score_with.patches == pytest.approx(score_without.patches, abs=0.02)
+    assert score_with.names[0] == "lonely"
+    assert not score_with.confusion[0].any()
+    assert score_with.confusion[1:].sum(axis=1) == pytest.approx(1.0)
 
 
 def test_a_library_lists_the_materials_that_could_not_be_judged():
-    few = draw_pixels(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
-    fit = fit_samples(add_lonely_material(few))
+    samples = draw_pixels(12, scans=3, pixels=3, means=MEANS[[0, 3, 4]])
+    fit = fit_samples(add_lonely_material(samples))
     assert (fit["materials"], fit["not_judged"]) == (4, ["lonely"])
     assert fit["pixel_accuracy"] == fit["patch_accuracy"] == 1.0
 
 
 def test_the_channels_alone_are_judged_on_the_same_materials():
-    some = draw_pixels(0, scans=4, pixels=6)
-    without = fit_weights(some).by_channel
-    beside = fit_weights(add_lonely_material(some)).by_channel
-    assert [beside[c] for c in "hv"] == pytest.approx([without[c] for c in "hv"])
+    pixels = draw_pixels(0, scans=4, pixels=6)
+    weights_without = fit_weights(pixels).by_channel
+    weights_with = fit_weights(add_lonely_material(pixels)).by_channel
+    assert [weights_with[c] for c in "hv"] == pytest.approx([weights_without[c] for c in "hv"])
 
 
 def test_a_material_of_two_scans_among_many_is_judged():

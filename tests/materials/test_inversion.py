@@ -53,9 +53,9 @@ def draw_leakage(rng):
     return 0.1 * rng.random() * np.exp(2j * np.pi * rng.random())
 
 
-def compute_distances(found, eps=EPS):
+def compute_distances(inversion, eps=EPS):
     out = []
-    for p, truth in zip(found.patches, eps, strict=True):
+    for p, truth in zip(inversion.patches, eps, strict=True):
         errors = p.permittivity - truth
         pair = np.array([errors.real, errors.imag])
         out.append(float(pair @ np.linalg.solve(p.covariance, pair)))
@@ -257,8 +257,8 @@ def test_a_mount_that_has_moved_is_found_whatever_is_drawn(draw):
     kinds = Kinds([*list_literature_kinds(), *plates], float(THETA))
     # With 0.05 one draw of four has 0.89: two of the plates have nearly the same V / H, and count for less than two.
     prior = RigPrior(0.0015, leakage_std=0.003, leakage_measured=True, channels_known=True, moved=0.1)
-    turned = draw_world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
-    model = SceneLikelihood(turned, prior, kinds)
+    patches = draw_world(np.random.default_rng(0), (0j, 0.055), eps=PUBLISHED[:8])
+    model = SceneLikelihood(patches, prior, kinds)
     particles, _, _ = sample_posterior(model, np.random.default_rng(draw))
     assert model.has_moved(particles).mean() > 0.9
     _, into_v = model.leakage(particles)
@@ -270,11 +270,11 @@ def test_images_with_the_other_sign_of_phase_are_distinguished_from_ours():
     prior = RigPrior(1e-3, leakage_std=0.01)
     measurements = draw_world(rng, (0.01, -0.01j))
     mirrored_measurements, their_prior = mirror_phases(measurements, prior)
-    right = invert(measurements, prior, KINDS)
-    wrong = invert(mirrored_measurements, their_prior, KINDS)
+    upright = invert(measurements, prior, KINDS)
+    mirrored = invert(mirrored_measurements, their_prior, KINDS)
     for prior_probability in (0.1, 0.5, 0.9):
-        _, wrong_probability = join_signs(right, wrong, prior_probability)
-        _, right_probability = join_signs(wrong, right, 1 - prior_probability)
+        _, wrong_probability = join_signs(upright, mirrored, prior_probability)
+        _, right_probability = join_signs(mirrored, upright, 1 - prior_probability)
         assert wrong_probability < 0.5
         assert right_probability == pytest.approx(1 - wrong_probability, abs=1e-9)
 
@@ -284,10 +284,10 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
     rng = np.random.default_rng(4)
     prior = RigPrior(1e-3, leakage_std=0.01)
     measurements = draw_world(rng, (0j, 0j))
-    right = invert(measurements, prior, KINDS)
-    wrong = replace(invert(*mirror_phases(measurements, prior), KINDS), log_evidence=right.log_evidence + evidence)
-    joined, wrong_probability = join_signs(right, wrong, 0.3)
-    for right_patch, wrong_patch, joined_patch in zip(right.patches, wrong.patches, joined.patches, strict=True):
+    upright = invert(measurements, prior, KINDS)
+    mirrored = replace(invert(*mirror_phases(measurements, prior), KINDS), log_evidence=upright.log_evidence + evidence)
+    joined, wrong_probability = join_signs(upright, mirrored, 0.3)
+    for right_patch, wrong_patch, joined_patch in zip(upright.patches, mirrored.patches, joined.patches, strict=True):
         assert joined_patch.permittivity == right_patch.permittivity
         distance2 = abs(wrong_patch.permittivity - right_patch.permittivity) ** 2
         expected = (1 - wrong_probability) * np.trace(right_patch.covariance) + wrong_probability * (
@@ -298,7 +298,7 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
         np.testing.assert_allclose(np.array(joined_patch.half_widths_68) / right_patch.half_widths_68, wider)
         assert sum(joined_patch.shares.values()) == pytest.approx(1.0)
     # Without any doubt nothing changes
-    assert join_signs(right, wrong, 1e-6)[0] == right
+    assert join_signs(upright, mirrored, 1e-6)[0] == upright
 
 
 def test_what_plates_may_be_counts_less_on_leakage_that_was_never_measured():

@@ -68,8 +68,8 @@ def test_permittivity_and_thickness_come_back(true, asked):
 
 def test_infinite_permittivity_is_metal_behind_a_layer():
     r_s, r_p = multilayer([1.0, METAL_PERMITTIVITY], [1e-3], 77e9, THETA)
-    turned = np.exp(-2j * 2 * np.pi * 77e9 / 299792458.0 * 1e-3 * np.cos(THETA))
-    np.testing.assert_allclose([r_s, r_p], -turned, rtol=1e-9)
+    round_trip = np.exp(-2j * 2 * np.pi * 77e9 / 299792458.0 * 1e-3 * np.cos(THETA))
+    np.testing.assert_allclose([r_s, r_p], -round_trip, rtol=1e-9)
 
 
 def test_an_error_that_all_bands_share_is_not_a_misfit_and_moves_little():

@@ -166,8 +166,8 @@ def test_fewer_data_than_unknowns_are_refused():
 
 
 def test_a_solution_at_the_end_of_the_search_range_is_reported():
-    beyond = fit_layer(measure_bands([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
-    assert any("at the limit" in words for words in beyond.warnings())
+    fit = fit_layer(measure_bands([Layer("dense", 60 - 2j)]), [Layer("dense")], THETA)
+    assert any("at the limit" in words for words in fit.warnings())
     lossless = fit_layer(measure_bands([Layer("clear", 4 - 0j)]), [Layer("clear")], THETA)
     assert not any("at the limit" in words for words in lossless.warnings())  # zero loss is a valid result
 

@@ -236,9 +236,9 @@ def test_a_channel_without_information_gets_a_small_weight():
 def test_one_strange_specimen_does_not_open_a_material_to_everything():
     """The KNN's reach of a material is at most three times the materials' median."""
     data = draw_samples(groups=6, noise=0.003)
-    strange = data.patches == data.patches[data.names == "m2"][0]
+    is_in_patch = data.patches == data.patches[data.names == "m2"][0]
     moved = data.x.copy()
-    moved[strange] += 5 * np.ptp(data.x, axis=0)
+    moved[is_in_patch] += 5 * np.ptp(data.x, axis=0)
     reach = fit_weights(Samples(moved, data.names, data.groups, data.patches)).thresholds
     assert reach["m2"] <= 3 * np.median(list(reach.values())) * (1 + 1e-9)
 

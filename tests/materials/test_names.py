@@ -88,8 +88,8 @@ def test_a_second_angle_makes_a_true_name_surer():
 
 def test_a_thin_plate_that_fits_no_half_space_is_a_possible_layer():
     t, _ = draw_sheets(ANGLES[0])
-    far = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
-    names = [name_ratios(complex(far)).patch_name.name, name_ratios(-0.25 + 0.2j).patch_name.name]
+    far_ratio = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
+    names = [name_ratios(complex(far_ratio)).patch_name.name, name_ratios(-0.25 + 0.2j).patch_name.name]
     assert LAYER in names
     assert not set(names) & set(LIBRARY)
 
@@ -189,14 +189,14 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
     kinds = Kinds([wood, *list_literature_kinds()], ANGLES[0], with_sheets=True)
     t = complex(inverse_ratio(2.6 - 0.1j, ANGLES[0]))
     evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5)
-    still = name_patch(
+    named_without_change = name_patch(
         (kinds,), (replace(evidence, dispersion=make_dispersion(np.zeros(3))),), np.array([[t]])
     ).patch_name
     changing = make_dispersion(np.array([0.2, -0.1, 0.3]))
-    rippled = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).patch_name
-    assert still.name == "wood"
-    assert still.confidence > 0.9
-    assert rippled.name == LAYER
+    named_with_change = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).patch_name
+    assert named_without_change.name == "wood"
+    assert named_without_change.confidence > 0.9
+    assert named_with_change.name == LAYER
 
 
 @pytest.mark.slow

@@ -12,9 +12,9 @@ from polysight.materials import UNKNOWN, Classifier, match_patches, pack_patches
 from polysight_shared.errors import ErrorCode
 
 
-def name_from_file(found, scene, classifier, path):
+def name_from_file(result, scene, classifier, path):
     """Names of a result's patches, by number, from its file."""
-    path.write_bytes(pack_patches(found, scene.x_m, scene.y_m, simulated=True))
+    path.write_bytes(pack_patches(result, scene.x_m, scene.y_m, simulated=True))
     patches = read_patches(path)
     matched = [m for m in match_patches([patches]) if m.label in patches.evidence]
     renamed = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
@@ -46,8 +46,10 @@ def test_brightness_that_all_plates_share_does_not_change_their_names(
     analysis = scene.analyse(classifier=classifier, pair=pair)
     renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
     names = {r.patch.label: r.named.patch_name.name for r in plain.patches if r.named is not None}
-    wrong = {n: (names[n], v.name) for n, v in renamed.items() if n in names and v.name not in (names[n], UNKNOWN)}
-    assert not wrong
+    changed_names = {
+        n: (names[n], v.name) for n, v in renamed.items() if n in names and v.name not in (names[n], UNKNOWN)
+    }
+    assert not changed_names
     assert sum(v.name == names.get(n) for n, v in renamed.items()) >= 0.7 * len(names)
 
 

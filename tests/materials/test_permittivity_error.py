@@ -67,12 +67,12 @@ def test_a_plate_that_the_end_of_a_small_aperture_lights_is_known_less_well(synt
     segmentation = scene.analyse().segmentation
     everywhere = np.ones(scene.h.shape, bool)
     inside = measure_with_separate_metal(scene, everywhere, segmentation)
-    beside = next(p for p in segmentation.patches if p.label in inside)
-    columns = np.flatnonzero(beside.mask.any(axis=0))
+    neighbour = next(p for p in segmentation.patches if p.label in inside)
+    columns = np.flatnonzero(neighbour.mask.any(axis=0))
     lit = everywhere.copy()
     lit[:, columns[-1] - 7 :] = False
     at_border = measure_with_separate_metal(scene, lit, segmentation)
-    assert at_border[beside.label] > 1.2 * inside[beside.label]
+    assert at_border[neighbour.label] > 1.2 * inside[neighbour.label]
 
 
 def test_a_plate_that_fills_the_lit_pixels_is_lit_as_the_metal_was(synthetic):

@@ -64,12 +64,12 @@ def draw_raster(levels_db, ratios, gap_px):
     }
 
 
-def convert_boxes_to_px(found):
-    return [tuple(round(b / PIXEL_MM + SIDE / 2) for b in patch.box_mm) for patch in found.patches]
+def convert_boxes_to_px(segmentation):
+    return [tuple(round(b / PIXEL_MM + SIDE / 2) for b in patch.box_mm) for patch in segmentation.patches]
 
 
-def assert_found(found, plates, tolerance_px=4):
-    boxes = convert_boxes_to_px(found)
+def assert_found(segmentation, plates, tolerance_px=4):
+    boxes = convert_boxes_to_px(segmentation)
     assert len(boxes) == len(plates), boxes
     for plate in plates:
         assert any(np.abs(np.subtract(plate, box)).max() <= tolerance_px for box in boxes), (plate, boxes)
@@ -245,13 +245,13 @@ def test_weak_plates_one_pitch_away_are_not_copies_if_both_channels_show_them():
     """Cups and sheets of a grid lie where a shift by one pitch would copy others, 16 dB weaker in H."""
     plates = draw_raster([0.0, 0.0, 0.0, 0.0], [COPPER, 0.3, 0.25, 0.35], 8)
     h, v = draw(5, plates, amplitude=0.05, phase_deg=3.0)
-    weak = 0.16 * np.roll(h, (30, 45), axis=(0, 1))
+    weak_copy = 0.16 * np.roll(h, (30, 45), axis=(0, 1))
     # Their own ratios have nothing to do with those of the plates beside them.
     level = np.where(np.arange(SIDE)[None, :] < SIDE // 2, 2.5, 0.7)
-    own_v = level * weak
-    assert find_copies(segment(h + weak, v, AXIS, AXIS).patches, h + weak, v, PIXEL_MM) is not None
-    segmentation = segment(h + weak, v + own_v, AXIS, AXIS)
-    assert find_copies(segmentation.patches, h + weak, v + own_v, PIXEL_MM) is None
+    own_v = level * weak_copy
+    assert find_copies(segment(h + weak_copy, v, AXIS, AXIS).patches, h + weak_copy, v, PIXEL_MM) is not None
+    segmentation = segment(h + weak_copy, v + own_v, AXIS, AXIS)
+    assert find_copies(segmentation.patches, h + weak_copy, v + own_v, PIXEL_MM) is None
 
 
 @pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")

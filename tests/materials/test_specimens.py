@@ -64,10 +64,10 @@ def test_a_material_with_one_patch_does_not_change_the_errors_of_others():
     samples = draw_pixels((0.03, 0.2), 6)
     repeated = np.isin(samples.names, ["a", "b", "c"])
     once = ~repeated & (samples.groups == samples.groups[0])
-    alone = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples.take(repeated))
-    beside = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples.take(repeated | once))
-    np.testing.assert_allclose(beside.spread[:3], alone.spread, rtol=1e-2)
-    np.testing.assert_allclose(np.diag(beside.between), np.diag(alone.between), rtol=1e-2)
+    fitted_alone = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples.take(repeated))
+    fitted_together = MODELS[DISCRIMINANT_MODEL]("H+V+P").fit(samples.take(repeated | once))
+    np.testing.assert_allclose(fitted_together.spread[:3], fitted_alone.spread, rtol=1e-2)
+    np.testing.assert_allclose(np.diag(fitted_together.between), np.diag(fitted_alone.between), rtol=1e-2)
 
 
 def test_without_specimens_apart_the_published_spread_stands():
@@ -133,8 +133,8 @@ def make_entries(samples):
 @pytest.mark.parametrize("model", ["knn", "discriminant"])
 def test_what_the_library_lacks_gets_no_name_from_any_model(model):
     classifier = Classifier(make_entries(draw_pixels((0.01, 0.05), 12, 3)), model=model, angles_deg=[60.0])
-    strange = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
-    test = draw_pixels((0.01, 0.05), 1, 9, kinds=strange)
+    other_materials = {"s": 8.0 - 0.5j, "t": 3.0 - 2.5j, "u": 2.8 - 0.02j, "v": 5.6 - 0.5j}
+    test = draw_pixels((0.01, 0.05), 1, 9, kinds=other_materials)
     named = classifier.scan([test.x[test.patches == p] for p in np.unique(test.patches)])
     assert not [n.patch_name.name for n in named if n.patch_name.source == "library"]
 

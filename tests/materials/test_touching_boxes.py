@@ -32,8 +32,8 @@ def test_each_box_is_filtered_by_itself():
     for name, eps in (("left", LEFT), ("right", RIGHT)):
         interior = next(p for p in segmentation.patches if p.label == labels[name]).interior
         np.testing.assert_allclose(smoothed[interior], fresnel(eps, THETA)[0], atol=1e-6)
-    outside = ~np.logical_or.reduce([p.interior for p in segmentation.patches])
-    assert np.isnan(smoothed[outside]).all()
+    is_outside = ~np.logical_or.reduce([p.interior for p in segmentation.patches])
+    assert np.isnan(smoothed[is_outside]).all()
 
 
 def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():

@@ -92,14 +92,14 @@ def test_report_prints_the_verdict_and_the_path_of_the_page(tmp_path, capsys, le
 def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, capsys, as_json):
     options = ["--json"] if as_json else []
     none = write_products_with_pixels(write_judged_products(tmp_path / "none", "none"))
-    good = write_products_with_pixels(write_judged_products(tmp_path / "good", "good"))
+    good_products = write_products_with_pixels(write_judged_products(tmp_path / "good", "good"))
     assert main(["classify", str(none), *options]) == NoResult.exit_status
     out = capsys.readouterr().out
     if as_json:
         assert {(p["name"], p["confidence"]) for p in json.loads(out)["patches"]} == {(None, None)}
     else:
         assert "pixels:" not in out
-    assert main(["classify", str(good), *options]) == 0
+    assert main(["classify", str(good_products), *options]) == 0
     out = capsys.readouterr().out
     if as_json:
         # Patch 1 is the metal reference

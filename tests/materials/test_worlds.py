@@ -40,8 +40,8 @@ def test_regions_hold_the_truth_and_sure_names_are_right(nuisance, least, reques
     distances = np.array([p.distance2 for p in patches if p.distance2 is not None])
     assert distances.size >= 0.8 * len(patches)
     assert np.mean(distances < CHI2_95) >= least
-    wrong = [p for p in patches if p.name not in (UNKNOWN, p.material) and p.confidence >= 0.9]
-    assert not wrong
+    misnamed = [p for p in patches if p.name not in (UNKNOWN, p.material) and p.confidence >= 0.9]
+    assert not misnamed
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "beside",
+    "neighbours",
     [
         Stack(((2.6 - 0.02j, 0.8e-3),), 1.0),
         Stack(((5.0 - 0.1j, 3e-3),), 9.4 - 18j),
@@ -70,8 +70,8 @@ def test_a_plate_tilted_beyond_what_is_modelled_gets_no_permittivity():
     ],
     ids=["a thin sheet", "liquid behind glass", "a lossy plate"],
 )
-def test_declared_copper_is_never_withdrawn(beside):
-    analysis, _ = analyse_world(simulate(make_world(make_half_space(4 - 0.4j), beside)))
+def test_declared_copper_is_never_withdrawn(neighbours):
+    analysis, _ = analyse_world(simulate(make_world(make_half_space(4 - 0.4j), neighbours)))
     assert not analysis.metal.evidence.against
     assert analysis.metal.certain or analysis.metal.evidence.culprit is not None
 

@@ -47,8 +47,8 @@ def test_what_no_row_has_lit_is_transparent(images):
 
 
 def test_nothing_lit_is_drawn_all_the_same(images):
-    nothing = replace(images, valid=np.zeros((NY, NX), bool))
-    assert all((decode_pixels(p.png)[..., 3] == 0).all() for p in draw(nothing).values())
+    nothing_lit = replace(images, valid=np.zeros((NY, NX), bool))
+    assert all((decode_pixels(p.png)[..., 3] == 0).all() for p in draw(nothing_lit).values())
 
 
 def test_phase_is_cyclic_and_comes_round(images):

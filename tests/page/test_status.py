@@ -182,15 +182,15 @@ def test_there_is_no_result_before_materials(history):
     assert judge_status(history, heard=replace(RUNNING, state="homing")).key == "homing_again"
     assert judge_status(history, heard=replace(RUNNING, row=-1)).key == "finishing"
     add_fact(history, {"fact": "scan_ended", "exit_status": "success", "reason": ""})
-    good = Verdict("good")
+    good_verdict = Verdict("good")
     # Its program still runs, and has not reported that it computes materials.
     assert judge_status(history).key == "finishing"
-    assert judge_status(history, make_signs("", "materials"), verdict=good).key == "materials"
-    assert make_snapshot(Inputs(FOLDER, history, make_signs("", "materials"), verdict=good)).verdict is None
+    assert judge_status(history, make_signs("", "materials"), verdict=good_verdict).key == "materials"
+    assert make_snapshot(Inputs(FOLDER, history, make_signs("", "materials"), verdict=good_verdict)).verdict is None
     for level in ("good", "care", "none"):
         assert judge_status(history, replace(LIVELY, life=None), verdict=Verdict(level)).key == f"result_{level}"
     running = Program("process", True, None, (), "2026-01-01T00:00:00", "")
-    assert judge_status(history, replace(LIVELY, life=None), verdict=good, program=running).key == "processing"
+    assert judge_status(history, replace(LIVELY, life=None), verdict=good_verdict, program=running).key == "processing"
     killed = replace(make_signs("", "materials"), alive=False, killed=True)
     assert "killed" in judge_status(history, killed).detail
 

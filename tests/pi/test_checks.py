@@ -175,8 +175,8 @@ def test_keys_that_root_made_are_given_to_the_services_user(tmp_path, monkeypatc
 
 
 def test_addresses_and_bursts(tmp_path, gpio_rig):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        address = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
         assert run_check("command address", checks._check_address, create_replier, address, tmp_path).level == "error"
     finding = run_check("event address", checks._check_address, create_publisher, "tcp://0.0.0.0:*", tmp_path)
     assert (finding.level, "polysight-pi keys" in finding.do) == ("error", True)

@@ -308,8 +308,8 @@ def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_
     right = read_findings(spi_rig)
     assert [right[name]["verdict"] for name in ("pulse width", "SYNC_IN line 10")] == ["ok", "ok"]
     for actual in ("400e6", "150e6"):
-        wrong = read_findings(spi_rig, core_hz=f"250e6,{actual}")["pulse width"]
-        assert (wrong["verdict"], "core_freq" in wrong["remedy"]) == ("fail", True)
+        finding_of_wrong_clock = read_findings(spi_rig, core_hz=f"250e6,{actual}")["pulse width"]
+        assert (finding_of_wrong_clock["verdict"], "core_freq" in finding_of_wrong_clock["remedy"]) == ("fail", True)
     longer = replace(spi_rig, burst=replace(spi_rig.burst, pulses=16))
     small = read_findings(longer, bufsiz="512")
     assert "512 bytes" in small["SYNC_IN line 10"]["found"]

@@ -103,7 +103,7 @@ def stranger(pi):
 
 
 @pytest.mark.parametrize(
-    ("commands", "field", "wrong"),
+    ("commands", "field", "impossible_value"),
     [
         ((BEGIN, PULSE), "period_us", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN, PULSE), "width_us", (NAN, INF, -INF, 1e300, 1e70)),
@@ -117,10 +117,10 @@ def stranger(pi):
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
-def test_an_impossible_value_is_not_a_command(commands, field, wrong):
+def test_an_impossible_value_is_not_a_command(commands, field, impossible_value):
     """Invalid messages are refused; the fuzz test below shows that through the socket."""
     for command in commands:
-        for value in wrong:
+        for value in impossible_value:
             raw = msgpack.packb(msgspec.to_builtins(command) | {field: value})
             assert raw is not None
             with pytest.raises(ProtocolError):
@@ -163,10 +163,10 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
         m.Hello(), m.Status(), ALIVE, m.Home(), JOG, RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
         host.make_begin("other"), host.make_begin(),
     ]  # fmt: skip
-    sent = taken = bytes_before = 0
+    sent = rows_taken = bytes_before = 0
     stage.pace_s = 0.05
     host.start_row(owner="mine")
-    while sent < amount or not taken:
+    while sent < amount or not rows_taken:
         assert stranger.ask(draw(rng, valid)) is not None
         sent += 1
         if sent == 1_000:
@@ -176,10 +176,10 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
             if isinstance(event, m.RowFinished):
                 pulses = instrument.grid.columns * instrument.burst.pulses
                 assert (event.status, event.pulses) == ("done", pulses), event
-                taken += 1
+                rows_taken += 1
                 # A Pi in fault would refuse every row.
                 host.wait_for_state("ready", "fault")
-                host.start_row(take=taken + 1, owner="mine")
+                host.start_row(take=rows_taken + 1, owner="mine")
             host.must_accept(m.Alive(scan_id="scan", owner="mine"))
     assert read_resident_bytes() - bytes_before < BOUND_BYTES
     assert pi.service.executor.crash is None
@@ -190,7 +190,7 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     period_ns = round(instrument.burst.period_us * 1e3)
     rises = wires.list_rises(instrument.pi.sync_out[0])
     full_bursts = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
-    assert len(full_bursts) >= taken * instrument.grid.columns
+    assert len(full_bursts) >= rows_taken * instrument.grid.columns
     assert all(t - b[0] == k * period_ns for b in full_bursts for k, t in enumerate(b))
 
 
@@ -344,9 +344,9 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
             while sent < ENOUGH_BYTES and not is_cut(peer):
                 with suppress(TimeoutError):
                     remaining = remaining or more_bytes()
-                    taken = peer.send(remaining)
-                    sent = sent + taken
-                    remaining = remaining[taken:]
+                    sent_now = peer.send(remaining)
+                    sent = sent + sent_now
+                    remaining = remaining[sent_now:]
     wait_for(has_cut, "the cut", HANG_S)
     cut_ns = time.monotonic_ns()
     ended.set()
@@ -389,7 +389,7 @@ def test_replays_do_not_keep_other_commands_waiting(pi):
     slow = threading.Event()
     pi.service.executor.post(lambda: slow.wait(HANG_S))
     replay = m.Replay(scan_id="scan", from_seq=1)
-    taken = [pi.service.executor.submit(replay, lambda _: None) for _ in range(10)]
-    assert taken == [True] * REPLAYS_WAITING + [False] * (10 - REPLAYS_WAITING)
+    is_queued = [pi.service.executor.submit(replay, lambda _: None) for _ in range(10)]
+    assert is_queued == [True] * REPLAYS_WAITING + [False] * (10 - REPLAYS_WAITING)
     assert pi.service.executor.submit(m.Abort(), lambda _: None)
     slow.set()

@@ -163,10 +163,12 @@ def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, pa
     folder.close()
 
 
-@pytest.mark.parametrize("left", [b"", MAGIC[:3], MAGIC[:3] + bytes(5), MAGIC[:1] + bytes(1), bytes(8), bytes(4096)])
-def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, left):
+@pytest.mark.parametrize(
+    "remaining_bytes", [b"", MAGIC[:3], MAGIC[:3] + bytes(5), MAGIC[:1] + bytes(1), bytes(8), bytes(4096)]
+)
+def test_a_new_journal_torn_by_a_power_cut_is_empty(tmp_path, remaining_bytes):
     path = tmp_path / "a.journal"
-    path.write_bytes(left)
+    path.write_bytes(remaining_bytes)
     j = JournalFile(path)
     assert (j.last_seq, path.read_bytes()) == (0, MAGIC)
     j.write([b"x"])
@@ -273,7 +275,7 @@ def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
 
 def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host = host_in_row
-    good = host.list_events(m.Capture)[0].seq
+    last_seq = host.list_events(m.Capture)[0].seq
     monkeypatch.setattr(journal_module.os, "pwrite", full)
     # The row would be done before a slow disk says that it is full.
     stage.stays_after = 4
@@ -285,7 +287,7 @@ def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     assert row_finished.status == "fault"
     assert host.wait_for_state("fault").fault == PiFault.JOURNAL_FULL
     last = host.ask(m.Hello()).last_seq
-    assert fault.seq == row_finished.seq == last >= good
+    assert fault.seq == row_finished.seq == last >= last_seq
     host.home()
     assert host.run_row(0, take=2).status == "done"
     replayed = host.replay()

@@ -94,20 +94,20 @@ KEYS = {
 }
 
 
-@pytest.mark.parametrize("which", KEYS)
-def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, which):
-    host_keys, pis = (tmp_path / name for name in KEYS[which])
+@pytest.mark.parametrize("key_case", KEYS)
+def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, key_case):
+    host_keys, pis = (tmp_path / name for name in KEYS[key_case])
     client, refused = make_client(zmq.REQ, served_pi.command_address, host_keys, pis)
     client.send(m.pack(m.Hello()))
     listener, _ = make_client(zmq.SUB, served_pi.event_address, host_keys, pis)
     listener.subscribe(b"")
-    if which == "allowed":
+    if key_case == "allowed":
         assert client.poll(HANG_S * 1e3)
         assert isinstance(m.unpack_reply(client.recv()), m.HelloReply)
         assert not refused()
         assert listener.poll(HANG_S * 1e3)
         return
-    if which != "another Pi's key":  # which cannot be distinguished from silence
+    if key_case != "another Pi's key":  # which cannot be distinguished from silence
         wait_for(refused, "the refusal")
     assert not listener.poll(300)
     assert not client.poll(0)

@@ -132,14 +132,14 @@ def test_a_row_whose_stage_counts_other_trigger_pulses_is_not_counted(extra_puls
     assert (finished.status, finished.fault) == ("fault", PiFault.POINTS_MISMATCH)
 
 
-@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize("is_held", [False, True])
 @given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
-def test_a_host_that_falls_silent_ends_the_row_in_time(held, beats, heartbeat_ms):
+def test_a_host_that_falls_silent_ends_the_row_in_time(is_held, beats, heartbeat_ms):
     """Virtual time from its last sign of life until the outputs are off and the stage has been sent a stop."""
     bench = Bench().begin_and_home()
     bench.machine.command("BeginRun", heartbeat_ms)
     bench.start()
-    bench.machine.command("Hold") if held else None
+    bench.machine.command("Hold") if is_held else None
     for _ in range(beats):
         bench.let_time_pass(heartbeat_ms / 1e3)
         bench.machine.note_host_alive()

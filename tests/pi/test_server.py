@@ -111,12 +111,12 @@ def test_refusals_have_their_number(pi):
     assert host.must_refuse(RUN_0) == PiFault.NOT_READY
     assert host.must_refuse(host.make_begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
     assert host.must_refuse(host.make_begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
-    for wrong in (
+    for impossible_values in (
         {"speed_mm_s": 1000.0}, {"speed_mm_s": 5e-324}, {"speed_mm_s": 0.1},
         {"pulses": 100}, {"plan": replace(plan, columns=402)},
         {"plan": replace(plan, step_x_mm=2.0011)},
     ):  # fmt: skip
-        assert host.must_refuse(host.make_begin(**wrong)) == PiFault.BAD_REQUEST
+        assert host.must_refuse(host.make_begin(**impossible_values)) == PiFault.BAD_REQUEST
     host.must_accept(host.make_begin())
     assert host.must_refuse(host.make_begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
     # The stage is not homed.

@@ -35,15 +35,15 @@ def dry_stage():
 @pytest.fixture
 def connect(dry_stage):
     """Opens the link; returns it and the queue of its unsolicited replies."""
-    opened = []
+    links = []
 
     def connect(**options):
         news = queue.SimpleQueue()
-        opened.append(StageLink(dry_stage.port, 115200, news.put, **options))
-        return opened[-1], news
+        links.append(StageLink(dry_stage.port, 115200, news.put, **options))
+        return links[-1], news
 
     yield connect
-    for link in opened:
+    for link in links:
         link.close()
 
 
@@ -135,12 +135,12 @@ def test_a_sketch_that_does_not_know_the_newest_setting_is_named_as_old(
 ):
     request = StageLink.request
 
-    def old(link, verb, *args):
+    def refuse_parameter(link, verb, *args):
         if verb == "SET" and args[0] == refused_parameter:
             raise StageRefusedError(verb, StageError.OUT_OF_RANGE)
         return request(link, verb, *args)
 
-    monkeypatch.setattr(StageLink, "request", old)
+    monkeypatch.setattr(StageLink, "request", refuse_parameter)
     with pytest.raises(StageRefusedError) as e, BenchStage(set_stage_port(instrument, dry_stage.port).stage) as bench:
         bench.home()
     is_old = e.value.remedy == "flash the sketch of this release"
@@ -187,14 +187,14 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
     pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")  # no service
     arguments = ["--config", str(write_config(msgspec.structs.replace(instrument, pi=pi))), "--stage-port", str(port)]
 
-    def place(*command):
+    def run_and_read_place(*command):
         assert main([*command, *arguments, "--json"]) == 0
         return json.loads(capsys.readouterr().out)
 
     with closing(StageProcess(tmp_path, "pc" if sketch_compiler() else "python", 20.0)):
-        assert place("home") == {"x_mm": 0.0, "y_mm": 0.0}
-        assert place("jog", "--dx", "10") == {"x_mm": 10.0, "y_mm": 0.0}
-        assert place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
+        assert run_and_read_place("home") == {"x_mm": 0.0, "y_mm": 0.0}
+        assert run_and_read_place("jog", "--dx", "10") == {"x_mm": 10.0, "y_mm": 0.0}
+        assert run_and_read_place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
 
         def is_lost() -> bool:
             """The stand-in sees how its port was closed only if it polls before the next program opens it."""

@@ -221,8 +221,8 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     assert host.wait_for_event(m.RowFinished).fault == PiFault.STAGE_LOST
 
 
-@pytest.mark.parametrize("which", ["command", "event"])
-def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
+@pytest.mark.parametrize("socket", ["command", "event"])
+def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, socket):
     monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
     server = pi.service.server
     host = pi.host
@@ -232,13 +232,13 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, which):
     stage.stays_after = 2
     host.start_row()
     host.wait_for_event(m.Capture)
-    busy = "_send_replies" if which == "command" else "_publish_heartbeat"
+    busy = "_send_replies" if socket == "command" else "_publish_heartbeat"
     real = getattr(server, busy)
     monkeypatch.setattr(server, busy, lambda *a: (go_on.wait(HANG_S), real(*a))[1])
     wait_for(lambda: stop_is_sent(stage), "STOP")
     go_on.set()
     row_finished = host.wait_for_event(m.RowFinished)
-    assert (row_finished.fault, which in row_finished.reason) == (PiFault.PROGRAM_LATE, True)
+    assert (row_finished.fault, socket in row_finished.reason) == (PiFault.PROGRAM_LATE, True)
 
 
 LEAVE = """

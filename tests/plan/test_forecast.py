@@ -197,7 +197,7 @@ def list_notes(rig: Instrument, topic: str, scene_mm: tuple[float, float] | None
 def test_a_warning_begins_beyond_its_limit(rig, topic, at_the_limit, beyond):
     texts = [list_notes(changes.apply(rig), topic) for changes in (at_the_limit, beyond)]
     # That a stage is faster than the published one is another note, which both have.
-    within, too_far = ([text for text in found if "published" not in text] for found in texts)
+    within, too_far = ([text for text in notes if "published" not in text] for notes in texts)
     assert not within
     assert len(too_far) == 1
 

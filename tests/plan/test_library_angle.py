@@ -9,14 +9,16 @@ from polysight.planning import forecast
 from polysight_shared.geometry import incidence_deg
 
 
-@pytest.mark.parametrize(("distance_mm", "known"), [(499.0, True), (505.0, True), (560.0, False), (450.0, False)])
-def test_a_library_with_another_angle_is_a_warning(rig, distance_mm, known):
+@pytest.mark.parametrize(
+    ("distance_mm", "is_known_angle"), [(499.0, True), (505.0, True), (560.0, False), (450.0, False)]
+)
+def test_a_library_with_another_angle_is_a_warning(rig, distance_mm, is_known_angle):
     geometry = msgspec.structs.replace(rig.geometry, object_distance_mm=distance_mm)
     moved = msgspec.structs.replace(rig, geometry=geometry)
     angle = incidence_deg(moved, moved.receivers[0])
     warnings = [w for w in forecast(moved).warnings if w.where == "library"]
     finding = check_library(make_context(moved))
-    assert (not warnings, finding.level) == (known, "ok" if known else "warning")
+    assert (not warnings, finding.level) == (is_known_angle, "ok" if is_known_angle else "warning")
     assert finding.facts["incidence_deg"] == pytest.approx(angle)
     for text in [finding.what, *(w.what for w in warnings)]:
         assert f"{angle:.1f} degrees" in text

@@ -154,5 +154,5 @@ def test_the_incidence_angle_is_that_of_the_specular_midpoint():
     assert np.ptp(angles.one_rad) == 0
     # Half of the Fresnel zone is some 70 mm wide in x: the weighted angle is less by hundredths of a degree.
     assert -0.15 < np.degrees(angles.pixel_rad - angles.one_rad)[2, 3] < 0
-    outside = polarimetry.incidence_choice(rig, np.array([mx + 2.0]), np.array([my]), "pixel").used_rad
-    assert outside[0, 0] == pytest.approx(polarimetry.specular_incidence_rad(rig), abs=1e-3)
+    angle_outside = polarimetry.incidence_choice(rig, np.array([mx + 2.0]), np.array([my]), "pixel").used_rad
+    assert angle_outside[0, 0] == pytest.approx(polarimetry.specular_incidence_rad(rig), abs=1e-3)

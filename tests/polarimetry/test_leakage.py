@@ -39,10 +39,10 @@ def measure_metal_standard(truth, wave, rng, noise=0.0):
 
 
 @given(leak, leak, gain, seeds, st.floats(0.0, 0.3))
-def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, g, seed, turned):
+def test_leakage_and_gain_are_recovered_from_a_plate_and_two_orientations(a, b, g, seed, rotation_rad):
     truth = Leakage(a, b, g, 0.0)
     rng = np.random.default_rng(seed)
-    waves = (PLATE, strips_wave(UPRIGHT + turned, THETA), strips_wave(LYING + turned, THETA))
+    waves = (PLATE, strips_wave(UPRIGHT + rotation_rad, THETA), strips_wave(LYING + rotation_rad, THETA))
     leakage = estimate_leakage([measure_metal_standard(truth, w, rng) for w in waves])
     np.testing.assert_allclose([leakage.h, leakage.v, leakage.imbalance], [a, b, g], rtol=1e-6, atol=1e-8)
     assert compute_remaining(leakage, truth) == pytest.approx((0, 0), abs=1e-7)
@@ -69,10 +69,10 @@ def test_more_orientations_give_a_least_squares_solution_and_a_residual(a, b, g,
     exact = estimate_leakage([measure_metal_standard(truth, w, rng) for w in waves])
     assert exact.residual < 1e-7
     assert compute_remaining(exact, truth) == pytest.approx((0, 0), abs=1e-7)
-    wrong = [measure_metal_standard(truth, w, rng) for w in waves]
+    other_measurements = [measure_metal_standard(truth, w, rng) for w in waves]
     # Wrong orientation
-    wrong[3] = MetalStandard(wrong[3].measured, strips_wave(np.radians(75), THETA))
-    assert estimate_leakage(wrong).residual > 0.02
+    other_measurements[3] = MetalStandard(other_measurements[3].measured, strips_wave(np.radians(75), THETA))
+    assert estimate_leakage(other_measurements).residual > 0.02
 
 
 @given(leak, gain, seeds)

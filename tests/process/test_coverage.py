@@ -92,9 +92,9 @@ def test_lost_positions_of_odd_rows_are_counted_by_column(make_scan, tmp_path):
         row = source.plan.row(index)
         columns = np.round((np.array(row.x_mm)[points] - min(row.x_mm)) / source.plan.step_x_mm).astype(int)
         expected[index, columns] = True
-    nothing = np.zeros((1, 1), np.complex64)
+    empty_image = np.zeros((1, 1), np.complex64)
     axis = np.zeros(1)
-    images = Images(nothing, nothing, axis, axis, nothing.astype(bool), nothing)
+    images = Images(empty_image, empty_image, axis, axis, empty_image.astype(bool), empty_image)
     scan = ProcessedScan.from_results(Path(), images=images, quality=quality, facts=ScanFacts(), plan=source.plan)
     for masked in find_masked_positions(scan).values():
         np.testing.assert_array_equal(masked, expected)

@@ -43,8 +43,10 @@ def kill(
     def mangle(name: str, row: int, words: np.ndarray) -> None:
         if name == board and row in rows:
             for k in rx:
-                part = words[_select_chirps(positions, words)]
-                part[..., k - 1] = draw_noise(100 * row + k, part, rms) if value is None else value
+                positions_of_rx = words[_select_chirps(positions, words)]
+                positions_of_rx[..., k - 1] = (
+                    draw_noise(100 * row + k, positions_of_rx, rms) if value is None else value
+                )
 
     return mangle
 
@@ -105,9 +107,9 @@ def images_without_rx2(six_plates: ScanFolder) -> Images:
     return form_images(six_plates, kill("RV", 2))
 
 
-@pytest.mark.parametrize("how", [{"rms": 60.0}, {"value": 0}, {"value": 1000}, {"value": 32767}], ids=str)
-def test_whatever_a_dead_rx_sends_the_images_are_the_same(source, images_without_rx2, how):
-    images = form_images(source, kill("RV", 2, **how))
+@pytest.mark.parametrize("dead_signal", [{"rms": 60.0}, {"value": 0}, {"value": 1000}, {"value": 32767}], ids=str)
+def test_whatever_a_dead_rx_sends_the_images_are_the_same(source, images_without_rx2, dead_signal):
+    images = form_images(source, kill("RV", 2, **dead_signal))
     tolerance = 1e-6 * np.abs(images_without_rx2.v).max()
     np.testing.assert_allclose(images.v, images_without_rx2.v, atol=tolerance)
     np.testing.assert_array_equal(images.h, images_without_rx2.h)
@@ -128,12 +130,12 @@ def test_the_images_are_those_of_a_rig_without_the_rx(source):
             words = recorded.payload.view(np.int16).reshape(-1, 4)[:, [0, 1, 3]]
             return replace(recorded, pieces=split_pieces(np.ascontiguousarray(words).reshape(-1).view(np.uint8)))
 
-    def both(name: str, row: int, words: np.ndarray) -> None:
+    def kill_rx3(name: str, row: int, words: np.ndarray) -> None:
         kill(name, 3)(name, row, words)
 
-    without = make_pipeline(Three()).form_images()  # type: ignore[arg-type]
-    images = form_images(source, both)
-    for image, image_without_rx in ((images.h, without.h), (images.v, without.v)):
+    images_of_three_rx = make_pipeline(Three()).form_images()  # type: ignore[arg-type]
+    images = form_images(source, kill_rx3)
+    for image, image_without_rx in ((images.h, images_of_three_rx.h), (images.v, images_of_three_rx.v)):
         np.testing.assert_allclose(image, image_without_rx, atol=2e-5 * np.abs(image_without_rx).max())
 
 
@@ -149,9 +151,9 @@ def test_an_rx_that_dies_within_the_scan_is_left_out(source, process, rows):
 
 
 @pytest.mark.parametrize("positions", [slice(38, None), slice(21, 27), slice(0, 5), slice(24, None)], ids=str)
-@pytest.mark.parametrize("how", [{"rms": 6.0}, {"value": 0}], ids=str)
-def test_an_rx_without_a_signal_in_a_few_positions_of_a_row_is_dead_in_the_row(source, positions, how):
-    mangled = Mangled(source, kill("RV", 2, rows=range(20, 21), positions=positions, **how))
+@pytest.mark.parametrize("dead_signal", [{"rms": 6.0}, {"value": 0}], ids=str)
+def test_an_rx_without_a_signal_in_a_few_positions_of_a_row_is_dead_in_the_row(source, positions, dead_signal):
+    mangled = Mangled(source, kill("RV", 2, rows=range(20, 21), positions=positions, **dead_signal))
     synchroniser = RowSynchroniser(mangled, source.instrument, {})  # type: ignore[arg-type]
     assert synchroniser.synchronise("RV", mangled.read_row("RV", 20))[0].dead_rx == [2]
     assert synchroniser.synchronise("RV", mangled.read_row("RV", 19))[0].dead_rx == []

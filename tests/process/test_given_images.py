@@ -103,8 +103,8 @@ def test_the_direction_of_an_axis_does_not_matter(save_images, pair, rig):
     x = 1.3 + np.arange(150) * 2e-3
     raised_m = np.linspace(-0.01, 0.01, 150 * 150).reshape(150, 150)
     upwards = analyse_file(save_images(x_m=x, y_m=x, raised_m=raised_m), rig)
-    turned = {name: image[::-1, ::-1] for name, image in {**pair, "raised_m": raised_m}.items()}
-    downwards = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **turned), rig)
+    rotated = {name: image[::-1, ::-1] for name, image in {**pair, "raised_m": raised_m}.items()}
+    downwards = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **rotated), rig)
     np.testing.assert_array_equal(upwards.images.h, downwards.images.h)
     np.testing.assert_array_equal(upwards.images.raised_m, downwards.images.raised_m)
     assert list_permittivities(upwards) == list_permittivities(downwards)
@@ -342,14 +342,14 @@ def test_the_published_picture_has_nine_plates_and_copper_is_the_reference(rig, 
     assert (metal.centre_x_mm, metal.centre_y_mm) == pytest.approx((x0 + x1 - 150, 2 * row - 150), abs=4)
 
 
-@pytest.mark.parametrize("beside", [True, False], ids=["beside scan.json", "alone"])
-def test_images_of_a_simulated_scan_stay_simulated(tmp_path, rig, pair, beside):
+@pytest.mark.parametrize("has_scan_file", [True, False], ids=["beside scan.json", "alone"])
+def test_images_of_a_simulated_scan_stay_simulated(tmp_path, rig, pair, has_scan_file):
     """Files of earlier states say it in scan.json only."""
-    name = "image.npz" if beside else "copy.npz"
+    name = "image.npz" if has_scan_file else "copy.npz"
     axis_m = 0.002 * (np.arange(len(pair["h"])) - len(pair["h"]) / 2)
     images = Images(pair["h"], pair["v"], axis_m, axis_m, np.ones(pair["h"].shape, bool), pair["h"] / pair["v"])
-    write_image(tmp_path / name, images, simulated=not beside)
-    if beside:
+    write_image(tmp_path / name, images, simulated=not has_scan_file)
+    if has_scan_file:
         write_json(tmp_path / "scan.json", {"scan_id": "s", "simulated": True})
     assert read_given_images(tmp_path / name, rig).simulated
     write_image(tmp_path / "measured.npz", images)

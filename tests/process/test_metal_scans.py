@@ -69,13 +69,13 @@ def scan(rig: Instrument, tmp_path_factory):
     return make
 
 
-def compute_remaining_leakage(found: Leakage, truth: Leakage) -> tuple[float, float]:
+def compute_remaining_leakage(estimate: Leakage, truth: Leakage) -> tuple[float, float]:
     """Remaining crosstalk and imbalance after both rigs measured the same plate."""
 
     def relative(x: Leakage) -> Leakage:
         return Leakage(x.h, x.v, (1 + x.v) / (1 + x.h), 0.0)
 
-    return compute_remaining(relative(found), relative(truth))
+    return compute_remaining(relative(estimate), relative(truth))
 
 
 def test_leakage_of_both_boards_is_recovered_from_metal_at_two_orientations(scan, capsys):

@@ -136,10 +136,10 @@ def test_rows_are_turned_back_by_all_jumps_and_the_longest_section_keeps_its_pha
     pipeline = make_pipeline(Cubes(load_published_rig(), decode_scene(EMPTY, "test")))  # type: ignore[arg-type]
     board = pipeline.quality.boards["RV"]
     monkeypatch.setattr(board, "find_phase_jumps", lambda: (PhaseJump(4, 0.5), PhaseJump(25, -0.2)))
-    turned: dict[str, Any] = {}
+    corrected_rows: dict[str, Any] = {}
     builder = SimpleNamespace(
-        boards={name: SimpleNamespace(turn_rows=partial(turned.__setitem__, name)) for name in ("RH", "RV")}
+        boards={name: SimpleNamespace(turn_rows=partial(corrected_rows.__setitem__, name)) for name in ("RH", "RV")}
     )
     pipeline.quality._remove_phase_jumps([builder])  # type: ignore[list-item]
-    assert not turned["RH"].any()
-    np.testing.assert_allclose(turned["RV"][[0, 3, 4, 24, 25, -1]], [0.5, 0.5, 0.0, 0.0, 0.2, 0.2])
+    assert not corrected_rows["RH"].any()
+    np.testing.assert_allclose(corrected_rows["RV"][[0, 3, 4, 24, 25, -1]], [0.5, 0.5, 0.0, 0.0, 0.2, 0.2])

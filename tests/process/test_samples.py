@@ -140,10 +140,10 @@ def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kep
 
 
 def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
-    beyond = 1e3 * PLANE_REACH_M + 200
-    process_scan(kept, depth_mm=beyond)
+    depth_mm = 1e3 * PLANE_REACH_M + 200
+    process_scan(kept, depth_mm=depth_mm)
     with pytest.raises(DataError):
-        process_scan(remove_raw(kept), depth_mm=beyond)
+        process_scan(remove_raw(kept), depth_mm=depth_mm)
 
 
 def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:

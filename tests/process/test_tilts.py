@@ -110,14 +110,14 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
 
 def test_tilts_follow_a_transposed_image(tilted_images):
     images = tilted_images[0]
-    turned = images.transpose()
-    assert (images.illumination.across, turned.illumination.across) == (1, 0)
+    transposed = images.transpose()
+    assert (images.illumination.across, transposed.illumination.across) == (1, 0)
     for mask in _make_inside_masks(images):
         rise = images.illumination.estimate_rise(images.h, images.v, mask)
-        transposed_rise = turned.illumination.estimate_rise(turned.h, turned.v, mask.T)
+        transposed_rise = transposed.illumination.estimate_rise(transposed.h, transposed.v, mask.T)
         assert transposed_rise[::-1] == pytest.approx(rise, abs=1e-9)
         factors = images.illumination.to_level(mask, rise)
-        swapped = turned.illumination.to_level(mask.T, transposed_rise)
+        swapped = transposed.illumination.to_level(mask.T, transposed_rise)
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 

@@ -179,9 +179,9 @@ def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock)
     def never(serial: str) -> BoardWords:
         raise AssertionError(f"{serial} was opened")
 
-    wrong = change_radar_table(rig, rx_gain_db=31)
+    invalid_rig = change_radar_table(rig, rx_gain_db=31)
     with expect_refusal(ErrorCode.VALUE_INVALID, "RX gain step"):
-        NativeRadars(wrong, never, clock)
+        NativeRadars(invalid_rig, never, clock)
     with NativeRadars(rig, usb.open, clock) as native_radars, expect_refusal(ErrorCode.VALUE_INVALID, "frames"):
         native_radars.arm(65536)
 

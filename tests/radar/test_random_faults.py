@@ -254,14 +254,14 @@ def clean() -> Simulated:
     return outcome.board
 
 
-def is_rightly_accepted(found: Outcome, clean: Simulated) -> bool:
+def is_rightly_accepted(outcome: Outcome, clean: Simulated) -> bool:
     """Return True if the board of a completed row has the settings of a sound one and has made its frames.
 
     A board that loses power at the last poll of the host has lost its settings.
     """
-    over = found.words.at == found.words.count
-    same = found.board.settings == clean.settings or (over and found.board.executed == clean.executed)
-    return same and found.radar.state is State.DONE and found.board.cores.frames_left == 0
+    over = outcome.words.at == outcome.words.count
+    same = outcome.board.settings == clean.settings or (over and outcome.board.executed == clean.executed)
+    return same and outcome.radar.state is State.DONE and outcome.board.cores.frames_left == 0
 
 
 @pytest.mark.slow

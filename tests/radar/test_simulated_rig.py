@@ -66,8 +66,8 @@ def test_a_board_unplugged_from_its_socket_server_is_a_fault_with_its_address(ri
 
 
 def test_an_address_without_a_server_is_an_error():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
     with expect_refusal(ErrorCode.NO_ANSWER, f"tcp://127.0.0.1:{port}"):
         open_board(f"tcp://127.0.0.1:{port}")
     with expect_refusal(ErrorCode.NO_ANSWER, "tcp://nonsense"):

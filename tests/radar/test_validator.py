@@ -73,11 +73,11 @@ def test_the_published_chirp_with_centred_receivers_holds(rig):
     ],
 )
 def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name, table, values):
-    wrong = change_rig(rig, table, **values)
-    assert name in list_broken_constraints(wrong)
+    invalid_rig = change_rig(rig, table, **values)
+    assert name in list_broken_constraints(invalid_rig)
     with pytest.raises(ConfigError) as caught:
-        check_constraints(wrong, FRAMES)
-    result = next(c for c in list_constraints(wrong, FRAMES) if c.name == name and not c.holds)
+        check_constraints(invalid_rig, FRAMES)
+    result = next(c for c in list_constraints(invalid_rig, FRAMES) if c.name == name and not c.holds)
     assert str(result) in str(caught.value)
     assert result.formula in str(result)
     assert f"{result.value:.12g}" in str(result)
@@ -88,8 +88,8 @@ def test_76_ghz_is_inside_the_band_to_the_code(rig):
     """The ICD's lowest code stands for a little less than 76 GHz."""
     transmitter = msgspec.structs.replace(rig.transmitter, start_offset_hz=0.0)
     for start, holds in ((76e9, True), (0x5471C71B * 3.6e9 / 2**26, True), (0x5471C71A * 3.6e9 / 2**26, False)):
-        wrong = change_rig(rig, "chirp", start_hz=start)
-        assert (f"start frequency of {transmitter.name}" not in list_broken_constraints(wrong)) is holds
+        changed_rig = change_rig(rig, "chirp", start_hz=start)
+        assert (f"start frequency of {transmitter.name}" not in list_broken_constraints(changed_rig)) is holds
 
 
 def test_only_simulated_radars_may_have_no_filters(rig):
@@ -122,9 +122,11 @@ ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
 @example({("chirp", "start_hz"): 9e307}, {}, 9e307, 0)
 def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
     rig = change_receiver(make_native_rig(), start_offset_hz=offset_hz)
-    wrong = floats | ints
-    for table in sorted({table for table, _ in wrong}):
-        rig = change_rig(rig, table, **{key: value for (section, key), value in wrong.items() if section == table})
+    unusable_numbers = floats | ints
+    for table in sorted({table for table, _ in unusable_numbers}):
+        rig = change_rig(
+            rig, table, **{key: value for (section, key), value in unusable_numbers.items() if section == table}
+        )
     if all(c.holds for c in list_constraints(rig, frames)):
         for board in rig.boards:
             for sent in make_program(rig, board).make_frame_commands(frames):
@@ -173,8 +175,8 @@ def test_a_frame_of_many_chirps_needs_a_longer_period(rig):
 
 def test_a_usb_path_does_not_acknowledge_ldo_bypass(rig):
     native = {**rig.radar.native, "RH": NativeRadar(usb_path="1-4.2", ldo_bypass=True)}
-    wrong = change_radar_table(rig, native=native)
-    assert list_broken_constraints(wrong) == {"LDO bypass of RH"}
+    invalid_rig = change_radar_table(rig, native=native)
+    assert list_broken_constraints(invalid_rig) == {"LDO bypass of RH"}
 
 
 def test_ldo_bypass_needs_this_boards_serial(rig):
@@ -206,13 +208,13 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
     ("complex2x", 0.0, True), ("complex2x", -1.1e6, False), ("complex2x", 700e3, False),
 ])  # fmt: skip
 def test_if_budget(rig, mode, offset, holds):
-    wrong = change_rig(change_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
-    assert ("IF budget of RH" not in list_broken_constraints(wrong)) is holds
+    changed_rig = change_rig(change_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
+    assert ("IF budget of RH" not in list_broken_constraints(changed_rig)) is holds
 
 
 def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
-    wrong = change_receiver(rig, start_offset_hz=0.0)
-    result = next(c for c in list_constraints(wrong, FRAMES) if c.name == "IF budget of RH")
+    changed_rig = change_receiver(rig, start_offset_hz=0.0)
+    result = next(c for c in list_constraints(changed_rig, FRAMES) if c.name == "IF budget of RH")
     offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
     mended = change_receiver(rig, start_offset_hz=offset)
     assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
@@ -233,7 +235,7 @@ def test_every_constraint_is_tested(rig):
 @pytest.mark.parametrize(("size", "is_usable"), [(1e29, True), (1.1e30, False), (math.inf, False), (math.nan, False)])
 def test_a_number_that_no_radar_has_is_named_alone(rig, sign, size, is_usable):
     receiver = rig.receivers[0]
-    strange = msgspec.structs.replace(receiver, start_offset_hz=sign * size)
-    boards = tuple(strange if b is receiver else b for b in rig.boards)
+    extreme_receiver = msgspec.structs.replace(receiver, start_offset_hz=sign * size)
+    boards = tuple(extreme_receiver if b is receiver else b for b in rig.boards)
     names = [c.name for c in list_constraints(msgspec.structs.replace(rig, boards=boards), 4) if not c.holds]
     assert (names == [f"boards.{receiver.name}.start_offset_hz"]) == (not is_usable)

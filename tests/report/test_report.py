@@ -324,7 +324,7 @@ def replace_every_number(content, value):
 def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
     """New results may contain NaN or infinity; products have null instead."""
     figures = replace_every_number({"segments": MATERIALS, "quality": QUALITY}, value)
-    strange = replace_results(
+    changed_scan = replace_results(
         scan,
         materials=ScanMaterials.decode(
             {"segments": figures["segments"], "pixel_accuracy": value, "library": "", "model": "knn",
@@ -334,30 +334,30 @@ def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
         expected_accuracy=value,
     )  # fmt: skip
     with skip_rendering():
-        html = render(strange, {})
+        html = render(changed_scan, {})
     words = re.findall(r"[\w.]+", Page(html).words.lower())
     assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]
     assert format_value(value) == "–"
 
 
 @pytest.mark.parametrize(
-    ("name", "in_library", "shown"),
+    ("name", "in_library", "text"),
     [
         ("unknown", False, "acrylic"), ("unknown", True, "✗ acrylic"),
         ("PET", False, "✗ acrylic"), ("acrylic", True, "✓ acrylic"),
     ],
 )  # fmt: skip
-def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(scan, name, in_library, shown):
+def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(scan, name, in_library, text):
     foreign = MATERIALS[1] | {"name": name, "truth": MATERIALS[1]["truth"] | {"in_library": in_library}}
     # As read from a file.
     figures = json.loads(json.dumps({"segments": [MATERIALS[0], foreign], "library": "", "model": "knn"}))
     figures |= {"pixel_accuracy": 0.5, "metal_reference": {"how": "given"}}
     with skip_rendering():
         words = Page(render(replace_results(scan, materials=ScanMaterials.decode(figures)), {})).words
-    assert shown in words
-    assert ("✗ acrylic" in words) is (shown == "✗ acrylic")
-    assert ("✓ acrylic" in words) is (shown == "✓ acrylic")
-    assert ("not in the library" in words) is (shown == "acrylic")
+    assert text in words
+    assert ("✗ acrylic" in words) is (text == "✗ acrylic")
+    assert ("✓ acrylic" in words) is (text == "✓ acrylic")
+    assert ("not in the library" in words) is (text == "acrylic")
 
 
 def test_a_standard_deviation_is_not_shown_as_the_value():

@@ -310,10 +310,14 @@ def list_hostile_requests(port: int) -> list[bytes]:
 
     out = list(NO_HEADS)
     for path in POSTS:
-        wrong = [[host_line, f"{TOKEN_HEADER}: {t}"] for t in ("", "x", TOKEN[:-1], "\xff")]
-        wrong += [[host_line], ["Host: evil.example", token], [host_line, token, "Sec-Fetch-Site: cross-site"]]
-        wrong += [[host_line, token, f"Origin: {o}"] for o in ("https://evil.example", "null")]
-        out += [request(f"POST /api/{path}", *w, "Content-Length: 2", body=b"{}") for w in wrong]
+        refused_headers = [[host_line, f"{TOKEN_HEADER}: {t}"] for t in ("", "x", TOKEN[:-1], "\xff")]
+        refused_headers += [
+            [host_line],
+            ["Host: evil.example", token],
+            [host_line, token, "Sec-Fetch-Site: cross-site"],
+        ]
+        refused_headers += [[host_line, token, f"Origin: {o}"] for o in ("https://evil.example", "null")]
+        out += [request(f"POST /api/{path}", *w, "Content-Length: 2", body=b"{}") for w in refused_headers]
     methods = ("GET", "PUT", "DELETE", "OPTIONS", "TRACE", "CONNECT", "BREW")
     out += [request(f"{method} /api/{POSTS[0]}", host_line, token) for method in methods]
     for description in ("scan", "result", "file/image.npz", "thumbnail"):
@@ -355,10 +359,10 @@ def test_a_thousand_hostile_requests_change_nothing_and_lock_no_client_out(scans
         assert get(view, "/api/scan?scan=one")["notes"] == "the operator's"
 
 
-@pytest.mark.parametrize("given", ["certificate", "key"])
-def test_a_certificate_without_its_key_is_refused_before_the_files_are_read(tmp_path, given):
+@pytest.mark.parametrize("options", ["certificate", "key"])
+def test_a_certificate_without_its_key_is_refused_before_the_files_are_read(tmp_path, options):
     with expect_refusal(ErrorCode.OTHER, "--certificate and --key"):
-        ServerAddress(**{given: tmp_path / "missing.pem"}).check()
+        ServerAddress(**{options: tmp_path / "missing.pem"}).check()
 
 
 def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
@@ -370,9 +374,9 @@ def test_with_a_certificate_everything_is_encrypted(scans, tmp_path):
     command = [program, "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", *files, *subject]
     subprocess.run([str(w) for w in command], check=True, capture_output=True)
     # Two equal processes that are independent of each other
-    for wrong in ("key.pem", "certificate.pem"):
-        with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path / wrong):
-            ServerAddress("127.0.0.1", 0, (), tmp_path / wrong, tmp_path / wrong).check()
+    for file_name in ("key.pem", "certificate.pem"):
+        with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path / file_name):
+            ServerAddress("127.0.0.1", 0, (), tmp_path / file_name, tmp_path / file_name).check()
     place = ServerAddress("127.0.0.1", 0, (), tmp_path / "certificate.pem", tmp_path / "key.pem")
     with serve_folder(scans, access=Access(TOKEN, control=True, secure=True), place=place) as view:
         trusted = ssl.create_default_context(cafile=str(tmp_path / "certificate.pem"))

@@ -471,8 +471,8 @@ def test_a_wrong_number_is_reported_with_the_labels_of_the_page(page):
     shown_text = page.browser.read_text("plan-wrong")
     assert "does not fit the stage" in shown_text
     assert not re.search(r"\w_\w|stage\.|grid\.|changed|rule of its format", shown_text), shown_text
-    wrong = "[...document.querySelectorAll('[aria-invalid=true]')].map((field) => field.id).join()"
-    assert page.browser.evaluate(wrong) == "columns,step_x_mm,speed_mm_s"
+    invalid_fields = "[...document.querySelectorAll('[aria-invalid=true]')].map((field) => field.id).join()"
+    assert page.browser.evaluate(invalid_fields) == "columns,step_x_mm,speed_mm_s"
     # The refused requests
     page.browser.errors.clear()
 

@@ -133,11 +133,15 @@ def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refus
     root = tmp_path / "scans"
     root.mkdir()
     with serve_folder(root, TOKEN, config=config) as view:
-        wrong = [
+        refused_requests = [
             {"name": "a"} | wrong_plan
             for wrong_plan in ({"plan": {"rows": 0}}, {"x": 1}, {"plan": {"columns": 1999}}, {"library": "no"})
         ]
-        for body, status in [({"name": "../out"}, 404), ({"name": ".hidden"}, 404), *((body, 400) for body in wrong)]:
+        for body, status in [
+            ({"name": "../out"}, 404),
+            ({"name": ".hidden"}, 404),
+            *((body, 400) for body in refused_requests),
+        ]:
             assert post(view, "/api/start", body)[0] == status, body
         assert [p.name for p in root.iterdir()] == []
         assert (

@@ -110,7 +110,7 @@ def test_every_state_shows_the_text_of_the_table(browser: Browser, still, size, 
 
 
 @pytest.mark.parametrize(
-    ("advice", "shown"),
+    ("advice", "shown_advice"),
     [
         ("Put it in, then `polysight resume scans/one`", "Put it in, then Try again"),
         ("Put it in (for a scan to resume: `polysight resume SCAN --config a.toml`)", "Put it in; then Try again"),
@@ -118,13 +118,13 @@ def test_every_state_shows_the_text_of_the_table(browser: Browser, still, size, 
         ("", "Try again"),
     ],
 )
-def test_advice_next_to_try_again_ends_with_the_button(browser: Browser, still, advice, shown):
+def test_advice_next_to_try_again_ends_with_the_button(browser: Browser, still, advice, shown_advice):
     """A scan that could not start cannot be resumed."""
     watch, view = still
     browser.visit(f"{view.address}/watch#token={TOKEN}", DESK)
     watch.show("start_failed", do=advice)
     browser.wait("document.getElementById('again')", "the button")
-    assert browser.read_text("do") == shown
+    assert browser.read_text("do") == shown_advice
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])

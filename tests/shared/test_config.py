@@ -400,7 +400,7 @@ def test_files_of_editors_of_windows_are_read(tmp_path: Path, encoding: str, end
 
 
 @pytest.mark.parametrize(
-    ("line", "wrong", "suggestion"),
+    ("line", "unknown_key", "suggestion"),
     [
         ("step_x_mm = 2.0", "stepx_mm = 2.0", "'step_x_mm'"),
         ("step_x_mm = 2.0", "samples = 2", "[chirp]"),
@@ -408,10 +408,10 @@ def test_files_of_editors_of_windows_are_read(tmp_path: Path, encoding: str, end
         ("[stage]", "[stagge]", "'stage'"),
     ],
 )
-def test_an_unknown_key_is_refused_with_a_suggestion(line, wrong, suggestion, tmp_path):
+def test_an_unknown_key_is_refused_with_a_suggestion(line, unknown_key, suggestion, tmp_path):
     text = RIG_FILE.read_text()
     assert text.count(f"\n{line}") == 1
-    (tmp_path / "rig.toml").write_text(text.replace(f"\n{line}", f"\n{wrong}"))
+    (tmp_path / "rig.toml").write_text(text.replace(f"\n{line}", f"\n{unknown_key}"))
     with expect_refusal(ErrorCode.KEY_UNKNOWN, suggestion):
         load_instrument(tmp_path / "rig.toml")
 

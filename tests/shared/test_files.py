@@ -10,11 +10,11 @@ import pytest
 from polysight_shared.files import name_in_errors, read_json, write_atomically
 
 
-@pytest.mark.parametrize(("known", "shown"), [(None, "mine"), ("theirs", "theirs")])
-def test_an_error_without_a_path_gets_one_and_keeps_its_own(tmp_path, known, shown):
+@pytest.mark.parametrize(("known_path", "shown_path"), [(None, "mine"), ("theirs", "theirs")])
+def test_an_error_without_a_path_gets_one_and_keeps_its_own(tmp_path, known_path, shown_path):
     with pytest.raises(OSError, match="No space left") as caught, name_in_errors(tmp_path / "mine"):
-        raise OSError(errno.ENOSPC, "No space left on device", known and str(tmp_path / known))
-    assert caught.value.filename == str(tmp_path / shown)
+        raise OSError(errno.ENOSPC, "No space left on device", known_path and str(tmp_path / known_path))
+    assert caught.value.filename == str(tmp_path / shown_path)
 
 
 def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):

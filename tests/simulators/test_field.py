@@ -29,9 +29,9 @@ def make_scene_and_rig(**tables: Any) -> tuple[Instrument, Scene]:
 
 def read(field: ObjectField, offsets_m: np.ndarray, f: np.ndarray, rx: int, samples: np.ndarray) -> np.ndarray:
     values, _ = node_matrix(field, samples)
-    picked = values[:, np.searchsorted(samples, f)]
+    values_at_f = values[:, np.searchsorted(samples, f)]
     carrier = np.exp(2j * np.pi * f * field.centre_path_m / SPEED_OF_LIGHT_M_S)
-    return field.interpolate(offsets_m[:, 0], offsets_m[:, 1])[:, rx] @ picked * carrier
+    return field.interpolate(offsets_m[:, 0], offsets_m[:, 1])[:, rx] @ values_at_f * carrier
 
 
 def test_interpolation_between_frequencies_is_exact() -> None:
@@ -56,16 +56,16 @@ def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
     )
     scene = scene.with_disturbances(leakage_h="off", leakage_v="off")
     board = rig.by_role(role)
-    ant = optics.antennas(rig, board)
+    antennas = optics.antennas(rig, board)
     rng = np.random.default_rng(1)
     offsets = rng.uniform(-0.06, 0.06, (200, 2))
     samples = sample_frequencies_hz(rig)
     f = samples[[128]]
     field = build_field(rig, scene, board, samples)
     field_values = read(field, offsets, f, 0, samples)[:, 0]
-    image = ant.rx_m[0] * [1, 1, -1] + [0, 0, 2 * ant.plane_z_m]
-    path = float(np.linalg.norm(image - ant.tx_m))
-    expected = -ant.direct_m[0] / path * np.exp(2j * np.pi * f[0] * path / SPEED_OF_LIGHT_M_S)
+    image = antennas.rx_m[0] * [1, 1, -1] + [0, 0, 2 * antennas.plane_z_m]
+    path = float(np.linalg.norm(image - antennas.tx_m))
+    expected = -antennas.direct_m[0] / path * np.exp(2j * np.pi * f[0] * path / SPEED_OF_LIGHT_M_S)
     # The plate's edges still ring by some percent at each offset; their mean does not.
     assert abs(np.mean(field_values) / expected - 1) < 0.03
     assert np.abs(np.abs(field_values) / abs(expected) - 1).max() < 0.25
@@ -130,10 +130,10 @@ def test_a_good_conductor_tends_to_metal_with_p_of_plus_one(theta: float) -> Non
 
 def test_scene_plates_choose_their_model() -> None:
     theta = np.array([0.9, 1.0])
-    half = Plate("h", (0, 0), (1, 1), permittivity=(3.78, 0.7))
-    thin = Plate("s", (0, 0), (1, 1), permittivity=(3.78, 0.7), thickness_mm=0.5)
-    assert np.allclose(optics.plate_reflection(half, F, theta), optics.half_space(3.78 - 0.7j, theta))
-    assert np.allclose(optics.plate_reflection(thin, F, theta), optics.slab(3.78 - 0.7j, 0.5e-3, F, theta))
+    half_space = Plate("h", (0, 0), (1, 1), permittivity=(3.78, 0.7))
+    thin_sheet = Plate("s", (0, 0), (1, 1), permittivity=(3.78, 0.7), thickness_mm=0.5)
+    assert np.allclose(optics.plate_reflection(half_space, F, theta), optics.half_space(3.78 - 0.7j, theta))
+    assert np.allclose(optics.plate_reflection(thin_sheet, F, theta), optics.slab(3.78 - 0.7j, 0.5e-3, F, theta))
 
 
 def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None:
@@ -145,11 +145,11 @@ def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None
     sheet = Plate("sheet", (0.0, 0.0), (45.0, 45.0), permittivity=(eps, 0.02), thickness_mm=1e3 * thick_m)
     f = np.linspace(76.3e9, 79.75e9, 400)
     path_m = np.linspace(-1.0, 1.0, 2001)
-    later = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m, f)) * np.hanning(f.size)
+    advance = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m, f)) * np.hanning(f.size)
     # Snell
     inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)
     for board in rig.receivers:
         reflect = optics.board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
-        amplitudes = np.abs(later @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
-        back = np.where(np.abs(path_m) > 0.15, amplitudes, 0)
-        assert abs(path_m[np.argmax(back)] - inside_m) < 0.01
+        amplitudes = np.abs(advance @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
+        echo_of_back = np.where(np.abs(path_m) > 0.15, amplitudes, 0)
+        assert abs(path_m[np.argmax(echo_of_back)] - inside_m) < 0.01

@@ -280,8 +280,8 @@ def test_clipping_is_bounded_and_counted() -> None:
 
 def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
     moving = make_radar(burst_motion=True)
-    still = make_radar()
+    radar_at_rest = make_radar()
     assert np.allclose(moving.burst_mm(1), 20.0 * (0.2e-3 + np.arange(16) * 1.5e-3))
-    assert np.allclose(still.burst_mm(-1), -0.229)
+    assert np.allclose(radar_at_rest.burst_mm(-1), -0.229)
     for direction in (1, -1):
-        assert np.isclose(moving.burst_mm(direction).mean(), still.burst_mm(direction).mean())
+        assert np.isclose(moving.burst_mm(direction).mean(), radar_at_rest.burst_mm(direction).mean())

@@ -75,7 +75,7 @@ def test_a_scene_with_shapes_names_the_missing_package(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "impossible_shape",
     [
         {"radius_mm": 5.0},
         {"metal": False},
@@ -87,6 +87,6 @@ def test_a_scene_with_shapes_names_the_missing_package(monkeypatch):
     ],
     ids=str,
 )
-def test_shapes_that_cannot_be_are_refused(wrong):
+def test_shapes_that_cannot_be_are_refused(impossible_shape):
     with pytest.raises(ConfigError):
-        make_scene(shapes=[{**BALL, **wrong}])
+        make_scene(shapes=[{**BALL, **impossible_shape}])

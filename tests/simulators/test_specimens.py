@@ -66,8 +66,8 @@ def test_shift_and_tilt_of_the_plane_apply_to_its_plates_and_points() -> None:
     assert drawn.plates[0].tilt_deg == pytest.approx((1.0, -0.5))
     assert drawn.plates[0].height_mm == pytest.approx(2.0 + 30.0 * x - 20.0 * y)
     assert drawn.points[0].height_mm == pytest.approx(3.0 + 100.0 * x)
-    turned = {**PLATE, "tilt_deg": [-1.0, 0.5], "height_mm": -2.0}
-    flat = draw_specimens(make_scene(plates=[turned], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0)).plates[0]
+    tilted_plate = {**PLATE, "tilt_deg": [-1.0, 0.5], "height_mm": -2.0}
+    flat = draw_specimens(make_scene(plates=[tilted_plate], plane_tilt_deg=[1.0, -0.5], plane_shift_mm=2.0)).plates[0]
     assert flat.tilt_deg == pytest.approx((0.0, 0.0))
 
 

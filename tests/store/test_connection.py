@@ -62,7 +62,7 @@ def is_without_effect(path: tuple[str | int, ...]) -> bool:
 
 def test_every_key_is_taken_up_or_refused_by_name(begun):
     """Each number, text and switch of the rig file, changed alone."""
-    taken = 0
+    accepted = 0
     refused = 0
     for path, value in list_leaves(to_builtins(begun)):
         table = copy.deepcopy(to_builtins(begun))
@@ -78,7 +78,7 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
         if may_change(path):
             check_same_scan(begun, given_rig, "mine.toml")
             assert with_connection(begun, extract_connection(given_rig)) == given_rig
-            taken += 1
+            accepted += 1
         elif is_without_effect(path):
             check_same_scan(begun, given_rig, "mine.toml")
             assert with_connection(begun, extract_connection(given_rig)) == begun
@@ -88,7 +88,7 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
                 check_same_scan(begun, given_rig, "mine.toml")
             assert f"{name} is {value!r} in the scan and {make_other_value(value)!r} there" in e.value.what
             refused += 1
-    assert taken > 20
+    assert accepted > 20
     assert refused > 40
 
 

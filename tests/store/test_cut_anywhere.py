@@ -130,7 +130,7 @@ def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
     for bit in sample(range(8 * committed), 16):
         scan = undisturbed_scan.copy(tmp_path / "s")
         turn(scan.path / "events.msgpack", bit)
-        turned = (scan.path / "events.msgpack").read_bytes()
+        events = (scan.path / "events.msgpack").read_bytes()
         readable = not read_events(scan.path / "events.msgpack").damage
         assert any("events.msgpack" in f for f in list_faults(scan)), bit
         if readable:
@@ -138,7 +138,7 @@ def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
         assert resume(scan, undisturbed_scan) == set()
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
         damaged_log = (scan.path / "events.msgpack.damaged").read_bytes()
-        assert raw[: -len(damaged_log)] + damaged_log == turned
+        assert raw[: -len(damaged_log)] + damaged_log == events
 
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
@@ -167,13 +167,15 @@ def test_bit_of_the_journal(undisturbed_scan, tmp_path, sample):
         check_resumed_journal(scan, undisturbed_scan, lost=sum(s > bit // 8 for s in starts[1:]) + 1)
 
 
-@pytest.mark.parametrize("left", [b"", b"PSJR", PAGE, None], ids=["empty", "torn magic", "zeros", "removed"])
-def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, left):
+@pytest.mark.parametrize(
+    "remaining_content", [b"", b"PSJR", PAGE, None], ids=["empty", "torn magic", "zeros", "removed"]
+)
+def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, remaining_content):
     scan = undisturbed_scan.copy(tmp_path / "s")
-    if left is None:
+    if remaining_content is None:
         find_journal(scan).unlink()
     else:
-        find_journal(scan).write_bytes(left)
+        find_journal(scan).write_bytes(remaining_content)
     manifest_path = scan.path / "manifest.jsonl"
     # Row 2 is not recorded yet
     manifest_path.write_bytes(b"".join(read_lines(manifest_path)[:-2]))

@@ -186,13 +186,13 @@ def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):
     assert "polysight resume" not in refusal.value.remedy
 
 
-@pytest.mark.parametrize("gone", [{0}, {COLUMNS - 1}, {0, 1, 5}])
-def test_the_other_boards_show_which_end_is_missing(tmp_path, gone):
-    folder, sent = record(tmp_path, {("RH", 2): gone})
+@pytest.mark.parametrize("missing_end", [{0}, {COLUMNS - 1}, {0, 1, 5}])
+def test_the_other_boards_show_which_end_is_missing(tmp_path, missing_end):
+    folder, sent = record(tmp_path, {("RH", 2): missing_end})
     scan = open_source(folder, BASE)
     mask = check(scan.read_row("RH", 2), sent["RH", 2])
-    np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.isin(range(COLUMNS), list(gone)))
-    assert scan.recording_facts()["recording"].boards["RH"]["positions_missing"] == len(gone)
+    np.testing.assert_array_equal(mask.reshape(COLUMNS, -1).all(axis=1), np.isin(range(COLUMNS), list(missing_end)))
+    assert scan.recording_facts()["recording"].boards["RH"]["positions_missing"] == len(missing_end)
 
 
 def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):

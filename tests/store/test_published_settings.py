@@ -140,8 +140,8 @@ def test_each_mount_angle_of_the_scan_turns_its_boards(write, base, key, value, 
             b = np.array(place(rig))
             origin = np.array([-0.75875 if name == "LS" else 0.75875, 0, 0])
             x, y, z = a - origin
-            turned = [np.cos(by) * x + np.sin(by) * z, y, -np.sin(by) * x + np.cos(by) * z]
-            np.testing.assert_allclose(b - origin, turned, atol=1e-9)
+            rotated = [np.cos(by) * x + np.sin(by) * z, y, -np.sin(by) * x + np.cos(by) * z]
+            np.testing.assert_allclose(b - origin, rotated, atol=1e-9)
 
 
 def test_a_board_never_looks_away_from_the_object(write, base):
@@ -155,9 +155,9 @@ def test_a_board_never_looks_away_from_the_object(write, base):
 def test_units_of_tis_tools_are_understood_too(write, base):
     chirp = {"f0": 76.01, "slope": 38.816929, "ramp_time": 128.5, "adc_start_time": 7, "num_adc": SAMPLES, "Fs": 2150}
     folder = write(chirp_configs=[chirp])
-    got = open_source(folder, base).instrument.chirp
+    read_chirp = open_source(folder, base).instrument.chirp
     for key in ("start_hz", "slope_hz_per_s", "ramp_end_us", "adc_start_us", "sample_rate_hz"):
-        assert getattr(got, key) == pytest.approx(getattr(base.chirp, key))
+        assert getattr(read_chirp, key) == pytest.approx(getattr(base.chirp, key))
 
 
 def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):

@@ -23,7 +23,7 @@ from polysight_shared.errors import ErrorCode
 from polysight_shared.raster import plan_raster
 
 
-def scan_with(folder: Path, lost: int | Collection[int], wrong: bool = False) -> tuple[ScanFolder, bytes]:
+def scan_with(folder: Path, lost: int | Collection[int], has_wrong_packet: bool = False) -> tuple[ScanFolder, bytes]:
     """One row of each board, with packets lost and a leftover; `wrong`: all masked, as by an earlier release."""
     rig = make_rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
@@ -43,7 +43,7 @@ def scan_with(folder: Path, lost: int | Collection[int], wrong: bool = False) ->
             placed, out = place_record(log, frame, evidence.past)
             packets_crc = write_packets(path.with_suffix(PACKETS_SUFFIX), log, evidence, placed)
             path.write_bytes(out.tobytes())
-            facts = {**placed.facts(), "missing": [(0, size)] if wrong else placed.missing}
+            facts = {**placed.facts(), "missing": [(0, size)] if has_wrong_packet else placed.missing}
             boards[board.name] = {
                 "file": str(path.relative_to(folder)), "bytes": size, "frames_expected": size // frame,
                 "frames_received": 0, "missing_bytes": sum(b - a for a, b in facts["missing"]),
@@ -79,7 +79,7 @@ def test_rows_with_the_same_result_are_not_touched(tmp_path):
 
 
 def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
-    scan, data = scan_with(tmp_path / "scan", lost=9, wrong=True)
+    scan, data = scan_with(tmp_path / "scan", lost=9, has_wrong_packet=True)
     assert list_errors(scan.path) == []
     assert inspect_placement(scan.path / "raw/RH/0000.bin", as_json=False) == 1
     assert "committed  differently" in capsys.readouterr().out
@@ -113,13 +113,13 @@ def test_of_more_than_eight_missing_ranges_the_first_are_printed(tmp_path, capsy
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("fault", ["killed within", "power cut", "worst power cut"])
 def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fault):
-    scan, data = scan_with(tmp_path / "count" / "scan", lost=9, wrong=True)
+    scan, data = scan_with(tmp_path / "count" / "scan", lost=9, has_wrong_packet=True)
     counting = FaultyDisk(tmp_path / "count")
     with counting():
         replace_rows(scan)
     for position in range(1, len(counting.done) + 1):
         folder = tmp_path / str(position)
-        scan, data = scan_with(folder / "scan", lost=9, wrong=True)
+        scan, data = scan_with(folder / "scan", lost=9, has_wrong_packet=True)
         with pytest.raises(Killed), FaultyDisk(folder, fault, position, seed=position)():
             replace_rows(scan)
         scan = ScanFolder.load(scan.path)

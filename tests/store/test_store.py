@@ -32,17 +32,17 @@ facts = st.dictionaries(st.text(max_size=6).filter(lambda k: k not in ("fact", "
 
 
 @given(st.lists(facts, max_size=4))
-def test_manifest_round_trip(some):
-    raw = b"".join(map(encode_line, some))
+def test_manifest_round_trip(facts):
+    raw = b"".join(map(encode_line, facts))
     content = parse(raw)
-    assert content.facts == [parse_fact(fact) for fact in some]
+    assert content.facts == [parse_fact(fact) for fact in facts]
     assert (content.length, content.torn, content.faults) == (len(raw), False, [])
 
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
-def test_flipped_bit_is_never_a_fact(some, data):
+def test_flipped_bit_is_never_a_fact(facts, data):
     """One flipped bit in a line: only that line is refused."""
-    lines = [encode_line(f) for f in some]
+    lines = [encode_line(f) for f in facts]
     line_number = data.draw(st.integers(0, len(lines) - 1))
     bad = bytearray(lines[line_number])
     bit = data.draw(st.integers(0, 8 * len(bad) - 1))
@@ -50,17 +50,17 @@ def test_flipped_bit_is_never_a_fact(some, data):
     lines[line_number] = bytes(bad)
     content = parse(b"".join(lines))
     if content.torn or content.faults:
-        assert len(content.facts) < len(some)
+        assert len(content.facts) < len(facts)
     else:
-        assert content.facts == [parse_fact(fact) for fact in some]
+        assert content.facts == [parse_fact(fact) for fact in facts]
 
 
 def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_continues(tmp_path):
-    some = [{"fact": "scan_paused"}, {"fact": "row_withdrawn", "row": 0}, {"fact": "scan_ended", "reason": "é"}]
+    facts = [{"fact": "scan_paused"}, {"fact": "row_withdrawn", "row": 0}, {"fact": "scan_ended", "reason": "é"}]
     path = tmp_path / "manifest.jsonl"
     ends = [0]
     with ManifestWriter(path, create=True) as writer:
-        for fact in some:
+        for fact in facts:
             writer.append(fact)
             ends.append(path.stat().st_size)
     raw = path.read_bytes()
@@ -68,7 +68,7 @@ def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_cont
         whole_lines = max(k for k, e in enumerate(ends) if e <= n)
         content = parse(raw[:n])
         assert (content.facts, content.torn, content.faults) == (
-            [parse_fact(fact) for fact in some[:whole_lines]],
+            [parse_fact(fact) for fact in facts[:whole_lines]],
             n not in ends,
             [],
         )
@@ -76,7 +76,7 @@ def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_cont
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
         restored = manifest.read(path)
-        assert restored.facts == [*map(parse_fact, some[:whole_lines]), ScanResumed()]
+        assert restored.facts == [*map(parse_fact, facts[:whole_lines]), ScanResumed()]
         assert (restored.torn, restored.faults) == (False, [])
 
 
@@ -252,18 +252,18 @@ def test_other_folders_are_refused(whole_scan, tmp_path):
 def test_truncated_events_continue_after_the_last_whole_one(tmp_path_factory, cut):
     path = tmp_path_factory.mktemp("e") / "events.msgpack"
     writer = EventWriter(path)
-    some = [Fault(scan_id="s", seq=k, t_mono_ns=k, number=1, problem="x" * k) for k in range(1, 5)]
-    for event in some:
+    events = [Fault(scan_id="s", seq=k, t_mono_ns=k, number=1, problem="x" * k) for k in range(1, 5)]
+    for event in events:
         writer.append(event)
     writer.close()
     raw = path.read_bytes()
     path.write_bytes(raw[:cut])
     log = read_events(path)
-    assert log.events == some[: len(log.events)]
+    assert log.events == events[: len(log.events)]
     assert log.torn == (log.length < min(cut, len(raw)))
     writer = EventWriter(path)
     assert writer.last_seq == len(log.events)
-    for event in some[len(log.events) :]:
+    for event in events[len(log.events) :]:
         writer.append(event)
     writer.close()
     assert path.read_bytes() == raw

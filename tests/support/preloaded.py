@@ -368,9 +368,9 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     connection = int(sys.argv[1])
-    nothing = os.open(os.devnull, os.O_RDWR)
+    null_file = os.open(os.devnull, os.O_RDWR)
     for number in (0, 1):
-        os.dup2(nothing, number)
+        os.dup2(null_file, number)
     os.closerange(3, connection)
     os.closerange(connection + 1, FIRST_SPARE)
     preload()

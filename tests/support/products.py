@@ -56,8 +56,8 @@ def make_segments(level: str | None) -> list[dict[str, Any]]:
         pet["permittivity"] = {k: v for k, v in PERMITTIVITY.items() if k not in _OLD}
         return [{k: v for k, v in s.items() if k != "refused"} for s in (metal, pet, noise)]
     if level == "none":
-        nothing = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}, "truth": None}
-        return [s | nothing for s in (metal, pet, noise)]
+        no_result = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}, "truth": None}
+        return [s | no_result for s in (metal, pet, noise)]
     return [metal, pet, noise]
 
 

@@ -78,8 +78,8 @@ FIRST = (
 def find_worker_group(node_id: str) -> str:
     """Folder or file whose tests share a worker."""
     file = node_id.partition("::")[0]
-    room = file.rpartition("/")[0]
-    return room if room in ROOMS else TOGETHER.get(file, file)
+    folder = file.rpartition("/")[0]
+    return folder if folder in ROOMS else TOGETHER.get(file, file)
 
 
 def sort_longest_first(items: list[pytest.Item]) -> None:

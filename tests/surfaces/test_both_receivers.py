@@ -42,8 +42,8 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[SeenEchoes, Shape]:
     normals = patch.normal.T
     # Tangents of the world as columns, and the rotation of the estimator's to them.
     own_tangents = np.einsum("ijn,jcn->nci", patch.tangents(), np.array([patch.d_a, patch.d_b]))
-    turned = np.swapaxes(compute_tangents(normals), 1, 2) @ own_tangents
-    curvature = turned @ np.moveaxis(patch.curvature(), -1, 0) @ np.swapaxes(turned, 1, 2)
+    rotation = np.swapaxes(compute_tangents(normals), 1, 2) @ own_tangents
+    curvature = rotation @ np.moveaxis(patch.curvature(), -1, 0) @ np.swapaxes(rotation, 1, 2)
     _, cos = find_normals(points, OFFSETS_M, optics.tx.at_m, optics.h.at_m)
     seen_from = {
         "h": OFFSETS_M,

@@ -60,10 +60,10 @@ def test_known_paths_of_a_window_are_measured_apart():
     paths = (echoes.at_m, echoes.path_m, echoes.slope, echoes.bend)
     together, inside = measure_echoes(scan, *paths, window=window)
     alone, _ = measure_echoes(scan, *paths)
-    weak = owner == 1
+    is_weak = owner == 1
     assert inside.all()
-    assert np.abs(together.amplitude[weak]) == pytest.approx(0.2, rel=0.05)
-    assert np.abs(np.abs(alone.amplitude[weak]) / 0.2 - 1).max() > 0.1
+    assert np.abs(together.amplitude[is_weak]) == pytest.approx(0.2, rel=0.05)
+    assert np.abs(np.abs(alone.amplitude[is_weak]) / 0.2 - 1).max() > 0.1
 
 
 def test_half_a_wave_is_one_echo():

@@ -352,8 +352,11 @@ def test_a_radius_is_reported_where_curvatures_and_normals_disagree(metal, optic
     sound = describe_segment(0, shape)
     assert sound.radius_mm == pytest.approx(125, rel=0.02)
     assert sound.radius_std_mm < 0.05 * sound.radius_mm
-    wrong = describe_segment(0, replace(shape, curvature=shape.curvature / 1.5))
-    assert abs(1 / wrong.radius_mm - 1 / 125) < 1.96 * wrong.radius_std_mm / wrong.radius_mm**2
+    flatter_segment = describe_segment(0, replace(shape, curvature=shape.curvature / 1.5))
+    assert (
+        abs(1 / flatter_segment.radius_mm - 1 / 125)
+        < 1.96 * flatter_segment.radius_std_mm / flatter_segment.radius_mm**2
+    )
     flat = describe_segment(0, replace(shape, curvature=0 * shape.curvature))
     assert flat.radius_mm is None
     assert flat.radius_std_mm is None

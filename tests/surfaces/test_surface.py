@@ -127,8 +127,10 @@ def test_scans_of_a_turntable_are_joined_where_the_object_stood(glass_ball):
     # A positive angle turns +z towards +x.
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     about = np.array([axis[0], 0.0, axis[1]])
-    turned = replace(surface, points_m=(surface.points_m - about) @ turn.T + about, normals=surface.normals @ turn.T)
-    joined = join_turned([surface, turned], [0.0, 40.0], axis)
+    rotated_surface = replace(
+        surface, points_m=(surface.points_m - about) @ turn.T + about, normals=surface.normals @ turn.T
+    )
+    joined = join_turned([surface, rotated_surface], [0.0, 40.0], axis)
     count = len(surface.points_m)
     assert np.allclose(joined.points_m[count:], surface.points_m, atol=1e-9)
     assert np.allclose(joined.normals[count:], surface.normals, atol=1e-9)

@@ -135,21 +135,21 @@ def test_a_chirp_of_noise_is_left_out(burst, noise, bad):
     assert (f - f.mean(axis=1, keepdims=True)).std() * 2.15e6 < 60  # Hz; a hundredth of an IF bin
 
 
-@pytest.mark.parametrize("how", ["saturated", "silent", "another signal"])
-@pytest.mark.parametrize("bad", [0, 9])
-def test_one_spoiled_chirp_of_16_changes_nothing(burst, how, bad):
+@pytest.mark.parametrize("content", ["saturated", "silent", "another signal"])
+@pytest.mark.parametrize("bad_chirp", [0, 9])
+def test_one_spoiled_chirp_of_16_changes_nothing(burst, content, bad_chirp):
     """The average is that of the 15 others for any content of the bad chirp."""
     frames, df, _, _ = burst(6, 15)
     spoiled = frames.copy()
-    if how == "saturated":
-        spoiled[:, bad] = np.clip(60 * spoiled[:, bad].astype(np.int32), -32768, 32767)
-    elif how == "silent":
-        spoiled[:, bad] = 0
+    if content == "saturated":
+        spoiled[:, bad_chirp] = np.clip(60 * spoiled[:, bad_chirp].astype(np.int32), -32768, 32767)
+    elif content == "silent":
+        spoiled[:, bad_chirp] = 0
     else:
         n = np.arange(frames.shape[2])
-        spoiled[:, bad] = np.rint(3000 * np.cos(2 * np.pi * (0.0004 * n + 0.3) * n))[:, None, None]
+        spoiled[:, bad_chirp] = np.rint(3000 * np.cos(2 * np.pi * (0.0004 * n + 0.3) * n))[:, None, None]
     without = np.ones(df.shape, bool)
-    without[:, bad] = False
+    without[:, bad_chirp] = False
     aligned = align_row(spoiled, np.ones(df.shape, bool), LINEAR)
     expected = align_row(frames, without, LINEAR)
     np.testing.assert_array_equal(aligned.good, without)

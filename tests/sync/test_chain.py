@@ -135,16 +135,16 @@ def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, 
     turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
     frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
     frames = (frames + 800 * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
-    some = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=64))
+    few_examined = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=64))
     all_positions = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=300))
-    assert {name: values.shape[1] for name, values in some.errors.items() if name != "referenced"} == {
+    assert {name: values.shape[1] for name, values in few_examined.errors.items() if name != "referenced"} == {
         "received": 64 * PULSES,
         "aligned": 64 * PULSES,
         "averaged": 64,
     }
     assert all_positions.errors["averaged"].shape[1] == 300
     for stage, spread in all_positions.stages.items():
-        np.testing.assert_allclose(some.stages[stage], spread, rtol=0.35)
+        np.testing.assert_allclose(few_examined.stages[stage], spread, rtol=0.35)
 
 
 def test_clipped_and_missing_chirps_are_left_out(row, setup):

@@ -323,16 +323,16 @@ def test_noise_alone_and_lost_positions_are_not_found(rig, paths, noise, direct_
     assert not referenced.samples[:, [5, 9, 20]].any()
 
 
-@pytest.mark.parametrize(("relative", "found"), [(0.35, True), (0.25, False)])
+@pytest.mark.parametrize(("relative", "is_found"), [(0.35, True), (0.25, False)])
 def test_a_direct_path_below_three_tenths_of_the_rows_is_lost(
-    rig, paths, direct_paths, align_single, board, relative, found
+    rig, paths, direct_paths, align_single, board, relative, is_found
 ):
     signal, _ = paths(board, 40, 0.0, np.random.default_rng(2))
     signal[9] *= relative
     signal *= np.exp(2j * np.pi * 0.2 * np.arange(256))
     referenced = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
-    assert referenced.found[9] == found
-    assert referenced.found.sum() == 39 + found
+    assert referenced.found[9] == is_found
+    assert referenced.found.sum() == 39 + is_found
 
 
 def test_a_row_of_noise_has_no_direct_path(rig, noise, direct_paths, align_single, board):

@@ -355,14 +355,14 @@ def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():
 
 
 @pytest.mark.parametrize(
-    ("part", "whole", "digits", "shown"),
+    ("part", "whole", "digits", "text"),
     [
         (1, 1, 0, "100 %"), (2, 1, 0, "100 %"), (0, 0, 1, "100 %"), (0, 7, 1, "0.0 %"), (1, 3, 2, "33.33 %"),
         (99_999, 100_000, 0, "99 %"), (99_999, 100_000, 1, "99.9 %"), (99_999, 100_000, 2, "99.99 %"),
     ],
 )  # fmt: skip
-def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, shown):
-    assert percent(part, whole, digits) == shown
+def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, text):
+    assert percent(part, whole, digits) == text
 
 
 def test_ripple_inside_given_boxes_names_the_edges_before_the_direct_path():

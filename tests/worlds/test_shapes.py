@@ -50,13 +50,13 @@ def compute_geometrical_optics(
     basis = patch.tangents()[..., 0]
     bends = np.linalg.eigvalsh(basis @ path.hessian[..., 0] @ basis.T)
     spread = cosine / (out_m * back_m * np.sqrt(np.abs(np.prod(bends))))
-    turned = 1 if np.all(bends > 0) else 1j
+    phase_factor = 1 if np.all(bends > 0) else 1j
     r_s, r_p = reflect(shape.stack, frequency_hz, cosine)
     sent = tx.field(incident[:, None])[:, 0]
     received = rx.field(-scattered[:, None])[:, 0]
     s_part = r_s * (sent @ s_axis) * (received @ s_axis)
     p_part = r_p * (sent @ np.cross(s_axis, incident)) * (received @ np.cross(scattered, s_axis))
-    wave = (s_part + p_part) * spread * turned
+    wave = (s_part + p_part) * spread * phase_factor
     direct_m = np.linalg.norm(rx.position - tx.position)
     phase = 2 * np.pi * frequency_hz / LIGHT_M_PER_S * (path.length_m[0] - direct_m)
     return complex(np.conj(wave) * np.exp(1j * phase))
@@ -101,19 +101,19 @@ def test_a_whole_scan_is_that_of_its_single_positions(shape):
     x = 0.002 * np.arange(-30, 30)
     offsets = np.stack([*np.meshgrid(x, x), np.zeros((60, 60))], axis=-1)
     full_scan = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets)
-    some = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets[::20, ::20])
+    part_of_scan = worlds.record_shapes([shape], ONE_RX, FREQUENCIES_HZ[:2], offsets[::20, ::20])
     for channel in full_scan:
-        difference = np.abs(full_scan[channel][..., ::20, ::20] - some[channel]).max()
-        assert difference < 5e-3 * np.abs(some[channel]).max()
+        difference = np.abs(full_scan[channel][..., ::20, ::20] - part_of_scan[channel]).max()
+        assert difference < 5e-3 * np.abs(part_of_scan[channel]).max()
 
 
 def test_a_large_flat_plate_is_the_same_in_facets_and_in_zones():
     # The mean over Fresnel zones of the edges: plates of growing size swing around the one without edges.
     widths_m = np.linspace(0.5, 0.56, 9)
     sharp = [worlds.plate("sharp", DIELECTRIC, make_point_behind(0.0), (w, w), tilt_deg=(4.0, -2.0)) for w in widths_m]
-    few = OFFSETS_M[:2]
-    first = [worlds.record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], few)["h"] for piece in sharp]
-    second = worlds.record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], few)["h"]
+    offsets_m = OFFSETS_M[:2]
+    first = [worlds.record_shapes([piece], ONE_RX, FREQUENCIES_HZ[:1], offsets_m)["h"] for piece in sharp]
+    second = worlds.record_shapes([SHAPES[4]], ONE_RX, FREQUENCIES_HZ[:1], offsets_m)["h"]
     assert np.mean(first, axis=0) == pytest.approx(second, rel=0.03)
 
 

@@ -150,9 +150,9 @@ def _draw_action(rng: random.Random, sequence: int) -> tuple[str, object]:
                 ("ROW", (x, rng.choice([-250, 250]), rng.randint(1, 20), y, rng.randint(500, 5_000))),
             ]
         )
-        return "rx", Command(sequence, verb, args).encode()
+        return "send", Command(sequence, verb, args).encode()
     if kind == "byte":
-        return "rx", bytes([rng.choice(list(Immediate))])
+        return "send", bytes([rng.choice(list(Immediate))])
     if kind == "run":
         return "run", rng.randint(1, 3_000_000)
     if kind == "rest":
@@ -169,7 +169,7 @@ def test_same_words_and_same_wires(both, seed: int):
     firmware, python = drivers = both()
     rng = random.Random(seed)
     greetings = [
-        ("rx", Command(n, v, a).encode()) for n, v, a in ((0, "HELLO", ()), (1, "ENABLE", (1,)), (2, "HOME", ()))
+        ("send", Command(n, v, a).encode()) for n, v, a in ((0, "HELLO", ()), (1, "ENABLE", (1,)), (2, "HOME", ()))
     ]
     script = [*greetings, ("run_until_rest", 40_000_000)]
     sequence = 2

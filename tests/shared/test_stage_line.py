@@ -76,3 +76,72 @@ def test_crc_is_xmodem():
 def test_out_of_range_is_refused(bad: Command):
     with pytest.raises(ProtocolError):
         bad.encode()
+
+
+def test_a_line_has_at_most_96_bytes():
+    """A star, four digits of the checksum and the end of the line are six of them."""
+    longest = "x" * (96 - 6)
+    assert unseal(seal(longest)) == longest
+    with pytest.raises(ProtocolError, match="longer"):
+        seal(longest + "x")
+    raw = (longest + "x").encode()
+    with pytest.raises(ProtocolError, match="longer"):
+        unseal(raw + b"*%04X\n" % crc16(raw))
+
+
+@pytest.mark.parametrize(
+    ("code", "is_taken"), [(0x1F, False), (0x20, True), (0x7E, True), (0x7F, False), (0x80, False)]
+)
+def test_a_line_is_printable_ascii(code, is_taken):
+    raw = b"ab" + bytes([code])
+    line = raw + b"*%04X\n" % crc16(raw)
+    if is_taken:
+        assert unseal(line) == raw.decode()
+        return
+    with pytest.raises(ProtocolError):
+        unseal(line)
+
+
+def test_a_line_may_be_empty_and_is_not_shorter():
+    assert unseal(seal("")) == ""
+    with pytest.raises(ProtocolError, match="not a stage line"):
+        unseal(seal("")[1:])
+
+
+@pytest.mark.parametrize(
+    ("body", "is_taken"),
+    [
+        ("N65535 SET 2147483647 -2147483648", True), ("N65536 SET 0", False), ("N0 SET 2147483648", False),
+        ("N0 SET -2147483649", False), ("N0 HELLO", True),
+    ],
+)  # fmt: skip
+def test_a_command_has_16_bits_of_sequence_and_32_of_each_argument(body, is_taken):
+    if not is_taken:
+        with pytest.raises(ProtocolError):
+            Command.decode(seal(body))
+        return
+    command = Command.decode(seal(body))
+    assert command.encode() == seal(body)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "ok", "ok 5", "ok N", "ok N123456", "ok:1 N5", "error N5", "error:1234 N5", "error: N5", "alarm", "alarm:x",
+        "done x=1", "status x", "status x=1 x=2", "other N5",
+    ],
+)  # fmt: skip
+def test_a_reply_has_its_number_sequence_and_fields(body):
+    with pytest.raises(ProtocolError):
+        Reply.decode(seal(body))
+
+
+def test_replies_are_read_with_their_numbers():
+    assert Reply.decode(seal("error:123 N-")) == Reply("error", None, 123)
+    assert Reply.decode(seal("error:1 N12345")) == Reply("error", 12345, 1)
+    assert Reply.decode(seal("alarm:7")) == Reply("alarm", number=7)
+    reply = Reply.decode(seal("done N5 x=-12 y=0 held=yes"))
+    assert (reply.integer("x"), reply.integer("y")) == (-12, 0)
+    for key in ("held", "missing"):
+        with pytest.raises(ProtocolError, match=key):
+            reply.integer(key)

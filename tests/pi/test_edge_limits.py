@@ -1,0 +1,134 @@
+"""The check of trigger edges at its tolerances, on a row whose motion is computed by hand."""
+
+from itertools import pairwise
+
+import pytest
+
+from polysight_pi.edges import EdgeTimes, RowMotion, slowest_feed
+
+# Four points 400 steps apart at 4,000 steps/s: 100 ms each.
+MOTION = RowMotion(x_start=10_000, step=400, points=4, y=500, feed=4000, accel=40_000, backlash=0)
+MS = 1_000_000
+BEGIN_NS = 5_000 * MS
+
+
+def note_edges(*intervals_ms: float, motion: RowMotion = MOTION) -> tuple[EdgeTimes, list[str]]:
+    """Edges with these times between them; return the check and what it says of each."""
+    check = EdgeTimes(motion)
+    edge_ns = BEGIN_NS
+    problems = [check.note_edge(edge_ns)]
+    for interval_ms in intervals_ms:
+        edge_ns += round(interval_ms * MS)
+        problems.append(check.note_edge(edge_ns))
+    return check, problems
+
+
+def test_lengths_of_a_row_are_its_ramp_and_its_points():
+    """4000^2 / (2 x 40000) = 200 steps of ramp, and a step of the row at full speed."""
+    assert (MOTION.ramp, MOTION.run_up, MOTION.length) == (200, 600, 3 * 400 + 2 * 600)
+    assert MOTION.end == (10_000 + 3 * 400 + 600, 500)
+    assert MOTION.distance(10_000) == 600
+    assert MOTION.distance(10_050) == 650
+    back = MOTION._replace(step=-400)
+    assert (back.direction, back.length, back.end) == (-1, MOTION.length, (10_000 - 3 * 400 - 600, 500))
+    assert back.distance(9_950) == 650
+    assert MOTION._replace(backlash=1000).run_up == 1200
+    assert MOTION._replace(feed=4001).ramp == 201
+
+
+@pytest.mark.parametrize(("accel", "feed"), [(40_000, 141), (200, 31), (1921, 31), (2048, 32)])
+def test_a_speed_with_which_the_stage_may_start_needs_no_ramp(accel, feed):
+    """The first step takes sqrt(2 / accel) seconds, and at most 1 / 31."""
+    assert slowest_feed(accel) == feed
+    assert MOTION._replace(accel=accel, feed=feed).ramp == 0
+    assert MOTION._replace(accel=accel, feed=feed + 1).ramp > 0
+
+
+def test_points_of_a_row_pass_at_its_speed_between_two_ramps():
+    points_s, end_s = MOTION.time_points([])
+    assert [later_s - earlier_s for earlier_s, later_s in pairwise(points_s)] == pytest.approx([0.1] * 3)
+    # From rest to the first point as from the last one to rest: v / a of ramp, and 400 steps at full speed
+    assert points_s[0] == pytest.approx(0.1 + 0.1, rel=0.05)
+    assert end_s - points_s[-1] == pytest.approx(points_s[0], rel=0.02)
+    # A stop between the second and third point costs two ramps: each takes v / a, half of it lost.
+    stopped_s, stopped_end_s = MOTION.time_points([600 + 600])
+    assert stopped_s[:2] == pytest.approx(points_s[:2], rel=0.03)
+    assert stopped_end_s - end_s == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("interval_ms", "problem"),
+    [
+        (100.0, ""), (100.9, ""), (99.1, ""), (101.1, "a late edge, or lost ones"), (98.9, "a spurious or early edge"),
+        (200.0, "1 edges lost"), (201.9, "1 edges lost"), (198.1, "1 edges lost"), (202.1, "a late edge, or lost ones"),
+        (300.0, "2 edges lost"), (302.9, "2 edges lost"), (303.1, "a late edge, or lost ones"),
+        (250.0, "a late edge, or lost ones"), (50.0, "a spurious or early edge"),
+    ],
+)  # fmt: skip
+def test_an_interval_is_that_of_the_speed_within_one_percent(interval_ms, problem):
+    _, (first, second) = note_edges(interval_ms)
+    assert first == ""
+    assert second.startswith(problem)
+    assert (second == "") == (problem == "")
+    if problem:
+        assert f"at point 1: {interval_ms:.2f} ms after the one before, not 100.00 ms" in second
+
+
+def test_after_a_hold_is_commanded_only_shorter_intervals_are_wrong_before_the_end():
+    check, _ = note_edges(100.0)
+    check.note_hold()
+    assert check.note_edge(BEGIN_NS + 900 * MS) == ""
+    assert "spurious" in check.note_edge(BEGIN_NS + 950 * MS)
+
+
+@pytest.mark.parametrize(
+    ("asked_ms", "points", "is_spurious"),
+    [(0, 1, False), (0, 0, True), (-1, 0, False), (100, 2, False), (100, 1, True)],
+)
+def test_no_more_edges_than_points_come_before_a_status_is_asked_for(asked_ms, points, is_spurious):
+    check, _ = note_edges(100.0, 100.0)
+    problem = check.note_status(points, BEGIN_NS + asked_ms * MS, BEGIN_NS + 10_000 * MS)
+    assert ("spurious" in problem) == is_spurious
+
+
+@pytest.mark.parametrize(("written_ms", "is_late"), [(100, False), (81, False), (79, True)])
+def test_an_edge_comes_by_the_status_that_counts_its_point(written_ms, is_late):
+    """A fifth of an interval later at most."""
+    check, _ = note_edges(100.0, 100.0, 100.0)
+    check.note_status(2, BEGIN_NS - 1, BEGIN_NS + written_ms * MS)
+    problem = check.judge(was_held=False, done_ns=BEGIN_NS + 1000 * MS)
+    assert ("1 edges had come" in problem) == is_late
+    assert (problem == "") != is_late
+
+
+def test_the_stage_runs_on_after_the_last_point():
+    points_s, end_s = MOTION.time_points([])
+    run_out_ms = 1e3 * (end_s - points_s[-1])
+    for share, is_wrong in ((1.0, False), (0.991, False), (0.989, True), (5.0, False)):
+        check, _ = note_edges(100.0, 100.0, 100.0)
+        problem = check.judge(was_held=False, done_ns=BEGIN_NS + round((300 + share * run_out_ms) * MS))
+        assert ("a spurious or late edge" in problem) == is_wrong
+
+
+@pytest.mark.parametrize(
+    ("x", "points", "waits"),
+    [
+        # Between the second and the third point, at the third one, and outside the row
+        (10_600, 2, {2}), (10_400, 2, {2}), (10_800, 2, {3}), (20_000, 2, set()), (10_000 - 600, 2, set()),
+        (10_000 + 3 * 400 + 600, 4, set()),
+    ],
+)  # fmt: skip
+def test_a_hold_lengthens_the_interval_in_which_the_stage_rests(x, points, waits):
+    for waiting_point in (1, 2, 3):
+        check, _ = note_edges()
+        check.note_hold()
+        check.note_stop(x, points)
+        stops = [MOTION.distance(x)] if waits else []
+        points_s, end_s = MOTION.time_points(stops)
+        rest_s = [0.0, 0.0, 0.0, 0.0]
+        for point in range(waiting_point, 4):
+            rest_s[point] = 7.0
+        for point in (1, 2, 3):
+            check.note_edge(BEGIN_NS + round((points_s[point] - points_s[0] + rest_s[point]) * 1e9))
+        done_ns = BEGIN_NS + round((end_s - points_s[0] + 7.0) * 1e9)
+        assert (check.judge(was_held=True, done_ns=done_ns) == "") == (waiting_point in waits)

@@ -1,0 +1,180 @@
+"""Levels, direct paths and skew at the limits of their checks, on signals that are given."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.support.rigs import make_programmed_rig
+
+from polysight.calibration import DirectSignal, band_hz, unwrap_if
+from polysight.doctor.signal_checks import check_level, judge_direct_path, judge_skew
+
+RIG = make_programmed_rig()
+SLOPE = RIG.chirp.slope_hz_per_s
+# Middle of the samples 0 to 191, seconds after the first one
+MIDDLE_S = 95.5 / RIG.chirp.sample_rate_hz
+EXPECTED_HZ = 900e3
+
+
+def make_signal(
+    delay_ns: float = 0.0, ppm: float = 0.0, jitter_ns: float = 0.0, found: int = 40, chirps: int = 40, **changes: Any
+) -> DirectSignal:
+    """A direct path of a board that starts this much later, with a faster crystal, and jitter up and down."""
+    offset_hz = ppm * 1e-6 * (RIG.chirp.first_sample_hz + 2 * SLOPE * MIDDLE_S)
+    signs = np.where(np.arange(found) % 2, 1.0, -1.0)
+    fields: dict[str, Any] = {
+        "if_hz": EXPECTED_HZ + offset_hz - SLOPE * 1e-9 * (delay_ns + jitter_ns * signs),
+        "power": np.full(found, 100.0), "noise_power": np.full(found, 1.0), "expected_hz": EXPECTED_HZ,
+        "drift_hz_per_s": 2e-6 * ppm * SLOPE, "chirps": chirps,
+    }  # fmt: skip
+    return DirectSignal(**(fields | changes))
+
+
+@pytest.mark.parametrize(("found", "chirps", "is_found"), [(5, 10, False), (6, 10, True), (1, 1, True), (0, 0, False)])
+def test_a_direct_path_is_found_in_more_than_half_of_the_chirps(found, chirps, is_found):
+    assert make_signal(found=found, chirps=chirps).found is is_found
+
+
+@pytest.mark.parametrize("ppm", [0.0, 12.0, -7.5])
+@pytest.mark.parametrize("delay_ns", [0.0, 3.0, -8.0])
+def test_delay_and_crystal_are_separated(ppm, delay_ns):
+    signal = make_signal(delay_ns, ppm, jitter_ns=2.0)
+    assert signal.crystal_ppm(RIG) == pytest.approx(ppm)
+    mean_s, error_s = signal.start_delay_s(RIG)
+    assert mean_s * 1e9 == pytest.approx(delay_ns, abs=1e-3)
+    assert error_s * 1e9 == pytest.approx(2.0 / np.sqrt(39), rel=1e-3)
+    assert make_signal(found=1, chirps=1).start_delay_s(RIG)[1] == np.inf
+
+
+@pytest.mark.parametrize("rates", [0, 1, -1, 2])
+def test_a_path_beyond_the_band_is_brought_back_by_whole_sample_rates(rates):
+    signal = make_signal(3.0)
+    beyond_hz = EXPECTED_HZ + rates * RIG.chirp.sample_rate_hz
+    aliased = make_signal(3.0, expected_hz=beyond_hz)
+    assert np.array_equal(aliased.if_hz, signal.if_hz)
+    assert aliased.start_delay_s(RIG)[0] * 1e9 == pytest.approx(3.0, abs=1e-3)
+
+
+def test_the_band_is_nine_tenths_of_the_sample_rate():
+    assert band_hz(RIG) == (0.0, pytest.approx(0.9 * RIG.chirp.sample_rate_hz))
+    symmetric = make_programmed_rig(chirp={"if_mode": "complex2x"})
+    assert band_hz(symmetric) == pytest.approx((-0.45 * 2.15e6, 0.45 * 2.15e6))
+
+
+def test_frequencies_on_both_sides_of_the_rate_lie_together():
+    rate = RIG.chirp.sample_rate_hz
+    given = np.array([0.98, 0.99, 0.01, 0.02, 0.97]) * rate
+    near = unwrap_if(given, RIG)
+    assert np.ptp(near) == pytest.approx(0.05 * rate)
+    np.testing.assert_allclose((near - given) / rate, np.round((near - given) / rate), atol=1e-9)
+    inside = np.array([0.4, 0.5, 0.6]) * rate
+    np.testing.assert_allclose(unwrap_if(inside, RIG), inside)
+
+
+@pytest.mark.parametrize(
+    ("delay_ns", "level"), [(9.9, "ok"), (-9.9, "ok"), (10.1, "warning"), (-10.1, "warning"), (0.0, "ok")]
+)
+def test_a_board_starts_within_10_ns_of_the_transmitter(delay_ns, level):
+    board = RIG.by_role("receive_h")
+    finding = judge_direct_path(RIG, board, make_signal(delay_ns))
+    assert finding.level == level
+    if level == "warning":
+        assert f"{-delay_ns:+.1f} ns away" in finding.what
+        # The start offset that the board would have then
+        offset_hz = board.start_offset_hz - delay_ns * 1e-9 * SLOPE
+        assert f"start_offset_hz = {offset_hz:.0f} for {board.name}" in finding.do
+
+
+@pytest.mark.parametrize(
+    ("expected_hz", "found", "words"),
+    [
+        # 194 kHz of jitter at either end of 0 to 1935 kHz, and nine tenths of the chirps
+        (195e3, 40, ""), (193e3, 40, "too near the edge"), (1740e3, 40, ""), (1742e3, 40, "too near the edge"),
+        (900e3, 36, ""), (900e3, 35, "too near the edge"), (900e3, 20, "no direct path in 20 of 40"),
+        (1936e3, 40, "outside 0..1935 kHz"), (-1e3, 40, "outside 0..1935 kHz"), (-1e3, 5, "no direct path in 35 of 40"),
+    ],
+)  # fmt: skip
+def test_a_direct_path_has_room_for_jitter_in_the_band(expected_hz, found, words):
+    board = RIG.by_role("receive_h")
+    signal = make_signal(expected_hz=expected_hz, if_hz=np.full(found, expected_hz) % RIG.chirp.sample_rate_hz)
+    finding = judge_direct_path(RIG, board, signal)
+    assert finding.level == ("error" if words else "ok")
+    assert words in finding.what
+    if "edge" in words or "outside" in words:
+        # Into the middle of the band
+        assert f"start_offset_hz = {board.start_offset_hz + 967.5e3 - expected_hz:.0f}" in finding.do
+
+
+@pytest.mark.parametrize(
+    ("skew_ns", "level"),
+    [(9.9, "ok"), (10.1, "warning"), (-10.1, "warning"), (19.9, "warning"), (20.1, "error"), (-20.1, "error")],
+)
+def test_receivers_start_together(skew_ns, level):
+    finding = judge_skew(RIG, {"RH": make_signal(-30.0), "RV": make_signal(skew_ns - 30.0)})
+    assert finding.level == level
+    assert f"RV starts {skew_ns:+.2f} +- 0.00 ns after RH" in finding.what
+    assert finding.facts["later_ns"]["RH"] == pytest.approx(-30.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(("jitter_ns", "level"), [(3.9, "ok"), (4.1, "warning")])
+def test_starts_scatter_by_less_than_two_clocks(jitter_ns, level):
+    for signals in ((jitter_ns, 0.0), (0.0, jitter_ns)):
+        finding = judge_skew(
+            RIG, {name: make_signal(jitter_ns=j) for name, j in zip(("RH", "RV"), signals, strict=True)}
+        )
+        assert finding.level == level
+        assert finding.facts["standard_error_ns"] == pytest.approx(jitter_ns / 39**0.5, rel=1e-3)
+
+
+def judge_words(words: np.ndarray) -> Any:
+    """Judge words int16 [chirp, sample, I or Q, RX], the last chirp of which is not complete."""
+    valid = np.ones(len(words), bool)
+    valid[-1] = False
+    context: Any = SimpleNamespace(captured={"RH": SimpleNamespace(words=words, valid=valid)})
+    return check_level(context, RIG.by_role("receive_h"))
+
+
+def make_words(level: int = 100) -> np.ndarray:
+    return np.full((201, 16, 2, 4), level, np.int16)
+
+
+@pytest.mark.parametrize("full", [32767, -32767, -32768])
+@pytest.mark.parametrize(("clipped", "level"), [(0, "ok"), (1, "warning"), (2, "warning"), (3, "error")])
+def test_one_percent_of_clipped_chirps_is_a_warning(full, clipped, level):
+    words = make_words()
+    for chirp in range(clipped):
+        words[chirp, 3, chirp % 2, 1] = full
+    # What is not complete does not count, and almost full is not full.
+    words[-1] = full
+    words[10, 0, 0, 0] = 32766
+    finding = judge_words(words)
+    assert finding.level == level
+    assert finding.facts["clipped_chirps"] == clipped
+    assert finding.facts["chirps"] == 200
+
+
+@pytest.mark.parametrize(
+    ("levels", "silent"),
+    [
+        ((100, 100, 100, 100), ""), ((100, 8, 100, 100), ""), ((100, 100, 6, 100), "RX3"),
+        ((0, 100, 0, 100), "RX1, RX3"),
+        # Noise of 4 counts, I and Q together
+        ((3, 3, 3, 3), ""), ((2, 2, 2, 2), "RX1, RX2, RX3, RX4"),
+    ],
+)  # fmt: skip
+def test_a_receiver_has_a_signal_of_its_own_and_not_much_less_than_the_others(levels, silent):
+    words = make_words()
+    words[:] = np.array(levels, np.int16)
+    finding = judge_words(words)
+    assert finding.level == ("error" if silent else "ok")
+    if silent:
+        assert f"no signal in {silent}:" in finding.what
+    assert finding.facts["rms"] == [round(level * 2**0.5, 1) for level in levels]
+    assert finding.facts["peak"] == max(levels)
+
+
+def test_without_a_complete_chirp_nothing_is_judged():
+    assert judge_words(make_words()[:1]).level == "note"
+    context: Any = SimpleNamespace(captured={})
+    assert check_level(context, RIG.by_role("receive_h")).level == "note"

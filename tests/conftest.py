@@ -70,6 +70,10 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--long"):
+        # Ten thousand draws beside other programs take longer than any limit that finds a hang.
+        for item in items:
+            item.add_marker(pytest.mark.timeout(0))
     if hasattr(config, "workerinput"):  # with one worker: in the order of collection
         sort_longest_first(items)
 

@@ -1,0 +1,129 @@
+"""When a stage counts as silent, and when the counts of a row agree, at each limit."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from polysight_pi.motions import RunningRow, estimate_row_duration_s
+from polysight_pi.stage import StatusWatch
+from polysight_pi.trigger import Counts
+from polysight_shared.faults import PiFault
+from polysight_shared.raster import Row, Stage
+
+ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=-2.0, points=50)
+HEARTBEAT_S = 0.5
+
+
+def make_watch(interval_s: float = 0.125) -> StatusWatch:
+    watch = StatusWatch(HEARTBEAT_S, 100.0)
+    watch.ask_every(interval_s, 100.0)
+    return watch
+
+
+def look(watch: StatusWatch, begin_s: float, end_s: float) -> float:
+    """Look every 50 ms as the reader does; return what the watch says at the end."""
+    silent_s = 0.0
+    steps = round((end_s - begin_s) / 0.05)
+    for step in range(steps + 1):
+        silent_s = watch.silent_s(begin_s + step * 0.05)
+    return silent_s
+
+
+def test_a_request_is_due_once_an_interval():
+    watch = make_watch()
+    assert [watch.is_due(100 + at_s) for at_s in (0.124, 0.125, 0.126, 0.249, 0.25)] == [
+        False,
+        True,
+        False,
+        False,
+        True,
+    ]
+    watch.ask_every(0.0, 101.0)
+    assert not watch.is_due(200.0)
+    assert not watch.is_at_rest
+
+
+@pytest.mark.parametrize(("heartbeat_s", "look_s"), [(0.5, 0.05), (0.1, 0.0125), (10.0, 0.05)])
+def test_a_watch_is_looked_at_twice_for_each_request(heartbeat_s, look_s):
+    assert StatusWatch(heartbeat_s, 0.0).look_s == pytest.approx(look_s)
+
+
+@pytest.mark.parametrize(("interval_s", "timeout_s"), [(0.125, 0.25), (1.0, 3.0)])
+def test_a_stage_is_silent_when_its_oldest_request_is_not_answered(interval_s, timeout_s):
+    watch = make_watch(interval_s)
+    assert watch.is_at_rest == (interval_s == 1.0)
+    # Nothing was asked: no silence.
+    assert look(watch, 100.0, 120.0) == 0.0
+    assert watch.is_due(120.0)
+    assert look(watch, 120.05, 120 + timeout_s) == 0.0
+    # A later request does not begin the time again.
+    assert watch.is_due(120 + timeout_s)
+    assert look(watch, 120.05 + timeout_s, 120.1 + timeout_s) == pytest.approx(timeout_s + 0.1)
+    watch.note_answer()
+    assert watch.silent_s(120.15 + timeout_s) == 0.0
+
+
+def test_time_in_which_the_reader_itself_was_late_does_not_count():
+    watch = make_watch()
+    look(watch, 100.0, 100.1)
+    assert watch.is_due(100.125)
+    assert watch.silent_s(100.125) == 0.0
+    # It slept for ten seconds; twice its interval of 50 ms is usual.
+    assert watch.silent_s(110.125) == 0.0
+    # Half of a heartbeat
+    timeout_s = 0.25
+    assert look(watch, 110.175, 110.025 + timeout_s) == 0.0
+    assert look(watch, 110.075 + timeout_s, 110.125 + timeout_s) == pytest.approx(timeout_s + 0.1)
+
+
+def test_another_interval_begins_the_time_again():
+    watch = make_watch()
+    assert watch.is_due(100.2)
+    watch.ask_every(0.1, 200.0)
+    assert look(watch, 200.0, 200.5) == 0.0
+
+
+def make_row(**changes: Any) -> RunningRow:
+    """A row of 50 points with 16 pulses each, all of which came."""
+    fields: dict[str, Any] = {
+        "sequence": 1, "row": ROW, "take": 1, "job": SimpleNamespace(spec=SimpleNamespace(pulses=16)),
+        "motion": None, "edges": SimpleNamespace(judge=lambda *_: ""), "points": 50, "triggers": 50,
+    }  # fmt: skip
+    return RunningRow(**(fields | changes))
+
+
+WHOLE = Counts(50, 50, 800)
+
+
+@pytest.mark.parametrize(
+    ("changes", "counts", "status", "fault"),
+    [
+        ({}, WHOLE, "done", 0), ({"was_held": True}, WHOLE, "done", 0),
+        ({"points": 49}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
+        ({"points": 51}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
+        ({"triggers": 49}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
+        ({"points": 51, "triggers": 51}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
+        ({}, Counts(49, 50, 800), "fault", PiFault.POINTS_MISMATCH),
+        ({}, Counts(50, 51, 800), "fault", PiFault.POINTS_MISMATCH),
+        ({}, Counts(50, 50, 799), "fault", PiFault.POINTS_MISMATCH),
+        ({}, Counts(50, 50, 801), "fault", PiFault.POINTS_MISMATCH),
+        ({"edges": SimpleNamespace(judge=lambda *_: "late")}, WHOLE, "fault", PiFault.EDGE_TIME),
+    ],
+)  # fmt: skip
+def test_a_row_is_done_when_all_counts_are_those_requested(changes, counts, status, fault):
+    row = make_row(**changes)
+    row.judge(counts)
+    assert (row.status, row.fault) == (status, int(fault))
+    assert ("held" in row.reason) == ("was_held" in changes)
+    if fault == PiFault.POINTS_MISMATCH:
+        assert f"50 points requested, {row.points} passed by the stage with {row.triggers} trigger pulses" in row.reason
+        assert f"{counts.pulses} of 800 pulses sent" in row.reason
+    # A result is decided once.
+    assert not row.set_result("aborted")
+    assert row.status == status
+
+
+def test_a_row_is_expected_to_last_as_long_as_its_travel_points_and_ramps():
+    stage = Stage("x", travel_x_mm=800.0, travel_y_mm=500.0, travel_speed_mm_s=40.0, accel_mm_s2=200.0)
+    assert estimate_row_duration_s(ROW, stage, 20.0) == pytest.approx(1300 / 40 + 50 * 2 / 20 + 4 * 20 / 200)

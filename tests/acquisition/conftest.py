@@ -5,14 +5,14 @@ import tomli_w
 import zmq
 from tests.support.acquisition.fake_cards import make_payload
 from tests.support.acquisition.fake_rig import FakeRig, make_small_instrument
-from tests.support.page.fixtures import finished, samples
+from tests.support.page.fixtures import finished_scan, samples
 
 from polysight.acquisition import capture_rig, scan
 from polysight.acquisition.pi_client import PiClient
 from polysight.capture import CardClient, ReceiverProcess
 from polysight_shared.tables import to_builtins
 
-__all__ = ["finished", "samples"]
+__all__ = ["finished_scan", "samples"]
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 GRIDS = [(3, 3), (91, 1), (7, 4)]
 
 
-def adversarial_rig(number: int) -> FakeRig:
+def make_adversarial_rig(number: int) -> FakeRig:
     points, pulses = GRIDS[number % len(GRIDS)]
     rig = FakeRig(make_small_instrument(columns=points, pulses=pulses, row_retakes=4))
     for board in rig.instrument.recorded:
@@ -93,7 +93,7 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
 
 def test_committed_bytes_are_right_or_masked(request, tmp_path):
     for number in range(100 if request.config.getoption("--long") else 3):
-        rig = adversarial_rig(number)
+        rig = make_adversarial_rig(number)
         folder = tmp_path / str(number)
         try:
             for attempt in range(6):

@@ -209,7 +209,7 @@ def call_when_paused(folder: Path, act: Callable[[], None]) -> None:
     threading.Thread(target=wait).start()
 
 
-def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, tmp_path):
+def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished_scan, tmp_path):
     stop = StopRequest()
 
     def pause() -> None:
@@ -222,7 +222,7 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished, t
     assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
     rows = ScanFolder.load(scan.path).committed_rows()
-    other_items = ScanFolder.load(finished).committed_rows()
+    other_items = ScanFolder.load(finished_scan).committed_rows()
     assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in other_items.items()}
 
 

@@ -135,7 +135,7 @@ def banded_metal(plate, tmp_path_factory):
 
 
 @pytest.fixture
-def taken_with(plate, make_rig, set_rig, tmp_path):
+def take_scan_with(plate, make_rig, set_rig, tmp_path):
     """`taken_with(metal, change)`: the plate's scan, recorded with a changed rig and this calibration file."""
 
     def make(metal, change=lambda _table: None):
@@ -181,9 +181,9 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
     assert not (out / "image.npz").exists()
 
 
-def test_processing_refuses_the_calibration_of_another_rig(full_metal, taken_with):
-    assert load_metal_plane(Pipeline(taken_with(full_metal))) is not None
-    moved = Pipeline(taken_with(full_metal, MATTERS["V moved"][0]))
+def test_processing_refuses_the_calibration_of_another_rig(full_metal, take_scan_with):
+    assert load_metal_plane(Pipeline(take_scan_with(full_metal))) is not None
+    moved = Pipeline(take_scan_with(full_metal, MATTERS["V moved"][0]))
     with expect_refusal(ErrorCode.MISMATCH, "RV"):
         load_metal_plane(moved)
     # Metal in the scene has the scene's rig
@@ -194,7 +194,7 @@ def load_metal_plane(pipeline, bands=1, in_scene=False):
     return pipeline.calibration.metal_plane(pipeline.rig, None, in_scene, bands)
 
 
-def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded_metal, taken_with):
+def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded_metal, take_scan_with):
     reference = load_calibration({"metal": banded_metal}).reference()
     expected = load_reference(plate, bands=BANDS)
     assert len(reference.bands) == len(expected.bands) == BANDS
@@ -202,21 +202,21 @@ def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band
         for name in ("h", "v", "valid"):
             np.testing.assert_array_equal(getattr(stored, name), getattr(computed, name))
         assert (stored.spread, stored.how) == (computed.spread, computed.how)
-    pipeline = Pipeline(taken_with(banded_metal))
+    pipeline = Pipeline(take_scan_with(banded_metal))
     assert len(load_metal_plane(pipeline, BANDS).bands) == BANDS
     assert load_metal_plane(pipeline) is not None
     with expect_refusal(ErrorCode.MISMATCH, "2 sub-bands, not 3", "--bands 3", "--bands 2"):
         load_metal_plane(pipeline, 3)
 
 
-def test_missing_sub_bands_are_refused_before_rows_are_read(full_metal, taken_with, tmp_path):
-    scan = taken_with(full_metal)
+def test_missing_sub_bands_are_refused_before_rows_are_read(full_metal, take_scan_with, tmp_path):
+    scan = take_scan_with(full_metal)
     assert main(["process", str(scan.path), "--bands", "2", "--out", str(tmp_path / "out"), "--model", "none"]) == 3
     assert not (tmp_path / "out" / "image.npz").exists()
 
 
-def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded_metal, taken_with):
-    pipeline = Pipeline(taken_with(banded_metal), Settings(bands=BANDS))
+def test_metal_is_one_in_the_whole_sweep_and_in_every_sub_band(banded_metal, take_scan_with):
+    pipeline = Pipeline(take_scan_with(banded_metal), Settings(bands=BANDS))
     for row in pipeline.source.rows():
         pipeline.add_row(row)
     reference = load_metal_plane(pipeline, BANDS)

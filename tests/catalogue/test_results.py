@@ -18,13 +18,13 @@ from polysight_shared.errors import DataError, ErrorCode
 CENTRE = tuple(PET["centre_mm"])
 
 
-def test_a_place_shows_its_own_pixel(processed):
-    pixels = Pixels(processed / "one" / "products")
+def test_a_place_shows_its_own_pixel(processed_scans):
+    pixels = Pixels(processed_scans / "one" / "products")
     row, column = pixels.nearest(*CENTRE)
-    answer = probe(processed / "one", *CENTRE)
+    answer = probe(processed_scans / "one", *CENTRE)
     p = complex(pixels.p[row, column])
     assert answer.p.value == pytest.approx(p, abs=1e-4)
-    map_of_scan = map_permittivity(read_products(processed / "one"))
+    map_of_scan = map_permittivity(read_products(processed_scans / "one"))
     assert answer.permittivity.value == pytest.approx(complex(map_of_scan.value[row, column]), abs=1e-4)
     assert answer.permittivity_real_std == pytest.approx(map_of_scan.real_std[row, column], abs=1e-4)
     assert answer.permittivity_loss_std == pytest.approx(map_of_scan.loss_std[row, column], abs=1e-4)
@@ -33,8 +33,8 @@ def test_a_place_shows_its_own_pixel(processed):
     assert any(near.name.startswith("PET") and near.sigmas < 2 for near in answer.nearest)
 
 
-def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
-    pixels = Pixels(processed / "one" / "products")
+def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed_scans):
+    pixels = Pixels(processed_scans / "one" / "products")
     rows, columns = pixels.p.shape
     pixel_mm = pixels.x_mm[1] - pixels.x_mm[0]
     x_min_mm, x_max_mm, y_min_mm, y_max_mm = pixels.extent_mm
@@ -56,24 +56,24 @@ def test_the_image_ends_half_a_pixel_beyond_its_outermost_pixels(processed):
             pixels.nearest(*place)
 
 
-def test_the_range_profile_has_its_peak_at_the_plate(processed):
+def test_the_range_profile_has_its_peak_at_the_plate(processed_scans):
     for plate in (COPPER, PET):
-        answer = probe(processed / "one", *plate["centre_mm"]).profile
+        answer = probe(processed_scans / "one", *plate["centre_mm"]).profile
         for levels in answer.boards.values():
             assert abs(answer.path_m[int(np.argmax(levels))]) < 0.03
 
 
-def test_metal_has_no_permittivity_and_the_reason_is_given(processed):
-    answer = probe(processed / "one", *COPPER["centre_mm"])
+def test_metal_has_no_permittivity_and_the_reason_is_given(processed_scans):
+    answer = probe(processed_scans / "one", *COPPER["centre_mm"])
     assert answer.permittivity is None
     assert "metal" in answer.why
     assert answer.patch.metal_reference
 
 
-def test_places_outside_the_image_are_refused(processed):
+def test_places_outside_the_image_are_refused(processed_scans):
     for place in ((1000.0, 0.0), (0.0, -500.0), (float("nan"), 0.0)):
         with expect_refusal(ErrorCode.VALUE_INVALID):
-            probe(processed / "one", *place)
+            probe(processed_scans / "one", *place)
 
 
 def test_without_a_result_no_material_is_reported(tmp_path):
@@ -83,34 +83,34 @@ def test_without_a_result_no_material_is_reported(tmp_path):
     assert {p.name for p in read_result(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
 
 
-def test_a_scan_does_not_differ_from_itself(processed):
-    comparison = compare(processed / "one", processed / "one")
+def test_a_scan_does_not_differ_from_itself(processed_scans):
+    comparison = compare(processed_scans / "one", processed_scans / "one")
     assert np.nanmax(np.abs(comparison.p)) == 0
     assert comparison.figures.significant_share == 0
     assert all(pair.sigmas == 0 for pair in comparison.figures.patches if pair.difference)
 
 
-def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed):
-    comparison = compare(processed / "one", processed / "two")
+def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed_scans):
+    comparison = compare(processed_scans / "one", processed_scans / "two")
     answer = [pair.sigmas for pair in comparison.figures.patches if pair.sigmas is not None]
     assert answer
     assert max(answer) < 3
     # Few pixels that are independent of each other
     assert (comparison.sigmas > 5).mean() < 0.05
-    back = compare(processed / "two", processed / "one")
+    back = compare(processed_scans / "two", processed_scans / "one")
     finite_in_both = np.isfinite(comparison.p) & np.isfinite(back.p)
     assert np.array_equal(comparison.p[finite_in_both], -back.p[finite_in_both])
 
 
-def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
+def test_a_changed_plate_is_found_where_it_lies(processed_scans, tmp_path):
     """The V channel of the PET's pixels is made 30 % stronger in a copy."""
     import shutil
     from dataclasses import replace
 
     from polysight.products import write_image
 
-    shutil.copytree(processed / "one" / "products", tmp_path / "changed")
-    saved = pixels = Pixels(processed / "one" / "products")
+    shutil.copytree(processed_scans / "one" / "products", tmp_path / "changed")
+    saved = pixels = Pixels(processed_scans / "one" / "products")
     v = saved.v.copy()
     x, y = CENTRE
     inside = np.ix_(abs(pixels.y_mm - y) < 15, abs(pixels.x_mm - x) < 15)
@@ -118,7 +118,7 @@ def test_a_changed_plate_is_found_where_it_lies(processed, tmp_path):
     with np.errstate(invalid="ignore", divide="ignore"):
         p = saved.h / v
     write_image(tmp_path / "changed" / "image.npz", replace(saved.images, v=v, p=p))
-    comparison = compare(processed / "one", tmp_path / "changed")
+    comparison = compare(processed_scans / "one", tmp_path / "changed")
     answer = np.nan_to_num(comparison.sigmas)
     # A copy, which shares its errors
     assert comparison.figures.scatter == 0.1
@@ -142,25 +142,25 @@ def test_errors_that_both_scans_share_do_not_hide_a_change():
     assert np.isnan(measure_scatter(np.array([np.nan])))
 
 
-def test_scans_that_cannot_be_compared_say_so(processed, tmp_path):
+def test_scans_that_cannot_be_compared_say_so(processed_scans, tmp_path):
     write_judged_products(tmp_path / "none", "none")
     with expect_refusal(ErrorCode.NO_DATA):
-        compare(processed / "one", tmp_path / "none")
+        compare(processed_scans / "one", tmp_path / "none")
 
 
-def test_every_map_is_drawn_in_the_size_of_the_image(processed):
+def test_every_map_is_drawn_in_the_size_of_the_image(processed_scans):
     import io
 
     from matplotlib.image import imread
 
-    pixels = Pixels(processed / "one" / "products")
+    pixels = Pixels(processed_scans / "one" / "products")
     for name in MAPS:
         picture = draw_products(pixels, name)
         assert imread(io.BytesIO(picture.png)).shape[:2] == pixels.valid.shape
         assert picture.low < picture.high
     shared = draw_products(pixels, "h_amplitude", (-20.0, 0.0))
     assert (shared.low, shared.high) == (-20.0, 0.0)
-    comparison = compare(processed / "one", processed / "two")
+    comparison = compare(processed_scans / "one", processed_scans / "two")
     for name in ("p", "sigmas", "permittivity", "loss"):
         assert imread(io.BytesIO(draw_comparison(comparison, name).png)).shape[:2] == pixels.valid.shape
     for draw in (lambda: draw_products(pixels, "x"), lambda: draw_comparison(comparison, "x")):
@@ -168,9 +168,9 @@ def test_every_map_is_drawn_in_the_size_of_the_image(processed):
             draw()
 
 
-def test_colours_of_differences_in_standard_deviations_reach_twice_the_significant_one(processed):
+def test_colours_of_differences_in_standard_deviations_reach_twice_the_significant_one(processed_scans):
     """A map without a significant difference looks like one; a larger difference widens the scale."""
-    comparison = compare(processed / "one", processed / "two")
+    comparison = compare(processed_scans / "one", processed_scans / "two")
     shape = comparison.sigmas.shape
     for sigmas, high in ((0.5, 2 * SIGNIFICANT_STDS), (30.0, 30.0)):
         picture = draw_comparison(replace(comparison, sigmas=np.full(shape, sigmas)), "sigmas")

@@ -23,10 +23,12 @@ from polysight_shared.errors import ConfigError, DataError
 
 
 @pytest.fixture
-def root(processed: Path, tmp_path: Path) -> Path:
+def root(processed_scans: Path, tmp_path: Path) -> Path:
     """A folder with a finished scan, one that was stopped, one whose program died, and products alone."""
     for name in ("done", "week/stopped", "week/lost"):
-        shutil.copytree(processed / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures"))
+        shutil.copytree(
+            processed_scans / "one", tmp_path / name, ignore=shutil.ignore_patterns("raw", "samples", "figures")
+        )
     facts = load_facts(tmp_path / "done")
     ended = {"fact": "scan_ended", "exit_status": "abort", "reason": "asked to", "rows_committed": 3}
     for name, kept_facts in (("week/stopped", [*facts[:4], ended]), ("week/lost", facts[:6])):

@@ -47,7 +47,7 @@ def nodes() -> list[ast.AST]:
     return [node for tree in parse_sources() for node in ast.walk(tree)]
 
 
-def name_of(called: ast.expr) -> str:
+def find_name(called: ast.expr) -> str:
     return called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
 
 
@@ -64,16 +64,16 @@ def test_values_that_are_handed_on_cannot_be_changed(nodes):
         for decorator in node.decorator_list:
             called = decorator.func if isinstance(decorator, ast.Call) else decorator
             keywords = decorator.keywords if isinstance(decorator, ast.Call) else []
-            if name_of(called) == "dataclass" and find_flag(keywords, "frozen") is not True:
+            if find_name(called) == "dataclass" and find_flag(keywords, "frozen") is not True:
                 changed["dataclass"].add(node.name)
-        if any(name_of(base) == "Struct" for base in node.bases) and find_flag(node.keywords, "frozen") is not True:
+        if any(find_name(base) == "Struct" for base in node.bases) and find_flag(node.keywords, "frozen") is not True:
             changed["Struct"].add(node.name)
     assert changed == CHANGED_IN_PLACE
 
 
 @pytest.mark.parametrize(("function", "flag", "value", "exceptions"), FLAGS, ids=lambda x: str(x))
 def test_a_flag_has_its_value_everywhere(function, flag, value, exceptions, nodes):
-    calls = [n for n in nodes if isinstance(n, ast.Call) and name_of(n.func) == function]
+    calls = [n for n in nodes if isinstance(n, ast.Call) and find_name(n.func) == function]
     values = Counter(find_flag(call.keywords, flag) for call in calls)
     assert values[value] > 0
     assert values[not value] == exceptions

@@ -164,7 +164,7 @@ def test_another_geometry_gets_other_kernels(aperture):
 
 
 @pytest.fixture
-def made():
+def small_cache():
     """Keys of a small cache whose arrays were made, in order, by `ask(key, share of the cache's size)`."""
     keys = []
 
@@ -178,8 +178,8 @@ def made():
     forget()
 
 
-def test_kernels_are_kept_while_they_fit_and_the_least_recently_used_go_first(made):
-    ask, keys = made
+def test_kernels_are_kept_while_they_fit_and_the_least_recently_used_go_first(small_cache):
+    ask, keys = small_cache
     for key in "abab":
         ask(key, 0.4)
     assert keys == ["a", "b"]
@@ -189,8 +189,8 @@ def test_kernels_are_kept_while_they_fit_and_the_least_recently_used_go_first(ma
     assert keys == ["a", "b", "c", "a"]
 
 
-def test_kernels_larger_than_the_cache_are_kept_alone(made):
-    ask, keys = made
+def test_kernels_larger_than_the_cache_are_kept_alone(small_cache):
+    ask, keys = small_cache
     assert ask("a", 1.5).size == ask("a", 1.5).size
     assert keys == ["a"]
 

@@ -398,16 +398,16 @@ def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeyp
     nominal = np.arange(6, dtype=complex).reshape(2, 3)
     axes = np.arange(3.0), np.arange(2.0)
 
-    def images_of(h):
+    def make_images(h):
         return Images(h, h, *axes, np.ones(h.shape, bool))
 
     builder = SimpleNamespace(
-        finish=lambda offset: images_of(nominal + offset),
+        finish=lambda offset: make_images(nominal + offset),
         form_dispersion=lambda offset: Dispersion(nominal + offset, nominal, (76e9, 80e9)),
     )
     estimate = replace(UNKNOWN_PLANE, offset_m=offset_m, plates=1)
     monkeypatch.setattr(plane, "find_plane", lambda *_: estimate)
-    first = images_of(nominal).transpose() if transposed else images_of(nominal)
+    first = make_images(nominal).transpose() if transposed else make_images(nominal)
     assert move_to_plane(builder, first, [], transposed, move=False) == (estimate, first)
     _, on_plane = move_to_plane(builder, first, [], transposed, move=True)
     expected = nominal + (offset_m if moved else 0.0)

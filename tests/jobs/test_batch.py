@@ -74,7 +74,7 @@ def make_job(data, out, **options):
     return batch.make_jobs([(data, Settings(**text))], out)[0]
 
 
-def make_jobs_of(folder, *names):
+def make_jobs(folder, *names):
     scans_found = batch.find_scans([folder])
     assert sorted(p.name for p in scans_found) == sorted(names)
     return batch.make_jobs([(data, Settings()) for data in scans_found], folder.parent / "out")
@@ -88,7 +88,7 @@ def read_runs(folder):
 def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
     names = ("a", "bad", "c", "killed")
     list_scan_paths(tmp_path / "in", *names)
-    first = batch.process_many(make_jobs_of(tmp_path / "in", *names), tmp_path / "out", 2)
+    first = batch.process_many(make_jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
     assert [o.name for o in first] == list(names)
     answer = {o.name: o.message for o in first}
@@ -99,7 +99,7 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
     assert [s["status"] for s in summary["scans"]] == ["done", "failed", "done", "failed"]
 
-    second_run = batch.process_many(make_jobs_of(tmp_path / "in", *names), tmp_path / "out", 2)
+    second_run = batch.process_many(make_jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert [o.status for o in second_run] == ["skipped", "failed", "skipped", "failed"]
     assert read_runs(tmp_path) == sorted([*names, "bad", "killed"])
     assert "2 finished before, 2 to process" in capsys.readouterr().err
@@ -108,7 +108,7 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
 @pytest.mark.usefixtures("worker")
 def test_a_program_killed_after_its_mark_has_finished_its_scan(tmp_path):
     list_scan_paths(tmp_path / "in", "late")
-    (job,) = make_jobs_of(tmp_path / "in", "late")
+    (job,) = make_jobs(tmp_path / "in", "late")
     assert many.run_scan(job).status == "done"
 
 
@@ -149,10 +149,10 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
     """Notes, programs of the page, exports and labels are not data; manifest, rows, calibration and truth are."""
     folder = write_scan(tmp_path / "in" / "scan")
     sample_file = folder / "samples" / "RH.npy"
-    batch.process_many(make_jobs_of(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    batch.process_many(make_jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
     def done():
-        return batch.is_finished(make_jobs_of(tmp_path / "in", "scan")[0])
+        return batch.is_finished(make_jobs(tmp_path / "in", "scan")[0])
 
     no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
     for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):
@@ -174,7 +174,7 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
             os.utime(file, ns=(times, times))
         assert done(), name
     drop(ScanFolder.load(folder), read_raw_digests(folder), tmp_path / "out" / "scan")
-    batch.process_many(make_jobs_of(tmp_path / "in", "scan"), tmp_path / "out", 1)
+    batch.process_many(make_jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
     assert done()
     sample_file.write_text("other samples")
     assert not done()  # these are the remaining files
@@ -188,7 +188,7 @@ def read_raw_digests(folder):
 @pytest.mark.usefixtures("worker")
 def test_ended_early_its_programs_end_too(tmp_path):
     list_scan_paths(tmp_path / "in", "slow", "slow2")
-    todo = make_jobs_of(tmp_path / "in", "slow", "slow2")
+    todo = make_jobs(tmp_path / "in", "slow", "slow2")
     results = many.run_here(todo, 2)
     # Slow2, which is not slow
     first = next(results)
@@ -264,7 +264,7 @@ def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatc
 def test_a_dask_cluster_does_the_same(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
     list_scan_paths(tmp_path / "in", "a", "bad", "c")
-    todo = make_jobs_of(tmp_path / "in", "a", "bad", "c")
+    todo = make_jobs(tmp_path / "in", "a", "bad", "c")
     # Threads of this process replace the workers; each still starts its own programs.
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=2, processes=False, dashboard_address=":0", protocol="tcp"
@@ -280,7 +280,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
     """A Dask worker that is killed after the mark has its scan sent to another one."""
     list_scan_paths(tmp_path / "in", "a")
-    (job,) = make_jobs_of(tmp_path / "in", "a")
+    (job,) = make_jobs(tmp_path / "in", "a")
     assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
     second_run = batch.process_many([job], tmp_path / "out", 1, again=True)
@@ -331,7 +331,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     )
     names = ("a", "b", "slow", "c")
     list_scan_paths(tmp_path / "in", *names)
-    todo = make_jobs_of(tmp_path / "in", *names)
+    todo = make_jobs(tmp_path / "in", *names)
     with (
         dask.config.set({"distributed.worker.preload": [str(preload)]}),
         distributed.LocalCluster(

@@ -31,7 +31,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path / "scans"
 
 
-def answer(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
+def run_command(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
     """Output of a command that must succeed."""
     capsys.readouterr()
     assert main([str(word) for word in words]) == 0
@@ -40,19 +40,19 @@ def answer(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
 
 def test_scans_are_listed_and_found_by_their_notes_and_tags(root, capsys):
     options = ("--text", "Eiche, zweites Brett", "--tag", "oak", "--tag", "new")
-    answer(capsys, "note", root / "one", *options)
+    run_command(capsys, "note", root / "one", *options)
     assert read_notes(root / "one") == Notes("Eiche, zweites Brett", ("oak", "new"))
-    assert "oak" in answer(capsys, "note", root / "one", "--untag", "new")
+    assert "oak" in run_command(capsys, "note", root / "one", "--untag", "new")
     assert read_notes(root / "one").tags == ("oak",)
-    rows = json.loads(answer(capsys, "scans", root, "--json"))["scans"]
+    rows = json.loads(run_command(capsys, "scans", root, "--json"))["scans"]
     assert {r["name"]: (r["state"], r["bytes"] > 1000) for r in rows} == {
         "one": ("finished", True),
         "two": ("products", True),
     }
     for words, names in ((["--tag", "oak"], {"one"}), (["--find", "BRETT"], {"one"}), (["--find", "pet"], {"two"})):
-        document = json.loads(answer(capsys, "scans", root, "--json", *words))["scans"]
+        document = json.loads(run_command(capsys, "scans", root, "--json", *words))["scans"]
         assert {r["name"] for r in document} == names
-    assert "2 scans" in answer(capsys, "scans", root)
+    assert "2 scans" in run_command(capsys, "scans", root)
 
 
 def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(root, capsys):
@@ -61,28 +61,28 @@ def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(r
     materials = root / "two" / "materials.json"
     materials.write_text(materials.read_text().replace("PET", "P\u202eET"))
     for words in (["scans", root], ["note", root / "two"], ["probe", root / "two", "0,0"]):
-        text = answer(capsys, *words)
+        text = run_command(capsys, *words)
         assert all(c.isprintable() or c == "\n" for c in text), ascii(text)
-    lines = answer(capsys, "scans", root).splitlines()
+    lines = run_command(capsys, "scans", root).splitlines()
     assert max(len(line) for line in lines if not line.startswith("long")) < 120
 
 
 def test_a_running_scan_is_asked(root, capsys):
     with open_control(root / "one") as stop:
-        assert "pause" in answer(capsys, "ask", root / "one", "pause")
+        assert "pause" in run_command(capsys, "ask", root / "one", "pause")
         assert stop.paused
     assert main(["ask", str(root / "one"), "pause"]) == 6
     assert "polysight resume" in capsys.readouterr().err
 
 
 def test_results_at_a_place_and_of_two_scans_are_printed(root, capsys, tmp_path):
-    text = answer(capsys, "probe", root / "two", "0,0")
+    text = run_command(capsys, "probe", root / "two", "0,0")
     assert "|H|" in text
-    assert json.loads(answer(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True
+    assert json.loads(run_command(capsys, "probe", root / "two", "0,0", "--json"))["referenced"] is True
     shutil.copytree(root / "two", root / "three")
-    assert "0.0 %" in answer(capsys, "compare", root / "two", root / "three", "--png", tmp_path / "d.png")
+    assert "0.0 %" in run_command(capsys, "compare", root / "two", root / "three", "--png", tmp_path / "d.png")
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
-    assert json.loads(answer(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
+    assert json.loads(run_command(capsys, "compare", root / "two", root / "three", "--json"))["significant_share"] == 0
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ def test_the_metal_reference_is_called_so_at_a_place(root, capsys):
     content = json.loads(materials.read_text())
     content["segments"][0]["outline_mm"] = [[-50.0, -20.0], [-20.0, -20.0], [-20.0, 20.0], [-50.0, 20.0]]
     materials.write_text(json.dumps(content))
-    assert "in patch 1: the metal reference" in answer(capsys, "probe", root / "two", "-35,0")
+    assert "in patch 1: the metal reference" in run_command(capsys, "probe", root / "two", "-35,0")
 
 
 def test_compare_says_where_its_picture_is(root, capsys, tmp_path):
@@ -131,7 +131,7 @@ def test_notes_are_of_a_scan(root, folder):
 def test_a_text_that_is_not_utf_8_is_refused_and_nothing_is_lost(root, capsys, option):
     """A terminal of another encoding gives such bytes; they cannot be stored."""
     options = ("--text", "oak", "--tag", "new")
-    answer(capsys, "note", root / "one", *options)
+    run_command(capsys, "note", root / "one", *options)
     with pytest.raises(SystemExit) as ended:
         main(["note", str(root / "one"), option, os.fsdecode(b"gr\xfcn")])
     assert ended.value.code == 2
@@ -144,14 +144,14 @@ def test_a_rounded_zero_has_no_sign(root, capsys, monkeypatch):
     zero = ComplexNumber(-0.0, -0.0)
     at_zero = replace(result, place_mm=(-0.0, 0.0), h_db=-0.0, v_db=-0.0, p=zero)
     monkeypatch.setattr(scans, "probe", lambda *_: at_zero)
-    lines = answer(capsys, "probe", root / "two", "0,0").splitlines()
+    lines = run_command(capsys, "probe", root / "two", "0,0").splitlines()
     assert lines[0].startswith("x 0 mm, y 0 mm")
     assert lines[1] == "|H| 0 dB, |V| 0 dB"
     assert lines[2].startswith("P = 0 + 0j ")
 
 
 def test_one_scan_is_counted_as_one(root, capsys):
-    assert "\n1 scan under" in answer(capsys, "scans", root, "--find", "one")
+    assert "\n1 scan under" in run_command(capsys, "scans", root, "--find", "one")
 
 
 def test_no_tag_of_commands_at_the_same_time_is_lost(root):

@@ -178,7 +178,7 @@ def find_marks(mutant: Mutant) -> list[tuple[Path, int]]:
         return [(mutant.file, _find_statement_line(function, mutant.line))]
     class_of = _find_innermost(tree, mutant.line, (ast.ClassDef,))
     statement = _find_innermost(tree, mutant.line, (ast.Assign, ast.AnnAssign))
-    names = {_name_of(target) for target in _list_targets(statement)}
+    names = {_find_name(target) for target in _list_targets(statement)}
     marks = {mark for name in names for mark in _find_users(mutant.file, name, in_class=class_of is not None)}
     if class_of is not None:
         # A field's default matters to those who make one.
@@ -208,7 +208,7 @@ def _list_targets(statement: ast.AST | None) -> Iterable[ast.expr]:
     return []
 
 
-def _name_of(target: ast.expr) -> str:
+def _find_name(target: ast.expr) -> str:
     return target.id if isinstance(target, ast.Name) else ""
 
 

@@ -1,5 +1,5 @@
 """Small scans, and watches of them."""
 
-from tests.support.page.fixtures import finished, growing, samples, watching
+from tests.support.page.fixtures import finished_scan, growing, samples, watching
 
-__all__ = ["finished", "growing", "samples", "watching"]
+__all__ = ["finished_scan", "growing", "samples", "watching"]

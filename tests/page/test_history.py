@@ -14,7 +14,7 @@ from polysight_shared.messages import Capture, Fault
 UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"
 
 
-def answer(facts):
+def make_history(facts):
     history = begin_history(facts[0])
     for fact in facts[1:]:
         add_fact(history, fact)
@@ -22,9 +22,9 @@ def answer(facts):
 
 
 @pytest.fixture
-def begun(finished):
+def begun(finished_scan):
     """A history whose scan began at 02:00 and has committed rows 0 and 1 at 02:01 and 02:02."""
-    facts = load_facts(finished)
+    facts = load_facts(finished_scan)
     rows = [f for f in facts if f["fact"] == "row_committed"]
     history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
     for minute, row in enumerate(rows[:2], 1):
@@ -32,9 +32,9 @@ def begun(finished):
     return history, rows[2]
 
 
-def test_counts_are_those_of_the_scan_folder(finished):
-    history = answer(load_facts(finished))
-    scan = ScanFolder.load(finished)
+def test_counts_are_those_of_the_scan_folder(finished_scan):
+    history = make_history(load_facts(finished_scan))
+    scan = ScanFolder.load(finished_scan)
     rows = scan.committed_rows()
     assert history.takes == {row: r.take for row, r in rows.items()}
     assert history.ended is not None
@@ -44,8 +44,8 @@ def test_counts_are_those_of_the_scan_folder(finished):
         assert board.frames_received == sum(b.frames_received for b in board_rows)
 
 
-def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished):
-    history = answer(load_facts(finished))
+def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished_scan):
+    history = make_history(load_facts(finished_scan))
     row = history.content.rows[1]
     boards = {
         name: structs.replace(part, missing_bytes=part.bytes // 8) if name == "RV" else part
@@ -56,17 +56,17 @@ def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished):
     assert history.lost_shares == {"RH": dict.fromkeys(rows, 0.0), "RV": dict.fromkeys(rows, 0.0) | {1: 12.5}}
 
 
-def test_trigger_health_is_the_worst_of_all_bursts(finished):
-    history = answer(load_facts(finished))
-    events = read_events(finished / EVENTS).events
+def test_trigger_health_is_the_worst_of_all_bursts(finished_scan):
+    history = make_history(load_facts(finished_scan))
+    events = read_events(finished_scan / EVENTS).events
     history.add_events(events)
     captures = [e for e in events if isinstance(e, Capture)]
     assert history.trigger.width_max_ns == max(c.width_max_ns for c in captures)
     assert history.trigger.jitter_max_ns == max(c.jitter_ns for c in captures)
 
 
-def test_a_fault_reported_twice_is_shown_once(finished):
-    history = answer(load_facts(finished))
+def test_a_fault_reported_twice_is_shown_once(finished_scan):
+    history = make_history(load_facts(finished_scan))
     fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, problem="a trigger edge was lost")
     history.add_events([fault])
     history.add_events([fault])
@@ -94,8 +94,8 @@ def test_a_pause_does_not_count_as_time_of_a_row(begun):
     assert history.row_seconds == (60.0, "measured")
 
 
-def test_time_left_after_one_row_is_what_that_row_took(finished):
-    facts = load_facts(finished)
+def test_time_left_after_one_row_is_what_that_row_took(finished_scan):
+    facts = load_facts(finished_scan)
     first_row, second_row, *_ = (fact for fact in facts if fact["fact"] == "row_committed")
     history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
     add_fact(history, first_row | {"committed_utc": UTC.format(1, 30)})
@@ -104,8 +104,8 @@ def test_time_left_after_one_row_is_what_that_row_took(finished):
     assert history.row_seconds == (60.0, "measured")
 
 
-def test_time_left_before_the_first_row_is_the_plan_s(finished):
-    started = load_facts(finished)[0]
+def test_time_left_before_the_first_row_is_the_plan_s(finished_scan):
+    started = load_facts(finished_scan)[0]
     real = begin_history(started | {"simulated": False})
     simulated = begin_history(started | {"simulated": True})
     row_s = real.row_seconds
@@ -140,8 +140,8 @@ def test_withdrawn_is_missing_until_taken_again(begun):
     assert (set(history.takes), 1 in history.marks) == ({0}, False)
 
 
-def test_resumed_is_not_ended(finished):
-    history = answer(load_facts(finished))
+def test_resumed_is_not_ended(finished_scan):
+    history = make_history(load_facts(finished_scan))
     add_fact(history, {"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0})
     assert history.ended is None
 

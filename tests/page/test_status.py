@@ -27,9 +27,9 @@ REJECTED["faults"] = [{"kind": "no_data", "board": "RV"}]
 
 
 @pytest.fixture
-def history(finished):
+def history(finished_scan):
     """One of three rows is committed."""
-    facts = load_facts(finished)
+    facts = load_facts(finished_scan)
     history = begin_history(facts[0])
     add_fact(history, next(f for f in facts if f["fact"] == "row_committed"))
     return history
@@ -71,10 +71,10 @@ def test_a_started_program_hangs_once_its_run_has_begun(history):
     assert (s.key, s.press) == ("frozen", ("abort", "resume"))
 
 
-def test_nothing_may_be_pressed_before_the_program_takes_commands(finished):
+def test_nothing_may_be_pressed_before_the_program_takes_commands(finished_scan):
     """The program writes its first sign of life when it begins."""
     started = Program("scan", True, None, (), "2000-01-01T00:00:00+00:00", "")
-    facts = load_facts(finished)
+    facts = load_facts(finished_scan)
     history = begin_history(facts[0])
     quiet = replace(LIVELY, life=None)
     between_rows = replace(RUNNING, row=-1)

@@ -24,18 +24,18 @@ from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 
 
-def answer(watch: Watch) -> dict:
+def read_state(watch: Watch) -> dict:
     return json.loads(watch.state.data)
 
 
-def shows(rows: int):
+def has_rows(rows: int):
     return lambda state: (state.get("pictures") or {}).get("rows") == rows
 
 
 @pytest.fixture(scope="module")
-def truth(finished):
+def truth(finished_scan):
     """Pictures of the finished folder, by the instrument's own pipeline."""
-    scan = ScanFolder.load(finished)
+    scan = ScanFolder.load(finished_scan)
     pipeline = Pipeline(scan, live=True)
     for row in scan.rows():
         pipeline.add_row(row)
@@ -50,11 +50,11 @@ def test_each_content_that_differs_is_a_new_version():
     assert third.publish(Motion(now_s=1)) is third
 
 
-def test_a_finished_folder_is_shown_unchanged(finished, truth, watching):
+def test_a_finished_folder_is_shown_unchanged(finished_scan, truth, watching):
     scan, pipeline, pictures = truth
-    watch = watching(finished)
-    watch.wait_for(shows(scan.plan.rows))
-    state = answer(watch)
+    watch = watching(finished_scan)
+    watch.wait_for(has_rows(scan.plan.rows))
+    state = read_state(watch)
     assert (state["status"]["level"], state["scan"]["marks"]) == ("done", "ccc")
     assert (state["scan"]["rows"], state["scan"]["committed"]) == (3, 3)
     assert state["scan"]["simulated"] is True
@@ -72,21 +72,21 @@ def test_a_finished_folder_is_shown_unchanged(finished, truth, watching):
 
 def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
-    assert answer(watch)["scan"] is None
+    assert read_state(watch)["scan"] is None
     growing.touch_alive()
     growing.grow_until("scan_started")
     watch.wait_for(lambda s: s["scan"] is not None)
-    assert answer(watch)["scan"]["marks"] == "..."
+    assert read_state(watch)["scan"]["marks"] == "..."
     revision = 0
     for row in range(3):
         growing.grow_until("row_committed")
-        watch.wait_for(shows(row + 1))
-        state = answer(watch)
+        watch.wait_for(has_rows(row + 1))
+        state = read_state(watch)
         assert state["scan"]["marks"] == "c" * (row + 1) + "." * (2 - row)
         assert state["pictures"]["revision"] > revision
         assert state["profile"]["row"] == row
         revision = state["pictures"]["revision"]
-    assert answer(watch)["status"]["level"] == "good"
+    assert read_state(watch)["status"]["level"] == "good"
     growing.grow_until("scan_ended")
     watch.wait_for(lambda s: s["status"]["key"] == "finishing")
     shutil.rmtree(growing.path / CONTROL_FOLDER)
@@ -99,12 +99,12 @@ def test_a_scan_that_becomes_silent_is_reported_as_ended(growing, watching):
 
     def is_alive() -> bool:
         growing.touch_alive()
-        state = answer(watch)
+        state = read_state(watch)
         return state["status"]["level"] == "good" and state["running"]
 
     wait_for(is_alive, "that it lives")
     watch.wait_for(lambda s: s["status"]["key"] in ("frozen", "killed"))
-    state = answer(watch)
+    state = read_state(watch)
     assert not state["running"]
     assert "polysight resume" in state["status"]["do"]
     wait_for(lambda: json.loads(watch.motion.data)["left_s"] is None, "that no time is left")
@@ -122,13 +122,13 @@ def test_a_killed_program_is_reported_immediately_however_long_its_timeout_is(gr
     program.kill()
     program.wait()
     watch.wait_for(lambda s: s["status"]["key"] == "killed")
-    assert answer(watch)["status"]["level"] == "bad"
-    assert answer(watch)["status"]["press"] == ["resume", "repeat"]
+    assert read_state(watch)["status"]["level"] == "bad"
+    assert read_state(watch)["status"]["press"] == ["resume", "repeat"]
 
 
 def test_an_unfinished_folder_without_a_program_is_reported_immediately(growing, watching):
     growing.grow_until("row_committed")
-    assert answer(watching(growing.path))["status"]["key"] in ("frozen", "killed")
+    assert read_state(watching(growing.path))["status"]["key"] in ("frozen", "killed")
 
 
 def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
@@ -137,43 +137,43 @@ def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
     while growing.grow():
         pass
     watch = watching(growing.path)
-    watch.wait_for(shows(2))
+    watch.wait_for(has_rows(2))
     watch.wait_for(lambda s: len(s["notices"]) == 1)
-    assert "0001.bin" in answer(watch)["notices"][0]["what"]
+    assert "0001.bin" in read_state(watch)["notices"][0]["what"]
 
 
-def test_another_scan_in_the_same_place_begins_afresh(growing, finished, watching):
+def test_another_scan_in_the_same_place_begins_afresh(growing, finished_scan, watching):
     growing.grow_until("row_committed")
     watch = watching(growing.path, lapse_s=1e6)
-    watch.wait_for(shows(1))
+    watch.wait_for(has_rows(1))
     shutil.rmtree(growing.path)
-    shutil.copytree(finished, growing.path)
-    watch.wait_for(shows(3))
-    assert answer(watch)["status"]["level"] == "done"
+    shutil.copytree(finished_scan, growing.path)
+    watch.wait_for(has_rows(3))
+    assert read_state(watch)["status"]["level"] == "done"
 
 
 def test_a_new_scan_of_an_old_name_has_nothing_of_the_old_one(growing, watching):
     growing.grow_until("row_committed")
     watch = watching(growing.path, lapse_s=1e6)
-    watch.wait_for(shows(1))
+    watch.wait_for(has_rows(1))
     shutil.rmtree(growing.path)
     watch.wait_for(lambda s: s["status"]["key"] == "folder_gone")
     # Its program has not written a manifest yet.
     growing.path.mkdir()
     watch.wait_for(lambda s: s["status"]["key"] == "empty")
-    assert answer(watch)["scan"] is None
+    assert read_state(watch)["scan"] is None
 
 
-def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
+def test_looking_on_changes_nothing_in_the_folder(finished_scan, watching, tmp_path):
     folder = tmp_path / "copy"
-    shutil.copytree(finished, folder)
+    shutil.copytree(finished_scan, folder)
 
     def read_file_times():
         return {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in sorted(folder.rglob("*"))}
 
     content_before = read_file_times()
     watch = watching(folder, control=True)
-    watch.wait_for(shows(3))
+    watch.wait_for(has_rows(3))
     watch.close()
     assert read_file_times() == content_before
 
@@ -181,7 +181,7 @@ def test_looking_on_changes_nothing_in_the_folder(finished, watching, tmp_path):
 def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
     growing.write({"fact": "scan_started", "scan_id": "s", "simulated": True, "instrument": {"new": 1}})
     watch = watching(growing.path)
-    status = answer(watch)["status"]
+    status = read_state(watch)["status"]
     assert (status["level"], status["headline"]) == ("bad", "This scan cannot be shown")
     assert "polysight validate" in status["do"]
 
@@ -192,12 +192,12 @@ CUTS = st.lists(st.floats(0, 1), max_size=12)
 
 
 @pytest.mark.parametrize(("name", "tail"), [(MANIFEST, ManifestTail), (EVENTS, EventTail)])
-def test_any_pieces_give_the_whole(finished, tmp_path_factory, name, tail):
-    raw = (finished / name).read_bytes()
+def test_any_pieces_give_the_whole(finished_scan, tmp_path_factory, name, tail):
+    raw = (finished_scan / name).read_bytes()
     if name == MANIFEST:
         all_facts = manifest.parse(raw).facts
     else:
-        all_facts = read_events(finished / name).events
+        all_facts = read_events(finished_scan / name).events
     assert len(all_facts) > 4
 
     @settings(max_examples=20)
@@ -218,9 +218,9 @@ def test_any_pieces_give_the_whole(finished, tmp_path_factory, name, tail):
     check_pieces()
 
 
-def test_another_file_in_its_place_is_read_from_the_beginning(finished, tmp_path):
+def test_another_file_in_its_place_is_read_from_the_beginning(finished_scan, tmp_path):
     path = tmp_path / MANIFEST
-    raw = (finished / MANIFEST).read_bytes()
+    raw = (finished_scan / MANIFEST).read_bytes()
     path.write_bytes(raw)
     tail = ManifestTail(path)
     first = tail.look()
@@ -233,10 +233,10 @@ def test_another_file_in_its_place_is_read_from_the_beginning(finished, tmp_path
     assert tail.file.replaced
 
 
-def test_another_and_longer_file_is_found_after_a_single_look(finished, tmp_path):
+def test_another_and_longer_file_is_found_after_a_single_look(finished_scan, tmp_path):
     """The file was replaced before anything was appended to the one that was read."""
     path = tmp_path / MANIFEST
-    raw = (finished / MANIFEST).read_bytes()
+    raw = (finished_scan / MANIFEST).read_bytes()
     other_items = [{"fact": "scan_ended", "reason": "another scan" * 50} for _ in raw.splitlines()]
     path.write_bytes(raw)
     tail = ManifestTail(path)

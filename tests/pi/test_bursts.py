@@ -371,7 +371,7 @@ def source(instrument):
 
 
 @pytest.fixture
-def rises(hub, instrument):
+def record_rises(hub, instrument):
     """Wire times of the next rising edges, each followed by its falling one."""
     with closing(WireClient(hub, listen=instrument.pi.sync_out)) as radar:
 
@@ -386,22 +386,22 @@ def rises(hub, instrument):
         assert radar.receive(0.2) is None, "no pulse more"
 
 
-def test_every_pulse_is_sent_once_and_bursts_keep_their_distance(pi, rises, source):
+def test_every_pulse_is_sent_once_and_bursts_keep_their_distance(pi, record_rises, source):
     sent = [pi.host.ask(m.Pulse(pulses=n, period_us=400.0, width_us=1.0)) for n in (3, 20)]
     assert [(s.pulses, s.width_max_ns, s.fault, s.timed_by, s.pulses_seen) for s in sent] == [
         (3, 1000, 0, source, True),
         (20, 1000, 0, source, True),
     ]
-    steps = [b - a for a, b in pairwise(rises(23))]
+    steps = [b - a for a, b in pairwise(record_rises(23))]
     assert steps[2] >= 400_000  # between two bursts
     assert steps[:2] + steps[3:] == [400_000] * 21
 
 
-def test_pulses_beyond_one_transfer_are_sent_in_several(pi, rises, source):
+def test_pulses_beyond_one_transfer_are_sent_in_several(pi, record_rises, source):
     """64 pulses do not fit in spidev's buffer: none is lost, none comes too early."""
     sent = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
     assert (sent.pulses, sent.fault, sent.timed_by) == (64, 0, source)
-    assert min(b - a for a, b in pairwise(rises(64))) >= 1_500_000
+    assert min(b - a for a, b in pairwise(record_rises(64))) >= 1_500_000
 
 
 @pytest.mark.parametrize("seen", [lambda n: n - 1, lambda n: n + 1, lambda _: 0])

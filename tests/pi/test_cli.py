@@ -22,7 +22,7 @@ from polysight_simulators.loopback import move_to_free_subnet
 
 
 @pytest.fixture
-def command(capsys):
+def run_command(capsys):
     """Runs a command in this process; gives its exit status, output and error text."""
 
     def command(*args):
@@ -56,63 +56,63 @@ def test_simulated_wires_need_neither_gpiod_nor_numpy(config, hub, stage, tmp_pa
         assert p.end()[0] == 0
 
 
-def test_a_wrong_key_is_exit_2_with_its_name(command, config):
+def test_a_wrong_key_is_exit_2_with_its_name(run_command, config):
     config.write_text(config.read_text().replace("heartbeat_ms = 50", "heartbeet_ms = 50"))
-    status, _, err = command("run", "--config", config)
+    status, _, err = run_command("run", "--config", config)
     assert (status, "heartbeet_ms" in err, "do:" in err) == (2, True, True)
 
 
-def test_an_open_address_needs_keys(command, config, tmp_path, hub, stage):
+def test_an_open_address_needs_keys(run_command, config, tmp_path, hub, stage):
     args = ("--config", config, "--wires", hub, "--stage-port", stage.port, "--command-address", "tcp://0.0.0.0:*")
-    status, _, err = command("run", *args)
+    status, _, err = run_command("run", *args)
     assert (status, "polysight-pi keys" in err) == (2, True)
-    assert command("keys", "--config", config)[0] == 0
+    assert run_command("keys", "--config", config)[0] == 0
     assert (tmp_path / "keys" / "pi.key_secret").stat().st_mode & 0o077 == 0
-    status, _, err = command("keys", "--config", config)
+    status, _, err = run_command("keys", "--config", config)
     assert (status, "--replace" in err) == (2, True)
     with Process(*args[1:]) as p:
         assert p.ready[1].startswith("tcp://0.0.0.0:")
 
 
-def test_check_names_every_hop(command, config, hub, stage):
+def test_check_names_every_hop(run_command, config, hub, stage):
     options = ("--config", config, "--wires", hub, "--stage-port", stage.port, "--json")
-    status, out, _ = command("check", *options)
+    status, out, _ = run_command("check", *options)
     findings = {f["name"]: f for f in json.loads(out)}
     assert status == 0, findings
     assert {"plan", "simulated wires", "stage", "journal", "command address"} <= set(findings)
-    status, out, _ = command("check", "--config", config, "--wires", hub)
+    status, out, _ = run_command("check", "--config", config, "--wires", hub)
     assert (status, "fail  stage" in out, "do:" in out) == (1, True, True)
 
 
-def test_commands_without_the_service(command, instrument, write_config, hub, stage):
+def test_commands_without_the_service(run_command, instrument, write_config, hub, stage):
     config = write_config(set_stage_port(move_to_free_subnet(instrument), stage.port))
     options = ("--config", config, "--wires", hub, "--count", 3, "--json")
-    status, out, _ = command("pulse", *options)
+    status, out, _ = run_command("pulse", *options)
     assert (status, [r["pulses"] for r in json.loads(out)]) == (0, [4, 4, 4])
     # Before the first homing, which `jog` needs
     for axis in "xy":
-        assert json.loads(command("buzz", axis, "--config", config, "--json")[1]) == {"x_mm": 0.0, "y_mm": 0.0}
+        assert json.loads(run_command("buzz", axis, "--config", config, "--json")[1]) == {"x_mm": 0.0, "y_mm": 0.0}
     assert [c.args for c in stage.seen if c.verb == "BUZZ"] == [(0,), (1,)]
-    assert command("jog", "--config", config, "--dx", 3)[0] != 0
-    assert command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
-    assert json.loads(command("jog", "--config", config, "--dx", 3, "--json")[1]) == {"x_mm": 3.0, "y_mm": 0.0}
-    assert command("events", "--config", config, "--limit-s", 0.1)[0] == 5
+    assert run_command("jog", "--config", config, "--dx", 3)[0] != 0
+    assert run_command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
+    assert json.loads(run_command("jog", "--config", config, "--dx", 3, "--json")[1]) == {"x_mm": 3.0, "y_mm": 0.0}
+    assert run_command("events", "--config", config, "--limit-s", 0.1)[0] == 5
 
 
-def test_commands_while_the_service_runs(command, instrument, write_config, start, hub):
+def test_commands_while_the_service_runs(run_command, instrument, write_config, start, hub):
     """Commands that need lines, stage or ports are refused because the service runs; the error has its address."""
     # Ports that stay the same from one program to the next
     rig = move_to_free_subnet(instrument)
     start(rig, "--wires", hub)
     config = write_config(rig)
-    assert command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
+    assert run_command("home", "--config", config)[1] == "stage at x 0.000 mm, y 0.000 mm\n"
     # Statuses of the stage are among them
-    _, out, _ = command("events", "--config", config, "--count", 10)
+    _, out, _ = run_command("events", "--config", config, "--count", 10)
     assert "Heartbeat" in [json.loads(line)["type"] for line in out.splitlines()]
     for name in ("check", "pulse", "jog"):
-        status, _, err = command(name, "--config", config, *(("--wires", hub) if name != "jog" else ()))
+        status, _, err = run_command(name, "--config", config, *(("--wires", hub) if name != "jog" else ()))
         assert (status, rig.pi.command_address in err) == (5, True)
-    status, _, err = command("events", "--config", config, "--scan-id", "none")
+    status, _, err = run_command("events", "--config", config, "--scan-id", "none")
     assert (status, "'none'" in err) == (5, True)
 
 
@@ -134,23 +134,23 @@ def test_an_impossible_number_is_a_usage_error_that_names_it(config, capsys, com
         assert (e.value.code, repr(value) in err, "_parse" in err) == (2, True, False)
 
 
-def test_a_name_that_no_scan_can_have_and_an_end_without_a_run(command, instrument, write_config, start, hub):
+def test_a_name_that_no_scan_can_have_and_an_end_without_a_run(run_command, instrument, write_config, start, hub):
     rig = move_to_free_subnet(instrument)
     start(rig, "--wires", hub)
     config = write_config(rig)
     for name in ("../x", "", "a\nb"):
-        status, _, err = command("events", "--config", config, "--scan-id", name)
+        status, _, err = run_command("events", "--config", config, "--scan-id", name)
         assert (status, "no journal of scan" in err, "releases" in err) == (5, True, False)
-    status, _, err = command("take-over", "end", "--config", config)
+    status, _, err = run_command("take-over", "end", "--config", config)
     assert (status, "no run is active" in err) == (5, True)
 
 
-def test_take_over_where_no_service_ever_ran_says_so(command, config):
-    status, _, err = command("take-over", "abort", "--config", config)
+def test_take_over_where_no_service_ever_ran_says_so(run_command, config):
+    status, _, err = run_command("take-over", "abort", "--config", config)
     assert (status, "has not run" in err, "systemctl" in err) == (5, True, True)
 
 
-def test_advice_for_another_users_file_is_the_whole_command(command, config, monkeypatch):
+def test_advice_for_another_users_file_is_the_whole_command(run_command, config, monkeypatch):
     """A test as root may read every file, so the refusal is simulated."""
 
     def refuse(*_args, **_kwargs):
@@ -158,20 +158,20 @@ def test_advice_for_another_users_file_is_the_whole_command(command, config, mon
 
     monkeypatch.setattr("pathlib.Path.read_text", refuse)
     monkeypatch.setattr("polysight_shared.config.load_instrument", lambda _: load_published_rig())
-    status, _, err = command("take-over", "abort", "--config", config)
+    status, _, err = run_command("take-over", "abort", "--config", config)
     assert status == 5
     assert f"sudo -u polysight {PROGRAM} take-over abort --config {config}`" in err
 
 
-def test_a_missing_rig_file_leads_to_that_of_the_pi(command, tmp_path, monkeypatch):
+def test_a_missing_rig_file_leads_to_that_of_the_pi(run_command, tmp_path, monkeypatch):
     installed = tmp_path / "installed.toml"
     installed.touch()
     monkeypatch.setattr("polysight_pi.cli.RIG_FILE", str(installed))
-    status, _, err = command("check", "--config", tmp_path / "none.toml")
+    status, _, err = run_command("check", "--config", tmp_path / "none.toml")
     assert (status, f"--config {installed}`" in err) == (2, True)
 
 
-def test_keys_are_advised_as_a_command_that_works(command, tmp_path):
+def test_keys_are_advised_as_a_command_that_works(run_command, tmp_path):
     """Every `do:` is pasted: keys before the first client, new keys for damaged ones, a damaged list removed."""
     folder = tmp_path / "the keys"
 
@@ -179,36 +179,36 @@ def test_keys_are_advised_as_a_command_that_works(command, tmp_path):
         (line,) = [line for line in err.splitlines() if line.strip().startswith("do:")]
         return shlex.split(line.split("`")[1])
 
-    status, _, err = command("keys", "--dir", folder, "--client", "laptop")
+    status, _, err = run_command("keys", "--dir", folder, "--client", "laptop")
     assert (status, folder.exists()) == (2, False)
-    assert command(*paste(err)[1:])[0] == 0
-    assert command("keys", "--dir", folder, "--client", "laptop")[0] == 0
+    assert run_command(*paste(err)[1:])[0] == 0
+    assert run_command("keys", "--dir", folder, "--client", "laptop")[0] == 0
 
     (folder / "allowed_clients").write_bytes(b"\xff\xfe\x00")
     for option in (["--list"], ["--client", "b"], ["--revoke", "laptop"]):
-        status, _, err = command("keys", "--dir", folder, *option)
+        status, _, err = run_command("keys", "--dir", folder, *option)
         assert (status, "allowed_clients" in err) == (2, True)
     assert paste(err) == ["rm", str(folder / "allowed_clients")]
 
     (folder / "allowed_clients").write_text("")
-    assert command("keys", "--dir", folder, "--list")[1] == "no client is allowed\n"
+    assert run_command("keys", "--dir", folder, "--list")[1] == "no client is allowed\n"
 
     (folder / "pi.key_secret").write_text("public-key = 'short'\nsecret-key = 'short'\n")
     with make_server_context() as context, expect_refusal(ErrorCode.FILE_MISSING, "CURVE") as error:
         create_replier(context, "tcp://0.0.0.0:*", folder).close()
-    assert command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == 0
+    assert run_command(*shlex.split(error.value.remedy.split("`")[1])[1:])[0] == 0
 
 
-def test_keys_on_a_full_disk_say_so(command, tmp_path, monkeypatch):
+def test_keys_on_a_full_disk_say_so(run_command, tmp_path, monkeypatch):
     def fill(*_args):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("polysight_pi.keys.create_certificates", fill)
-    status, _, err = command("keys", "--dir", tmp_path / "keys")
+    status, _, err = run_command("keys", "--dir", tmp_path / "keys")
     assert (status, "the disk is full" in err, str(tmp_path) in err, "sudo" in err) == (5, True, True, False)
 
 
-def test_pulse_reports_faults(command, config, monkeypatch):
+def test_pulse_reports_faults(run_command, config, monkeypatch):
     late = BurstRecord(
         pulses=2, first_ns=0, last_ns=1, end_ns=2, width_max_ns=1000, jitter_ns=900, fault=PiFault.PERIOD_TOO_SHORT
     )
@@ -217,5 +217,5 @@ def test_pulse_reports_faults(command, config, monkeypatch):
     monkeypatch.setattr("polysight_pi.trigger.send_burst", lambda *_: next(records))
     monkeypatch.setattr("polysight_pi.system.prepare_process", list)
     monkeypatch.setattr("polysight_pi.system.prepare_thread", list)
-    status, _, err = command("pulse", "--config", config, "--count", 3)
+    status, _, err = run_command("pulse", "--config", config, "--count", 3)
     assert (status, "fault 106 in 2 of 3 bursts" in err, "do:" in err) == (1, True, True)

@@ -57,7 +57,7 @@ def service_pid(pi: InstalledPi) -> str:
     return pi.read_property("MainPID")
 
 
-def seconds(begun: float) -> str:
+def format_s(begun: float) -> str:
     """Duration since `begun`, by this computer's clock, for a figure."""
     return f"{time.monotonic() - begun:.1f} s"
 
@@ -114,7 +114,7 @@ def test_home_brings_the_motors_to_zero(pi: InstalledPi):
     """`polysight-pi home` on the host, through the service; the steps are counted at the board's pins."""
     begun = time.monotonic()
     assert json.loads(pi.on_host("home", "--json")) == {"x_mm": 0.0, "y_mm": 0.0}
-    print_figure(f"home, through the service: {seconds(begun)}")
+    print_figure(f"home, through the service: {format_s(begun)}")
     assert pi.uno.stands_at_mm == (0.0, 0.0)
 
 
@@ -174,7 +174,7 @@ def test_a_jog_by_hand_moves_the_motors_by_its_distance(bench: InstalledPi):
     assert json.loads(bench.box.run(f"{by_hand} home {config}")) == {"x_mm": 0.0, "y_mm": 0.0}
     begun = time.monotonic()
     assert json.loads(bench.box.run(f"{by_hand} jog --dx 10 --dy 5 {config}")) == {"x_mm": 10.0, "y_mm": 5.0}
-    print_figure(f"jog by 10 mm and 5 mm, the program's start included: {seconds(begun)}")
+    print_figure(f"jog by 10 mm and 5 mm, the program's start included: {format_s(begun)}")
     bench.box.wait(lambda: not bench.uno.moving, "the motors rest")
     assert bench.uno.stands_at_mm == (10.0, 5.0)
 
@@ -208,7 +208,7 @@ def test_a_killed_service_comes_back_and_its_stage_rests(pi: InstalledPi, homed_
     assert beyond_mm <= (pi.rig.stage.heartbeat_ms / 1e3 + 0.1) * in_row_mm_s + ramp_mm
     pi.until_ready()
     print_figure(f"kill -9 in a row: the stage went on for {beyond_mm:.0f} mm (heartbeat"
-         f" {pi.rig.stage.heartbeat_ms / 1e3:g} s here); the service was ready after {seconds(begun)}")  # fmt: skip
+         f" {pi.rig.stage.heartbeat_ms / 1e3:g} s here); the service was ready after {format_s(begun)}")  # fmt: skip
     assert service_pid(pi) != killed
     back = pi.host()
     assert back.ask(m.Hello()).state == "idle"
@@ -223,7 +223,7 @@ def test_a_service_that_hangs_is_started_again(pi: InstalledPi):
     pi.systemctl("kill --signal=STOP polysight-pi")
     pi.box.wait(lambda: service_pid(pi) not in (hung, "0"), "another process")
     pi.until_ready()
-    print_figure(f"SIGSTOP: ready again after {seconds(begun)}")
+    print_figure(f"SIGSTOP: ready again after {format_s(begun)}")
     assert "watchdog" in pi.box.run("sudo journalctl --unit polysight-pi --no-pager").lower()
 
 
@@ -255,13 +255,13 @@ def test_update_and_roll_back(pi: InstalledPi):
     first = service_pid(pi)
     begun = time.monotonic()
     pi.install()
-    print_figure(f"update: {seconds(begun)}")
+    print_figure(f"update: {format_s(begun)}")
     pi.until_ready()
     assert pi.release() == "releases/2"
     second = service_pid(pi)
     begun = time.monotonic()
     pi.box.run("sudo ~/.cache/polysight-install/install.sh --roll-back")
-    print_figure(f"roll back: {seconds(begun)}")
+    print_figure(f"roll back: {format_s(begun)}")
     pi.until_ready()
     assert pi.release() == "releases/1"
     assert len({first, second, service_pid(pi)}) == 3

@@ -45,7 +45,7 @@ def from_raw(two_plates: Path) -> Pipeline:
 
 
 @pytest.fixture(scope="module")
-def expected(from_raw: Pipeline) -> Images:
+def expected_images(from_raw: Pipeline) -> Images:
     """Its images."""
     return from_raw.form_images()
 
@@ -56,16 +56,16 @@ def scan(two_plates: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def _processed(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def processed_scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = Path(shutil.copytree(two_plates, tmp_path_factory.mktemp("kept") / "scan"))
     process_scan(folder)
     return folder
 
 
 @pytest.fixture
-def kept(_processed: Path, tmp_path: Path) -> Path:
+def scan_with_samples(processed_scan: Path, tmp_path: Path) -> Path:
     """A copy of the scan with its samples."""
-    return Path(shutil.copytree(_processed, tmp_path / "scan"))
+    return Path(shutil.copytree(processed_scan, tmp_path / "scan"))
 
 
 def remove_raw(folder: Path) -> Path:
@@ -73,20 +73,24 @@ def remove_raw(folder: Path) -> Path:
     return folder
 
 
-def test_images_and_quality_from_samples_are_bit_exact(from_raw: Pipeline, expected: Images, kept: Path) -> None:
-    reprocessed = process_scan(remove_raw(kept))
-    assert are_same_images(reprocessed.form_images(), expected)
+def test_images_and_quality_from_samples_are_bit_exact(
+    from_raw: Pipeline, expected_images: Images, scan_with_samples: Path
+) -> None:
+    reprocessed = process_scan(remove_raw(scan_with_samples))
+    assert are_same_images(reprocessed.form_images(), expected_images)
     for key in ("boards", "coverage"):
         assert getattr(reprocessed.quality.result(), key) == getattr(from_raw.quality.result(), key)
 
 
-def test_rows_on_several_threads_make_the_same_products(from_raw: Pipeline, expected: Images, scan: Path) -> None:
+def test_rows_on_several_threads_make_the_same_products(
+    from_raw: Pipeline, expected_images: Images, scan: Path
+) -> None:
     threaded = Pipeline(ScanFolder.load(scan), samples="keep")
     rows = list(threaded.source.rows())
     assert list(map_rows(threaded.add_row, rows, threads=4)) == rows
-    assert are_same_images(threaded.form_images(), expected)
+    assert are_same_images(threaded.form_images(), expected_images)
     assert threaded.quality.result().boards == from_raw.quality.result().boards
-    assert are_same_images(process_scan(remove_raw(scan)).form_images(), expected)
+    assert are_same_images(process_scan(remove_raw(scan)).form_images(), expected_images)
 
 
 def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,26 +115,28 @@ def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(begun) <= 3
 
 
-def test_samples_with_sub_bands_can_be_used_without_them(expected: Images, scan: Path) -> None:
+def test_samples_with_sub_bands_can_be_used_without_them(expected_images: Images, scan: Path) -> None:
     first = process_scan(scan, bands=3)
     reprocessed = process_scan(remove_raw(scan), bands=3)
     for first_item, second_item in zip(reprocessed.sub_bands.finish(), first.sub_bands.finish(), strict=True):
         assert are_same_images(first_item, second_item)
-    assert are_same_images(process_scan(scan).form_images(), expected)
+    assert are_same_images(process_scan(scan).form_images(), expected_images)
 
 
-def test_samples_without_the_sub_bands_asked_for_are_not_used(kept: Path) -> None:
-    processed_again = process_scan(kept, bands=2)
+def test_samples_without_the_sub_bands_asked_for_are_not_used(scan_with_samples: Path) -> None:
+    processed_again = process_scan(scan_with_samples, bands=2)
     assert len(processed_again.sub_bands.finish()) == 2
-    assert process_scan(remove_raw(kept), bands=2).sub_bands.bands == processed_again.sub_bands.bands
+    assert process_scan(remove_raw(scan_with_samples), bands=2).sub_bands.bands == processed_again.sub_bands.bands
 
 
 @pytest.mark.parametrize(
     "view", [{"depth_mm": 8.0}, {"depth_mm": -12.0}, {"columns": 31, "rows": 24, "pixel_mm": 5.0}, {"pixel_mm": 2.0}]
 )
-def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kept: Path, view: dict[str, Any]) -> None:
+def test_other_planes_and_grids_come_from_the_same_samples(
+    two_plates: Path, scan_with_samples: Path, view: dict[str, Any]
+) -> None:
     expected = process_scan(two_plates, "none", **view).form_images()
-    reprocessed = process_scan(remove_raw(kept), **view).form_images()
+    reprocessed = process_scan(remove_raw(scan_with_samples), **view).form_images()
     np.testing.assert_array_equal(reprocessed.x_m, expected.x_m)
     pairs = [(reprocessed.h_raw, expected.h_raw), (reprocessed.v_raw, expected.v_raw)]
     pairs += zip(reprocessed.illumination.footprints, expected.illumination.footprints, strict=True)
@@ -139,23 +145,23 @@ def test_other_planes_and_grids_come_from_the_same_samples(two_plates: Path, kep
         assert np.abs(first_item - second_item).max() < 2e-3 * np.abs(second_item).max()
 
 
-def test_a_plane_beyond_what_was_kept_needs_raw_data(kept: Path) -> None:
+def test_a_plane_beyond_what_was_kept_needs_raw_data(scan_with_samples: Path) -> None:
     depth_mm = 1e3 * PLANE_REACH_M + 200
-    process_scan(kept, depth_mm=depth_mm)
+    process_scan(scan_with_samples, depth_mm=depth_mm)
     with pytest.raises(DataError):
-        process_scan(remove_raw(kept), depth_mm=depth_mm)
+        process_scan(remove_raw(scan_with_samples), depth_mm=depth_mm)
 
 
-def test_other_planes_do_not_change_the_kept_samples(kept: Path) -> None:
-    samples_before = {p.name: p.read_bytes() for p in (kept / "samples").iterdir()}
-    process_scan(kept, depth_mm=300.0)
-    process_scan(kept, depth_range_mm=50.0)
-    assert {p.name: p.read_bytes() for p in (kept / "samples").iterdir()} == samples_before
+def test_other_planes_do_not_change_the_kept_samples(scan_with_samples: Path) -> None:
+    samples_before = {p.name: p.read_bytes() for p in (scan_with_samples / "samples").iterdir()}
+    process_scan(scan_with_samples, depth_mm=300.0)
+    process_scan(scan_with_samples, depth_range_mm=50.0)
+    assert {p.name: p.read_bytes() for p in (scan_with_samples / "samples").iterdir()} == samples_before
 
 
 @pytest.mark.parametrize("what", ["record", "torn line", "line", "head", "array gone", "array short"])
-def test_damaged_samples_are_made_again(expected: Images, kept: Path, what: str) -> None:
-    folder = kept / "samples"
+def test_damaged_samples_are_made_again(expected_images: Images, scan_with_samples: Path, what: str) -> None:
+    folder = scan_with_samples / "samples"
     rows = folder / "rows.jsonl"
     array = folder / "RH.npy"
     if what == "record":
@@ -172,11 +178,13 @@ def test_damaged_samples_are_made_again(expected: Images, kept: Path, what: str)
         array.unlink()
     else:
         array.write_bytes(array.read_bytes()[:-3000])
-    assert are_same_images(process_scan(kept).form_images(), expected)
-    assert are_same_images(process_scan(remove_raw(kept)).form_images(), expected)
+    assert are_same_images(process_scan(scan_with_samples).form_images(), expected_images)
+    assert are_same_images(process_scan(remove_raw(scan_with_samples)).form_images(), expected_images)
 
 
-def test_rows_with_other_raw_data_are_synchronised_again(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_with_other_raw_data_are_synchronised_again(
+    scan_with_samples: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As after a retake or a new placement of the row: the committed digest differs."""
     committed = ScanFolder.committed_rows
 
@@ -186,29 +194,29 @@ def test_rows_with_other_raw_data_are_synchronised_again(kept: Path, monkeypatch
         return rows
 
     monkeypatch.setattr(ScanFolder, "committed_rows", change_row)
-    pipeline = Pipeline(ScanFolder.load(kept), samples="read")
+    pipeline = Pipeline(ScanFolder.load(scan_with_samples), samples="read")
     assert [row for row in pipeline.source.rows() if not pipeline.samples.restore(row)] == [2]
 
 
-def test_samples_of_another_calibration_are_not_used(kept: Path) -> None:
-    head = json.loads((kept / "samples" / "samples.json").read_text())
+def test_samples_of_another_calibration_are_not_used(scan_with_samples: Path) -> None:
+    head = json.loads((scan_with_samples / "samples" / "samples.json").read_text())
     head["made_with"]["object_distance_mm"] += 1.0
-    (kept / "samples" / "samples.json").write_text(json.dumps(head))
-    pipeline = Pipeline(ScanFolder.load(kept), samples="read")
+    (scan_with_samples / "samples" / "samples.json").write_text(json.dumps(head))
+    pipeline = Pipeline(ScanFolder.load(scan_with_samples), samples="read")
     assert not any(pipeline.samples.restore(row) for row in pipeline.source.rows())
 
 
 def test_a_scan_is_processed_even_if_samples_cannot_be_written(
-    expected: Images, scan: Path, caplog: pytest.LogCaptureFixture
+    expected_images: Images, scan: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (scan / "samples").write_text("a file is in the way")
-    assert are_same_images(process_scan(scan).form_images(), expected)
+    assert are_same_images(process_scan(scan).form_images(), expected_images)
     assert str(scan / "samples") in caplog.text
 
 
-def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, kept: Path) -> None:
+def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, scan_with_samples: Path) -> None:
     """The lines of docs/spec/samples.md."""
-    folder = kept / "samples"
+    folder = scan_with_samples / "samples"
     head = json.loads((folder / "samples.json").read_text())
     records = np.load(folder / "RH.npy", mmap_mode="r")
     lines = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
@@ -244,10 +252,10 @@ def test_samples_are_kept_only_if_their_paths_are_those_of_every_other_image(nee
         lambda h: [h],
     ],
 )
-def test_an_invalid_head_is_ignored(expected: Images, kept: Path, head) -> None:
-    path = kept / "samples" / "samples.json"
+def test_an_invalid_head_is_ignored(expected_images: Images, scan_with_samples: Path, head) -> None:
+    path = scan_with_samples / "samples" / "samples.json"
     path.write_text(json.dumps(head(json.loads(path.read_text()))))
-    assert are_same_images(process_scan(kept, "read").form_images(), expected)
+    assert are_same_images(process_scan(scan_with_samples, "read").form_images(), expected_images)
 
 
 @pytest.mark.parametrize(
@@ -260,14 +268,16 @@ def test_an_invalid_head_is_ignored(expected: Images, kept: Path, head) -> None:
         {"positions_masked": -5},
     ],
 )
-def test_a_row_with_invalid_figures_is_made_again(expected: Images, kept: Path, change: dict | None) -> None:
-    path = kept / "samples" / "rows.jsonl"
+def test_a_row_with_invalid_figures_is_made_again(
+    expected_images: Images, scan_with_samples: Path, change: dict | None
+) -> None:
+    path = scan_with_samples / "samples" / "rows.jsonl"
     facts = [json.loads(line) for line in path.read_text().splitlines()]
     entry = facts[4]["boards"]["RH"]
     entry["figures"] = change if change is None else {**entry["figures"], **change}
     path.write_bytes(b"".join(encode_line({k: v for k, v in f.items() if k != "crc"}) for f in facts))
-    assert are_same_images(process_scan(kept).form_images(), expected)
-    assert are_same_images(process_scan(remove_raw(kept)).form_images(), expected)
+    assert are_same_images(process_scan(scan_with_samples).form_images(), expected_images)
+    assert are_same_images(process_scan(remove_raw(scan_with_samples)).form_images(), expected_images)
 
 
 def damage_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarray], None]) -> None:

@@ -57,7 +57,7 @@ def examine(rig):
 
 
 @pytest.fixture(scope="module")
-def plain(examine):
+def plain_scene(examine):
     """Results for all plates with a rig whose leakage was measured."""
     return examine(make_scene(disturbances={"leakage_measured": 0.003}))
 
@@ -83,8 +83,8 @@ def has_no_results(findings):
     return all(r.name is None and r.permittivity is None and r.ratio is None for r in findings.analysis.rows())
 
 
-def test_a_measured_rig_and_a_plain_scene_are_good(plain):
-    findings, true = plain
+def test_a_measured_rig_and_a_plain_scene_are_good(plain_scene):
+    findings, true = plain_scene
     assert findings.verdict.level == "good", join_reasons(findings)
     assert np.sqrt(compute_distances(findings, true).mean() / 2) < 1.5
     assert sum(r.patch_name is not None and r.patch_name.name.startswith(true[r.patch.label].name)
@@ -231,8 +231,8 @@ def test_products_without_a_result_hold_images_and_no_name(rig, tmp_path):
     assert msgspec.json.decode((tmp_path / "out/labels.json").read_bytes())["labels"].keys() <= {"patch", "patch (2)"}
 
 
-def test_p_sigma_covers_the_error_of_p(plain):
-    findings, true = plain
+def test_p_sigma_covers_the_error_of_p(plain_scene):
+    findings, true = plain_scene
     analysis = findings.analysis
     sigma = analysis.p_sigma(findings.images.valid)
     inside = []

@@ -1,5 +1,5 @@
 """Small scans, and watches of them."""
 
-from tests.support.page.fixtures import finished, growing, processed, samples, watching
+from tests.support.page.fixtures import finished_scan, growing, processed_scans, samples, watching
 
-__all__ = ["finished", "growing", "processed", "samples", "watching"]
+__all__ = ["finished_scan", "growing", "processed_scans", "samples", "watching"]

@@ -63,10 +63,12 @@ def abort_once(server: Server, folder: Path) -> float:
     return took_s
 
 
-def test_an_abort_is_accepted_whatever_other_clients_request(processed: Path, tmp_path: Path, request, record_property):
+def test_an_abort_is_accepted_whatever_other_clients_request(
+    processed_scans: Path, tmp_path: Path, request, record_property
+):
     attack = LONG if request.config.getoption("--long") else BRIEF
     for k in range(VIEWS + 1):
-        shutil.copytree(processed / "one", tmp_path / "scans" / f"s{k}", ignore=shutil.ignore_patterns("figures"))
+        shutil.copytree(processed_scans / "one", tmp_path / "scans" / f"s{k}", ignore=shutil.ignore_patterns("figures"))
     (tmp_path / "state").mkdir()
     took_s = []
     with run_server(tmp_path / "scans", tmp_path / "state") as server, run_attack(server.port, attack, tmp_path):

@@ -31,9 +31,9 @@ READ = ("scan", "result", "thumbnail", "state", "map/h_amplitude", "file/image.n
 
 
 @pytest.fixture
-def scans(finished: Path, tmp_path: Path) -> Path:
+def scans(finished_scan: Path, tmp_path: Path) -> Path:
     """A folder with a scan that was processed, next to a file that must not be served."""
-    shutil.copytree(finished, tmp_path / "scans" / "one")
+    shutil.copytree(finished_scan, tmp_path / "scans" / "one")
     write_judged_products(tmp_path / "scans" / "one" / "products", "care")
     (tmp_path / "secret.txt").write_text(SECRET)
     (tmp_path / "scans" / "out").symlink_to(tmp_path)

@@ -123,8 +123,8 @@ def write_points(path: Path, permittivities: tuple[float, ...] = (2.5, 3.0, 3.5,
 
 
 @pytest.fixture
-def scans(processed: Path, tmp_path: Path) -> Path:
-    shutil.copytree(processed, tmp_path / "scans")
+def scans(processed_scans: Path, tmp_path: Path) -> Path:
+    shutil.copytree(processed_scans, tmp_path / "scans")
     write_points(tmp_path / "scans" / "one" / "products" / "surface.ply")
     x_mm, y_mm = PET["centre_mm"]
     for name, permittivity in KNOWN_PERMITTIVITY.items():

@@ -170,8 +170,8 @@ def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refus
         end_program(folder, "scan")
 
 
-def test_files_that_a_page_leaves_in_a_scan_folder_are_not_a_fault(finished, tmp_path):
-    shutil.copytree(finished, tmp_path / "one")
+def test_files_that_a_page_leaves_in_a_scan_folder_are_not_a_fault(finished_scan, tmp_path):
+    shutil.copytree(finished_scan, tmp_path / "one")
     findings_before = validate(tmp_path / "one")
     (tmp_path / "one" / PROGRAM_FOLDER).mkdir()
     (tmp_path / "one" / PROGRAM_FOLDER / "scan.log").touch()

@@ -45,8 +45,8 @@ def read_example(port: int, served_port: int) -> str:
 
 
 @pytest.fixture
-def scans(finished: Path, tmp_path: Path) -> Path:
-    shutil.copytree(finished, tmp_path / "scans" / "one")
+def scans(finished_scan: Path, tmp_path: Path) -> Path:
+    shutil.copytree(finished_scan, tmp_path / "scans" / "one")
     return tmp_path / "scans"
 
 

@@ -76,8 +76,8 @@ def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
     assert (TOKEN.encode(), TOKEN.encode()) in compared
 
 
-def test_a_command_to_a_finished_scan_is_refused_with_a_remedy(finished, watching):
-    with serve_view(watching(finished, control=True), TOKEN) as view:
+def test_a_command_to_a_finished_scan_is_refused_with_a_remedy(finished_scan, watching):
+    with serve_view(watching(finished_scan, control=True), TOKEN) as view:
         status, body, _ = ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})
     assert status == 409
     assert "polysight resume" in json.loads(body)["do"]

@@ -63,8 +63,8 @@ class StillWatch:
 
 
 @pytest.fixture
-def still(finished: Path, tmp_path: Path) -> Iterator[tuple[StillWatch, Served]]:
-    watch = StillWatch(tmp_path / "one", begin_history(load_facts(finished)[0]))
+def still(finished_scan: Path, tmp_path: Path) -> Iterator[tuple[StillWatch, Served]]:
+    watch = StillWatch(tmp_path / "one", begin_history(load_facts(finished_scan)[0]))
     watch.show("rows")
     watches = Watches(True, {"one": watch})  # type: ignore[dict-item]
     site = Site(Scans(tmp_path, "one"), watches, Programs(), RIG_FILE)

@@ -24,8 +24,8 @@ def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_a_finished_scan_at_a_glance(browser, finished, watching, tmp_path, size):
-    watch = watching(finished)
+def test_a_finished_scan_at_a_glance(browser, finished_scan, watching, tmp_path, size):
+    watch = watching(finished_scan)
     watch.wait_for(lambda s: s["pictures"]["rows"] == 3)
     with serve_view(watch) as view:
         open_page(browser, view, size)
@@ -81,11 +81,11 @@ def test_buttons_reach_the_scan(browser, growing, watching):
         assert browser.errors == []
 
 
-def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished, watching):
+def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished_scan, watching):
     """At an address of its own: a free port of 127.0.0.1 may be used by another program by then."""
     rig = move_to_free_subnet(load_published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
-    watch = watching(finished)
+    watch = watching(finished_scan)
     with serve_view(watch, host=host, port=int(port)) as view:
         open_page(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")

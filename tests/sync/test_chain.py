@@ -19,19 +19,19 @@ PULSES = 6
 
 
 @pytest.fixture(scope="module")
-def small(rig):
+def short_bursts_rig(rig):
     return msgspec.structs.replace(rig, burst=msgspec.structs.replace(rig.burst, pulses=PULSES))
 
 
 @pytest.fixture(scope="module")
-def row(small, paths, noise):
+def make_row(short_bursts_rig, paths, noise):
     """Frames of one row in ADC counts, disturbed or not, and the ideal referenced samples [rx, position, block]."""
-    board = small.receivers[1]
+    board = short_bursts_rig.receivers[1]
 
     def make(offsets=True, filtered=False, snr_db=12.0, seed=0):
         signal, direct = paths(board, POSITIONS, 1.0, np.random.default_rng(8))
         rng = np.random.default_rng(seed)
-        chirp = small.chirp
+        chirp = short_bursts_rig.chirp
         f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
         ideal = signal * np.exp(-2j * np.pi * f * direct[:, None] / SPEED_OF_LIGHT_M_S)
         n = np.arange(chirp.samples)
@@ -54,8 +54,8 @@ def row(small, paths, noise):
 
 
 @pytest.fixture(scope="module")
-def setup(small):
-    return BoardSetup.from_rig(small, small.receivers[1], compensate_filter=False)
+def setup(short_bursts_rig):
+    return BoardSetup.from_rig(short_bursts_rig, short_bursts_rig.receivers[1], compensate_filter=False)
 
 
 def _compute_relative_error(row, ideal, inside=slice(None)):
@@ -63,8 +63,8 @@ def _compute_relative_error(row, ideal, inside=slice(None)):
     return np.sqrt((np.abs(scaled - ideal)[..., inside] ** 2).mean() / (np.abs(ideal)[..., inside] ** 2).mean())
 
 
-def test_a_disturbed_row_is_restored_to_the_ideal(row, setup):
-    frames, valid, ideal = row()
+def test_a_disturbed_row_is_restored_to_the_ideal(make_row, setup):
+    frames, valid, ideal = make_row()
     synchronised = synchronise_row(frames, valid, setup)
     assert synchronised.valid.all()
     assert (synchronised.chirps == PULSES).all()
@@ -72,16 +72,16 @@ def test_a_disturbed_row_is_restored_to_the_ideal(row, setup):
     assert _compute_relative_error(synchronised, ideal) < 1.3 * noise_floor
 
 
-def test_offsets_have_no_effect_beyond_noise(row, setup):
-    with_offsets = synchronise_row(*row(offsets=True, snr_db=30)[:2], setup)
-    without = synchronise_row(*row(offsets=False, snr_db=30)[:2], setup)
+def test_offsets_have_no_effect_beyond_noise(make_row, setup):
+    with_offsets = synchronise_row(*make_row(offsets=True, snr_db=30)[:2], setup)
+    without = synchronise_row(*make_row(offsets=False, snr_db=30)[:2], setup)
     difference = np.abs(with_offsets.samples - without.samples)
     assert np.sqrt((difference**2).mean()) < 0.04 * 800
 
 
-def test_the_high_pass_filter_is_compensated(row, small, setup):
-    frames, valid, ideal = row(filtered=True, snr_db=30)
-    undone = synchronise_row(frames, valid, BoardSetup.from_rig(small, small.receivers[1]))
+def test_the_high_pass_filter_is_compensated(make_row, short_bursts_rig, setup):
+    frames, valid, ideal = make_row(filtered=True, snr_db=30)
+    undone = synchronise_row(frames, valid, BoardSetup.from_rig(short_bursts_rig, short_bursts_rig.receivers[1]))
     remainder = synchronise_row(frames, valid, setup)
     assert _compute_relative_error(undone, ideal, slice(3, None)) < 0.04
     assert _compute_relative_error(undone, ideal, slice(3, None)) < 0.4 * _compute_relative_error(
@@ -89,8 +89,8 @@ def test_the_high_pass_filter_is_compensated(row, small, setup):
     )
 
 
-def test_errors_shrink_from_received_to_averaged(row, setup):
-    synchronised = synchronise_row(*row()[:2], setup)
+def test_errors_shrink_from_received_to_averaged(make_row, setup):
+    synchronised = synchronise_row(*make_row()[:2], setup)
     assert list(synchronised.stages) == ["received", "aligned", "averaged", "referenced"]
     f, phase, amplitude = zip(*synchronised.stages.values(), strict=True)
     assert f[0] > 20 * f[1]
@@ -147,8 +147,8 @@ def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, 
         np.testing.assert_allclose(few_examined.stages[stage], spread, rtol=0.35)
 
 
-def test_clipped_and_missing_chirps_are_left_out(row, setup):
-    frames, valid, ideal = row()
+def test_clipped_and_missing_chirps_are_left_out(make_row, setup):
+    frames, valid, ideal = make_row()
     frames[2, 3 * PULSES + 1, 40] = 32767
     valid[5 * PULSES : 5 * PULSES + 2] = False
     valid[7 * PULSES : 8 * PULSES] = False
@@ -161,9 +161,9 @@ def test_clipped_and_missing_chirps_are_left_out(row, setup):
     assert np.abs(synchronised.samples[:, is_valid] / 800 - ideal[:, is_valid]).mean() < 0.2
 
 
-def test_bursts_of_one_chirp(row, setup):
+def test_bursts_of_one_chirp(make_row, setup):
     """They are synchronised only by the direct path; residuals that need two chirps are missing."""
-    frames, valid, ideal = row(snr_db=20)
+    frames, valid, ideal = make_row(snr_db=20)
     single_chirp = replace(setup, pulses=1)
     synchronised = synchronise_row(frames[:, ::PULSES], valid[::PULSES], single_chirp)
     assert synchronised.valid.all()
@@ -191,9 +191,9 @@ def test_a_truncated_recording_is_refused(setup):
 
 
 @pytest.mark.parametrize("conjugate", [False, True])
-def test_a_row_of_a_cube_is_turned_completed_and_masked_where_it_is_empty_or_not_finite(small, conjugate):
+def test_a_row_of_a_cube_is_turned_completed_and_masked_where_it_is_empty_or_not_finite(short_bursts_rig, conjugate):
     rng = np.random.default_rng(3)
-    shape = (4, POSITIONS, small.chirp.samples)
+    shape = (4, POSITIONS, short_bursts_rig.chirp.samples)
     cube = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
     cube[:, 1] = 0
     cube[2, 3, 7] = np.nan
@@ -201,9 +201,9 @@ def test_a_row_of_a_cube_is_turned_completed_and_masked_where_it_is_empty_or_not
     # One number is enough
     cube[:, 6] = 0
     cube[3, 6, -1] = -1e-30j
-    turn = np.exp(2j * np.pi * rng.uniform(size=(4, small.chirp.samples))).astype(np.complex64)
+    turn = np.exp(2j * np.pi * rng.uniform(size=(4, short_bursts_rig.chirp.samples))).astype(np.complex64)
     constant = np.arange(4).astype(np.complex64)
-    form = CubeForm(conjugate, turn, constant, None, small.chirp, "")
+    form = CubeForm(conjugate, turn, constant, None, short_bursts_rig.chirp, "")
     row = form.convert_row(cube[:, ::-1], 16)
     masked = [POSITIONS - 1 - position for position in (1, 3, 4)]
     assert np.flatnonzero(~row.valid).tolist() == sorted(masked)

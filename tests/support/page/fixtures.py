@@ -26,7 +26,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
 
 
 @pytest.fixture(scope="session")
-def finished(samples: Samples, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished_scan(samples: Samples, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a finished scan of three rows."""
     scan = SmallScan(samples, tmp_path_factory.mktemp("finished"))
     assert scan.run().exit_status == "success"
@@ -34,9 +34,9 @@ def finished(samples: Samples, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.fixture
-def growing(finished: Path, tmp_path: Path) -> GrowingScan:
+def growing(finished_scan: Path, tmp_path: Path) -> GrowingScan:
     """A scan that has not begun yet."""
-    return GrowingScan(finished, tmp_path / "scan")
+    return GrowingScan(finished_scan, tmp_path / "scan")
 
 
 class Watched(Watch):
@@ -61,7 +61,7 @@ def watching() -> Iterator[Callable[..., Watched]]:
 
 
 @pytest.fixture(scope="session")
-def processed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def processed_scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two processed scans, `one` and `two`, of copper and PET with other noise."""
     scene = decode_scene(make_scene(COPPER, PET, columns=15, rows=17), "test")
 

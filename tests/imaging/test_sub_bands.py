@@ -1,5 +1,6 @@
 """Sub-bands cover the sweep and overlap by half; the model of layers uses the same frequencies."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -8,7 +9,7 @@ from tests.support.rigs import load_published_rig
 
 from polysight.imaging.images import MIN_SAMPLES, sub_bands
 from polysight.materials.layers import Spectrum
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import ConfigError, ErrorCode
 
 CHIRP = load_published_rig().chirp
 
@@ -44,3 +45,15 @@ def test_the_model_of_a_layer_averages_over_the_same_frequencies(count):
 def test_too_many_are_refused(count):
     with expect_refusal(ErrorCode.VALUE_INVALID, count):
         sub_bands(CHIRP, count)
+
+
+@pytest.mark.parametrize("linear_samples", [(0, 192), (10, 100), (0, 25), (0, 37)])
+def test_the_advised_number_of_parts_is_the_largest_that_is_possible(linear_samples):
+    """Parts of at least 24 samples, which overlap by half."""
+    chirp = msgspec.structs.replace(CHIRP, linear_samples=linear_samples)
+    with pytest.raises(ConfigError) as refusal:
+        sub_bands(chirp, 1000)
+    most = int(refusal.value.remedy.removeprefix("use 1 to "))
+    assert len(sub_bands(chirp, most)) == most
+    with expect_refusal(ErrorCode.VALUE_INVALID):
+        sub_bands(chirp, most + 1)

@@ -15,6 +15,7 @@ from polysight.materials.discriminant import (
     estimate_common_error,
     shares_of_materials,
 )
+from polysight.materials.kinds import _compute_shares, _tabulate_coordinate_density
 from polysight.materials.names import _evaluate_normal, weigh_kinds
 
 COVARIANCES = np.array([[[2.0, 0.5], [0.5, 1.0]], [[0.5, -0.1], [-0.1, 0.3]]])
@@ -163,3 +164,36 @@ def test_a_density_of_two_scans_is_that_of_four_numbers():
     law = scipy.stats.multivariate_normal([0.0, 0.1, 1.0, 0.0], covariance)
     expected = [law.pdf([0.5, 0.2, 1.0, -1.0]), law.pdf([0.0, 0.0, 0.0, 2.0])]
     np.testing.assert_allclose(_evaluate_normal(draws, mean, covariance), expected)
+
+
+def test_half_spaces_of_no_kind_have_a_density_over_all_of_their_range():
+    """Over ln eps' and asinh(eps'' / 0.05) it sums up to one; a fifth of it is even, the rest near the literature."""
+    table, real_axis, loss_axis = _tabulate_coordinate_density()
+    assert (np.exp(real_axis[[0, -1]])).tolist() == pytest.approx([1.2, 30.0])
+    assert (0.05 * np.sinh(loss_axis[[0, -1]])).tolist() == pytest.approx([0.0, 30.0])
+    assert np.trapezoid(np.trapezoid(table, loss_axis), real_axis) == pytest.approx(1.0, rel=0.02)
+    area = np.log(30 / 1.2) * np.arcsinh(30 / 0.05)
+    assert table.min() == pytest.approx(0.2 / area, rel=1e-3)
+
+
+@pytest.mark.parametrize(("sheets", "others"), [(0.0, 0.5), (0.3, 0.35)])
+def test_kinds_of_a_source_share_its_part(sheets, others):
+    """Metal 0.1, literature 0.4, other half spaces 0.5 of what is in no library; thin plates take theirs from these."""
+    kinds: Any = [
+        SimpleNamespace(source=source, permittivity=eps)
+        for source, eps in (
+            ("library", 3.0),
+            ("library", None),
+            ("literature", 4.0),
+            ("literature", 5.0),
+            ("literature", None),
+        )
+    ]
+    shares, other = _compute_shares(kinds, sheets)
+    left = 1 - sheets
+    np.testing.assert_allclose(shares, [0.5, 0.5, 0.2 * left, 0.2 * left, 0.1 * left])
+    assert other == pytest.approx(others)
+    assert shares[2:].sum() + other == pytest.approx(left)
+    shares, other = _compute_shares(kinds[:2], sheets)
+    assert shares.tolist() == [0.5, 0.5]
+    assert other == pytest.approx(0.9 * left)

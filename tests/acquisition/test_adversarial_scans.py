@@ -14,6 +14,7 @@ from tests.support.acquisition.fake_rig import FakeRig, make_small_instrument
 from tests.support.store.plain_scan import list_errors
 
 from polysight.acquisition.scan import resume_scan, run_scan
+from polysight.capture.dca1000 import Code
 from polysight.store import ScanFolder, place_again
 from polysight_shared.config import Board
 from polysight_shared.errors import ScanError
@@ -54,10 +55,10 @@ class AdversarialCard(FakeCard):
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
         super()._command(code, sender)
-        if code == 1:
+        if code == Code.RESET_FPGA:
             self.adversary.reset_by_host()
         # Before the row runs; after its stop
-        if code in (5, 6):
+        if code in (Code.RECORD_START, Code.RECORD_STOP):
             self._send(self.adversary.take_late(0.3))
 
 

@@ -18,7 +18,7 @@ PULSES = 6
 
 @pytest.fixture
 def timed_rig(make_instrument, monkeypatch, request):
-    """Rows of 8 points and 6 pulses; the parameter: a row's retakes.
+    """A rig with rows of 8 points and 6 pulses; the parameter of the fixture is the number of a row's retakes.
 
     Data and events carry their times of arrival, so that the load of this machine has no influence.
     """
@@ -28,6 +28,7 @@ def timed_rig(make_instrument, monkeypatch, request):
     fake.pi.timed = True
 
     def receive_in_time(event, _):
+        # Events arrive a millisecond after the last pulse.
         return ReceivedCapture(event, event.last_pulse_ns - PI_AHEAD_NS + 1_000_000)
 
     def read_timed_index(path):

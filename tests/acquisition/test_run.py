@@ -259,12 +259,12 @@ class LateCard(FakeCard):
     """
 
     def __init__(self, board: Board, row_bytes: int, lag_s: float) -> None:
-        # number of the record
         self._lag_s = lag_s
+        # Number of the record, and with the same number the bytes of its short last packet until they are sent.
         self._record = 0
-        self._tail: tuple[int, bytes] | None = None  # record and content
+        self._tail: tuple[int, bytes] | None = None
         self._lock = threading.Lock()
-        # (row, take): number of bytes that arrive
+        # By row and take: number of the row's bytes that the card gets.
         self.cut: dict[tuple[int, int], int] = {}
         super().__init__(board, row_bytes)
 
@@ -290,9 +290,9 @@ class LateCard(FakeCard):
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
         recorded = self.recording
-        self._record += code == 5
+        self._record += code == Code.RECORD_START
         super()._command(code, sender)
-        if code == 6 and recorded:
+        if code == Code.RECORD_STOP and recorded:
             time.sleep(self._lag_s)
             self._finish(self._record)
 

@@ -121,7 +121,7 @@ def test_a_new_card_gets_its_boards_addresses(cards, rig, tmp_path):
 def test_a_card_that_stays_where_it_was_must_have_been_off(cards, card, rig, tmp_path, monkeypatch):
     running_cards = cards("RH", RH=Faults(boot_s=HANG_S))
     endpoint = running_cards.endpoints["RH"]
-    monkeypatch.setattr(devices, "_ASK_S", HANG_S)
+    monkeypatch.setattr(devices, "_REPLY_TIMEOUT_S", HANG_S)
     options = ("--mac", NEW_MAC, "--yes", "--wait", "1")
     process = card("program", "RH", *options)
     assert process.status == 5

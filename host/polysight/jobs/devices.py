@@ -40,9 +40,9 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Axis
 
-# Timeout of a question to a card that may be starting, all attempts together, and the time between two questions; both
+# Timeout of a request to a card that may be starting, all attempts together, and the time between two requests; both
 # chosen.
-_ASK_S = 1.5
+_REPLY_TIMEOUT_S = 1.5
 _PAUSE_S = 0.2
 
 
@@ -196,7 +196,7 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
     was_off = not same_place
     while time.monotonic() < deadline:
         try:
-            with CardClient(board, _ASK_S) as card:
+            with CardClient(board, _REPLY_TIMEOUT_S) as card:
                 version = str(card.read_version())
         except DeviceError:
             was_off = True

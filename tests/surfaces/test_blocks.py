@@ -1,0 +1,48 @@
+"""Sums over correlated points: near points count together, far ones by themselves."""
+
+import numpy as np
+import pytest
+
+from polysight.surfaces.gains import number_blocks
+from polysight.surfaces.permittivity import _sum_over_blocks
+
+BLOCK_M = 0.02
+
+
+def test_blocks_are_squares_of_the_stage():
+    places = np.array([[0.001, 0.001], [0.019, 0.019], [0.021, 0.001], [0.001, -0.001], [0.0, 0.0]])
+    numbers = number_blocks(places, (0.0, 0.0), BLOCK_M)
+    assert numbers[0] == numbers[1] == numbers[4]
+    assert len({numbers[0], numbers[2], numbers[3]}) == 3
+    # Borders that are moved by half of a block
+    moved = number_blocks(places, (0.5, 0.0), BLOCK_M)
+    assert moved[1] == moved[2]
+    assert moved[0] != moved[1]
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m"), [(0.0, 0.0), (0.005, 0.0), (0.0, 0.015), (0.01, 0.01), (0.021, 0.0), (0.5, 0.5)]
+)
+def test_a_pair_of_points_counts_by_its_distance(x_m, y_m):
+    """On average over where it lies by 1 - s along either axis, s in blocks."""
+    terms = np.array([[2.0, -1.0], [1.0, 3.0]])
+    influence = np.ones((2, 2), complex)
+    evenly_m = (np.arange(12) + 0.5) / 12 * BLOCK_M
+    covariances = []
+    effective = []
+    for origin in np.stack(np.meshgrid(evenly_m, evenly_m), axis=-1).reshape(-1, 2):
+        covariance, blocks = _sum_over_blocks(terms, influence, origin + np.array([[0.0, 0.0], [x_m, y_m]]), BLOCK_M)
+        covariances.append(covariance)
+        effective.append(blocks)
+    share = max(0.0, 1 - x_m / BLOCK_M) * max(0.0, 1 - y_m / BLOCK_M)
+    own = terms.T @ terms
+    both = np.outer(terms[0], terms[1]) + np.outer(terms[1], terms[0])
+    np.testing.assert_allclose(np.mean(covariances, axis=0), own + share * both, atol=0.4)
+    # Alone each is a block, together they are one.
+    assert np.mean(effective) == pytest.approx(2 - share, abs=0.07)
+
+
+def test_blocks_of_more_influence_count_more():
+    """(3^2 + 1)^2 / (3^4 + 1) of two points whose influences are 3 and 1."""
+    _, blocks = _sum_over_blocks(np.ones((2, 2)), np.array([[3.0, 1j]]), np.array([[0.0, 0.0], [1.0, 0.0]]), BLOCK_M)
+    assert blocks == pytest.approx(100 / 82)

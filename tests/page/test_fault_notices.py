@@ -1,0 +1,54 @@
+"""Notices of faults: their level, their cause and remedy, and how they begin."""
+
+import pytest
+
+from polysight.page.history import _find_cause, capitalise, make_fault_notice
+from polysight.store import RowFault
+from polysight_shared.faults import PiFault, explain
+from polysight_shared.messages import Fault
+
+
+def make_event(number: int, problem: str = "", **changes: str) -> Fault:
+    return Fault(scan_id="a", seq=1, t_mono_ns=0, number=number, problem=problem or explain(number).problem, **changes)
+
+
+@pytest.mark.parametrize("fault", list(PiFault))
+def test_a_fault_that_ends_a_row_alone_is_a_warning(fault):
+    """Those of a burst, of counts, and of a silent host; one that a person asked for is a note."""
+    if fault == 113:
+        expected = "note"
+    elif fault in (103, 104, 105, 106, 108, 110):
+        expected = "warning"
+    else:
+        expected = "error"
+    notice = make_fault_notice(make_event(fault))
+    assert notice.level == expected
+    assert notice.what == f"Fault {int(fault)} at the Pi: {explain(fault).problem}"
+    assert notice.facts == {}
+    assert notice.why[:1] == notice.why[:1].upper()
+
+
+def test_a_notice_has_the_events_own_words_before_those_of_the_table():
+    fault = PiFault.STAGE_LOST
+    notice = make_fault_notice(make_event(fault, "port gone", cause="unplugged", remedy="plug it in"))
+    assert (notice.why, notice.do, notice.facts) == ("Unplugged", "Plug it in", {"detail": "port gone"})
+    notice = make_fault_notice(make_event(fault))
+    assert (notice.why, notice.do) == (capitalise(explain(fault).cause), capitalise(explain(fault).remedy))
+
+
+def test_a_sentence_begins_with_a_capital_letter_and_a_command_does_not():
+    texts = ("the stage", "", "a", "polysight-pi home", "Already")
+    assert [capitalise(text) for text in texts] == ["The stage", "", "A", "polysight-pi home", "Already"]
+
+
+def test_the_cause_of_several_faults_is_that_of_the_first_known_one():
+    silent = RowFault("no_data", "RH", 0)
+    stage = RowFault("pi_fault", "", int(PiFault.STAGE_LOST))
+    unknown = RowFault("of a later release", "", 0)
+    without_number = RowFault("pi_fault", "", 0)
+    cause_of_stage = capitalise(explain(PiFault.STAGE_LOST).cause)
+    assert _find_cause([stage, silent])[0] == cause_of_stage
+    cause_of_silence = _find_cause([silent])[0]
+    assert cause_of_silence not in ("", cause_of_stage)
+    assert _find_cause([unknown, without_number, silent, stage])[0] == cause_of_silence
+    assert _find_cause([unknown]) == _find_cause([]) == ("", "")

@@ -1,0 +1,153 @@
+"""What a take's counts, its end and its boards say, one difference at a time, without a rig."""
+
+import threading
+from typing import Any
+
+import msgspec
+import pytest
+from tests.support.rigs import load_published_rig
+
+from polysight.acquisition.progress import ProcessingQueue
+from polysight.acquisition.pulse_times import ReceivedCapture
+from polysight.acquisition.ready import list_stage_differences
+from polysight.acquisition.row import FaultKind, Take, TakeFault
+from polysight.capture import RowCapture
+from polysight.capture.placement import Losses, PacketCounts
+from polysight_shared.faults import PiFault, explain
+from polysight_shared.messages import Capture, HelloReply, RowFinished
+from polysight_shared.raster import Row
+
+ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
+PULSES = 2
+ABORTED = TakeFault(FaultKind.RADAR_STOPPED, "the radar has stopped", "RV")
+BYTES = 480
+
+
+def make_end(**fields: Any) -> RowFinished:
+    """The Pi's report of a row that ended as planned, with other `fields`."""
+    planned = {"status": "done", "points": 3, "edges": 3, "bursts": 3, "pulses": 3 * PULSES}
+    return RowFinished(scan_id="s", seq=1, t_mono_ns=1, row_index=0, take=1, **planned | fields)
+
+
+def make_capture(**fields: Any) -> RowCapture:
+    """A board's whole row, with other `fields`."""
+    whole = {
+        "row": 0, "take": 1, "expected": BYTES, "bytes": BYTES, "missing": [], "located": True, "reason": "",
+        "counts": PacketCounts(placed=4), "losses": Losses(), "strangers": 0, "stale": 0, "kernel_drops": 0,
+        "first_arrival_ns": 1, "last_arrival_ns": 2, "crc32": 1, "index_crc32": 1,
+    }  # fmt: skip
+    return RowCapture(**whole | fields)
+
+
+def list_kinds(take: Take) -> list[FaultKind]:
+    return [fault.kind for fault in take.faults(PULSES)]
+
+
+def test_a_whole_take_has_no_fault():
+    assert list_kinds(Take(ROW, 1, finished=make_end(), captures={"RV": make_capture()})) == []
+
+
+@pytest.mark.parametrize("counts", [{"points": 2}, {"points": 4}, {"pulses": 5}, {"pulses": 7}])
+def test_a_point_or_pulse_too_few_or_too_many_is_a_fault(counts):
+    (fault,) = Take(ROW, 1, finished=make_end(**counts)).faults(PULSES)
+    assert fault.kind is FaultKind.COUNTS_DIFFER
+    assert "3 and 6 planned" in fault.text
+
+
+def test_without_a_report_the_hosts_own_reason_is_the_fault():
+    assert list_kinds(Take(ROW, 1)) == [FaultKind.NO_END]
+    assert Take(ROW, 1, aborted=ABORTED).faults(PULSES) == [ABORTED]
+
+
+@pytest.mark.parametrize(
+    ("status", "aborted", "kind"),
+    [
+        ("aborted", ABORTED, FaultKind.RADAR_STOPPED),
+        ("aborted", None, FaultKind.PI_FAULT),
+        ("fault", ABORTED, FaultKind.PI_FAULT),
+    ],
+)
+def test_a_row_that_the_host_aborted_has_the_hosts_kind(status, aborted, kind):
+    end = make_end(status=status, fault=int(PiFault.EDGE_LOST))
+    (fault,) = Take(ROW, 1, finished=end, aborted=aborted).faults(PULSES)
+    assert fault.kind is kind
+    assert fault.number == (int(PiFault.EDGE_LOST) if kind is FaultKind.PI_FAULT else 0)
+
+
+def test_the_text_is_the_pis_reason_or_else_the_faults_own():
+    number = int(PiFault.EDGE_LOST)
+    (said,) = Take(ROW, 1, finished=make_end(status="fault", fault=number, reason="a wire is off")).faults(PULSES)
+    assert said.text == "the row ended as fault: a wire is off"
+    (unsaid,) = Take(ROW, 1, finished=make_end(status="fault", fault=number)).faults(PULSES)
+    assert unsaid.text == f"the row ended as fault: {explain(number).problem}"
+
+
+def test_data_of_an_aborted_row_count_only_if_pulses_were_sent():
+    no_data = make_capture(counts=PacketCounts(), bytes=0, missing=[(0, BYTES)], located=False, reason="no packet came")
+    take = Take(ROW, 1, aborted=ABORTED, captures={"RH": no_data})
+    assert list_kinds(take) == [FaultKind.RADAR_STOPPED]
+    burst = Capture(
+        scan_id="s", seq=1, t_mono_ns=1, row_index=0, take=1, point=0, column=0, pulses=PULSES,
+        edge_ns=1, first_pulse_ns=2, last_pulse_ns=3, width_max_ns=1000, jitter_ns=0,
+    )  # fmt: skip
+    take.events.append(ReceivedCapture(burst, 3))
+    assert list_kinds(take) == [FaultKind.RADAR_STOPPED, FaultKind.NO_DATA]
+    assert list_kinds(Take(ROW, 1, finished=make_end(), captures={"RH": no_data})) == [FaultKind.NO_DATA]
+
+
+@pytest.mark.parametrize(
+    ("fields", "kind"),
+    [
+        ({"missing": [(0, 16)]}, FaultKind.LOST_ON_THE_WAY),
+        ({"missing": [(0, 16)], "kernel_drops": 1}, FaultKind.LOST_BY_HOST),
+        ({"missing": [(0, 16)], "counts": PacketCounts(placed=4, conflicting=1)}, FaultKind.CONFLICTING),
+    ],
+)
+def test_missing_bytes_have_the_kind_of_their_cause(fields, kind):
+    assert list_kinds(Take(ROW, 1, finished=make_end(), captures={"RV": make_capture(**fields)})) == [kind]
+
+
+def test_packets_that_differ_but_were_masked_nowhere_are_no_fault():
+    capture = make_capture(counts=PacketCounts(placed=4, conflicting=1))
+    assert list_kinds(Take(ROW, 1, finished=make_end(), captures={"RV": capture})) == []
+
+
+@pytest.mark.parametrize("change", [-0.5, 0.5])
+def test_a_setting_that_places_rows_differs_if_it_is_smaller_or_larger_on_the_pi(change):
+    stage = load_published_rig().stage
+    same = HelloReply(
+        pi_release="1", firmware="1", backend="WIRES", state="idle", scan_id="", last_seq=0,
+        stage=stage.placement_settings,
+    )  # fmt: skip
+    assert list_stage_differences(stage, same) == []
+    other = msgspec.structs.replace(same, stage=same.stage | {"centre_x_mm": stage.centre_x_mm + change})
+    (difference,) = list_stage_differences(stage, other)
+    assert difference.startswith("stage.centre_x_mm is ")
+    assert list_stage_differences(stage, msgspec.structs.replace(same, stage={})) == []
+
+
+def test_rows_wait_for_processing_only_beyond_the_limit():
+    may_process = threading.Event()
+    queue = ProcessingQueue(lambda _: may_process.wait(), limit=2)
+    queue.add_earlier([0])
+    waiting = []
+    for row in (1, 2, 3):
+        queue.add(row)
+        waiting.append(queue.over_limit)
+    assert (waiting, queue.rows_left) == ([0, 0, 3], 4)
+    may_process.set()
+    assert queue.close(now=False) is None
+    assert (queue.over_limit, queue.rows_left) == (0, 0)
+
+
+def test_the_first_error_of_processing_is_kept_until_the_end():
+    def fail_from_row_1(row: int) -> None:
+        if row:
+            raise ValueError(row)
+
+    queue = ProcessingQueue(fail_from_row_1, limit=9)
+    for row in range(3):
+        queue.add(row)
+    error = queue.close(now=False)
+    assert isinstance(error, ValueError)
+    assert error.args == (1,)

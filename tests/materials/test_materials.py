@@ -145,10 +145,10 @@ def test_distances_are_distances():
 
 def test_pixels_that_are_not_finite_are_unknown(library):
     features = pixel_features([0.5, np.nan, 0.5], [0.1, 0.1, 0.1], [4 + 1j, 4 + 1j, 0])
-    verdicts, empty = materials.Classifier(library, Weights()).scan([features, pixel_features([], [], [])])
-    assert verdicts.names[1] == verdicts.names[2] == materials.UNKNOWN
-    assert verdicts.names[0] != materials.UNKNOWN
-    assert np.isinf(verdicts.distance[1:]).all()
+    named, empty = materials.Classifier(library, Weights()).scan([features, pixel_features([], [], [])])
+    assert named.pixel_names[1] == named.pixel_names[2] == materials.UNKNOWN
+    assert named.pixel_names[0] != materials.UNKNOWN
+    assert np.isinf(named.distance[1:]).all()
     assert empty.patch_name.name == materials.UNKNOWN
 
 

@@ -146,7 +146,7 @@ def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, m
         monkeypatch.setattr(pi.service.executor, "_find_late", lambda: "the event socket has not been served")
 
     pi.service.executor.post(pause)
-    finished = host_in_row.wait(m.RowFinished)
+    finished = host_in_row.wait_for_event(m.RowFinished)
     assert finished.fault == PiFault.PROGRAM_LATE
     assert "served, nor has the executor turned for" in finished.reason
 

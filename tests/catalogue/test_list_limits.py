@@ -1,13 +1,13 @@
 """Limits of the list of scans: names, depth, the index, logs of programs, notes."""
 
-import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
 from tests.support.refusals import expect_refusal
 
-from polysight.catalogue import NOTES_FILE, Notes, Scans, read_notes, write_notes
+from polysight.catalogue import NOTES_FILE, Notes, Scans, read_notes, scans as scans_module, write_notes
 from polysight.catalogue.scans import (
     Program,
     Summary,
@@ -82,8 +82,9 @@ def test_a_scan_to_be_made_need_not_be_there(tmp_path):
 @pytest.mark.parametrize(
     ("ages_s", "is_kept"), [((10.0, 10.0), True), ((2.5, 10.0), True), ((10.0, 1.5), False), ((-100.0, 10.0), False)]
 )
-def test_an_index_keeps_what_was_written_more_than_two_seconds_ago(tmp_path, ages_s, is_kept):
-    now_ns = time.time_ns()
+def test_an_index_keeps_what_was_written_more_than_two_seconds_ago(tmp_path, monkeypatch, ages_s, is_kept):
+    now_ns = 1_800_000_000_000_000_000
+    monkeypatch.setattr(scans_module, "time", SimpleNamespace(time=lambda: now_ns / 1e9))
     stamp = tuple((now_ns - int(age_s * 1e9), 1) for age_s in ages_s)
     write_index(tmp_path / "list.json", {"a": (stamp, Summary("a", "begun"))})
     assert (read_index(tmp_path / "list.json") != {}) == is_kept

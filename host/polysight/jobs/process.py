@@ -380,12 +380,12 @@ class LiveProcessing:
             self._source = ScanFolder.load(self._folder)
             self._pipeline = Pipeline(self._source, self._settings, self._inputs, live=True, samples="keep")
         self._source.reload()
-        told = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
+        dead_rx_before = {name: board.dead_rx for name, board in self._pipeline.quality.boards.items()}
         was_in_order = {name: not board.rx_order for name, board in self._pipeline.quality.boards.items()}
         self._pipeline.add_row(row)
         for name, board in self._pipeline.quality.boards.items():
             # Reported with the row that shows it, not after the scan.
-            new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in told[name]}
+            new = {rx: [row] for rx in board.rows[row].figures.dead_rx if rx not in dead_rx_before[name]}
             for finding in rules.judge_dead_rx(name, new, rows=1):
                 _log.warning("row %d: %s", row, format_one_line(finding))
             if not was_in_order[name]:

@@ -351,7 +351,7 @@ def find_median_gains(images: Images, metal_mask: Mask) -> tuple[complex, comple
 
     Plates are measured by their median, too. The paper uses root mean squares over the metal
     (:func:`measure_metal_gains`); where the end of the scan lights the metal unevenly, their ratio differs from the
-    median by up to 7 %. They are returned if the median is zero or not finite. Raises DataError as they do.
+    median by up to 7 %. They are returned if the median is zero or not finite. Raises DataError as that function.
     """
     gain_h, gain_v = measure_metal_gains(images.h, images.v, metal_mask)
     metal_p = compute_median_ratio(images.h[metal_mask] / gain_h, images.v[metal_mask] / gain_v)

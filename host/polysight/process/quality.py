@@ -471,8 +471,9 @@ class Quality:
         middle_m = specular_midpoint_m(rig, self.boards[name].board)[1]
         y_m = middle_m + np.array([row.y_mm for row in plan_raster(rig.grid)]) / 1e3
         removed_rad = drift.at(y_m)
-        # Unless the images show how much it is.
-        not_removed_rad = drift.rms_rad
+        # Difference between two plates, root mean square, of what the images still have; all of it until they are
+        # measured again.
+        remaining_rad = float(np.sqrt(2)) * drift.rms_rad
         for _ in range(MOST_DRIFT_ROUNDS):
             for builder in builders:
                 builder.boards[name].turn_rows(sign * removed_rad)
@@ -482,8 +483,8 @@ class Quality:
                 break
             drift = estimate_phase_drift(plates, (y_m, removed_rad))
             change_rad = drift.at(y_m) - removed_rad
-            not_removed_rad = float(np.std(change_rad))
-            if not_removed_rad < DRIFT_DONE_RAD:
+            remaining_rad = float(np.sqrt(2) * np.std(change_rad))
+            if np.std(change_rad) < DRIFT_DONE_RAD:
                 break
             # Half of the change: with all of it the estimates swing about the drift.
             removed_rad = removed_rad + change_rad / 2
@@ -491,7 +492,7 @@ class Quality:
             board=name,
             range_rad=drift.range_rad,
             rms_rad=drift.rms_rad,
-            left_rad=float(np.hypot(drift.left_rad, not_removed_rad)),
+            left_rad=float(np.hypot(drift.left_rad, remaining_rad)),
         )
         return images
 

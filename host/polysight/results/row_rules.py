@@ -25,9 +25,9 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[Finding]
             " removed from the images as measured between the rows, and the errors contain what may be left",
             "fix the stage and the object, and scan again", 4.7,
         ))  # fmt: skip
-    for board, found in jumps.items():
-        shared_rows = {jump.row for jump in shared}
-        own = [jump for jump in found if jump.row not in shared_rows]
+    shared_rows = {jump.row for jump in shared}
+    for board, jumps_of_board in jumps.items():
+        own = [jump for jump in jumps_of_board if jump.row not in shared_rows]
         if not own:
             continue
         reasons.append(reason(
@@ -43,11 +43,12 @@ def _find_shared_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[PhaseJu
     """Return the jumps that all boards have before the same row, alike within `ALIKE_RAD`, with their mean angle."""
     if len(jumps) < 2:
         return []
-    first, *others = jumps.values()
+    jumps_of_first, *jumps_of_others = jumps.values()
     shared = []
-    for jump in first:
-        alike = [other for of_board in others for other in of_board if _is_alike(jump, other)]
-        if len(alike) == len(others):
+    for jump in jumps_of_first:
+        alike = [other for of_board in jumps_of_others for other in of_board if _is_alike(jump, other)]
+        # A board has one jump before a row at most.
+        if len(alike) == len(jumps_of_others):
             shared.append(PhaseJump(jump.row, float(np.mean([jump.angle_rad, *(other.angle_rad for other in alike)]))))
     return shared
 

@@ -340,7 +340,7 @@ def _decode_fact(kind: str, line: bytes) -> Fact:
 # --- the reader ---
 
 
-def find_manifest_fault(line: int, what: str, lost: int = 0) -> Finding:
+def make_manifest_fault(line: int, what: str, lost: int = 0) -> Finding:
     """Return a fault of the manifest at a line (from 1); `lost` facts are missing because of it."""
     line_text = f"{MANIFEST} line {line}"
     return Finding("error", what, where=line_text, code=ErrorCode.FILE_DAMAGED, facts={"line": line, "lost": lost})
@@ -406,7 +406,7 @@ class Manifest:
                 break
             self._lines += 1
             if head is None:
-                self.faults.append(find_manifest_fault(self._lines, "damaged: its CRC is wrong", 1))
+                self.faults.append(make_manifest_fault(self._lines, "damaged: its CRC is wrong", 1))
                 self.count += 1
             else:
                 self._add_line(head, line)
@@ -434,20 +434,20 @@ class Manifest:
         if missing > 0 and line_before_is_damaged:
             # A damaged line end joins two lines: both are lost by the one fault that was found.
             last = self.faults.pop()
-            self.faults.append(find_manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
+            self.faults.append(make_manifest_fault(last.facts["line"], last.what, last.facts["lost"] + missing))
         elif missing > 0:
             if missing > 1:
                 problem = f"{missing} lines before it are missing"
             else:
                 problem = "a line before it is missing"
             self.faults.append(
-                find_manifest_fault(self._lines, f"{problem} (count {count}, {self.count} expected)", missing)
+                make_manifest_fault(self._lines, f"{problem} (count {count}, {self.count} expected)", missing)
             )
         elif count < self._next_whole:
             problem = f"repeated or out of order (count {count}, {self._next_whole} expected)"
-            self.faults.append(find_manifest_fault(self._lines, problem))
+            self.faults.append(make_manifest_fault(self._lines, problem))
         elif not line_before_is_damaged and previous != self.digest:
-            self.faults.append(find_manifest_fault(self._lines, "the line before it was replaced", 1))
+            self.faults.append(make_manifest_fault(self._lines, "the line before it was replaced", 1))
 
     def _add_up(self, fact: Fact) -> None:
         """Update rows, rejected rows, start, end and pause of the scan by a fact."""

@@ -47,8 +47,8 @@ from polysight.store.manifest import (
     ScanEnded,
     ScanResumed,
     ScanStarted,
-    find_manifest_fault,
     lock_file,
+    make_manifest_fault,
 )
 from polysight.store.source import HEADER_LOCK, RowData, allocate_pages
 from polysight_shared import __version__
@@ -329,7 +329,7 @@ class ScanFolder:
         if lost_rows <= sum(fault.facts["lost"] for fault in faults):
             return faults
         problem = f"scan_ended counts {counted} rows, the lines before it commit {len(rows)}"
-        return (*faults, find_manifest_fault(content.numbers[last], problem, lost_rows))
+        return (*faults, make_manifest_fault(content.numbers[last], problem, lost_rows))
 
     @property
     def rows_absent(self) -> list[int]:

@@ -41,10 +41,11 @@ from polysight_shared.units import NS_PER_S
 BITS_PER_BYTE = 10
 # The first opening of the port resets an UNO, whose boot loader takes up to 2 s; a second more is chosen.
 BANNER_TIMEOUT_S = 3.0
-# The longest line and its answer take 14 ms at 115200 baud; the rest is for a busy machine.
-ANSWER_TIMEOUT_S = 0.5
-# How often a line is sent before the stage counts as lost (chosen).
-TRIES = 4
+# The longest line and its answer take 14 ms at 115200 baud. While an answer is lost the stage may move already, and a
+# stop waits for this timeout; it is a third of the 0.5 s within which a stop has to be sent.
+ANSWER_TIMEOUT_S = 0.15
+# How often a line is sent before the stage counts as lost: for 2.1 s, because a busy machine may read late (chosen).
+TRIES = 14
 # Error numbers of answers that report a damaged line: it is sent again.
 RETRIED_ERRORS = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 # Status requests to a moving stage per heartbeat, so that a lost one does not stop it.

@@ -68,6 +68,12 @@ def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage, connect):
     assert [(c.sequence, c.verb) for c in dry_stage.seen] == [(0, "HELLO"), (1, "SET"), (2, "SET")]
 
 
+def test_a_lost_answer_leaves_a_stop_its_time():
+    """The thread that waits for an answer sends the stops, within half a second; a busy machine has 2 s to answer."""
+    assert stage.ANSWER_TIMEOUT_S <= 0.5 / 3
+    assert stage.ANSWER_TIMEOUT_S * stage.TRIES >= 2.0
+
+
 def test_refusals_carry_the_table(connect):
     link, _ = connect()
     with pytest.raises(StageRefusedError) as e:

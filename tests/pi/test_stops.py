@@ -282,7 +282,10 @@ def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, req
 
 @pytest.mark.slow
 def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, request, record_testsuite_property):
-    """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs."""
+    """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs.
+
+    In a third of the moments the stage's answer is lost, so that the row's command is sent again while it runs.
+    """
     moments = 4
     moments_of_a_minute: tuple[int, ...] = ()
     if request.config.getoption("--long"):
@@ -304,6 +307,8 @@ def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, reques
         freeze_before = rng.random() < 0.3
         if freeze_before:
             disk.freeze()
+        if rng.random() < 0.3:
+            stage.damage = 1
         answers: list[Any] = []
         pi.service.executor.submit(m.RunRow(scan_id="scan", row_index=0, take=take, owner=OWNER), answers.append)
         wait_for(lambda: stage.moving, "motion")

@@ -24,20 +24,20 @@ from polysight_simulators.cards import NETWORK_TROUBLES, Adversary, Arrival
 class AdversarialCard(FakeCard):
     """Sends each row with randomly drawn faults; delayed packets arrive among the packets of later rows."""
 
-    def __init__(self, board: Board, row_bytes: int, frame_bytes: int, chance: random.Random) -> None:
-        self._chance = chance
+    def __init__(self, board: Board, row_bytes: int, frame_bytes: int, rng: random.Random) -> None:
+        self._rng = rng
         self._frame = frame_bytes
         self.rate = 0.5  # share of records with faults
-        self.adversary = Adversary(chance, frame_bytes)
+        self.adversary = Adversary(rng, frame_bytes)
         self.sent: list[tuple[int, int, tuple[str, ...]]] = []
         super().__init__(board, row_bytes)
 
     def send_row(self, row: int, take: int) -> None:
         if not self.recording:
             return
-        troubled = self._chance.random() < self.rate
+        troubled = self._rng.random() < self.rate
         if troubled:
-            troubles = tuple(self._chance.sample(NETWORK_TROUBLES, self._chance.randint(1, 3)))
+            troubles = tuple(self._rng.sample(NETWORK_TROUBLES, self._rng.randint(1, 3)))
         else:
             troubles = ()
         sent = self.adversary.record(
@@ -71,8 +71,8 @@ def make_adversarial_rig(number: int) -> FakeRig:
     points, pulses = GRIDS[number % len(GRIDS)]
     rig = FakeRig(make_small_instrument(columns=points, pulses=pulses, row_retakes=4))
     for board in rig.instrument.recorded:
-        chance = random.Random(f"{number} {board.name}")
-        rig.cards[board.name] = AdversarialCard(board, rig.instrument.row_bytes, rig.instrument.frame_bytes, chance)
+        rng = random.Random(f"{number} {board.name}")
+        rig.cards[board.name] = AdversarialCard(board, rig.instrument.row_bytes, rig.instrument.frame_bytes, rng)
     rig.start_pi()
     return rig
 

@@ -70,12 +70,12 @@ def keep(sent: SentRecord, past: EarlierRecords, pulses: np.ndarray, frame: int)
 
 def draw_takes(seed: int) -> Iterator[tuple[tuple[str, ...], Kept, SentRecord]]:
     """One to three takes of a rig, each with up to three faults."""
-    chance = random.Random(seed)
+    rng = random.Random(seed)
     points, count, frame = GRIDS[seed % len(GRIDS)]
-    card = Adversary(chance, frame, 0, 1)
+    card = Adversary(rng, frame, 0, 1)
     past = EarlierRecords.after_reset()
-    for number in range(chance.randint(1, 3)):
-        troubles = tuple(chance.sample(TROUBLES, chance.randint(1, 3)))
+    for number in range(rng.randint(1, 3)):
+        troubles = tuple(rng.sample(TROUBLES, rng.randint(1, 3)))
         pulses = draw_pulse_times(points, count) + number * 10**11
         sent = card.take(pulses.reshape(-1), troubles)
         judged_take = keep(sent, past, pulses, frame)
@@ -112,14 +112,14 @@ def test_no_wrong_byte_is_kept(request: pytest.FixtureRequest):
 @pytest.mark.parametrize("grid", range(len(GRIDS)))
 def test_a_perfect_take_after_trouble_is_committed(grid):
     points, count, frame = GRIDS[grid]
-    chance = random.Random(grid)
-    card = Adversary(chance, frame)
+    rng = random.Random(grid)
+    card = Adversary(rng, frame)
     past = EarlierRecords.after_reset()
     pulses = draw_pulse_times(points, count)
     refused = 0
     for number in range(40):
         start_ns = pulses + number * 10**11
-        troubles = tuple(chance.sample(TROUBLES, 2)) if number % 2 == 0 else ()
+        troubles = tuple(rng.sample(TROUBLES, 2)) if number % 2 == 0 else ()
         judged_take = keep(card.take(start_ns.reshape(-1), troubles), past, start_ns, frame)
         refused += not troubles and not judged_take.whole
         past = judged_take.placed.past

@@ -53,20 +53,20 @@ class Rows(RuleBasedStateMachine):
     def begin(self, grid, seed, fresh, near_wrap):
         self.frame, self.frames = grid
         self.size = self.frame * self.frames
-        chance = random.Random(seed)
+        rng = random.Random(seed)
         if fresh:
             count = 0
         elif near_wrap:
-            count = 2**48 - chance.randint(1, 40_000)
+            count = 2**48 - rng.randint(1, 40_000)
         else:
-            count = chance.randrange(2**48)
+            count = rng.randrange(2**48)
         if fresh:
             sequence = 1
         elif near_wrap:
-            sequence = 2**32 - chance.randint(1, 60)
+            sequence = 2**32 - rng.randint(1, 60)
         else:
-            sequence = chance.randrange(2**32)
-        self.card = Adversary(chance, self.frame, count, sequence)
+            sequence = rng.randrange(2**32)
+        self.card = Adversary(rng, self.frame, count, sequence)
         self.past = EarlierRecords(Counters(count, sequence))
         # The next record's start is known
         self.sure = True

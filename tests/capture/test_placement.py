@@ -39,15 +39,15 @@ near_sequence_wrap = st.one_of(st.integers(0, SEQUENCE - 1), st.integers(SEQUENC
     count=near_wrap,
     sequence=near_sequence_wrap,
     batch=st.integers(1, 40),
-    chance=st.randoms(use_true_random=True),
+    rng=st.randoms(use_true_random=True),
     rate=st.sampled_from([0.0, 0.02, 0.05, 0.3]),
 )
-def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, chance: random.Random, rate):
+def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, rng: random.Random, rate):
     """Start known. Unmasked bytes are original; where the record's place is certain, the mask is exactly the loss."""
     record = Record.make(frame * frames, count, sequence)
-    sent = [(k, p) for k, p in enumerate(record.packets) if chance.random() >= rate]
-    sent += [numbered for numbered in sent if chance.random() < rate]
-    order = sorted(sent, key=lambda numbered: numbered[0] + (chance.randint(-3, 3) if chance.random() < rate else 0))
+    sent = [(k, p) for k, p in enumerate(record.packets) if rng.random() >= rate]
+    sent += [numbered for numbered in sent if rng.random() < rate]
+    order = sorted(sent, key=lambda numbered: numbered[0] + (rng.randint(-3, 3) if rng.random() < rate else 0))
     placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
     received = {k for k, _ in sent}
@@ -100,7 +100,7 @@ class Oracle:
     count=near_wrap,
     sequence=near_sequence_wrap,
     batch=st.integers(1, 64),
-    chance=st.randoms(use_true_random=True),
+    rng=st.randoms(use_true_random=True),
     loss=st.floats(0, 0.05),
     double=st.floats(0, 0.05),
     shuffle=st.floats(0, 0.05),
@@ -109,31 +109,31 @@ class Oracle:
     strange=st.floats(0, 0.05),
 )
 def test_every_disorder_together(
-    frame, packets, count, sequence, batch, chance: random.Random, loss, double, shuffle, lateness, cut, strange
+    frame, packets, count, sequence, batch, rng: random.Random, loss, double, shuffle, lateness, cut, strange
 ):
     """Loss, duplicates, reordering, late and truncated packets, leftovers and nonsense, each up to 5 %."""
     size = max(1, packets * FULL // frame) * frame
     record = Record.make(size, count, sequence)
     sent: list[tuple[float, int, bytes]] = []  # time, position, packet
     for k, packet in enumerate(record.packets):
-        if chance.random() < loss:
+        if rng.random() < loss:
             continue
-        for copy in range(1 + (chance.random() < double)):
-            short = chance.random() < cut and len(packet) > 20
-            moved = chance.uniform(0, lateness) if chance.random() < shuffle else 0
-            sent.append((k + moved + copy / 2, k, packet[: chance.randint(11, len(packet))] if short else packet))
+        for copy in range(1 + (rng.random() < double)):
+            short = rng.random() < cut and len(packet) > 20
+            moved = rng.uniform(0, lateness) if rng.random() < shuffle else 0
+            sent.append((k + moved + copy / 2, k, packet[: rng.randint(11, len(packet))] if short else packet))
     sent.sort(key=lambda s: s[0])
     arriving = [(k, packet) for _, k, packet in sent]
     leftovers = malformed = 0
     for position in range(len(arriving), 1, -1):
-        if chance.random() < strange:
-            distance = chance.randint(1, 5)
+        if rng.random() < strange:
+            distance = rng.randint(1, 5)
             arriving.insert(
                 position, (-1, encode_packet(sequence - distance, count - distance * FULL, bytes([0xEE]) * FULL))
             )
             leftovers += 1
-        if chance.random() < strange:
-            arriving.insert(position, (-2, chance.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
+        if rng.random() < strange:
+            arriving.insert(position, (-2, rng.choice([b"", b"0123456789", bytes(1467), bytes(1536)])))
             malformed += 1
     oracle = Oracle(size)
     for k, packet in arriving:
@@ -173,16 +173,14 @@ def test_every_disorder_together(
     count=near_wrap,
     sequence=near_sequence_wrap,
     skip=st.integers(0, 3),
-    chance=st.randoms(use_true_random=True),
+    rng=st.randoms(use_true_random=True),
 )
-def test_counters_continue_and_are_not_proportional(
-    frames, frame, records, count, sequence, skip, chance: random.Random
-):
+def test_counters_continue_and_are_not_proportional(frames, frame, records, count, sequence, skip, rng: random.Random):
     """Each record ends with a short packet: sequence and byte count drift apart, but every record is found."""
     start = EarlierRecords(Counters(count, sequence))
     for n in range(records):
         record = Record.make(frames * frame, count, sequence, seed=n)
-        head = chance.randint(0, skip) if len(record.packets) > 2 * skip + 2 else 0
+        head = rng.randint(0, skip) if len(record.packets) > 2 * skip + 2 else 0
         placed, out = place(len(record.data), record.packets[head:], start, frame)
         assert placed.located
         assert placed.missing == ([(0, head * FULL)] if head else [])

@@ -99,7 +99,7 @@ class SentRecord:
 
 
 class Adversary:
-    """A card and network with troubles drawn from `chance`.
+    """A card and network with troubles drawn from `rng`.
 
     `byte_count` and `sequence` are the card's counters at the first record, `payload_bytes` the data of a full packet
     (the card's default), without its header. `resets` counts the card's resets since the host's last.
@@ -107,19 +107,19 @@ class Adversary:
 
     def __init__(
         self,
-        chance: random.Random,
+        rng: random.Random,
         frame_bytes: int,
         byte_count: int = 0,
         sequence: int = 1,
         payload_bytes: int = 1456,
     ) -> None:
-        self._chance = chance
+        self._rng = rng
         self._frame = frame_bytes
         self._payload = payload_bytes
         self._card = Packetiser(payload_bytes, sequence, byte_count)
         self._now_ns = 1_000_000_000
         self._number = 0
-        self._twin = Packetiser(payload_bytes, chance.randrange(1 << 32), chance.randrange(1 << 48))
+        self._twin = Packetiser(payload_bytes, rng.randrange(1 << 32), rng.randrange(1 << 48))
         # Packets that arrive in a later record.
         self._late: list[Arrival] = []
         # Data of the record that is being made, numbers of its bytes that are not in a packet yet, and number of the
@@ -131,7 +131,7 @@ class Adversary:
 
     def take_late(self, share: float) -> list[Arrival]:
         """Return delayed packets that arrive now, on average this share of them."""
-        coming = [a for a in self._late if self._chance.random() < share]
+        coming = [a for a in self._late if self._rng.random() < share]
         self._late = [a for a in self._late if not any(a is c for c in coming)]
         return coming
 
@@ -147,20 +147,20 @@ class Adversary:
         Troubles may also be of `RADAR_TROUBLES`. The row's data (`SentRecord.data`) is what all pulses would have
         given; frames of other edges hold other bytes. Each packet arrives when its last frame fills it.
         """
-        chance = self._chance
-        byte_generator = np.random.default_rng(chance.getrandbits(32))
+        rng = self._rng
+        byte_generator = np.random.default_rng(rng.getrandbits(32))
         frames = byte_generator.integers(1, 256, (pulses_ns.size, self._frame), np.uint8)
         edges = [(int(t), frames[k]) for k, t in enumerate(pulses_ns)]
         if "missed" in troubles:
-            for _ in range(chance.randint(1, min(3, len(edges) - 1))):
-                edges.pop(chance.randrange(len(edges)))
+            for _ in range(rng.randint(1, min(3, len(edges) - 1))):
+                edges.pop(rng.randrange(len(edges)))
         if "near" in troubles:
-            t, _ = edges.pop(chance.randrange(len(edges)))
-            edge_near_pulse = t + chance.choice([-1, 1]) * chance.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
+            t, _ = edges.pop(rng.randrange(len(edges)))
+            edge_near_pulse = t + rng.choice([-1, 1]) * rng.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
             edges.append((edge_near_pulse, byte_generator.integers(1, 256, self._frame, np.uint8)))
         if "spurious" in troubles:
-            for _ in range(chance.randint(1, 2)):
-                t = chance.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
+            for _ in range(rng.randint(1, 2)):
+                t = rng.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
                 # An edge during a frame or just after it starts none; one near a missed pulse counts as that pulse.
                 if np.abs(np.append(pulses_ns, [e for e, _ in edges]) - t).min() > 5 * _FRAME_NS:
                     edges.append((t, byte_generator.integers(1, 256, self._frame, np.uint8)))
@@ -181,10 +181,10 @@ class Adversary:
 
         `edges_ns` are the times of its frames; without them, the packets follow each other.
         """
-        chance = self._chance
+        rng = self._rng
         self._number += 1
         if not data:
-            byte_generator = np.random.default_rng(chance.getrandbits(32))
+            byte_generator = np.random.default_rng(rng.getrandbits(32))
             data = byte_generator.integers(1, 256, frames * self._frame, np.uint8).tobytes()
         begin_ns = self._now_ns + 1_000_000
         if edges_ns is not None:
@@ -202,16 +202,16 @@ class Adversary:
         arriving = self._transmit(packets, made_ns, sent)
         if "twin" in troubles or "twin_alone" in troubles:
             sent.is_complete = False
-            twin_data = np.random.default_rng(chance.getrandbits(32)).integers(1, 256, len(data), np.uint8)
+            twin_data = np.random.default_rng(rng.getrandbits(32)).integers(1, 256, len(data), np.uint8)
             twin = [bytes(p) for p in [*self._twin.feed(twin_data), *self._twin.flush()]]
             arriving += [Arrival(made_ns[min(k, len(made_ns) - 1)], p, -1) for k, p in enumerate(twin)]
             arriving.sort(key=lambda a: a.t_ns)
         # Half of them come among the first three packets.
         for late_packet in packets_between:
             latest_place = len(arriving)
-            if chance.random() < 0.5:
+            if rng.random() < 0.5:
                 latest_place = min(latest_place, 3)
-            place = chance.randint(0, latest_place)
+            place = rng.randint(0, latest_place)
             t_ns = made_ns[0]
             if place:
                 t_ns = arriving[place - 1].t_ns
@@ -232,47 +232,45 @@ class Adversary:
     def _send_record(self, sent: SentRecord, data: NDArray[np.int64]) -> list[bytes]:
         """Send bytes of the data, by their numbers."""
         troubles = sent.troubles
-        chance = self._chance
+        rng = self._rng
         frame = self._frame
         frames = len(data) // frame
         if "miss_frames" in troubles and frames > 1:
             sent.is_complete = False
-            for missed_frame in sorted(
-                chance.sample(range(frames), chance.randint(1, min(3, frames - 1))), reverse=True
-            ):
+            for missed_frame in sorted(rng.sample(range(frames), rng.randint(1, min(3, frames - 1))), reverse=True):
                 data = np.delete(data, slice(missed_frame * frame, (missed_frame + 1) * frame))
         if "drop_inside" in troubles or "drop_frames" in troubles:
             sent.is_complete = False
             if "drop_frames" in troubles:
-                dropped_bytes = frame * chance.randint(1, 3)
+                dropped_bytes = frame * rng.randint(1, 3)
             else:
                 # Blocks of 16 bytes; chosen.
-                dropped_bytes = 16 * chance.randint(1, 200)
-            cut = chance.randrange(max(1, len(data) - dropped_bytes))
+                dropped_bytes = 16 * rng.randint(1, 200)
+            cut = rng.randrange(max(1, len(data) - dropped_bytes))
             data = np.delete(data, slice(cut, cut + dropped_bytes))
         if "two_drops" in troubles:
             sent.is_complete = False
-            dropped_bytes = frame * chance.randint(1, 2)
-            first_part = 16 * chance.randint(1, dropped_bytes // 16 - 1)
+            dropped_bytes = frame * rng.randint(1, 2)
+            first_part = 16 * rng.randint(1, dropped_bytes // 16 - 1)
             for size in (first_part, dropped_bytes - first_part):
-                cut = chance.randrange(max(1, len(data) - size))
+                cut = rng.randrange(max(1, len(data) - size))
                 data = np.delete(data, slice(cut, cut + size))
         if "reset_between" in troubles:
             self._reset()
         out: list[bytes] = []
         if "end_early" in troubles and frames > 2:
             sent.is_complete = False
-            cut = chance.randint(1, frames - 2) * frame
-            lost_bytes = chance.randint(0, 1) * frame
+            cut = rng.randint(1, frames - 2) * frame
+            lost_bytes = rng.randint(0, 1) * frame
             out += self._make_stream(data[:cut]) + self._end()
             data = data[cut + lost_bytes :]
         if "reset" in troubles or "reset_early" in troubles:
             sent.is_complete = False
-            cut = chance.randrange(len(data) + 1)
+            cut = rng.randrange(len(data) + 1)
             if "reset_early" in troubles:
                 cut = min(cut, 3 * self._payload)
             out += self._make_stream(data[:cut])
-            lost_bytes = chance.choice([0, 0, chance.randint(1, 4000)])
+            lost_bytes = rng.choice([0, 0, rng.randint(1, 4000)])
             self._reset()
             data = data[cut + lost_bytes :]
         return out + self._make_stream(data) + self._end()
@@ -317,22 +315,22 @@ class Adversary:
         Each trouble delays a packet by at most 0.6 ms, and lets others overtake it; only "held" waits for later pulses.
         """
         troubles = sent.troubles
-        chance = self._chance
+        rng = self._rng
         n = len(packets)
         lost_packets: set[int] = set()
         if "lose_all" in troubles or "twin_alone" in troubles:
             lost_packets = set(range(n))
         if "lose" in troubles:
-            lost_packets |= {k for k in range(n) if chance.random() < chance.choice([0.02, 0.2])}
+            lost_packets |= {k for k in range(n) if rng.random() < rng.choice([0.02, 0.2])}
         if "lose_head" in troubles:
-            lost_packets |= set(range(min(n, chance.randint(1, 4))))
+            lost_packets |= set(range(min(n, rng.randint(1, 4))))
         if "lose_tail" in troubles:
-            lost_packets |= set(range(max(0, n - chance.randint(1, 4)), n))
+            lost_packets |= set(range(max(0, n - rng.randint(1, 4)), n))
         late_packets: set[int] = set()
         if "delay" in troubles and n:
-            late_packets |= {chance.randrange(n) for _ in range(chance.randint(1, 3))}
+            late_packets |= {rng.randrange(n) for _ in range(rng.randint(1, 3))}
         if "backlog" in troubles:
-            late_packets |= set(range(max(0, n - chance.randint(1, 4)), n))
+            late_packets |= set(range(max(0, n - rng.randint(1, 4)), n))
         self._late += [Arrival(0, packets[k], sent.number) for k in sorted(late_packets - lost_packets)]
         # Arrival time, number in the record, and bytes of each packet.
         coming = [
@@ -341,13 +339,13 @@ class Adversary:
             if k not in lost_packets | late_packets
         ]
         if "duplicate" in troubles and coming:
-            coming += [chance.choice(coming) for _ in range(chance.randint(1, 4))]
+            coming += [rng.choice(coming) for _ in range(rng.randint(1, 4))]
         if "two_paths" in troubles:
-            coming += [(t_ns + chance.choice([10_000, 600_000]), k, p) for t_ns, k, p in coming]
-            if chance.random() < 0.5 and n:
+            coming += [(t_ns + rng.choice([10_000, 600_000]), k, p) for t_ns, k, p in coming]
+            if rng.random() < 0.5 and n:
                 self._late.append(Arrival(0, packets[-1], sent.number))
         if "reorder" in troubles:
-            coming = [(t_ns + chance.randint(0, 120_000) * (chance.random() < 0.2), k, p) for t_ns, k, p in coming]
+            coming = [(t_ns + rng.randint(0, 120_000) * (rng.random() < 0.2), k, p) for t_ns, k, p in coming]
         if "flows" in troubles:
             coming = [(t_ns + 100_000 * (k % 3), k, p) for t_ns, k, p in coming]
         if "held" in troubles:
@@ -357,10 +355,10 @@ class Adversary:
 
     def _damage(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:
         """Return a packet, perhaps truncated or with a flipped bit in its header."""
-        if "truncate" in troubles and self._chance.random() < 0.05:
-            return packet[: self._chance.randint(DATA_HEADER_BYTES, len(packet))]
-        if "turn_header_bit" in troubles and self._chance.random() < 0.05:
-            bit = self._chance.randrange(8 * DATA_HEADER_BYTES)
+        if "truncate" in troubles and self._rng.random() < 0.05:
+            return packet[: self._rng.randint(DATA_HEADER_BYTES, len(packet))]
+        if "turn_header_bit" in troubles and self._rng.random() < 0.05:
+            bit = self._rng.randrange(8 * DATA_HEADER_BYTES)
             damaged_packet = bytearray(packet)
             damaged_packet[bit // 8] ^= 1 << bit % 8
             return bytes(damaged_packet)

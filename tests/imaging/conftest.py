@@ -49,10 +49,11 @@ def synced_row(rig):
 
 @pytest.fixture(scope="session")
 def points_rows(synced_row):
-    """Makes rows of point targets [(x, y, z) m] with complex amplitudes, direct path included, in plan order.
+    """`points_rows(rig, board, points, amplitudes)`: rows of point targets at (x, y, z) m, in the order of the plan.
 
-    `gains` are those of the RX, `noise` the standard deviation of each part; `shifts_m` [row] moves rows along x,
-    `jitter_m` [row, position, 3] positions.
+    The samples contain the direct path from TX to each RX, of amplitude `direct` over its length. `gains` are those of
+    the four RX; `noise` is the standard deviation of real and imaginary part. `shifts_m` [row] moves whole rows along
+    x, `jitter_m` [row, position, 3] moves single positions.
     """
 
     def make(
@@ -69,15 +70,19 @@ def points_rows(synced_row):
         rng = np.random.default_rng(4)
         antennas = Antennas.from_rig(rig, board)
         for row in plan_raster(rig.grid):
-            u = np.column_stack([row_offsets_m(rig, row), np.zeros(row.points)])
-            u[:, 0] += 0 if shifts_m is None else shifts_m[row.index]
-            u += 0 if jitter_m is None else jitter_m[row.index]
-            s = np.tile((direct / antennas.direct_m)[:, None, None].astype(complex), (1, row.points, rig.chirp.samples))
+            stage_m = np.column_stack([row_offsets_m(rig, row), np.zeros(row.points)])
+            if shifts_m is not None:
+                stage_m[:, 0] += shifts_m[row.index]
+            if jitter_m is not None:
+                stage_m += jitter_m[row.index]
+            direct_waves = (direct / antennas.direct_m)[:, None, None].astype(complex)
+            s = np.tile(direct_waves, (1, row.points, rig.chirp.samples))
             for point, amplitude in zip(points, amplitudes, strict=True):
-                d = np.linalg.norm(point - u - antennas.tx_m, axis=1) + np.linalg.norm(
-                    point - u - antennas.rx_m[:, None], axis=2
-                )
-                turn_per_hz = 2j * np.pi / SPEED_OF_LIGHT_M_S * (d - antennas.direct_m[:, None])
+                from_tx_m = np.linalg.norm(point - stage_m - antennas.tx_m, axis=1)
+                to_rx_m = np.linalg.norm(point - stage_m - antennas.rx_m[:, None], axis=2)
+                # Synchronised samples have the phase of the path in excess of the direct one.
+                excess_m = from_tx_m + to_rx_m - antennas.direct_m[:, None]
+                turn_per_hz = 2j * np.pi / SPEED_OF_LIGHT_M_S * excess_m
                 # Each sample advances by the same angle: this is faster than as many exponentials.
                 waves = np.repeat(np.exp(turn_per_hz * rig.chirp.hz_per_sample)[..., None], rig.chirp.samples, axis=2)
                 waves[..., 0] = amplitude * np.exp(turn_per_hz * rig.chirp.first_sample_hz)

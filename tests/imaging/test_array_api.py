@@ -39,55 +39,68 @@ def library(request):
 
 @pytest.fixture
 def aperture(make_rig):
-    rig = make_rig(15, 6, 4.0, 4.0, (12, 10))
+    rig = make_rig(columns=15, rows=6, step_x=4.0, step_y=4.0, pixels=(12, 10))
     grid = image_grid(rig)
     antennas = Antennas.from_rig(rig, rig.receivers[0])
-    return Aperture(antennas, scan_offsets_m(rig), np.linspace(76.3e9, 79.7e9, 7), grid)
+    # Seven frequencies over the linear part of the rig's sweep
+    return Aperture(antennas, scan_offsets_m(rig), frequencies_hz=np.linspace(76.3e9, 79.7e9, 7), grid=grid)
 
 
 def _copy_to_numpy(array):
-    array = array.cpu() if hasattr(array, "cpu") else array
-    return np.asarray(array.get() if hasattr(array, "get") else array)
+    """The array in the memory of the CPU: PyTorch copies with `cpu`, CuPy with `get`."""
+    if hasattr(array, "cpu"):
+        array = array.cpu()
+    if hasattr(array, "get"):
+        array = array.get()
+    return np.asarray(array)
 
 
-@pytest.mark.parametrize("make", [SpectralImager, IncrementalImager, DirectImager])
-def test_images_and_samples_are_those_of_numpy(aperture, library, make):
+@pytest.mark.parametrize("make_imager", [SpectralImager, IncrementalImager, DirectImager])
+def test_images_and_samples_are_those_of_numpy(aperture, library, make_imager):
     xp, device = library
     rng = np.random.default_rng(0)
     samples = (rng.standard_normal(aperture.shape) + 1j * rng.standard_normal(aperture.shape)).astype(np.complex64)
     pixels = (rng.standard_normal(aperture.grid.shape) + 0j).astype(np.complex64)
     echo = samples[:, :, 0, 0]
     weights = rng.uniform(size=aperture.shape[2:]).astype(np.float32)
-    plain = make(aperture)
-    imager = make(aperture) if make is DirectImager else make(aperture, xp=xp, device=device)
+    numpy_imager = make_imager(aperture)
+    if make_imager is DirectImager:
+        # It computes on the library of its samples.
+        imager = make_imager(aperture)
+    else:
+        imager = make_imager(aperture, xp=xp, device=device)
 
     def put(array):
         return xp.asarray(array, device=device)
 
-    for result, want in (
-        (imager.image(put(samples)), plain.image(samples)),
-        (imager.image_constant_echo(put(echo), put(weights)), plain.image_constant_echo(echo, weights)),
-        (imager.samples(put(pixels)), plain.samples(pixels)),
+    for result, expected in (
+        (imager.image(put(samples)), numpy_imager.image(samples)),
+        (imager.image_constant_echo(put(echo), put(weights)), numpy_imager.image_constant_echo(echo, weights)),
+        (imager.samples(put(pixels)), numpy_imager.samples(pixels)),
     ):
         assert type(result) is type(put(samples))
-        assert np.abs(_copy_to_numpy(result) - want).max() < 1e-5 * np.abs(want).max()
+        # Single precision: the libraries sum in another order.
+        assert np.abs(_copy_to_numpy(result) - expected).max() < 1e-5 * np.abs(expected).max()
 
 
 def test_backproject_and_project_run_on_the_library_of_their_samples(library):
+    """Samples of seven pulses at nine frequencies, and seven voxels, all at random places."""
     xp, device = library
     rng = np.random.default_rng(1)
-    f = 76e9 + 1e8 * np.arange(9)
-    reference = rng.uniform(0, 1, 7)
-    places = [rng.uniform(-0.5, 0.5, (7, 3)) for _ in range(3)]
+    frequencies_hz = 76e9 + 1e8 * np.arange(9)
+    reference_m = rng.uniform(0, 1, 7)
+    tx_m, rx_m, voxels_m = (rng.uniform(-0.5, 0.5, (7, 3)) for _ in range(3))
+    geometry = (frequencies_hz, tx_m, rx_m, voxels_m, reference_m)
     samples = rng.standard_normal((7, 9)) + 1j
     pixels = rng.standard_normal(7) + 1j
     for function, array in ((backproject, samples), (project, pixels)):
-        result = function(xp.asarray(array, device=device), f, *places, reference)
-        np.testing.assert_allclose(_copy_to_numpy(result), function(array, f, *places, reference), rtol=1e-9)
+        result = function(xp.asarray(array, device=device), *geometry)
+        np.testing.assert_allclose(_copy_to_numpy(result), function(array, *geometry), rtol=1e-9)
 
 
 def test_without_array_api_compat_other_libraries_are_refused(monkeypatch, aperture):
     strict = importlib.import_module("array_api_strict")
+    # An import of a module that is None in `sys.modules` fails.
     monkeypatch.setitem(importlib.import_module("sys").modules, "array_api_compat", None)
     with expect_refusal(ErrorCode.PACKAGE_MISSING, "array-api-compat"):
         DirectImager(aperture).image(strict.asarray(np.zeros(aperture.shape, np.complex64)))

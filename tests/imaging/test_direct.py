@@ -8,6 +8,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
 
 def _compute_phase_history(f, tx, rx, reference, points, amplitudes):
+    """Samples [pulse, frequency] of point targets; the phase is that of the path minus the pulse's reference path."""
     out = np.zeros((len(tx), f.size), complex)
     for point, amplitude in zip(points, amplitudes, strict=True):
         d = np.linalg.norm(point - tx, axis=1) + np.linalg.norm(point - rx, axis=1) - reference
@@ -16,21 +17,25 @@ def _compute_phase_history(f, tx, rx, reference, points, amplitudes):
 
 
 def test_a_monostatic_radar_referenced_to_the_scene_centre_focuses_in_three_dimensions():
+    """60 pulses at 9 to 10 GHz from 50 m; heights that scatter by 3 m give a resolution in z."""
     rng = np.random.default_rng(0)
     f = np.linspace(9e9, 10e9, 40)
     angle = np.linspace(-0.1, 0.1, 60)
     radar = 50 * np.column_stack([np.sin(angle), np.full(60, -1.0), 0.3 + 0.06 * rng.standard_normal(60)])
+    # The phase of each pulse is that of the path to the middle of the scene and back.
     reference = 2 * np.linalg.norm(radar, axis=1)
     points = np.array([[1.0, -0.5, 0.2], [-1.5, 1.0, 0.0]])
     amplitudes = np.array([1.0, 0.5j])
     samples = _compute_phase_history(f, radar, radar, reference, points, amplitudes)
-    axes = np.linspace(-2, 2, 81), np.linspace(-2, 2, 41)
-    x, y = np.meshgrid(*axes)
+    # The plane z = 0.2, in steps of 5 and 10 cm: the first point lies on it, and on one of its voxels.
+    x, y = np.meshgrid(np.linspace(-2, 2, 81), np.linspace(-2, 2, 41))
     voxels = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.2)])
     image = np.abs(backproject(samples, f, radar, radar, voxels, reference)) / samples.size
     brightest_voxel = voxels[np.argmax(image)]
     assert np.abs(brightest_voxel - points[0]).max() < 1e-9
+    # The point has amplitude 1; the second one, half as strong, adds sidelobes. The limits are chosen.
     assert image.max() == pytest.approx(1, abs=0.15)
+    # A line through the point along z; it is the middle one of 21 voxels.
     along_z = points[0] + np.linspace(-1, 1, 21)[:, None] * [0, 0, 1]
     focus = backproject(samples, f, radar, radar, along_z, reference) / samples.size
     assert np.argmax(np.abs(focus)) == 10
@@ -45,6 +50,7 @@ def test_evenly_spaced_frequencies_by_horner_equal_the_plain_sum():
     voxels = rng.uniform(-0.5, 0.5, (7, 3))
     reference = rng.uniform(0, 1, 7)
     s = rng.standard_normal((7, 9)) + 1j * rng.standard_normal((7, 9))
+    # Frequencies in another order are not evenly spaced, so that each gets an exponential of its own.
     order = rng.permutation(9)
     even = backproject(s, f, tx, rx, voxels, reference)
     shuffled = backproject(s[:, order], f[order], tx, rx, voxels, reference)
@@ -54,10 +60,14 @@ def test_evenly_spaced_frequencies_by_horner_equal_the_plain_sum():
     np.testing.assert_allclose(even, plain, rtol=1e-8)
 
 
-@pytest.mark.parametrize("even", [True, False])
-def test_project_is_its_adjoint_for_any_antennas_and_voxels(even):
+@pytest.mark.parametrize("evenly_spaced", [True, False])
+def test_project_is_the_adjoint_of_backproject_for_any_antennas_and_voxels(evenly_spaced):
+    """<project(x), y> = <x, backproject(y)> for any x and y."""
     rng = np.random.default_rng(5)
-    f = 76e9 + (4e8 * np.arange(9) if even else np.sort(rng.uniform(0, 4e9, 9)))
+    if evenly_spaced:
+        f = 76e9 + 4e8 * np.arange(9)
+    else:
+        f = 76e9 + np.sort(rng.uniform(0, 4e9, 9))
     tx = rng.uniform(-1, 1, (40, 3))
     rx = rng.uniform(-1, 1, (40, 3))
     reference = rng.uniform(0, 2, 40)
@@ -76,10 +86,11 @@ def test_backprojection_is_linear_and_works_with_one_frequency():
     voxels = rng.uniform(-0.5, 0.5, (5, 3))
     a = rng.standard_normal((5, 1)) + 0j
     b = rng.standard_normal((5, 1)) + 0j
-    args = ([77e9], tx, rx, voxels, np.zeros(5))
-    np.testing.assert_allclose(
-        backproject(a + 2j * b, *args), backproject(a, *args) + 2j * backproject(b, *args), rtol=1e-9
-    )
+    no_reference_m = np.zeros(5)
+    geometry = ([77e9], tx, rx, voxels, no_reference_m)
+    image_of_sum = backproject(a + 2j * b, *geometry)
+    sum_of_images = backproject(a, *geometry) + 2j * backproject(b, *geometry)
+    np.testing.assert_allclose(image_of_sum, sum_of_images, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -96,5 +107,6 @@ def test_shapes_that_do_not_fit_are_refused(change):
         "reference_m": np.zeros(3),
     }
     assert backproject(**valid_arguments).shape == (4,)
+    # The message has the expected shapes in brackets, as "[position, frequency]".
     with pytest.raises(ValueError, match=r"\["):
         backproject(**{**valid_arguments, **change})

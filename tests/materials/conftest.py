@@ -15,8 +15,9 @@ from polysight.materials import Classifier, Library, MaterialsResult, TrainingSc
 from polysight.materials.analyse import KnownScene, Optics, analyse
 from polysight.materials.inversion import RigPrior
 
-# The paper's incidence angle, and its Table 2 (eps' - j eps''; None is metal).
+# The paper's incidence angle.
 THETA = np.radians(55.0)
+# Nine plates with the permittivities eps' - j eps'' of the paper's Table 2; None is metal.
 NINE = {
     "rubber": 5.06 - 1.11j,
     "cardboard (rough)": 4.54 - 0.56j,
@@ -46,25 +47,30 @@ class Synthetic:
         return Images(self.h, self.v, self.x_m, self.y_m, np.ones(self.h.shape, bool))
 
     def analyse(self, metal=None, segmentation=None, classifier=None, pair=None):
+        """Return the materials of the scene; `pair` replaces its images."""
         known_scene = KnownScene(segmentation, metal, plates=self.plates)
-        prior = RigPrior(1e-3, leakage_std=0.003, leakage_measured=True)
+        # The images have neither leakage nor an error of the angle: a rig that was measured well.
+        prior = RigPrior(theta_std_rad=1e-3, leakage_std=0.003, leakage_measured=True)
         return analyse(pair or self.pair, Optics(self.theta, prior), known_scene, classifier)
 
 
 def smooth_field(rng, shape, correlation_px):
-    """Random field of unit rms that varies slowly over the plane."""
+    """Return a random field of unit standard deviation that varies slowly over the plane."""
     field = ndimage.gaussian_filter(rng.standard_normal(shape), correlation_px, mode="wrap")
     return field / field.std()
 
 
 def reflect(eps, theta):
-    """r_s and r_p by Eq. 2, independent of the code under test."""
+    """Return r_s and r_p by Eq. 2 of the paper, independent of the code under test."""
     if eps is None:
         return -1.0, -1.0
-    n = np.sqrt(eps)
-    c = np.cos(theta)
-    ct = np.sqrt(1 - np.sin(theta) ** 2 / eps)
-    return (c - n * ct) / (c + n * ct), (ct - n * c) / (ct + n * c)
+    index = np.sqrt(eps)
+    cos_in_air = np.cos(theta)
+    # Snell's law: sin(theta) = index * sin(angle in the plate).
+    cos_in_plate = np.sqrt(1 - np.sin(theta) ** 2 / eps)
+    r_s = (cos_in_air - index * cos_in_plate) / (cos_in_air + index * cos_in_plate)
+    r_p = (cos_in_plate - index * cos_in_air) / (cos_in_plate + index * cos_in_air)
+    return r_s, r_p
 
 
 def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, theta=THETA):
@@ -77,31 +83,50 @@ def make(seed, materials=None, uneven=0.01, noise=0.006, gain_v=0.3 + 0.6j, thet
     pixel_mm = 2.0
     rng = np.random.default_rng(seed)
     materials = NINE if materials is None else materials
-    x = (np.arange(pixels) - (pixels - 1) / 2) * pixel_mm
+    # Both axes of the image, millimetres from its middle.
+    axis_mm = (np.arange(pixels) - (pixels - 1) / 2) * pixel_mm
+
+    # Reflection of every point of the plane: 0 between the plates.
     places = [((i % 3 - 1) * 60.0, (i // 3 - 1) * 60.0) for i in rng.permutation(9)]
-    s = np.zeros((pixels, pixels), complex)
-    p = np.zeros((pixels, pixels), complex)
+    r_s = np.zeros((pixels, pixels), complex)
+    r_p = np.zeros((pixels, pixels), complex)
     plates = []
-    for (name, eps), (cx, cy) in zip(materials.items(), places, strict=False):
-        cx = cx + rng.uniform(-5.0, 5.0)
-        cy = cy + rng.uniform(-5.0, 5.0)
+    for (name, eps), (raster_x, raster_y) in zip(materials.items(), places, strict=False):
+        centre_x = raster_x + rng.uniform(-5.0, 5.0)
+        centre_y = raster_y + rng.uniform(-5.0, 5.0)
         half = 22.5
-        plates.append(TruthPlate(name, (cx - half, cy - half, cx + half, cy + half), eps, metal=eps is None))
-        inside = (abs(x[:, None] - cy) <= half) & (abs(x[None, :] - cx) <= half)
-        s[inside], p[inside] = reflect(eps, theta)
+        box = (centre_x - half, centre_y - half, centre_x + half, centre_y + half)
+        plates.append(TruthPlate(name, box, eps, metal=eps is None))
+        inside = (abs(axis_mm[:, None] - centre_y) <= half) & (abs(axis_mm[None, :] - centre_x) <= half)
+        r_s[inside], r_p[inside] = reflect(eps, theta)
+
+    # A sharp limit f of the spatial frequencies, which rings at edges as images of a real aperture do. The response to
+    # a point, sin(2 pi f x) / (2 pi f x), is 0.443 / f wide at half of its power: 3.6 mm along y, 5.4 mm along x.
     frequency = np.fft.fftfreq(pixels, pixel_mm)
     passed = (abs(frequency[:, None]) < 0.443 / 3.6) & (abs(frequency[None, :]) < 0.443 / 5.4)
-    out = []
-    for channel, gain in ((s, 1.0), (gain_v * p, abs(gain_v))):
-        n = rng.standard_normal((2, pixels, pixels))
-        n = np.fft.ifft2(np.fft.fft2(n[0] + 1j * n[1]) * passed)
-        n *= noise * gain / np.sqrt(np.mean(abs(n) ** 2)) if noise else 0.0
-        light = np.exp(uneven * (smooth_field(rng, channel.shape, 20) + 1j * smooth_field(rng, channel.shape, 20)))
-        out.append((np.fft.ifft2(np.fft.fft2(channel) * passed) * light + n).astype(np.complex64))
-    common = np.exp(1j * rng.uniform(-3, 3))
-    axis = x / 1e3
-    phase = np.complex64(common)
-    return Synthetic(out[0] * phase, out[1] * phase, axis - 0.0132, axis + 0.1, tuple(plates), theta)
+    images = []
+    for reflection, gain in ((r_s, 1.0), (gain_v * r_p, abs(gain_v))):
+        parts = rng.standard_normal((2, pixels, pixels))
+        white_noise = parts[0] + 1j * parts[1]
+        noise_image = np.fft.ifft2(np.fft.fft2(white_noise) * passed)
+        noise_image *= noise * gain / np.sqrt(np.mean(abs(noise_image) ** 2)) if noise else 0.0
+        ln_amplitude = smooth_field(rng, reflection.shape, 20)
+        phase_rad = smooth_field(rng, reflection.shape, 20)
+        illumination = np.exp(uneven * (ln_amplitude + 1j * phase_rad))
+        image = np.fft.ifft2(np.fft.fft2(reflection) * passed) * illumination
+        images.append((image + noise_image).astype(np.complex64))
+
+    # The distance of the plane is not known to a wavelength: a phase that both channels have in common.
+    common_phase = np.complex64(np.exp(1j * rng.uniform(-3, 3)))
+    axis_m = axis_mm / 1e3
+    return Synthetic(
+        h=images[0] * common_phase,
+        v=images[1] * common_phase,
+        x_m=axis_m - 0.0132,
+        y_m=axis_m + 0.1,
+        plates=tuple(plates),
+        theta=theta,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,11 @@ from polysight.cli.main import main
 from polysight_shared.errors import ErrorCode
 from polysight_shared.tables import read_toml
 
-VACUUM = 8.8541878128e-12
+# Permittivity of the vacuum (CODATA 2018).
+VACUUM_F_PER_M = 8.8541878128e-12
 
-# ITU-R P.2040-4, Table 3: a, b, c, d and the upper and lower limits in GHz.
+# ITU-R P.2040-4, Table 3. With f in GHz, eps' = a f^b and the conductivity is c f^d S/m: a, b, c, d, and the lowest and
+# highest frequency in GHz.
 ITU = {
     "concrete": (5.24, 0, 0.0462, 0.7822, 1, 100),
     "brick": (4.15, 0, 0.0006, 1.5712, 110, 330),
@@ -33,22 +35,27 @@ ITU = {
 
 
 def look_up(name: str) -> tuple[complex, float]:
-    """Permittivity and frequency in GHz of a material of the catalogue."""
+    """Return permittivity and frequency in GHz of a material of the catalogue."""
     material = materials.find_material(name)
     assert material is not None, name
     return material.permittivity, material.frequency_hz / 1e9
 
 
 def compute_debye_water(water_c: float, ghz: float) -> complex:
-    """Double-Debye water of ITU-R P.527-6, as in Liebe, Hufford, Manabe (1991)."""
-    theta = 300 / (water_c + 273.15) - 1
-    static = 77.66 + 103.3 * theta
-    middle = 0.0671 * static
-    high = 3.52 - 7.52 * theta
-    first_ghz = 20.20 - 146.4 * theta + 316 * theta**2
-    slow = (static - middle) / (1 + 1j * ghz / first_ghz)
-    fast = (middle - high) / (1 + 1j * ghz / (39.8 * first_ghz))
-    return slow + fast + high
+    """Return the permittivity of water by ITU-R P.527-6, as in Liebe, Hufford, Manabe (1991).
+
+    Two relaxations, each with its frequency: the permittivity falls from its static value to a middle one, and from
+    that to the one at high frequencies.
+    """
+    inverse_temperature = 300 / (water_c + 273.15) - 1
+    static_eps = 77.66 + 103.3 * inverse_temperature
+    middle_eps = 0.0671 * static_eps
+    high_eps = 3.52 - 7.52 * inverse_temperature
+    slow_ghz = 20.20 - 146.4 * inverse_temperature + 316 * inverse_temperature**2
+    fast_ghz = 39.8 * slow_ghz
+    slow_part = (static_eps - middle_eps) / (1 + 1j * ghz / slow_ghz)
+    fast_part = (middle_eps - high_eps) / (1 + 1j * ghz / fast_ghz)
+    return slow_part + fast_part + high_eps
 
 
 def test_values_are_of_passive_dielectrics_at_millimetre_waves():
@@ -59,7 +66,7 @@ def test_values_are_of_passive_dielectrics_at_millimetre_waves():
         assert all(0 < spread < 2 for spread in material.spread), material
 
 
-def test_names_are_unique_over_aliases():
+def test_no_name_or_alias_is_of_two_materials():
     names = Counter(materials.normalise_name(name) for m in materials.load_catalogue() for name in (m.name, *m.aliases))
     assert [name for name, count in names.items() if count > 1] == []
     for material in materials.load_catalogue():
@@ -71,6 +78,7 @@ def test_every_source_is_used_and_every_value_has_one():
     listed = read_toml(materials.CATALOGUE)["sources"]
     assert {source.key for m in materials.load_catalogue() for source in m.sources} == set(listed)
     assert all(material.sources for material in materials.load_catalogue())
+    # Author, title and year take more than 40 characters: a source is more than a key word.
     assert all(len(text) > 40 for text in listed.values())
 
 
@@ -79,17 +87,19 @@ def test_building_materials_follow_the_recommendation(name):
     a, b, c, d, lowest_ghz, highest_ghz = ITU[name]
     eps, ghz = look_up(name)
     assert lowest_ghz <= ghz <= highest_ghz
-    loss = c * ghz**d / (2 * math.pi * VACUUM * ghz * 1e9)
+    loss = c * ghz**d / (2 * math.pi * VACUUM_F_PER_M * ghz * 1e9)
+    # The catalogue's numbers are rounded to three digits.
     assert eps == pytest.approx(a * ghz**b - 1j * loss, rel=3e-3)
 
 
 @pytest.mark.parametrize("celsius", [0, 5, 20, 37])
 def test_water_is_the_double_debye_formula(celsius):
     eps, ghz = look_up(f"water at {celsius} degrees")
+    # The catalogue's numbers are rounded to three digits.
     assert eps == pytest.approx(compute_debye_water(celsius, ghz), rel=3e-3)
 
 
-def test_names_of_one_material():
+def test_aliases_and_generic_names_are_of_one_material_and_two_of_its_kinds_are_not():
     assert materials.is_same_material("Acrylic (3 mm)", "PMMA")
     assert materials.is_same_material("PCB", "FR4")
     assert materials.is_same_material("glass fibre", "fr-4")
@@ -102,7 +112,7 @@ def test_names_of_one_material():
     assert not materials.is_same_material("own mixture 7", "own mixture 8")
 
 
-def test_same_is_symmetric():
+def test_whether_two_names_are_of_one_material_does_not_depend_on_their_order():
     names = ["wood", "plywood", "PMMA", "acrylic", "glass", "Pyrex", "water", "copper", "cardboard (rough)"]
     for first_name in names:
         assert materials.is_same_material(first_name, first_name)
@@ -112,7 +122,7 @@ def test_same_is_symmetric():
             )
 
 
-def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
+def test_a_material_without_a_spread_has_the_default_of_its_kind(tmp_path):
     line = 'real = 2.0, loss = 0.1, ghz = 77, source = ["Own"], kind = "felt"'
     text = f'materials = [{{ name = "a", {line} }}, {{ name = "b", spread = [0.01, 0.2], {line} }}]\n'
     path = tmp_path / "catalogue.toml"
@@ -124,7 +134,7 @@ def test_a_spread_is_of_the_line_or_the_default_of_the_kind(tmp_path):
     assert own_spread.spread == (0.01, 0.2)
 
 
-def test_a_bad_file_is_refused(tmp_path):
+def test_a_missing_or_damaged_catalogue_and_an_unlisted_kind_or_source_are_refused(tmp_path):
     path = tmp_path / "catalogue.toml"
     with expect_refusal(ErrorCode.FILE_MISSING, path):
         materials.read_catalogue(path)

@@ -8,6 +8,7 @@ from polysight.materials import SIMULATED_LIBRARY, UNKNOWN, Classifier, Library
 from polysight.materials.result import pixel_features
 from polysight_shared.errors import ErrorCode
 
+# The published rig's 55 degrees, not exactly: a measured angle is not that of the library.
 ANGLE_DEG = 54.9
 
 
@@ -16,19 +17,22 @@ def library() -> Library:
     return Library.load(SIMULATED_LIBRARY)
 
 
+# Ratios H / V and brightnesses of which most belong to no material of the library.
 @pytest.mark.parametrize("ratio", [1.5, 1.5j, -2.0, 0.2 + 0.1j, 30.0])
 @pytest.mark.parametrize("gain", [0.1, 0.7, 1.0, 3.0])
-def test_an_unknown_patch_has_no_likelier_name(library, ratio, gain):
-    """A patch is unknown for its distance or its probability; then "unknown" is the likeliest entry of the list."""
+def test_the_name_of_a_patch_is_the_likeliest_of_its_list(library, ratio, gain):
+    """This holds for "unknown" too, whether a patch is unknown for its distance or for its probabilities."""
     rng = np.random.default_rng(5)
+    # 0.45 is a usual |H| of a plate; the pixels scatter by 0.6 %.
     h = 0.45 * gain * (1 + 0.006 * rng.standard_normal(60))
     p = ratio * (1 + 0.006 * rng.standard_normal(60))
-    patch_name = Classifier(library, angles_deg=[ANGLE_DEG]).scan([pixel_features(h, np.abs(h / p), p)])[0].patch_name
+    features = pixel_features(h, np.abs(h / p), p)
+    (named,) = Classifier(library, angles_deg=[ANGLE_DEG]).scan([features])
+    patch_name = named.patch_name
+    likeliest = max(patch_name.probabilities, key=lambda name: patch_name.probabilities[name])
+    assert patch_name.name == likeliest
     if patch_name.name == UNKNOWN:
-        assert max(patch_name.probabilities, key=lambda n: patch_name.probabilities[n]) == UNKNOWN
         assert patch_name.confidence >= 0.5
-    else:
-        assert max(patch_name.probabilities, key=lambda n: patch_name.probabilities[n]) == patch_name.name
 
 
 def test_one_angle_given_twice_is_refused(library):

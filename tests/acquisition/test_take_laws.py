@@ -1,13 +1,14 @@
 """What a take's counts, its end and its boards say, one difference at a time, without a rig."""
 
 import threading
+from os import PRIO_PROCESS, getpriority
 from typing import Any
 
 import msgspec
 import pytest
 from tests.support.rigs import load_published_rig
 
-from polysight.acquisition.progress import ProcessingQueue
+from polysight.acquisition.progress import NICE, ProcessingQueue
 from polysight.acquisition.pulse_times import ReceivedCapture
 from polysight.acquisition.ready import list_stage_differences
 from polysight.acquisition.row import FaultKind, Take, TakeFault
@@ -151,3 +152,12 @@ def test_the_first_error_of_processing_is_kept_until_the_end():
     error = queue.close(now=False)
     assert isinstance(error, ValueError)
     assert error.args == (1,)
+
+
+def test_rows_are_processed_below_the_priority_of_the_program():
+    nice_values = []
+    queue = ProcessingQueue(lambda _: nice_values.append(getpriority(PRIO_PROCESS, threading.get_native_id())), limit=1)
+    queue.add(0)
+    assert queue.close(now=False) is None
+    # 19 is the system's largest value.
+    assert nice_values == [min(19, getpriority(PRIO_PROCESS, threading.get_native_id()) + NICE)]

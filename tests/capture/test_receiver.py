@@ -8,7 +8,7 @@ import sys
 import time
 import zlib
 from contextlib import closing
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +116,30 @@ def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
     assert row.complete
     assert (row.strangers, row.stale) == (1, 4)
     assert (tmp_path / "a.part").read_bytes() == data
+
+
+@pytest.mark.parametrize("last_bytes", [FULL, 100])
+def test_a_row_is_reported_as_complete_without_a_request(board, card, tmp_path, monkeypatch, last_bytes):
+    """Also if its last packet is full, and not marked by its size."""
+    for name in ("take_core", "take_priority"):
+        monkeypatch.setattr(receiver_process, name, lambda *_, **__: (None, ""))
+    data = draw_noise(3 * FULL + last_bytes, 8)
+    host, process = Pipe()
+    receiver = receiver_process.Receiver(process)
+    receiver._answer(Open(board.name, board.host_address, board.data_port, board.card_address, 212_992))
+    receiver._answer(BeginRow(0, 1, len(data), FULL, str(tmp_path / "a.part"), after_reset=True))
+    packets = encode_packets(data, 1, 0)
+    reports = []
+    for sent in (packets[:-1], packets[-1:]):
+        send(card, board, sent)
+        receiver._receive()
+        reports.append(host.poll())
+    assert reports == [False, True]
+    receiver._discard()
+    assert receiver._socket is not None
+    receiver._socket.close()
+    host.close()
+    process.close()
 
 
 @pytest.mark.parametrize("clock_set_s", [0, 3600])

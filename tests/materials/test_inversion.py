@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from polysight.materials import inversion
 from polysight.materials.inversion import SOURCES, RigPrior, SceneLikelihood, invert, sample_posterior, true_ratio
 from polysight.materials.kinds import (
     Kind,
@@ -370,3 +371,28 @@ def test_plates_are_of_one_material_if_their_ratios_agree_within_their_errors():
     leaking = draw_world(np.random.default_rng(0), (0.05j, 0.04), noise=0.002, eps=np.full(5, 4.0 - 0.4j))
     assert compute_probability_of_same_material(leaking) == pytest.approx(same[:5, :5], abs=0.05)
     assert compute_probability_of_same_material([]).shape == (0, 0)
+
+
+@pytest.mark.parametrize("painted_share", [0.25, 0.75])
+def test_without_the_evidence_of_a_patch_the_metal_is_painted_as_probably_as_before(painted_share):
+    """Of a particle of one column, the metal is painted where it is positive. No patch tells anything."""
+
+    class PaintAlone:
+        width = 2
+
+        @staticmethod
+        def paint(z):
+            return z[:, :1]
+
+        @staticmethod
+        def log_likelihoods(z):
+            return np.zeros((len(z), 1))
+
+    rng = np.random.default_rng(5)
+    z = rng.standard_normal((400, 2))
+    is_painted = np.arange(400) < 400 * painted_share
+    z[:, 0] = np.where(is_painted, abs(z[:, 0]), -abs(z[:, 0]))
+    weights = np.zeros(1)
+    moved = inversion._anneal_without_patch(PaintAlone(), z, weights, weights, rng, PaintAlone.log_likelihoods(z))
+    assert np.mean(moved[:, 0] > 0) == painted_share
+    assert not np.isin(moved, z).all()

@@ -9,10 +9,18 @@ from scipy import ndimage
 
 from polysight.imaging import Images
 from polysight.materials import common_change
-from polysight.materials.analyse import KnownScene, Optics, analyse
+from polysight.materials.analyse import HALO_OF_METAL, KnownScene, Optics, SceneScatter, analyse
 from polysight.materials.common_change import _ExpectedFromSlopes, estimate_common_change
-from polysight.materials.measure import Scatter, compute_median_ratio
-from polysight.materials.metal import divide_by_reference, find_halo, measure_metal_unevenness, take_patch_as_metal
+from polysight.materials.inversion import RigPrior
+from polysight.materials.measure import LEAST_STD, Scatter, compute_median_ratio, relative_errors
+from polysight.materials.metal import (
+    Halo,
+    divide_by_reference,
+    find_halo,
+    measure_metal_unevenness,
+    take_patch_as_metal,
+)
+from polysight.materials.result import Tilts
 from polysight.materials.segment import align, segment
 from polysight.polarimetry import calibrate as to_metal_by_paper
 
@@ -310,3 +318,14 @@ def test_fringes_that_only_weak_plates_show_are_not_reported():
     weak = estimate_common_change(by_weak_plates, ORIGIN_M)
     assert weak.fringes < 0.5
     np.testing.assert_array_equal(weak.std, change.std)
+
+
+def test_the_metals_error_is_the_root_of_the_sum_of_squares_of_its_parts():
+    scene = SceneScatter(
+        scatter={}, usual=(0.02, 0.01), metal=None, change=None, metal_spread=None, border={},
+        tilts=Tilts({}, across=1), lit_evenly=True, metal_rise=(0.0, 0.0), halo=Halo(level=0.003), metal_std=0.017,
+    )  # fmt: skip
+    amplitude, phase = relative_errors(None, (0.02, 0.01))
+    parts = (LEAST_STD, amplitude / np.sqrt(2), phase / np.sqrt(2), 0.003 * HALO_OF_METAL, 0.017)
+    assert scene.prior(RigPrior(0.01), 0.0).reference_std == pytest.approx(np.sqrt(np.sum(np.square(parts))))
+    assert replace(scene, metal_spread=0.1).prior(RigPrior(0.01), 0.0).reference_std == LEAST_STD

@@ -81,10 +81,12 @@ def test_splitting_and_joining_is_the_identity():
         ),
         "b_real": ("t", [1.0, 2.0, 3.0], {"units": "m", "long_name": "not a part of anything"}),
         "c": ("t", np.array([1e-300 + 1e300j, 0, 1]), {"units": "V", "long_name": "c"}),
+        "is_valid": ("t", np.array([True, False, True]), {"long_name": "whether a position is usable"}),
+        "count": ("t", np.array([1, 2, 3]), {"units": "1", "long_name": "number of chirps"}),
     }
     dataset = xarray.Dataset(variables, attrs={"title": "x"})
     split = split_complex(dataset)
-    assert set(split.data_vars) == {"a_real", "a_imag", "b_real", "c_real", "c_imag"}
+    assert set(split.data_vars) == {"a_real", "a_imag", "b_real", "c_real", "c_imag", "is_valid", "count"}
     joined = join_complex(split)
     xarray.testing.assert_identical(joined[sorted(variables)], dataset[sorted(variables)])
     assert {name: v.dtype for name, v in joined.items()} == {name: v.dtype for name, v in dataset.items()}

@@ -1,12 +1,14 @@
 """The picture of a surface: near points hide those behind them."""
 
 import io
+from dataclasses import replace
 
 import matplotlib
 import numpy as np
 from matplotlib.image import imread
 
 from polysight.report import surface_figure
+from polysight.report.figures import find_point_permittivities
 from polysight.surfaces import Segment, Surface
 
 
@@ -65,3 +67,13 @@ def count_pixels(surface: Surface, value: float) -> int:
 def test_an_object_hides_the_table_behind_it():
     # The colour bar spans 1.8 to 6.2.
     assert count_pixels(make_surface(), (6 - 1.8) / 4.4) > 500
+
+
+def test_each_point_has_the_permittivity_of_its_own_segment():
+    surface = make_surface()
+    expected = np.where(surface.segment == 1, 6.0, 2.0)
+    assert np.array_equal(find_point_permittivities(surface), expected)
+    far, near = surface.segments
+    unknown = replace(surface, segments=(far, replace(near, permittivity=None)))
+    expected = np.where(surface.segment == 1, np.nan, 2.0)
+    assert np.array_equal(find_point_permittivities(unknown), expected, equal_nan=True)

@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from multiprocessing.sharedctypes import Synchronized
 
+# What pages read, with the number of a scan.
 PATHS = ("scans", "scan?scan=s{}", "result?scan=s{}", "map/h_amplitude?scan=s{}", "running")
 counted: Counter[str] = Counter()
 
@@ -62,7 +63,7 @@ async def ask(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, reques
 
 
 async def guess_token(port: int, scan: int) -> None:
-    """Abort with a wrong token."""
+    """Try to abort a scan with a wrong token, again and again."""
     head = f"POST /api/control/abort?scan=s{scan} HTTP/1.1\r\nHost: localhost\r\nX-Polysight-Token: wrong\r\n"
     while True:
         try:
@@ -84,7 +85,7 @@ def open_connections(port: int, rate: int, opened: Synchronized[int]) -> None:
                 socket.create_connection(("127.0.0.1", port)).close()
                 opened.value += 1
         else:
-            # All due packets are sent: the rate is the requested one.
+            # As many connections as are due were opened.
             time.sleep(0.002)
 
 
@@ -99,7 +100,7 @@ async def report(opened: Synchronized[int]) -> None:
 
 async def main() -> None:
     """Run all clients until the process is ended."""
-    # The aborts of an attack are sent by the test, not from here.
+    # The sixth argument, the number of aborts, is for the test that sends them.
     port, streams, readers, wrong_tokens, connections, _, views = map(int, sys.argv[1:])
     clients = [read_stream(port, k % views) for k in range(streams)]
     clients += [read_pages(port, views) for _ in range(readers)]

@@ -34,7 +34,7 @@ from polysight_shared.errors import ErrorCode
 
 @pytest.fixture
 def scans(tmp_path: Path) -> Path:
-    """A folder of two processed scans."""
+    """A folder of two processed scans; their verdict is "care", that is usable with a warning."""
     for name in ("one", "two"):
         write_judged_products(tmp_path / name / "products", "care")
         (tmp_path / name / "program").mkdir()
@@ -75,6 +75,7 @@ def test_a_wrong_request_is_refused_in_plain_words(view, path, body, code, value
     text = " ".join(answer[part] for part in ("what", "why", "do"))
     assert all(value in text for value in values), text
     assert all(answer[part] for part in ("what", "why", "do"))
+    # Words of the decoder's own messages, such as "Expected `int` - at `$.plan.rows`".
     assert not any(word in text for word in ("Expected", "Object", "`", "array", "null", "$."))
 
 
@@ -117,18 +118,24 @@ def test_pages_of_a_scan_without_a_name_lead_to_the_list(view, page):
 
 
 def test_a_pair_is_compared_once_for_all_its_maps(view, scans, monkeypatch):
-    done: list[tuple[Path, Path]] = []
-    real = site.catalogue.compare
-    monkeypatch.setattr(site.catalogue, "compare", lambda a, b: done.append((a, b)) or real(a, b))
+    compared_pairs: list[tuple[Path, Path]] = []
+    compare = site.catalogue.compare
+
+    def record_and_compare(a: Path, b: Path) -> object:
+        compared_pairs.append((a, b))
+        return compare(a, b)
+
+    monkeypatch.setattr(site.catalogue, "compare", record_and_compare)
     for path in ("compare", "compare/sigmas", "compare/p", "compare/loss"):
         assert ask(view, f"/api/{path}?a=one&b=two")[0] == 200, path
-    assert len(done) == 1
+    assert len(compared_pairs) == 1
+
+    # The pair in the other order is another one, and so is a pair with new products.
     assert ask(view, "/api/compare?a=two&b=one")[0] == 200
     shutil.rmtree(scans / "one" / "products")
     write_judged_products(scans / "one" / "products", "care")
     assert ask(view, "/api/compare/p?a=one&b=two")[0] == 200
-    # Other products are compared again
-    assert len(done) == 3
+    assert len(compared_pairs) == 3
 
 
 @pytest.mark.parametrize(("damaged", "other"), [("one", "two"), ("two", "one")])
@@ -143,36 +150,38 @@ def test_a_damaged_scan_does_not_hide_the_other_check_plates(view, scans, damage
     (scans / damaged / "products" / "materials.json").write_text("{")
     chart = get(view, "/api/check")
     assert [scan["name"] for scan in chart["scans"]] == [other]
-    # It was good before, but now its products are others.
+    # Its level from before is not shown: it belongs to other products.
     assert chart["unreadable"] == [damaged]
 
 
 def test_one_of_two_simultaneous_starts_is_refused(view, scans, monkeypatch):
-    barrier = threading.Barrier(2, timeout=3.0)
-    real = control._check_free
+    """The check that the rig is free and the start are one step, so the second request sees the first one's program."""
+    # Would let both requests pass the check before either starts. With one step for both, only one comes here, and
+    # the barrier breaks after 3 s.
+    both_have_checked = threading.Barrier(2, timeout=3.0)
+    check_free = control._check_free
 
-    def together(site: object) -> None:
-        real(site)
+    def check_free_and_wait(site: object) -> None:
+        check_free(site)
         with suppress(threading.BrokenBarrierError):
-            # Without one step for checking and starting, neither would see the other's program
-            barrier.wait()
+            both_have_checked.wait()
 
-    monkeypatch.setattr(control, "_check_free", together)
-    collected: list[int] = []
+    monkeypatch.setattr(control, "_check_free", check_free_and_wait)
+    statuses: list[int] = []
     threads = [
-        threading.Thread(target=lambda n=name: collected.append(post(view, "/api/start", {"name": n})[0]))
+        threading.Thread(target=lambda n=name: statuses.append(post(view, "/api/start", {"name": n})[0]))
         for name in ("first", "second")
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert sorted(collected) == [200, 409]
+    assert sorted(statuses) == [200, 409]
     assert sum((scans / name).exists() for name in ("first", "second")) == 1
 
 
 def test_open_live_views_do_not_prevent_pausing_and_stopping(view, scans):
-    """A request does not close the view of its own scan, nor those of as many others as may be open."""
+    """A command needs no live view: it neither opens one nor closes those of other pages, of which no more may open."""
     for k in range(site.MAX_WATCHES):
         (scans / f"view{k}" / "program").mkdir(parents=True)
     with ExitStack() as pages, open_control(scans / "one") as stop:
@@ -181,6 +190,7 @@ def test_open_live_views_do_not_prevent_pausing_and_stopping(view, scans):
             pages.callback(page.close)
             page.request("GET", f"/api/events?scan=view{k}")
             assert page.getresponse().readline().startswith(b"event: ")
+        # One view more is refused.
         assert ask(view, "/api/state?scan=one")[0] == 409
         assert post(view, "/api/control/pause?scan=one")[0] == 200
         assert stop.paused
@@ -190,18 +200,19 @@ def test_open_live_views_do_not_prevent_pausing_and_stopping(view, scans):
         assert stop.now
 
 
-def test_of_two_live_views_that_are_opened_together_one_follows_the_scan(tmp_path, monkeypatch):
-    """The folder is read without a lock, so that another request may open the view meanwhile."""
+def test_of_two_live_views_of_a_scan_that_are_opened_together_one_is_closed(tmp_path, monkeypatch):
+    """A view is made without a lock, since that reads the folder: another request may make one meanwhile."""
     views = []
-    # Views that other requests open while one is being made.
-    views_of_others = []
+    views_of_other_request = []
 
     class Watch:
+        """A live view; while the first one is being made, another request opens a view of the same scan."""
+
         def __init__(self, folder: Path, _control: bool) -> None:
             self.calls = []
             views.append(self)
             if len(views) == 1:
-                views_of_others.append(watches.open("one", folder))
+                views_of_other_request.append(watches.open("one", folder))
 
         def start(self) -> None:
             self.calls.append("start")
@@ -213,26 +224,37 @@ def test_of_two_live_views_that_are_opened_together_one_follows_the_scan(tmp_pat
     watches = site.Watches(control=True)
     opened = watches.open("one", tmp_path)
     outer, inner = views
-    assert views_of_others == [inner]
+    assert views_of_other_request == [inner]
     assert opened is inner
     assert watches.open("one", tmp_path) is inner
     assert (outer.calls, inner.calls) == (["close"], ["start"])
 
 
 @pytest.mark.parametrize(
-    ("lives", "age_s", "state"), [(True, 0, "running"), (True, 60, "frozen"), (False, 0, "lost"), (False, 1e5, None)]
+    ("is_alive", "age_s", "state"),
+    [
+        (True, 0, "running"),
+        # The process exists, but has not renewed its sign of life for a minute.
+        (True, 60, "frozen"),
+        # The process was killed just now, or more than a day ago: that is not news any more.
+        (False, 0, "lost"),
+        (False, 1e5, None),
+    ],
 )
-def test_every_page_knows_whether_a_scan_runs_was_killed_or_hangs(view, scans, lives, age_s, state):
-    alive = scans / "one" / CONTROL_FOLDER / ALIVE_FILE
-    alive.parent.mkdir()
-    pid = os.getpid() if lives else 1
-    alive.write_bytes(msgspec.json.encode(SignOfLife(pid, read_start_ticks(os.getpid()) or 0, socket.gethostname())))
-    os.utime(alive, (time.time() - age_s,) * 2)
+def test_every_page_shows_whether_a_scan_runs_was_killed_or_hangs(view, scans, is_alive, age_s, state):
+    alive_file = scans / "one" / CONTROL_FOLDER / ALIVE_FILE
+    alive_file.parent.mkdir()
+    # A process is its number and its start time: process 1 did not start together with this one.
+    pid = os.getpid() if is_alive else 1
+    start_ticks = read_start_ticks(os.getpid()) or 0
+    alive_file.write_bytes(msgspec.json.encode(SignOfLife(pid, start_ticks, socket.gethostname())))
+    renewed_at = time.time() - age_s
+    os.utime(alive_file, (renewed_at, renewed_at))
     running = get(view, "/api/running")
     assert [scan["state"] for scan in running] == ([state] if state else [])
 
 
-def test_a_scan_is_put_away_by_who_types_its_name(view, scans):
+def test_a_scan_is_archived_or_deleted_only_if_its_name_is_typed(view, scans):
     for path in ("archive", "delete"):
         status, answer = post(view, f"/api/{path}?scan=one", {"name": "two"})
         assert (status, answer["code"]) == (400, ErrorCode.MISMATCH)
@@ -249,7 +271,8 @@ def test_a_request_can_be_repeated_and_is_checked_again(view, scans):
     (scans / "one" / "program" / "request.json").write_text(json.dumps({"name": "other", "plan": plan}))
     request = get(view, "/api/request?scan=one")
     assert (request["name"], request["plan"]["rows"], request["plan"]["columns"]) == ("one", 5, 7)
-    assert post(view, "/api/again?scan=one")[0] == 400  # it has products, so it could start
+    # The scan has products, so it did start: only one that could not start is started again.
+    assert post(view, "/api/again?scan=one")[0] == 400
     (scans / "one" / "program" / "request.json").write_text('{"plan": {"rows": 0}}')
     assert post(view, "/api/again?scan=one")[0] == 400
     assert ask(view, "/api/request?scan=two")[0] == 404
@@ -284,12 +307,15 @@ def test_a_result_that_is_polled_while_products_are_replaced_is_never_a_mixture(
     worker.start()
     levels: list[str] = []
     try:
+        # Until both verdicts were seen, and 20 answers in all (chosen).
         while len(set(levels)) < 2 or len(levels) < 20:
             status, body, _ = ask(view, "/api/result?scan=one")
+            # 409: the products were replaced while they were being read.
             assert status in (200, 409)
             if status == 200:
                 result = json.loads(body)
                 levels.append(result["verdict"]["level"])
+                # Only products without a result ("none") have no named patch.
                 assert any(patch["name"] for patch in result["patches"]) is (levels[-1] != "none")
     finally:
         ended.set()
@@ -306,16 +332,17 @@ def test_exports_stay_in_the_scan(view, scans, tmp_path):
 
 @pytest.mark.parametrize(("base", "saved"), [(None, 40), ({"notes": "", "tags": []}, 1)])
 def test_notes_that_somebody_else_has_changed_are_not_overwritten(view, scans, base, saved):
+    """A request has the notes on which it is based: of 40 with the empty ones, the first is saved. Without, all are."""
     with ThreadPoolExecutor(2) as pool:
-        texts = ({"notes": f"{k}", "base": base} for k in range(40))
-        answers = list(pool.map(lambda body: post(view, "/api/notes?scan=one", body), texts))
+        requests = ({"notes": f"{k}", "base": base} for k in range(40))
+        answers = list(pool.map(lambda body: post(view, "/api/notes?scan=one", body), requests))
     assert [status for status, _ in answers].count(200) == saved
     assert {(status, body.get("code")) for status, body in answers} <= {(200, None), (409, ErrorCode.MISMATCH)}
     assert [p.name for p in (scans / "one").glob(".*.part")] == []
 
 
 @pytest.mark.parametrize(("number", "code"), [(errno.ENOSPC, ErrorCode.DISK_FULL), (errno.EROFS, ErrorCode.OTHER)])
-def test_a_disk_that_takes_nothing_is_named(view, scans, monkeypatch, number, code):
+def test_a_full_or_read_only_disk_is_reported_with_the_unwritten_file(view, scans, monkeypatch, number, code):
     def fail(_: int) -> None:
         raise OSError(number, os.strerror(number))
 
@@ -326,19 +353,23 @@ def test_a_disk_that_takes_nothing_is_named(view, scans, monkeypatch, number, co
     assert not list((scans / "one").glob("*operator.json*"))
 
 
-def test_a_client_that_hangs_up_is_not_a_fault_of_the_server(view, capfd):
+def test_a_client_that_disconnects_in_its_request_causes_no_traceback(view, capfd):
     head = f"POST /api/notes?scan=one HTTP/1.1\r\nHost: 127.0.0.1\r\n{TOKEN_HEADER}: {TOKEN}\r\n"
     for _ in range(3):
         with socket.create_connection(("127.0.0.1", view.port)) as s:
+            # One of 90 bytes.
             s.sendall(f"{head}Content-Length: 90\r\n\r\n{{".encode())
     assert get(view, "/api/scans")
+    # The traceback would come after the answer of the next request.
     time.sleep(0.2)
     assert "Traceback" not in capfd.readouterr().err
 
 
 def test_the_last_box_can_be_removed(view):
     extent = get(view, "/api/result?scan=one")["extent_mm"]
+    # From the corner with the smallest x and y to the middle of the image.
     box = [extent[0], extent[2], 0.0, 0.0]
+    # No labels are there to remove.
     assert post(view, "/api/labels?scan=one", {"boxes": {}})[0] == 404
     status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": box}})
     assert status == 200, saved

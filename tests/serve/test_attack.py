@@ -23,15 +23,22 @@ from tests.support.processes import wait_for
 
 
 class Attack(NamedTuple):
-    """Clients of each kind; `connections` are opened each second and closed without a request."""
+    """Numbers of clients of each kind, in the order of the arguments of `attackers.py`."""
 
+    # Clients that follow a live view.
     streams: int
+    # Clients that request one page after another.
     readers: int
+    # Clients that send the abort of a scan with a wrong token.
     wrong_tokens: int
+    # Connections that are opened each second, and closed without a request.
     connections: int
+    # Aborts with the right token that the test sends meanwhile.
     aborts: int
 
 
+# The brief one shows in a few seconds that the test works. The long one was chosen so that the server has more work
+# than a laboratory's pages make, and so many aborts that a rare failure is seen.
 BRIEF = Attack(streams=4, readers=10, wrong_tokens=4, connections=50, aborts=3)
 LONG = Attack(streams=48, readers=250, wrong_tokens=90, connections=1000, aborts=100)
 # Each of these scans has a live view.
@@ -40,7 +47,7 @@ VIEWS = 4
 
 @contextmanager
 def run_attack(port: int, attack: Attack, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Clients of another process, which runs for the block."""
+    """Run the clients in a process of their own during the block."""
     command = [sys.executable, "-m", "tests.serve.attackers", str(port), *map(str, attack), str(VIEWS)]
     with (folder / "attackers.txt").open("wb") as output_file:
         clients = subprocess.Popen(command, cwd=REPO, stdout=output_file)
@@ -53,7 +60,7 @@ def run_attack(port: int, attack: Attack, folder: Path) -> Iterator[subprocess.P
 
 
 def abort_once(server: Server, folder: Path) -> float:
-    """Abort a scan that runs; seconds until the answer."""
+    """Abort a running scan; return the seconds until the answer."""
     with open_control(folder) as stop:
         begun_s = time.monotonic()
         status, answer = post(server, f"/api/control/abort?scan={folder.name}", token=server.token)
@@ -67,12 +74,13 @@ def test_an_abort_is_accepted_whatever_other_clients_request(
     processed_scans: Path, tmp_path: Path, request, record_property
 ):
     attack = LONG if request.config.getoption("--long") else BRIEF
+    # The last of the scans has no live view; it is the one that the test aborts.
     for k in range(VIEWS + 1):
         shutil.copytree(processed_scans / "one", tmp_path / "scans" / f"s{k}", ignore=shutil.ignore_patterns("figures"))
     (tmp_path / "state").mkdir()
     took_s = []
     with run_server(tmp_path / "scans", tmp_path / "state") as server, run_attack(server.port, attack, tmp_path):
-        # They report once a second; after the first report all are running.
+        # The clients report once a second; after the first report all are running.
         wait_for(lambda: "answers" in (tmp_path / "attackers.txt").read_text(), "the attack")
         for _ in range(attack.aborts):
             took_s.append(abort_once(server, tmp_path / "scans" / f"s{VIEWS}"))
@@ -80,6 +88,7 @@ def test_an_abort_is_accepted_whatever_other_clients_request(
     record_property("median_s", statistics.median(took_s))
     record_property("longest_s", max(took_s))
     record_property("load", os.getloadavg()[0])
+    # Reported only: a busy machine may be slow.
     late = sum(seconds >= 1 for seconds in took_s)
     sys.stdout.write(f"median {statistics.median(took_s):.3f} s, longest {max(took_s):.3f} s, {late} of {len(took_s)}")
     sys.stdout.write(f" took 1 s or more; load {os.getloadavg()[0]:.1f}\n{(tmp_path / 'attackers.txt').read_text()}")

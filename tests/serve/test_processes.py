@@ -1,4 +1,8 @@
-"""The processes of `polysight serve`: commands are answered even if the other processes fail, and after a restart."""
+"""The processes of `polysight serve`: commands are answered even if the other processes fail, and after a restart.
+
+The server's own process answers the pages. The *door* accepts all connections, answers commands to a running scan
+itself, and hands everything else over. The *reading process* reads scans, with a low priority.
+"""
 
 import os
 import re
@@ -34,11 +38,11 @@ class Server:
     token: str
 
     def reading_process(self) -> int | None:
-        """Number of the reading process, the one of low priority; None while there is none."""
+        """Process id of the reading process, the child with a lower priority; None while there is none."""
         return self._find_child(lambda priority: priority > 0)
 
     def door(self) -> int | None:
-        """Number of the process that accepts connections: it has the priority of the server."""
+        """Process id of the door, the child with the priority of the server; None while there is none."""
         return self._find_child(lambda priority: priority == 0)
 
     def _find_child(self, is_wanted: Callable[[int], bool]) -> int | None:
@@ -57,6 +61,7 @@ class Server:
 
 @contextmanager
 def run_server(root: Path, state: Path, *options: str, command: str = "serve") -> Iterator[Server]:
+    """Run the command for the scans below `root`, with its token in `state`, until the block ends."""
     words = [sys.executable, "-m", "polysight", command, str(root), "--port", "0", *options]
     environment = os.environ | {"XDG_STATE_HOME": str(state)}
     program = subprocess.Popen(words, cwd=state, env=environment, stderr=subprocess.PIPE, text=True)
@@ -84,36 +89,37 @@ def scans(tmp_path: Path) -> Path:
 def test_a_scan_is_aborted_while_the_reading_process_is_frozen_killed_and_started_again(scans, tmp_path):
     with run_server(scans, tmp_path / "state") as server, open_control(scans / "one") as stop:
         wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list")
-        first = server.reading_process()
-        assert first is not None
-        os.kill(first, signal.SIGSTOP)
+        first_process = server.reading_process()
+        assert first_process is not None
+        os.kill(first_process, signal.SIGSTOP)
         assert post(server, "/api/control/pause?scan=one", token="wrong")[0] == 403
         assert post(server, "/api/control/pause?scan=one", token=server.token)[0] == 200
         assert stop.paused
         assert [(s["name"], s["state"]) for s in get(server, "/api/running")] == [("one", "running")]
-        os.kill(first, signal.SIGKILL)
+        os.kill(first_process, signal.SIGKILL)
         assert post(server, "/api/control/abort?scan=one", token=server.token)[0] == 200
         assert stop.now
         assert "the page" in stop.asker
-        wait_for(lambda: server.reading_process() not in (None, first), "another one")
+        wait_for(lambda: server.reading_process() not in (None, first_process), "another one")
         wait_for(lambda: ask(server, "/api/scans")[0] == 200, "the list again")
 
 
-def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_are_silent(scans, tmp_path):
-    """More silent connections than are kept; a request that came with them is answered when the pages continue."""
+def test_a_command_is_answered_while_the_pages_are_frozen_and_many_connections_are_silent(scans, tmp_path):
+    """A page that was requested meanwhile is answered when the pages' process continues."""
     with run_server(scans, tmp_path / "state") as server, open_control(scans / "one") as stop, ExitStack() as clients:
         assert ask(server, "/api/page")[2]["connection"] == "close"
-        # Until it has its priority it looks like the door.
+        # A reading process that has just begun still has the priority of the door, by which that is found.
         wait_for(lambda: server.reading_process() is not None, "the reading process")
         door = server.door()
         assert door is not None
-        # Signals come to the whole group, and the server ends its door by itself.
+        # Ctrl-C and the end of a session reach all processes of a terminal. The door ignores them: the server ends it.
         os.kill(door, signal.SIGTERM)
         os.kill(door, signal.SIGINT)
         os.kill(server.program.pid, signal.SIGSTOP)
         try:
             reading = clients.enter_context(socket.create_connection(("127.0.0.1", server.port), HANG_S))
             reading.sendall(b"GET /api/page HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            # More connections without a request than the door keeps.
             for _ in range(MOST_SILENT + 100):
                 clients.enter_context(socket.create_connection(("127.0.0.1", server.port), HANG_S))
             assert post(server, "/api/control/abort?scan=one", token=server.token)[0] == 200
@@ -123,18 +129,23 @@ def test_a_command_is_answered_while_the_pages_are_frozen_and_connections_are_si
         assert reading.recv(100).startswith(b"HTTP/1.1 200")
 
 
-def test_the_live_view_of_one_scan_has_its_control_alone(scans, tmp_path):
-    """`polysight preview`. Pause and resume are in e2e/test_operator_page, a killed scan is in tests/page."""
+def test_preview_shows_and_controls_its_scan_only(scans, tmp_path):
+    """Pause and resume are tested in e2e/test_operator_page, a killed scan in tests/page."""
     (tmp_path / "scans" / "two").mkdir()
     with run_server(scans / "one", tmp_path / "state", "--control", command="preview") as server:
         state = get(server, "/api/state")
-        assert (state["control"], state["running"], state["status"]["headline"]) == (True, False, "No scan here yet")
+        assert state["control"]
+        assert not state["running"]
+        assert state["status"]["headline"] == "No scan here yet"
         with open_control(scans / "one") as stop:
             assert post(server, "/api/control/pause", token=server.token)[0] == 200
             assert stop.paused
         assert ask(server, "/api/scan?scan=two")[0] == 404
 
 
+# A program with a server that interrupts itself, as Ctrl-C does, when it forks. Arguments: numbers of the forks ("12"),
+# the hook of `os.register_at_fork` (before or after the fork, in the parent or the child), and the command line.
+# It also reports a child that lives longer than the temporary folder with the sockets of the processes.
 INTERRUPT_AT_FORKS = """
 import multiprocessing, os, signal, sys, tempfile
 from polysight.cli.main import main
@@ -153,6 +164,7 @@ sys.exit(main(sys.argv[3:]))
 """
 
 
+# A program with a server that interrupts itself while asyncio makes its event loop.
 INTERRUPT_IN_LOOP = """
 import os, signal, socket, sys
 from polysight.cli.main import main
@@ -170,7 +182,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 def serve_interrupted(forks: str, where: str, folder: Path) -> tuple[int, str]:
-    """Exit status and stderr of a server, interrupted at these forks, in itself or in the new processes."""
+    """Interrupt a server at these forks, at the hook `where`; return its exit status and stderr."""
     words = [sys.executable, "-c", INTERRUPT_AT_FORKS, forks, where, "serve", str(folder), "--port", "0"]
     environment = os.environ | {"XDG_STATE_HOME": str(folder)}
     messages = ""
@@ -183,10 +195,12 @@ def serve_interrupted(forks: str, where: str, folder: Path) -> tuple[int, str]:
     return program.returncode, messages
 
 
-@pytest.mark.parametrize("fork", "12")
+# The server forks twice when it starts: for the door and for the reading process.
+@pytest.mark.parametrize("fork", ["1", "2"])
 def test_an_interrupt_at_a_fork_is_not_lost(tmp_path, fork):
     """Python ignores exceptions of functions that it calls at a fork: the server would continue."""
     status, messages = serve_interrupted(fork, "after_in_parent", tmp_path)
+    # The status of a program that Ctrl-C ended, as shells report it.
     assert status == 128 + signal.SIGINT
     assert messages.splitlines() == ["polysight serve: starting", "polysight serve: stopped"]
 
@@ -209,18 +223,20 @@ def test_an_interrupt_while_the_event_loop_is_made_ends_the_server_as_any_other(
 
 
 @pytest.mark.parametrize(
-    ("head", "answered_here"),
+    ("head", "is_answered"),
     [
         (b"POST /api/control/abort?scan=one HTTP/1.1\r\nX-Polysight-Token: right\r\n\r\n{}", True),
         (b"POST /api/control/abort?scan=one HTTP/1.1\r\nx-polysight-token:right\r\nHost: a\r\n\r\n", True),
         (b"POST /api/control/abort?scan=one HTTP/1.1\r\nX-Polysight-Token: wrong\r\n\r\n", False),
+        # A head that has not ended, and a token in the body.
         (b"POST /api/control/abort?scan=one HTTP/1.1\r\nX-Polysight-Token: right\r\n", False),
         (b"POST /api/control/abort?scan=one HTTP/1.1\r\nHost: a\r\n\r\nX-Polysight-Token: right", False),
+        # Not a command to a scan.
         (b"POST /api/notes?scan=one HTTP/1.1\r\nX-Polysight-Token: right\r\n\r\n", False),
     ],
 )
-def test_only_a_whole_command_with_the_right_token_is_answered_at_the_door(head, answered_here):
-    assert is_command(head, b"right") == answered_here
+def test_the_door_answers_only_whole_commands_with_the_right_token(head, is_answered):
+    assert is_command(head, b"right") == is_answered
 
 
 def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_path, monkeypatch):
@@ -230,11 +246,12 @@ def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_p
         assert status == 200
         cookie = headers["set-cookie"]
     path = tmp_path / "state" / "polysight" / "token"
-    assert (path.stat().st_mode & 0o777, path.read_text()) == (0o600, token)
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert path.read_text() == token
     with run_server(scans, tmp_path / "state") as server:
         assert server.token == token
         _, _, headers = ask(server, "/api/session", "POST", {}, **{TOKEN_HEADER: token})
-        # Another port has another name; the secret is the same.
+        # The cookie's name has the port, which is another one now; its secret follows from the token.
         assert cookie.partition("=")[2] == headers["set-cookie"].partition("=")[2]
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     path.chmod(0o644)
@@ -249,7 +266,7 @@ def test_the_token_survives_a_restart_and_no_other_user_can_read_it(scans, tmp_p
 
 
 def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
-    """Then all clients have this machine's address and the proxy's name."""
+    """All its clients seem to come from this machine, so their address does not show who they are."""
     with run_server(scans, tmp_path / "state", "--allow-host", "lab.example.org") as server:
         token = {TOKEN_HEADER: server.token}
         for host in ("lab.example.org", "127.0.0.1"):
@@ -260,18 +277,18 @@ def test_behind_a_reverse_proxy_reading_needs_the_token_too(scans, tmp_path):
         assert ask(server, "/", Host="elsewhere.example.org", **token)[0] == 400
 
 
-def test_a_first_folder_is_made_here_and_nowhere_else(tmp_path):
-    """A folder elsewhere may be on an unmounted drive: scans would fill another one."""
+def test_a_missing_folder_of_scans_is_made_in_the_current_folder_only(tmp_path):
+    """One elsewhere may be on a drive that is not mounted: scans would fill the drive below its mount point."""
     with run_server(Path("scans"), tmp_path) as server:
         assert get(server, "/api/scans")["scans"] == []
     assert (tmp_path / "scans").is_dir()
     for folder, control in ((tmp_path / "drive" / "scans", True), (Path("only-shown"), False)):
         with expect_refusal(ErrorCode.FILE_MISSING, folder, "mkdir -p"):
-            serve(folder, ServerAddress(), None, control)
+            serve(folder, ServerAddress(), config=None, control=control)
         assert not folder.exists()
     (tmp_path / "scene.toml").touch()
     with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path / "scene.toml", "is not a folder"):
-        serve(tmp_path / "scene.toml", ServerAddress(), None, True)
+        serve(tmp_path / "scene.toml", ServerAddress(), config=None, control=True)
 
 
 @pytest.mark.parametrize("folder", ["scans", "pictures"])
@@ -280,12 +297,14 @@ def test_a_folder_of_something_else_than_a_scan_has_no_live_view(scans, folder):
     (scans.parent / "pictures" / "one.jpg").touch()
     with expect_refusal(ErrorCode.FILE_FOREIGN, scans.parent / folder) as caught:
         preview(scans.parent / folder, ServerAddress(port=0), control=False)
-    assert (f"polysight preview {scans / 'one'}" in str(caught.value)) == (folder == "scans")
+    # For a folder of scans the error offers the scan in it.
+    offers_scan = f"polysight preview {scans / 'one'}" in str(caught.value)
+    assert offers_scan == (folder == "scans")
 
 
 @pytest.mark.parametrize(("folder", "words"), [("ones", "did you mean 'one'"), ("tomorrow", "waits"), ("new", "waits")])
 def test_the_live_view_reports_that_no_scan_has_begun(scans, capsys, monkeypatch, folder, words):
-    """The scan may begin later, or the folder is mistyped."""
+    """The scan may begin later, or the folder is mistyped. For the folder of a scan nothing is reported."""
     monkeypatch.setattr(server, "_run", lambda *_: 0)
     (scans / "new").mkdir()
     assert preview(scans / folder, ServerAddress(port=0), control=False) == 0

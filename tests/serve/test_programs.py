@@ -1,4 +1,8 @@
-"""Programs that a page starts: found again by another server, never signalled, and distinguished from others."""
+"""Programs that a page starts: found again by another server, never signalled, and distinguished from others.
+
+Each program leaves three files in a folder of the scan: KIND.json (its process id, start time and command line),
+KIND.log (its output) and KIND.status (its exit status).
+"""
 
 import json
 import os
@@ -34,21 +38,30 @@ def programs() -> Iterator[Programs]:
     running_programs.close()
 
 
-def end_program(folder: Path, kind: str) -> None:
-    wait_for(lambda: not (find_program(folder, kind) or pytest.fail("none")).running, "its end")
+def wait_for_end(folder: Path, kind: str) -> None:
+    def has_ended() -> bool:
+        program = find_program(folder, kind)
+        assert program is not None
+        return not program.running
+
+    wait_for(has_ended, "its end")
 
 
 def test_a_program_leaves_its_log_and_its_exit_status(programs, tmp_path):
     programs.start(tmp_path, "export", ["--version"])
     wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
     program = find_program(tmp_path, "export")
-    assert (program.status, program.words, program.log.split()[0]) == (0, ("polysight", "--version"), "polysight")
+    assert program.status == 0
+    assert program.words == ("polysight", "--version")
+    assert program.log.split()[0] == "polysight"
+
+    # The folder is not a scan, so that the second program fails: 3 is the status of wrong data.
     programs.start(tmp_path, "export", ["validate", tmp_path])
     wait_for(lambda: find_program(tmp_path, "export").status is not None, "its status")
     program = find_program(tmp_path, "export")
     assert program.status == 3
     assert "why:" in program.log
-    # The log of the earlier one stays in the file
+    # The output of the first program stays in the file, but is not shown.
     assert "--version" not in program.log
 
 
@@ -61,16 +74,16 @@ def sleeping(programs: Programs, tmp_path: Path) -> Iterator[Path]:
     finally:
         os.killpg(pid, 9)
         os.waitpid(pid, 0)
-    # Killed, so it left no exit status
+    # A program that is killed leaves no exit status.
     assert find_program(tmp_path, "scan").status is None
 
 
-def test_a_program_is_known_by_its_number_and_its_begin(sleeping):
+def test_a_program_is_recognized_by_its_process_id_and_its_start_time(sleeping):
     assert find_program(sleeping, "scan").running
     file = sleeping / PROGRAM_FOLDER / "scan.json"
     answer = json.loads(file.read_text())
     file.write_text(json.dumps(answer | {"ticks": answer["ticks"] - 1}))
-    # Another process has the number now
+    # With another start time the process id is that of another process, which got it later.
     assert not find_program(sleeping, "scan").running
 
 
@@ -90,7 +103,8 @@ def test_an_invented_process_number_is_not_a_running_program(tmp_path, content):
     assert program is None or not program.running
 
 
-def test_a_log_is_shown_without_what_moves_a_terminal(tmp_path):
+def test_a_log_is_shown_without_control_characters(tmp_path):
+    """Colours, the bell, and U+202E, which reverses text, are left out; a byte that is not UTF-8 becomes U+FFFD."""
     (tmp_path / PROGRAM_FOLDER).mkdir()
     answer = {"pid": 0, "ticks": 0, "words": ["x"], "started_utc": ""}
     (tmp_path / PROGRAM_FOLDER / "scan.json").write_text(json.dumps(answer))
@@ -144,30 +158,34 @@ def test_a_scan_starts_with_its_plan_and_a_refusal_by_the_pi_has_its_cause(refus
         ]:
             assert post(view, "/api/start", body)[0] == status, body
         assert [p.name for p in root.iterdir()] == []
-        assert (
-            post(view, "/api/start", {"name": "week/one", "plan": {"rows": 3}, "notes": "n", "tags": ["t"]})[0] == 200
-        )
+
+        request = {"name": "week/one", "plan": {"rows": 3}, "notes": "n", "tags": ["t"]}
+        assert post(view, "/api/start", request)[0] == 200
         folder = root / "week" / "one"
         rig = tomllib.loads((folder / PROGRAM_FOLDER / "instrument.toml").read_text())
         assert rig["grid"]["rows"] == 3
         assert get(view, "/api/scan?scan=week/one")["state"] == "begun"
-        assert post(view, "/api/start", {"name": "two"})[0] == 409  # there is one rig
+        # The rig does one scan at a time.
+        assert post(view, "/api/start", {"name": "two"})[0] == 409
         assert not (root / "two").exists()
+
         refuse()
-        end_program(folder, "scan")
+        wait_for_end(folder, "scan")
         wait_for(lambda: find_program(folder, "scan").status is not None, "its status")
         assert find_program(folder, "scan").status != 0
         wait_for(lambda: get(view, "/api/scan?scan=week/one")["state"] == "failed", "the state")
         reason = get(view, "/api/scan?scan=week/one")["reason"]
         assert "its lid is open" in reason
+        # The reason is not a command line of the log.
         assert "polysight" not in reason
         assert reason in find_program(folder, "scan").log
         assert get(view, "/api/scans")["scans"][0]["tags"] == ["t"]
-        # Once more, by the same name
+
+        # A scan that could not start may be started again by the same name, and keeps its notes.
         assert post(view, "/api/start", {"name": "week/one"})[0] == 200
         assert get(view, "/api/scan?scan=week/one")["notes"] == "n"
         refuse()
-        end_program(folder, "scan")
+        wait_for_end(folder, "scan")
 
 
 def test_files_that_a_page_leaves_in_a_scan_folder_are_not_a_fault(finished_scan, tmp_path):

@@ -14,21 +14,24 @@ from polysight_shared.errors import DeviceError, ErrorCode, ScanError
 
 
 class Rig:
-    """Starts what it is asked to, unless it is busy or broken; `states` has scans that did not finish."""
+    """A rig that starts a requested scan unless it is busy or broken."""
 
     def __init__(self) -> None:
+        # Names of scans that the queue has started.
         self.started: list[str] = []
         # Number of requests to start a scan.
         self.asked = 0
         self.is_busy = True
         self.is_broken = False
+        # States of scans that did not finish, and of one that was started without the queue, "by hand".
         self.states: dict[str, str] = {}
 
     def list_states(self) -> dict[str, str]:
         """States of the scans by name, the newest first."""
         started = {name: self.states.get(name, "finished") for name in reversed(self.started)}
-        by_hand = "by hand"
-        return started | {by_hand: self.states[by_hand]} if by_hand in self.states else started
+        if "by hand" in self.states:
+            started["by hand"] = self.states["by hand"]
+        return started
 
     def start(self, request: bytes) -> None:
         self.asked += 1
@@ -47,6 +50,7 @@ def rig() -> Rig:
 
 @pytest.fixture
 def queue(rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
+    # The queue looks at the rig every 10 ms, for a fast test.
     monkeypatch.setattr(programs, "LOOK_S", 0.01)
     rig_queue = Queue(tmp_path / "queue", rig.start, rig.list_states)
     for name in ("first", "second", "third"):
@@ -98,6 +102,7 @@ def test_a_queue_survives_a_restart(queue, rig, tmp_path):
 def test_a_scan_that_somebody_else_started_holds_the_queue_too(queue, rig, state):
     """A person who aborts a scan may be touching the rig."""
     rig.states["by hand"] = "running"
+    # The queue reads the states with each request: two more requests show that it has read them.
     wait_for(lambda: rig.asked > 2, "that the queue has seen it")
     rig.states["by hand"] = state
     rig.is_busy = False
@@ -108,7 +113,7 @@ def test_a_scan_that_somebody_else_started_holds_the_queue_too(queue, rig, state
     wait_for(lambda: rig.started == ["first"], "the first")
 
 
-def test_a_scan_that_was_stopped_before_anything_waited_holds_nothing(queue, rig):
+def test_a_scan_that_was_stopped_while_the_queue_was_empty_does_not_hold_it(queue, rig):
     for name in queue.waiting().names:
         queue.remove(name)
     rig.states["by hand"] = "stopped"

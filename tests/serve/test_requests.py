@@ -58,18 +58,19 @@ BOX = (0.0, 0.0, 10.0, 10.0)
         (ExportRequest, {"formats": ["csv"]}, {"formats": []}),
     ],
 )  # fmt: skip
-def test_a_limit_holds_just_inside_and_not_just_outside(kind, inside, outside):
+def test_values_at_a_limit_are_accepted_and_those_just_beyond_it_refused(kind, inside, outside):
+    """The limits are those of `serve/commands.py`, which gives their reasons."""
     decode(inside, kind, "the request")
     with expect_refusal(ErrorCode.VALUE_INVALID):
         decode(outside, kind, "the request")
 
 
-def test_a_plan_of_the_page_has_at_most_so_many_positions_after_its_steps():
-    """A smaller step makes more positions in the same area of 698 mm."""
+def test_a_plan_with_a_new_step_has_no_more_positions_than_a_request_may_have():
+    """A smaller step makes more positions in the same area, 698 mm: 698 / 0.35 + 1 = 1995, 698 / 0.3491 + 1 = 2000."""
     within = PlanRequest(step_x_mm=0.35, speed_mm_s=5.0).apply(RIG_FILE)
     assert within.grid.columns == 1995
-    most = PlanRequest(step_x_mm=0.3491, speed_mm_s=5.0).apply(RIG_FILE)
-    assert most.grid.columns == MAX_POSITIONS
+    largest = PlanRequest(step_x_mm=0.3491, speed_mm_s=5.0).apply(RIG_FILE)
+    assert largest.grid.columns == MAX_POSITIONS
     with expect_refusal(ErrorCode.VALUE_INVALID, MAX_POSITIONS):
         PlanRequest(step_x_mm=0.348, speed_mm_s=5.0).apply(RIG_FILE)
 
@@ -85,19 +86,19 @@ def root(tmp_path) -> Path:
 
 @pytest.fixture
 def start_program(root, monkeypatch) -> Iterator[tuple[Any, list[list[str]]]]:
-    """A server, and the command lines of the programs that it would start."""
-    collected: list[list[str]] = []
+    """A server, and the list of command lines of the programs that it would start."""
+    command_lines: list[list[str]] = []
 
     def start(_self: Programs, _folder: Path, _kind: str, words: list[str | Path]) -> None:
-        collected.append([str(word) for word in words])
+        command_lines.append([str(word) for word in words])
 
     monkeypatch.setattr(Programs, "start", start)
     with serve_folder(root, TOKEN, config=RIG_FILE) as view:
-        yield view, collected
+        yield view, command_lines
 
 
 def to_plain(value: Any, root: Path) -> Any:
-    """Paths as text, `%` for the folder of scans."""
+    """Write paths as text, with `%` for the folder of scans."""
     if isinstance(value, list):
         return [to_plain(item, root) for item in value]
     if isinstance(value, str | Path):
@@ -128,12 +129,14 @@ def to_plain(value: Any, root: Path) -> Any:
          {"products": "%/one", "csv": True, "netcdf": True, "mat": False, "out": "%/one/export"}),
     ],
 )  # fmt: skip
-def test_a_request_is_a_command_line_that_the_parser_takes(start_program, root, path, body, values):
-    view, commands = start_program
+def test_a_request_becomes_a_command_line_that_the_parser_accepts(start_program, root, path, body, values):
+    view, command_lines = start_program
     status, answer = post(view, f"/api/{path}", body)
     assert status == 200, answer
-    (words,) = commands
-    assert words[0] == path.partition("?")[0].replace("start", "scan").replace("layers", "permittivity")
+    (words,) = command_lines
+    # Two commands have another name on the page.
+    expected_command = path.partition("?")[0].replace("start", "scan").replace("layers", "permittivity")
+    assert words[0] == expected_command
     options = vars(build_parser(words[0]).parse_args(join_negative_values(words)))
 
     arguments_shown = {name: to_plain(options[name], root) for name in values}
@@ -141,9 +144,9 @@ def test_a_request_is_a_command_line_that_the_parser_takes(start_program, root, 
 
 
 def test_boxes_drawn_on_the_page_are_used_when_it_processes(start_program, root):
-    view, commands = start_program
+    view, command_lines = start_program
     status, saved = post(view, "/api/labels?scan=one", {"boxes": {"oak": [0, 0, 10, 10]}, "specimens": {"oak": "7"}})
     assert status == 200, saved
     assert post(view, "/api/process?scan=one", {"labels": True})[0] == 200
-    assert commands[0][-2:] == ["--labels", saved["file"]]
+    assert command_lines[0][-2:] == ["--labels", saved["file"]]
     assert Path(saved["file"]).is_relative_to(root / "one")

@@ -41,19 +41,22 @@ def desk(growing):
         yield growing.path, stop
 
 
-def test_only_a_post_with_the_token_asks(desk, watching):
+def test_only_a_post_with_the_token_in_its_header_commands_a_scan(desk, watching):
+    """A token in the address does not count: addresses are stored in histories and logs."""
     folder, stop = desk
     with serve_view(watching(folder, control=True), TOKEN) as view:
         for headers in ({}, {TOKEN_HEADER: ""}, {TOKEN_HEADER: TOKEN + "s"}, {TOKEN_HEADER: TOKEN[:-1]}):
             for command in ScanCommand:
                 status, body, _ = ask(view, f"/api/control/{command}?token={TOKEN}", "POST", **headers)
-                assert (status, "token" in json.loads(body)["what"]) == (403, True)
+                assert status == 403
+                assert "token" in json.loads(body)["what"]
         for method in ("GET", "HEAD", "PUT", "DELETE", "OPTIONS", "TRACE", "PATCH"):
             assert ask(view, "/api/control/abort", method, **{TOKEN_HEADER: TOKEN})[0] in (404, 405)
-        assert (stop.after_row, stop.paused) == (False, False)
-        for command, holds in ((ScanCommand.PAUSE, True), (ScanCommand.CONTINUE, False)):
+        assert not stop.after_row
+        assert not stop.paused
+        for command, is_paused_after in ((ScanCommand.PAUSE, True), (ScanCommand.CONTINUE, False)):
             assert ask(view, f"/api/control/{command}", "POST", **{TOKEN_HEADER: TOKEN})[0] == 200
-            assert stop.paused is holds
+            assert stop.paused is is_paused_after
         assert ask(view, "/api/control/destroy", "POST", **{TOKEN_HEADER: TOKEN})[0] == 400
 
 
@@ -69,8 +72,14 @@ def test_a_view_is_read_only_unless_control_is_allowed(desk, watching):
 
 
 def test_tokens_are_compared_in_constant_time(desk, watching, monkeypatch):
+    """The right token is refused when the standard library's comparison says that it differs, so no other is used."""
     compared = []
-    monkeypatch.setattr(hmac, "compare_digest", lambda a, b: compared.append((a, b)) or False)
+
+    def record_and_deny(given: bytes, expected: bytes) -> bool:
+        compared.append((given, expected))
+        return False
+
+    monkeypatch.setattr(hmac, "compare_digest", record_and_deny)
     with serve_view(watching(desk[0], control=True), TOKEN) as view:
         assert ask(view, "/api/control/pause", "POST", **{TOKEN_HEADER: TOKEN})[0] == 403
     assert (TOKEN.encode(), TOKEN.encode()) in compared
@@ -83,43 +92,47 @@ def test_a_command_to_a_finished_scan_is_refused_with_a_remedy(finished_scan, wa
     assert "polysight resume" in json.loads(body)["do"]
 
 
-def test_loopback_is_the_default():
+def test_by_default_only_this_machine_reaches_the_server():
     args = build_parser().parse_args(["preview", "scans/one"])
     assert (args.host, args.port, args.control) == ("127.0.0.1", 8080, False)
     assert all(ServerAddress(host).loopback for host in (args.host, "localhost", "::1", "127.3.2.1"))
     assert not any(ServerAddress(host).loopback for host in ("0.0.0.0", "::", "192.168.33.30", "pi.lab"))
 
 
-def test_the_page_needs_nothing_from_elsewhere():
+def test_the_page_loads_nothing_from_other_servers():
+    """The one address in its files is the name of the SVG format, which is not loaded."""
     for path in STATIC.iterdir():
         addresses = set(re.findall(r"https?://[^\s\"'<)]+", path.read_text(encoding="utf-8")))
         assert addresses <= {"http://www.w3.org/2000/svg"}, path
     assert 'src="' in (STATIC / "frame.html").read_text()
 
 
-def test_a_page_that_never_reads_delays_no_other_client(growing, watching):
+def test_clients_that_never_read_their_events_delay_no_other_client(growing, watching):
     watch = watching(growing.path, lapse_s=1e6)
     growing.touch_alive()
     with serve_view(watch) as view:
-        deaf = []
+        deaf_clients = []
         for _ in range(8):
             connection = socket.socket()
+            # A small buffer: the server cannot send everything to a client that does not read.
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
             connection.connect(("127.0.0.1", view.port))
             connection.sendall(b"GET /api/events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-            deaf.append(connection)
+            deaf_clients.append(connection)
         for rows in range(3):
             growing.grow_until("row_committed")
             watch.wait_for(lambda s, n=rows + 1: (s.get("pictures") or {}).get("rows") == n)
             assert json.loads(ask(view, "/api/state")[1])["pictures"]["rows"] == rows + 1
-        for connection in deaf:
+        for connection in deaf_clients:
             connection.close()
 
 
+# A client that does not read the answer, and one whose request is not complete.
 @pytest.mark.parametrize("request_head", [b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", b"GET / HT"])
 def test_connections_end_with_their_server(request_head):
     async def answer_much(_scope, _receive, send):
         await send({"type": "http.response.start", "status": 200})
+        # 64 MiB, more than the system's buffers hold.
         await send({"type": "http.response.body", "body": bytes(1 << 26)})
 
     config = uvicorn.Config(answer_much, host="127.0.0.1", port=0, lifespan="off", log_config=None)
@@ -140,17 +153,22 @@ def test_connections_end_with_their_server(request_head):
 
 
 def read_queue_length(listener: socket.socket) -> int:
-    """Return the number of connections that the kernel queues for a listening socket: struct tcp_info, tcpi_sacked."""
+    """Return how many connections the kernel queues for a listening socket, which is the limit given to `listen`.
+
+    For these sockets Linux reports it in the field `tcpi_sacked` of `struct tcp_info`, bytes 28 to 31.
+    """
     return int.from_bytes(listener.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 32)[28:32], sys.byteorder)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="struct tcp_info is Linux's")
-def test_connections_wait_in_a_long_queue():
+def test_connections_wait_in_the_longest_queue_that_the_system_allows():
+    """Not in the shorter one that uvicorn is configured with, 100 here."""
+
     async def ignore(_scope, _receive, _send):
         """No requests come."""
 
     with socket.create_server(("127.0.0.1", 0), backlog=BACKLOG) as listener:
-        # At most the kernel's limit, net.core.somaxconn.
+        # The kernel shortens the requested length to its limit, net.core.somaxconn.
         longest = read_queue_length(listener)
         server = EndingServer(uvicorn.Config(ignore, lifespan="off", log_config=None, backlog=100))
         thread = threading.Thread(target=server.run, args=([listener],))
@@ -163,8 +181,15 @@ def test_connections_wait_in_a_long_queue():
 
 
 def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
-    """Rows of modules, True for dark, as a terminal with black text on white shows them, or one with white on black."""
+    """Return the rows of modules, True for dark, as a terminal shows them whose own text is black or white.
+
+    A character shows two modules, one above the other, by half blocks of Unicode.
+    """
+    # Escape codes: the terminal's own colours, and black (16 of 256) on white (231). Values: whether the foreground is
+    # dark, and the background.
     colours = {"0": (black_text, not black_text), "38;5;16;48;5;231": (True, False)}
+    # For each character whether its upper and its lower half have the colour of the foreground (0) or background (1):
+    # space, upper half, lower half, full block.
     blocks = {" ": (1, 1), "\u2580": (0, 1), "\u2584": (1, 0), "\u2588": (0, 0)}
     rows: list[list[bool]] = []
     dark = colours["0"]
@@ -183,11 +208,13 @@ def show_on_terminal(text: str, black_text: bool) -> list[list[bool]]:
 
 
 @pytest.mark.parametrize("black_text", [True, False])
-def test_the_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_text):
+def test_a_qr_code_is_dark_on_light_whatever_the_terminal_s_colours_are(black_text):
+    """A phone's camera does not read one that is light on dark."""
     address = f"http://192.168.33.7:8080/#token={TOKEN}"
     expected = [[bool(module) for module in row] for row in segno.make(address, error="l").matrix_iter()]
     modules = show_on_terminal(draw_code(address), black_text)
     assert modules[: len(expected)] == expected
+    # An odd number of rows is filled up with an empty one.
     assert not any(map(any, modules[len(expected) :]))
 
 

@@ -19,13 +19,14 @@ _MCL_CURRENT_FUTURE_ONFAULT = 1 | 2 | 4
 # holds it must not be preempted by other programs.
 TRIGGER_PRIORITY = 50
 OTHERS_PRIORITY = 40
-# Longest time for which a thread keeps the interpreter while others wait. The default of 5 ms is three periods of the
-# published rig's pulses.
+# Longest time for which a thread keeps the interpreter while others wait. Python's default of 5 ms would delay the
+# trigger thread by three pulses of a burst, which come 1.5 ms apart.
 SWITCH_INTERVAL_S = 100e-6
-# Memory above which connections are cut. The program needs 30 to 60 MB, a subscriber that does not read up to 50.
+# Memory above which connections are cut. The program itself needs 30 to 60 MB. A subscriber that stops reading costs up
+# to 50 MB more, for the events that wait for it.
 MAX_BYTES = 160 << 20
-# Least distance of the limit from the memory that is left after connections were cut, because not all freed memory
-# returns to the system. Chosen.
+# After connections were cut, memory stays in use because not all that was freed returns to the system. The limit is
+# then raised to so much above it, or the next check would cut connections again. Chosen.
 SPARE_BYTES = 64 << 20
 # Time between two checks of the memory, and time in which connections are cut after too much was used; chosen.
 CHECK_INTERVAL_S = 0.05
@@ -85,7 +86,7 @@ class MemoryWatch(threading.Thread):
     """Cuts the network connections at `ports` when they use too much memory; clients connect again.
 
     ZeroMQ limits the size of a frame, but neither the frames of a message nor the subscriptions of a client. The unit's
-    own limit (MemoryMax) would end the program and its row. Each cut is reported to `warn`.
+    own limit (MemoryMax) would end the program in the middle of a scan. Each cut is reported to `warn`.
     """
 
     def __init__(self, ports: set[int], warn: Callable[[str], object]) -> None:
@@ -133,6 +134,7 @@ class MemoryWatch(threading.Thread):
                         connection.family in (socket.AF_INET, socket.AF_INET6)
                         and connection.getsockname()[1] in self._ports
                     ):
+                        # Raises OSError for a socket without a peer: the one that listens must stay open.
                         connection.getpeername()
                         connection.shutdown(socket.SHUT_RDWR)
                         cut += 1

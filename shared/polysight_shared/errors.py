@@ -49,15 +49,17 @@ class PolysightError(Exception):
 def expand_paths(text: str) -> str:
     """Return a text with pages of the documentation, such as docs/how-to/install.md, as paths of this installation.
 
-    The host's wheel brings the pages; without it (on the Pi alone) the text is not changed.
+    The pages come with the package `polysight`: as its folder `data` where it was installed, in the repository two
+    folders above it. Where it is not installed, as on a Raspberry Pi, the text is not changed.
     """
     if "docs/" not in text:
         return text
     package = find_spec("polysight")
     if package is None or package.origin is None:
         return text
-    host = Path(package.origin).parent
-    folder = next((candidate for candidate in (host / "data", host.parents[1]) if (candidate / "docs").is_dir()), None)
+    package_folder = Path(package.origin).parent
+    candidates = (package_folder / "data", package_folder.parents[1])
+    folder = next((candidate for candidate in candidates if (candidate / "docs").is_dir()), None)
     if folder is None:
         return text
     return re.sub(r"(?<![\w/])docs/[\w/-]+\.md", lambda page: str(folder / page[0]), text)
@@ -97,7 +99,7 @@ class DataError(PolysightError):
 
 
 def make_missing_path_error(path: Path) -> DataError:
-    """Return the error for a missing file or folder."""
+    """Return the error for a path at which there is nothing, or a file where a folder is needed."""
     if path.is_file():
         problem = f"{path}: is a file"
         return DataError(problem, "a folder is needed here", "give a folder", code=ErrorCode.FILE_FOREIGN)
@@ -148,7 +150,9 @@ def convert_os_error(
     code = ErrorCode.OTHER
     if e.errno in (errno.ENOSPC, errno.EDQUOT):
         code = ErrorCode.DISK_FULL
-    return DeviceError(summary, cause, join_advice(remedy, *getattr(e, "__notes__", ())), code=code)
+    # Whoever raised the error may have added advice as notes (`add_note`).
+    notes = getattr(e, "__notes__", ())
+    return DeviceError(summary, cause, join_advice(remedy, *notes), code=code)
 
 
 class ScanError(PolysightError):

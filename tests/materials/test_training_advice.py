@@ -25,7 +25,7 @@ def test_unnamed_pieces_make_an_underconfident_library_that_asks_for_specimens()
     """They differ by 12 %, which counts as an error of placement for all materials alike."""
     text = advise(fit_samples(draw_pixels((0.12, 0.6), 6, seed=1, labelled=False)))
     assert "underconfident" in text
-    assert "no second specimen" in text
+    assert "each material has one specimen" in text
     assert f"scan {FREEDOM_NEEDED} more" in text
 
 

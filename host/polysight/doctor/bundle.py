@@ -27,7 +27,7 @@ from polysight_shared.findings import Finding
 
 README = """Findings of `polysight doctor --bundle`, {utc}.
 
-findings.txt, findings.json  the finding for each hop
+findings.txt, findings.json  what each check of the doctor found
 rig.toml                     the rig file
 versions.json                releases of this program, Python and every installed package; the system
 kernel.txt                   kernel, limits of this login, receive buffers
@@ -52,8 +52,9 @@ _KEY_BYTES = 64 << 10
 _MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",
            "proc/meminfo", "proc/net/udp", "proc/net/snmp")  # fmt: skip
-# Values that a name like `token` or `password`, or the word "bearer", announces: the first group is the name, which
-# stays, the second is the value in quotes or as a word.
+# A secret behind its name, in three parts: (1) a name that contains `token`, `password` or the like, or is that of a
+# key; (2) the sign `=` or `:`, perhaps quotes, perhaps `bearer` or `basic`; or (1, 2) the word `bearer` alone; (3) the
+# value: up to the closing quote if it is quoted, else a word. The first group (1, 2) stays, the second (3) is replaced.
 _NAMED_SECRET = re.compile(
     r"""(?ix)((?:[\w-]*(?:secret|token|password|passwd|passphrase|psk)[\w-]*|(?:private|public|curve|api)[_-]?key
     |authorization)["']?\s*[=:]\s*["']?(?:bearer\s+|basic\s+)?|\bbearer\s+)
@@ -105,10 +106,10 @@ def write_bundle(
     `rig` is None if the rig file could not be read; `text` is the printed form of `findings`; `root` is the root of
     the file system. Raises DeviceError if the file cannot be written.
     """
-    keys = [options.config.resolve().parent / "keys"]
+    key_folders = [options.config.resolve().parent / "keys"]
     if rig is not None and rig.pi.key_dir:
-        keys.append(Path(rig.pi.key_dir))
-    redact = Redactor(keys)
+        key_folders.append(Path(rig.pi.key_dir))
+    redact = Redactor(key_folders)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in _collect_contents(options, rig, findings, text, root):

@@ -22,8 +22,8 @@ def describe_accuracy(library: Library) -> list[str]:
         materials_in_one_scan = ", ".join(fit["not_judged"])
         if not fit["judged"]:
             lines.append(
-                f"{angle} degrees: accuracy not known: it is measured on a second scan of a material, and there is none"
-                " but of metal. Scan each material once more, placed again, and train on all scans"
+                f"{angle} degrees: accuracy not known: it is measured on materials that two scans show,"
+                " and only metal is in two of them. Scan each material once more, placed again, and train on all scans"
             )
             continue
         lines += _judge_confidence(angle, fit)
@@ -36,8 +36,8 @@ def describe_accuracy(library: Library) -> list[str]:
     return lines
 
 
-# Specimens beyond the first of a material that are asked for: a standard deviation from n degrees of freedom is known
-# to 1 / sqrt(2 n) of itself, 25 % with 8.
+# Degrees of freedom that are asked for, which are the specimens beyond the first of each material: a standard deviation
+# from n degrees of freedom is known to 1 / sqrt(2 n) of itself, 25 % with 8.
 FREEDOM_NEEDED = 8
 # With fewer scans than this they are the likely cause of overconfidence. Chosen.
 FEW_SCANS = 4
@@ -60,7 +60,7 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
         # Libraries of earlier releases have no confidence.
         return []
     missing = max(FREEDOM_NEEDED - fit["specimen_freedom"], 0)
-    # Scans of a single piece cannot show how often names are right on another piece.
+    # The spread between specimens is known from materials of which more than one specimen was scanned.
     freedom = fit["specimen_freedom"]
     if freedom == 0:
         spread_text = "how far specimens of a material differ is not known: no second one of any is named"
@@ -71,15 +71,20 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
     need = f"{spread_text}; to know it to 25 %, scan {missing} more"
     need += " (polysight label SCAN --specimen NAME=WHICH names them)"
     lines = []
-    # Standard deviation of a share of so many names by chance, at least that of a share of about 95 %.
-    chance = np.sqrt(max(fit["right"] * (1 - fit["right"]), 0.05) / max(fit["named"], 1))
-    misfit = fit["said"] - fit["right"]
-    if abs(misfit) > max(2 * chance, LEAST_MISFIT):
+    # Standard deviation of the share p of correct names among n, sqrt(p (1 - p) / n). A few names may all be correct by
+    # chance: p (1 - p) counts as 0.05 at least, its value for 95 %.
+    judged_names = max(fit["named"], 1)
+    share_std = np.sqrt(max(fit["right"] * (1 - fit["right"]), 0.05) / judged_names)
+    mean_confidence = fit["said"]
+    misfit = mean_confidence - fit["right"]
+    if abs(misfit) > max(2 * share_std, LEAST_MISFIT):
         kind = "overconfident" if misfit > 0 else "underconfident"
         if misfit < 0 and not fit["specimen_freedom"]:
-            cause = "no second specimen of a material is known: how they differ counts as an error of placement"
+            cause = (
+                "each material has one specimen: how specimens differ is unknown, and counts as an error of placement"
+            )
         elif misfit < 0:
-            cause = "its specimens differ less than the published spread says, which counts as 4 specimens"
+            cause = "its specimens differ less than published ones, whose spread counts as that of 4 specimens"
         elif fit["scans"] < FEW_SCANS:
             cause = f"the errors of metal reference and placement are known from {fit['scans']} scans only"
         elif missing:
@@ -87,8 +92,8 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
         else:
             cause = "errors of its scans are not alike: a scan may be disturbed, or a label wrong"
         lines.append(
-            f"{angle} degrees: {kind}: names are said with {100 * fit['said']:.0f} % and {100 * fit['right']:.0f} % are"
-            f" right: {cause}"
+            f"{angle} degrees: {kind}: names are said with {100 * mean_confidence:.0f} % and"
+            f" {100 * fit['right']:.0f} % are right: {cause}"
         )
     if missing:
         lines.append(f"{angle} degrees: {need}")

@@ -42,6 +42,8 @@ Incidence = Literal["one", "pixel"]
 def _compute_normal_wavenumber(eps: Complex, sine: Real) -> Complex:
     """Return index times cosine in the medium, sqrt(eps - sin^2 theta_i), the root that decays (Im <= 0)."""
     q: Complex = np.sqrt(eps - sine**2)
+    # NumPy's root has a positive real part, and so Im <= 0 for a lossy medium. Only in total reflection is the real
+    # part 0, and the sign of the imaginary part that of a rounding error or of a zero.
     return np.where((q.real == 0) & (q.imag > 0), -q, q)
 
 
@@ -122,7 +124,10 @@ def permittivity_from_ratio(p: npt.ArrayLike, theta_rad: npt.ArrayLike) -> Compl
     # Use P or 1/P, whichever has modulus <= 1: no overflow near the Brewster angle.
     is_large = np.abs(p) > 1
     with np.errstate(invalid="ignore"):
-        small = np.where(np.isinf(p), 0.0, np.where(is_large, 1.0 / np.where(is_large, p, 1.0), p))
+        inverse = 1.0 / np.where(is_large, p, 1.0)
+        small = np.where(is_large, inverse, p)
+        # The inverse of a complex infinity is NaN.
+        small = np.where(np.isinf(p), 0.0, small)
         pole = small == 1
         u = (1 + small) / np.where(pole, 1.0, 1 - small)
         eps = np.sin(theta) ** 2 * (1 + np.tan(theta) ** 2 * u**2)
@@ -214,8 +219,9 @@ def multilayer(
     theta = np.asarray(theta_rad, np.float64)
     s = np.sin(theta)
     k0 = 2 * np.pi * np.asarray(frequency_hz, np.float64) / SPEED_OF_LIGHT_M_S
-    # Normal wavenumbers over k0, and the same over the permittivity: ratios of the tangential fields for s and for p,
-    # whose differences at an interface reflect. Those for p are taken the other way round: the signs of Eq. 2.
+    # In each medium `q` is the normal wavenumber over k0, the admittance of a wave of polarisation s, and y = q / eps
+    # the impedance of one of polarisation p. A change of q or y at an interface reflects (q1 - q2) / (q1 + q2); for p
+    # the difference is taken the other way round, which gives the sign of Eq. 2.
     q = [np.cos(theta).astype(np.complex128), *(_compute_normal_wavenumber(e, s) for e in media[1:])]
     y = [qi / ei for qi, ei in zip(q, media, strict=True)]
     r_s: Complex = (q[-2] - q[-1]) / (q[-2] + q[-1])
@@ -226,6 +232,7 @@ def multilayer(
         front_p = (y[i + 1] - y[i]) / (y[i + 1] + y[i])
         r_s = (front_s + r_s * z) / (1 + front_s * r_s * z)
         r_p = (front_p + r_p * z) / (1 + front_p * r_p * z)
+    # Without a layer the frequency has no effect, but it still gives its shape to the result.
     shape = np.broadcast_shapes(r_s.shape, k0.shape)
     return np.broadcast_to(r_s, shape)[()], np.broadcast_to(r_p, shape)[()]
 
@@ -272,8 +279,11 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
     count = np.array([rig.grid.columns, rig.grid.rows])
     wavelength = SPEED_OF_LIGHT_M_S / (rig.chirp.first_sample_hz + rig.chirp.swept_hz / 2)
     # The stage offsets that count for a pixel are found by convolving the scanned grid with the weight around a point.
-    # The first Fresnel zone is longest along x, half its length is sqrt(lambda z / (2 cos^3)); sum twice as far.
-    zone = np.sqrt(wavelength * rig.geometry.object_distance_mm / 2e3 / np.cos(specular_incidence_rad(rig)) ** 3)
+    # The first Fresnel zone is longest along x, the plane of incidence. Two paths of length z / cos, over which a shift
+    # by u changes the sum by u^2 cos^3 / z, differ by half a wavelength at u = sqrt(lambda z / (2 cos^3)). Sum twice as
+    # far.
+    distance_m = rig.geometry.object_distance_mm / 1e3
+    zone = np.sqrt(wavelength * distance_m / 2 / np.cos(specular_incidence_rad(rig)) ** 3)
     reach = np.ceil(2 * zone / step).astype(int)
     dx, dy = (np.arange(-n, n + 1) * s for n, s in zip(reach, step, strict=True))
     visited = np.ones((count[1], count[0]))
@@ -289,8 +299,9 @@ def effective_incidence_map(rig: Instrument, x_m: npt.ArrayLike, y_m: npt.ArrayL
         weight = np.exp(-((2 * np.pi / wavelength * (path - shortest)) ** 2) / 8)
         deviation_sum = _convolve(visited, weight * (angle - specular))
         weight_sum = _convolve(visited, weight)
-        # An index of the full convolution is that of the offset (0 mm at (count - 1) / 2) plus that of the displacement
-        # (0 at reach); both together lead from the midpoint to the pixel.
+        # In a full convolution an index is the sum of an index of either array. Here a pixel lies at a stage offset
+        # plus a displacement from the midpoint: the offset 0 has index (count - 1) / 2 in the grid, the displacement 0
+        # has index `reach` among the weights.
         column = (x - middle[0]) / step[0] + (count[0] - 1) / 2 + reach[0]
         row = (y - middle[1]) / step[1] + (count[1] - 1) / 2 + reach[1]
         grid = np.meshgrid(row, column, indexing="ij")
@@ -365,8 +376,9 @@ def incidence_choice(
 def incidence_on_planes(angle_rad: Real, raised_m: Real | None, rig: Instrument) -> Real:
     """Return the angles [ny, nx] on planes that lie `raised_m` [ny, nx] behind the rig's object plane; None: on it.
 
-    All antennas are nearly as far from it as the rig's `object_distance_mm` z, so that z tan(angle) is the same on each
-    plane.
+    Positive values are farther from the antennas. An antenna at the distance z from the object plane sees a place of it
+    at a sideways distance of z tan(angle). A plane behind has the same sideways distance and another z. z is the rig's
+    `object_distance_mm` for all antennas, from which theirs hardly differ.
     """
     if raised_m is None:
         return angle_rad

@@ -25,10 +25,12 @@ RESPONSE_TIMEOUT_S = 1.0
 ATTEMPTS = 3
 # Time from the interrupt to the first word (ICD 20).
 SETTLE_S = 30e-6
-# Time from the falling interrupt to the first word read, as in TI's port.
+# Time from the falling interrupt to the first word read, as in the driver that TI supplies for this board.
 DATA_DELAY_S = 1e-3
 # Time between two polls (chosen).
 _INTERVAL_S = 0.5e-3
+# Time between two looks at the interrupt while the host waits for its fall (chosen).
+_INTERRUPT_INTERVAL_S = 30e-6
 # Time in which the interrupt falls after the host is ready to read (chosen).
 _INTERRUPT_TIMEOUT_S = 0.1
 # Time in which a power-up event arrives after a refusal (chosen).
@@ -37,7 +39,8 @@ _RESTART_EVENT_S = 0.1
 MAX_MESSAGES = 64
 MAX_POLL_S = 0.25
 _MAX_WARNINGS = 100
-# Bytes in which the sync word is searched after the first four: the rest of a longest message.
+# Bytes in which the sync word is searched after the first four: the rest of a longest message, which has 256 bytes and
+# may lie before it if its reading was interrupted.
 _SYNC_SEARCH_BYTES = 252
 # Bytes that are read after an invalid header, to resynchronise with the device (docs/spec/mmwavelink.md).
 _FLUSH_BYTES = 244
@@ -273,7 +276,7 @@ class Link:
         while self._words.interrupt():
             if self._clock.now() > deadline:
                 return False
-            self._clock.sleep(SETTLE_S)
+            self._clock.sleep(_INTERRUPT_INTERVAL_S)
         return True
 
     def _keep(self, message: messages.Message) -> None:
@@ -313,8 +316,9 @@ def _make_problem(what: str, why: str) -> Finding:
 def _is_answer(message: messages.Message, request: messages.Message) -> bool:
     """Return True if a response or NACK belongs to a command, by its message id and sequence number.
 
-    A refusal has message id 0 (ICD 4.4). The only known refusal without a body had sequence number 0; it is not known
-    if such a device repeats the number of the command. One with number 0 therefore always ends the command.
+    A refusal has message id 0 (ICD 4.4), and usually the sequence number of the command. The only refusal without a
+    body that is known had the number 0, and it is not known whether its command had it, too. So a refusal without a
+    body and with the number 0 is taken as the answer to whatever command is waiting.
     """
     if message.kind is messages.Kind.NACK:
         return True

@@ -44,12 +44,14 @@ class ChirpConfig(msgspec.Struct, frozen=True):
 
 
 class Collection(msgspec.Struct, frozen=True):
-    """Keys of the JSON files. Lengths in mm, times in ms, angles in degrees, `board_dist` in m.
+    """The settings of a data collection, as in its JSON files. Lengths in mm, times in ms, angles in degrees.
 
-    `total_x`, `total_y` are positions `dx`, `dy` apart; `num_trigger` the pulses of a position, `period_frame` apart;
-    `num_chirp` the chirps of a pulse. `moving_direction` is "row" (along x) or "col". With `packet_zero_filling` the
-    file of a row has zeros where packets were lost, otherwise nothing. Angles and offsets that are None stay those of
-    the base rig. `num_adc` is required, but the samples of a chirp are those of `chirp_configs`.
+    `board_dist` is in metres.
+    `total_x` and `total_y` are numbers of positions, and `dx` and `dy` their distances; `num_trigger` is the number of
+    pulses at a position, `period_frame` the time between them, and `num_chirp` the number of chirps of a pulse.
+    `moving_direction` is "row" (along x) or "col". With `packet_zero_filling` the file of a row has zeros where packets
+    were lost, otherwise nothing. Angles and offsets that are None stay those of the base rig. `num_adc` is not used,
+    the number of samples is that of `chirp_configs`; a file without it is not a file of the published program.
     """
 
     dx: _Step
@@ -79,7 +81,7 @@ class Collection(msgspec.Struct, frozen=True):
 
 
 class Rig(NamedTuple):
-    """The rig of a scan, with x from TX to RX, and notices on settings that were read otherwise than written."""
+    """The rig of a scan, whose x points from TX to RX, and notices on settings whose sign in the file was reversed."""
 
     instrument: Instrument
     notices: tuple[str, ...]
@@ -148,8 +150,8 @@ def build_rig(settings: Collection, base: Instrument, path: Path) -> Rig:
 def _scale_if_below(value: float, limit: float, factor: float) -> float:
     """Return a value in the wanted unit: the authors' files have some in SI, some in the units of TI's tools.
 
-    No chirp has a value below `limit` in the wanted unit, but for 0; such a value is in the other unit and is
-    multiplied.
+    In the wanted unit every real chirp has at least `limit`. A smaller value is therefore in the other unit, and is
+    multiplied by `factor` (0 stays 0).
     """
     if value < limit:
         return value * factor
@@ -159,9 +161,13 @@ def _scale_if_below(value: float, limit: float, factor: float) -> float:
 def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tuple[MountStep, ...]:
     """Return the base rig's mount with the angles and offsets of the scan; append to `notices` deviations from them.
 
-    The last turn about y points the board at the object, and the last about z tilts the receivers; the V board has
-    another turn about y before. The last shift but one is the offset of the tilt, and the last step, if it is a shift,
-    half the distance between the board origins.
+    A setting replaces one step of the base rig, which is known by its place in the order of steps:
+
+    - the first turn about y of the V board: `rxboard_v_angle_y`,
+    - the last turn about z: `rxboard_angle_z`, the tilt of a receiver,
+    - the last turn about y, towards the object: `txboard_angle_y` or `rxboard_angle_y`,
+    - the last shift but one: `rxboard_tilt_offset`,
+    - the last step, if it is a shift: half of `board_dist`, the distance between the boards' origins.
     """
     steps = list(board.mount)
     transmits = board.role == "transmit"
@@ -170,7 +176,9 @@ def _adapt_mount(board: Board, settings: Collection, notices: list[str]) -> tupl
     # The transmitter stands at negative x and faces +x, receivers the other way round.
     side = -1 if transmits else 1
     if facing_deg is not None and (turns := _list_turns(steps, "y")):
-        # Its normal, (sin a, 0, cos a), would point away from the other boards.
+        # The normal of a board is (sin a, 0, cos a), and the object lies between the boards: the transmitter, at
+        # negative x, needs a positive angle, a receiver a negative one. The other sign is that of the other sense of
+        # rotation.
         if facing_deg * side > 0:
             notices.append(
                 f"{board.name}: {key} = {facing_deg:g} would turn the board away from the object;"
@@ -231,7 +239,7 @@ def mirror_rig(rig: Instrument) -> Instrument:
 
 
 def _mirror_step(step: MountStep) -> MountStep:
-    """Return the step mirrored in x = y."""
+    """Return the step, which is either a shift or a turn, mirrored in x = y."""
     if step.shift_mm is not None:
         x, y, z = step.shift_mm
         return MountStep(shift_mm=(y, x, z))

@@ -47,7 +47,10 @@ class BuildError(Exception):
 
 
 def source_digest() -> str:
-    """Return 16 hex digits for C sources and headers. Libraries end with them, so no old or cut one is loaded."""
+    """Return 16 hex digits that change with the C sources and headers.
+
+    They are the last bytes of a library's file, so that one of older sources, or one that was cut, is not loaded.
+    """
     digest = hashlib.sha256()
     for path in sorted([*HERE.glob("*.c"), *HERE.glob("*.h")]):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")

@@ -23,25 +23,36 @@ from polysight_shared.faults import PiFault
 from polysight_shared.raster import MAX_WIDTH_NS, MIN_PERIOD_NS, MIN_WIDTH_NS
 from polysight_shared.wires import WireClient, WireEdge
 
-PERIOD = 1_500_000
-SPEC = trigger.BurstSpec(16, PERIOD, 1000)
+# The burst of the published rig: 16 pulses of 1 us, 1.5 ms apart. Times here are nanoseconds.
+PERIOD_NS = 1_500_000
+SPEC = trigger.BurstSpec(16, PERIOD_NS, 1000)
+# The fake lines count sleeps and changes of the output from 0. Pulse k, from 0, has two of each: it waits for its time
+# in sleep 2 k and for its end in sleep 2 k + 1, and its changes are 2 k (high) and 2 k + 1 (low).
 
 
 @given(
     pulses=st.integers(1, 40),
     period=st.integers(MIN_PERIOD_NS, 10**7),
     start=st.integers(0, 10**12),
-    late=st.lists(st.integers(0, 50_000), min_size=1),
+    delays=st.lists(st.integers(0, 50_000), min_size=1),
 )
-def test_deadlines_do_not_drift(pulses, period, start, late):
+def test_deadlines_do_not_drift(pulses, period, start, delays):
     """The delay of a pulse does not depend on those of earlier pulses."""
-    lines = FakeLines(late=lambda n: late[n // 2 % len(late)] if n % 2 == 0 else 0)
+
+    def delay_sleep(n: int) -> int:
+        """Delay the sleep before each pulse, and not the one within it."""
+        if n % 2 == 0:
+            return delays[n // 2 % len(delays)]
+        return 0
+
+    lines = FakeLines(late=delay_sleep)
+    # With the longest delay, 50 us, pulses still keep the shortest period that the radar allows.
     spec = trigger.BurstSpec(pulses, period + 50_000, 1000)
     sent = trigger.send_burst(lines, spec, start + 1)
     assert sent.fault == 0
-    lateness = [late[k % len(late)] for k in range(pulses)]
-    assert lines.rises == [start + 1 + k * spec.period_ns + lateness[k] for k in range(pulses)]
-    assert sent.jitter_ns == max(lateness)
+    pulse_delays = [delays[k % len(delays)] for k in range(pulses)]
+    assert lines.rises == [start + 1 + k * spec.period_ns + pulse_delays[k] for k in range(pulses)]
+    assert sent.jitter_ns == max(pulse_delays)
     assert (sent.first_ns, sent.last_ns, sent.pulses) == (lines.rises[0], lines.rises[-1], pulses)
     assert not lines.level
 
@@ -50,41 +61,49 @@ def test_a_start_that_has_passed_moves_the_whole_burst():
     lines = FakeLines()
     lines.t = 5_000
     trigger.send_burst(lines, SPEC, 1_000)
-    assert lines.rises == [5_000 + k * PERIOD for k in range(16)]
+    assert lines.rises == [5_000 + k * PERIOD_NS for k in range(16)]
 
 
 @given(st.integers(0, 15), st.integers(0, 10_000), st.integers(0, 10_000))
 def test_width_is_an_upper_bound_of_every_pulse(k, set_ns, clear_ns):
     """The line changes at an unknown time within each call, so the bound covers both calls completely."""
-    lines = FakeLines(long=lambda n: set_ns if n == 2 * k else clear_ns if n == 2 * k + 1 else 0)
+    durations_ns = {2 * k: set_ns, 2 * k + 1: clear_ns}
+    lines = FakeLines(long=lambda n: durations_ns.get(n, 0))
     sent = trigger.send_burst(lines, SPEC, 1_000)
-    worst = max(1000, set_ns) + clear_ns
-    assert sent.width_max_ns == worst
-    assert sent.fault == (PiFault.PULSE_TOO_LONG if worst > 4000 else 0)
-    assert sent.pulses == (k + 1 if worst > 4000 else 16)
+    # The call that clears the line is 1000 ns after the begin of the one that sets it, or at its end if that is later.
+    widest_ns = max(1000, set_ns) + clear_ns
+    assert sent.width_max_ns == widest_ns
+    # The radar's longest pulse: 4 us.
+    is_too_long = widest_ns > MAX_WIDTH_NS
+    assert sent.fault == (PiFault.PULSE_TOO_LONG if is_too_long else 0)
+    assert sent.pulses == (k + 1 if is_too_long else 16)
+
+    # Behind a one-shot, which makes the width itself, it is not checked.
     lines = FakeLines(long=lines.long)
     lines.check_width = False
     unchecked = trigger.send_burst(lines, SPEC, 1_000)
     assert (unchecked.fault, unchecked.pulses) == (0, 16)
 
 
-@given(st.integers(1, 15), st.integers(0, 3 * PERIOD))
-def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late):
-    """Pulse k is late; the next one may be too close, and is then left out."""
-    lines = FakeLines(late=lambda n: late if n == 2 * (k - 1) else 0)
+@given(st.integers(1, 15), st.integers(0, 3 * PERIOD_NS))
+def test_a_pulse_too_early_for_the_radar_is_never_sent(k, late_ns):
+    """Pulse k, counted from 1, is late; the next one would come too soon after it, and is then left out."""
+    lines = FakeLines(late=lambda n: late_ns if n == 2 * (k - 1) else 0)
     sent = trigger.send_burst(lines, SPEC, 1_000)
     gaps = [b - a for a, b in zip(lines.rises, lines.rises[1:], strict=False)]
     assert all(g >= MIN_PERIOD_NS for g in gaps)
-    assert sent.fault == (PiFault.PERIOD_TOO_SHORT if late > PERIOD - MIN_PERIOD_NS and k < 16 else 0)
+    assert sent.fault == (PiFault.PERIOD_TOO_SHORT if late_ns > PERIOD_NS - MIN_PERIOD_NS and k < 16 else 0)
     assert sent.pulses == len(lines.rises)
 
 
-def test_the_spacing_includes_the_previous_burst():
+def test_the_least_spacing_of_pulses_also_holds_between_two_bursts():
     sent = trigger.send_burst(FakeLines(), SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 1)
     assert (sent.pulses, sent.fault) == (0, PiFault.PERIOD_TOO_SHORT)
 
 
 class Loop:
+    """A trigger loop that answers a row's edges in its own thread; ends with its lines closed and low."""
+
     def __init__(self, points=3, lines=None):
         self.lines = lines or FakeLines()
         self.posted = queue.SimpleQueue()
@@ -93,9 +112,11 @@ class Loop:
         self.loop.start()
 
     def edge(self, t_ms, seqno):
+        """Put an edge on the trigger line; the kernel numbers all edges, so a missing number is a lost edge."""
         self.lines.edges.put(trigger.Edge(t_ms * 1_000_000, seqno))
 
     def next(self):
+        """Return the next report of the loop: a burst that was sent, or a fault."""
         return self.posted.get(timeout=HANG_S)
 
     def __enter__(self):
@@ -121,21 +142,23 @@ def test_each_edge_gets_its_burst_at_a_fixed_delay():
 @pytest.mark.parametrize(
     ("edges", "number", "bursts"),
     [
+        # Edges as (time in ms, kernel's number): number 2 is missing; the second comes within the first one's burst,
+        # which lasts 22.5 ms; and one more than the row's three points.
         ([(100, 1), (200, 3)], PiFault.EDGE_LOST, 1),
         ([(100, 1), (110, 2)], PiFault.EDGE_DURING_BURST, 1),
         ([(100, 1), (200, 2), (300, 3), (400, 4)], PiFault.POINTS_MISMATCH, 3),
     ],
 )
-def test_fault_table_of_the_loop(edges, number, bursts):
+def test_an_edge_that_is_lost_too_early_or_too_many_is_a_fault(edges, number, bursts):
     with Loop() as x:
-        for e in edges:
-            x.edge(*e)
+        for edge in edges:
+            x.edge(*edge)
         for _ in range(bursts):
             assert isinstance(x.next(), trigger.BurstSent)
         fault = x.next()
         assert isinstance(fault, trigger.LoopFault)
         assert (fault.number, fault.job) == (number, x.job)
-        # Nothing is answered after a fault
+        # After the fault edges are counted as strays and get no burst.
         x.edge(900, 99)
         x.edge(901, 100)
         while x.loop.strays < 2:
@@ -145,13 +168,17 @@ def test_fault_table_of_the_loop(edges, number, bursts):
 
 @pytest.mark.parametrize("number", [PiFault.PULSE_TOO_LONG, PiFault.PERIOD_TOO_SHORT])
 def test_a_failed_burst_is_reported_and_then_a_fault(number):
-    long = number == PiFault.PULSE_TOO_LONG
-    lines = FakeLines(
-        long=lambda n: 5_000 if long and n == 4 else 0, late=lambda n: 0 if long or n != 2 else PERIOD - 100_000
-    )
+    if number == PiFault.PULSE_TOO_LONG:
+        # Setting the line for the third pulse takes 5 us, longer than the radar's 4 us.
+        lines = FakeLines(long=lambda n: 5_000 if n == 4 else 0)
+        pulses_sent = 3
+    else:
+        # The second pulse is so late that the third one would follow 0.1 ms after it; the radar allows 0.3 ms.
+        lines = FakeLines(late=lambda n: PERIOD_NS - 100_000 if n == 2 else 0)
+        pulses_sent = 2
     with Loop(lines=lines) as x:
         x.edge(100, 1)
-        assert x.next().record.pulses == (3 if long else 2)
+        assert x.next().record.pulses == pulses_sent
         assert x.next().number == number
 
 
@@ -196,7 +223,7 @@ def test_an_exception_inside_a_pulse_leaves_the_outputs_low_and_is_a_fault(monke
 
 def test_disarming_ends_a_running_burst_after_its_pulse():
     def disarm(n):
-        # The third pulse is awaited
+        # Sleep 4 is the one before the third pulse.
         if n == 4:
             threading.Thread(target=lambda: counted.put(x.loop.disarm())).start()
             while x.loop._job is not None:
@@ -217,6 +244,9 @@ def test_stop_within_a_burst_ends_it_at_a_whole_pulse():
     assert not lines.level
 
 
+# --- the SPI controller: a burst is a sequence of bits on its output MOSI, and each pulse one set bit -----------------
+
+# Pulses, period and width in nanoseconds of bursts that the controller can make.
 bursts = st.tuples(st.integers(1, 256), st.integers(MIN_PERIOD_NS, 20_000_000), st.integers(500, 2000))
 # Bytes of a buffer of spidev that every burst of these tests fits into.
 LARGE_BUFFER = 1 << 22
@@ -228,7 +258,8 @@ def list_set_bits(data: bytes) -> list[int]:
 
 
 @given(bursts)
-def test_one_set_bit_a_pulse_at_its_place(burst):
+def test_each_pulse_is_one_set_bit_at_the_place_nearest_to_its_time(burst):
+    """It is off by at most half a bit, and the distance of two by a bit; 1 ns more for rounding the bit's length."""
     pulses, period_ns, width_ns = burst
     made_burst = trigger.make_spi_burst(trigger.BurstSpec(pulses, period_ns, width_ns), LARGE_BUFFER)
     assert made_burst.bit_ns == pytest.approx(width_ns, rel=1e-5), "the width that was asked for"
@@ -244,7 +275,7 @@ def test_one_set_bit_a_pulse_at_its_place(burst):
 
 
 @given(bursts, st.integers(trigger.MIN_BYTES, 65_536))
-def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
+def test_a_burst_that_exceeds_the_buffer_of_spidev_is_refused_with_the_size_to_set(burst, bufsiz):
     needed_bytes = len(trigger.make_spi_burst(trigger.BurstSpec(*burst), LARGE_BUFFER).data)
     if needed_bytes > bufsiz:
         with expect_refusal(ErrorCode.VALUES_CONFLICT, bufsiz) as e:
@@ -259,14 +290,16 @@ def test_what_spidev_does_not_take_is_refused_with_what_to_set(burst, bufsiz):
 @pytest.mark.parametrize("width_ns", [MIN_WIDTH_NS, 499, 2001, MAX_WIDTH_NS])
 def test_a_width_that_the_controller_cannot_make_is_refused(width_ns):
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "0.5..2 us"):
-        trigger.make_spi_burst(trigger.BurstSpec(1, PERIOD, width_ns), LARGE_BUFFER)
+        trigger.make_spi_burst(trigger.BurstSpec(1, PERIOD_NS, width_ns), LARGE_BUFFER)
 
 
-def test_the_published_burst_fits_every_pi_as_it_comes():
-    b = load_published_rig().burst
-    burst = trigger.make_spi_burst(trigger.BurstSpec.from_burst(b))
+def test_the_published_burst_fits_the_default_buffer_of_a_pi():
+    published_burst = load_published_rig().burst
+    burst = trigger.make_spi_burst(trigger.BurstSpec.from_burst(published_burst))
     assert SpiWireLines.bufsiz == trigger.DEFAULT_BUFSIZ == 4096
-    assert (burst.clock_hz, len(burst.data)) == (1_000_000, 2815)
+    assert burst.clock_hz == 1_000_000
+    # 15 periods of 1500 bits between 8 low bits before and after, (22,500 + 16) / 8 bytes, and one byte more.
+    assert len(burst.data) == 2815
     assert [y - x for x, y in itertools.pairwise(burst.bits)] == [1500] * 15
 
 
@@ -305,17 +338,18 @@ class Controller:
 def test_a_record_bounds_what_the_controller_did(late_ns):
     lines = Controller(late_ns=late_ns)
     record = trigger.send_burst(lines, SPEC, 1_000_000)
-    ((began, burst),) = lines.sent
-    first = began + round(burst.bits[0] * burst.bit_ns)
+    ((begin_ns, burst),) = lines.sent
+    true_first_ns = begin_ns + round(burst.bits[0] * burst.bit_ns)
     assert (record.pulses, record.fault) == (16, 0)
-    assert abs(record.first_ns - first) <= record.jitter_ns
-    assert record.last_ns - record.first_ns == 15 * 1_500_000
+    assert abs(record.first_ns - true_first_ns) <= record.jitter_ns
+    assert record.last_ns - record.first_ns == 15 * PERIOD_NS
+    # The width follows from the time of the whole call, 22.5 ms: 0.2 ms more are 0.9 %.
     assert 1000 <= record.width_max_ns <= 1010
     # Half of the call's time beyond the burst: it may have been spent before the burst or after it.
     assert record.jitter_ns <= late_ns / 2 + burst.bit_ns
 
 
-@pytest.mark.parametrize(("period_ns", "rounding_bits"), [(PERIOD, 0), (PERIOD + 1, 0.5)])
+@pytest.mark.parametrize(("period_ns", "rounding_bits"), [(PERIOD_NS, 0), (PERIOD_NS + 1, 0.5)])
 def test_only_pulses_between_bits_are_rounded(period_ns, rounding_bits):
     """A period of whole bits puts every pulse at its exact time."""
     lines = Controller(late_ns=0)
@@ -324,8 +358,8 @@ def test_only_pulses_between_bits_are_rounded(period_ns, rounding_bits):
     assert record.jitter_ns == pytest.approx(rounding_bits * burst.bit_ns, abs=1)
 
 
-def test_no_position_is_lost_to_a_width_fault():
-    """10,000 positions by the SPI controller; the kernel is up to 5 ms late in every call."""
+def test_a_late_kernel_causes_no_width_fault_of_the_controller():
+    """10,000 bursts; the kernel begins up to 5 ms late in every call, which lengthens no pulse."""
     rng = random.Random(1)
     lines = Controller()
     faults = 0
@@ -336,21 +370,31 @@ def test_no_position_is_lost_to_a_width_fault():
 
 
 def test_a_burst_can_be_stopped_only_before_it_begins():
+    """The controller sends a whole transfer: once, before it, the burst asks whether it is to stop."""
     lines = Controller()
     questions = []
-    record = trigger.send_burst(lines, SPEC, 0, None, lambda: bool(questions.append(1)))
+
+    def note_question() -> bool:
+        questions.append("stop?")
+        return False
+
+    record = trigger.send_burst(lines, SPEC, 0, previous_rise_ns=None, stop=note_question)
     assert (record.pulses, len(questions)) == (16, 1)
-    assert trigger.send_burst(lines, SPEC, 50_000_000, None, lambda: True).pulses == 0
+    stopped_record = trigger.send_burst(lines, SPEC, 50_000_000, previous_rise_ns=None, stop=lambda: True)
+    assert stopped_record.pulses == 0
     assert len(lines.sent) == 1
 
 
 @pytest.mark.parametrize(("rate", "fault"), [(1.0, 0), (1.6, PiFault.PERIOD_TOO_SHORT), (0.2, PiFault.PULSE_TOO_LONG)])
 def test_a_wrong_clock_is_a_fault(rate, fault):
-    """A Pi's core clock changes where `core_freq` is not fixed, and with it the SPI clock."""
+    """A Pi's core clock changes where `core_freq` is not fixed, and with it the SPI clock.
+
+    At 1.6 times the clock the transfer is too short: periods are. At a fifth of it pulses last 5 us instead of 1 us.
+    """
     assert trigger.send_burst(Controller(rate), SPEC, 0).fault == fault
 
 
-def test_a_burst_that_would_come_too_soon_is_not_sent():
+def test_a_burst_too_soon_after_the_one_before_is_not_sent():
     lines = Controller()
     record = trigger.send_burst(lines, SPEC, 1_000_000, previous_rise_ns=1_000_000 - MIN_PERIOD_NS + 50_000)
     assert (record.pulses, record.fault, lines.sent) == (0, PiFault.PERIOD_TOO_SHORT, [])
@@ -366,7 +410,7 @@ def instrument(instrument, request):
 
 @pytest.fixture
 def source(instrument):
-    """Widths of pulses in the events."""
+    """What sets the width of pulses, by the name that events have for it."""
     return "spi" if instrument.pi.wiring == "spi" else "one-shot"
 
 
@@ -388,25 +432,27 @@ def record_rises(hub, instrument):
 
 def test_every_pulse_is_sent_once_and_bursts_keep_their_distance(pi, record_rises, source):
     sent = [pi.host.ask(m.Pulse(pulses=n, period_us=400.0, width_us=1.0)) for n in (3, 20)]
-    assert [(s.pulses, s.width_max_ns, s.fault, s.timed_by, s.pulses_seen) for s in sent] == [
-        (3, 1000, 0, source, True),
-        (20, 1000, 0, source, True),
-    ]
-    steps = [b - a for a, b in pairwise(record_rises(23))]
-    assert steps[2] >= 400_000  # between two bursts
-    assert steps[:2] + steps[3:] == [400_000] * 21
+    assert [s.pulses for s in sent] == [3, 20]
+    for burst in sent:
+        assert (burst.width_max_ns, burst.fault, burst.timed_by, burst.pulses_seen) == (1000, 0, source, True)
+    periods_ns = [b - a for a, b in pairwise(record_rises(23))]
+    within_bursts_ns = periods_ns[:2] + periods_ns[3:]
+    assert within_bursts_ns == [400_000] * 21
+    between_bursts_ns = periods_ns[2]
+    assert between_bursts_ns >= 400_000
 
 
 def test_pulses_beyond_one_transfer_are_sent_in_several(pi, record_rises, source):
-    """64 pulses do not fit in spidev's buffer: none is lost, none comes too early."""
+    """64 pulses need 11.8 kB, and spidev's buffer holds 4 kB: no pulse is lost, and none comes too early."""
     sent = pi.host.ask(m.Pulse(pulses=64, period_us=1500.0, width_us=1.0))
     assert (sent.pulses, sent.fault, sent.timed_by) == (64, 0, source)
     assert min(b - a for a, b in pairwise(record_rises(64))) >= 1_500_000
 
 
+# One pulse fewer on the return wire than were sent, one more, and none.
 @pytest.mark.parametrize("seen", [lambda n: n - 1, lambda n: n + 1, lambda _: 0])
-def test_pulses_that_are_not_seen_are_a_fault(seen):
-    """Each burst is compared with the return wire: a defective buffer or cable is found at the first point."""
+def test_other_pulses_on_the_return_wire_than_were_sent_are_a_fault(seen):
+    """Each burst is compared with it, so that a defective buffer or cable is found at the first point."""
     lines = FakeLines()
     lines.seen = seen
     posted = []
@@ -418,13 +464,14 @@ def test_pulses_that_are_not_seen_are_a_fault(seen):
     assert f"16 pulses sent, {seen(16)} seen" in fault.detail
 
 
-def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch):
-    """With simulated wires; a rig without a return wire reports that."""
+def test_a_return_wire_that_is_cut_ends_the_row(pi, hub, instrument, monkeypatch):
+    # How long the simulated wires wait for returned pulses; short, for a fast test.
     monkeypatch.setattr(pi_lines, "SIMULATED_LOOK_BACK_S", 0.2)
     with closing(WireClient(hub)) as cutter:
         pi.host.must_accept(pi.host.make_begin())
         pi.host.home()
         assert pi.host.run_row(0).pulses_seen
+        # The hub's command to cut a wire, and its acknowledgement.
         cutter._socket.sendall(f"X {instrument.pi.pulses_in} 1\n".encode())
         assert cutter._read_line(HANG_S) == "K"
         row_finished = pi.host.run_row(1)
@@ -432,7 +479,7 @@ def test_a_return_wire_that_is_off_ends_the_row(pi, hub, instrument, monkeypatch
         assert all(c.pulses_seen for c in pi.host.list_events(m.Capture))
 
 
-def test_a_row_afterwards_is_complete_and_during_a_run_no_pulse_is_sent(pi, instrument):
+def test_single_pulses_are_refused_during_a_run_and_do_not_disturb_the_next_row(pi, instrument):
     pulse = m.Pulse(pulses=5, period_us=1500.0, width_us=1.0)
     assert not pi.host.ask(m.Hello()).in_run
     assert pi.host.ask(pulse).pulses == 5

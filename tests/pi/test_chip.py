@@ -29,18 +29,19 @@ from polysight_simulators import gpio
 
 require_stand_in_chip()
 
+# Lines (GPIO numbers) of the published rig: trigger input, output to the radars, and the output of the SPI controller.
 TRIGGER = 26
 SYNC = 22
 MOSI = 10
-# An input that the program does not use
-LEVEL = 5
+# An input that the program does not use.
+UNUSED = 5
 POINTS = 4
 replace = msgspec.structs.replace
 
 
 @pytest.fixture
 def rig(gpio_rig):
-    """Pulses behind a one-shot: this machine may be too busy for 4 us."""
+    """A rig whose pulses get their width from a one-shot: this machine may be too busy for the 4 us allowed without."""
     burst = replace(gpio_rig.burst, pulses=4, period_us=2000.0)
     grid = replace(gpio_rig.grid, columns=POINTS)
     pi = replace(gpio_rig.pi, one_shot=True)
@@ -49,7 +50,7 @@ def rig(gpio_rig):
 
 @pytest.fixture
 def long_bursts(rig):
-    """Bursts of 0.8 s."""
+    """Bursts of nine pulses 0.1 s apart, 0.8 s long, so that tests can act within one."""
     burst = replace(rig.burst, pulses=9, period_us=100_000.0)
     return replace(rig, burst=burst, stage=replace(rig.stage, speed_mm_s=2.0))
 
@@ -63,8 +64,9 @@ def wires(hub):
 
 @pytest.fixture
 def in_row(start, stage, hub, wires):
-    """Starts the program on a chip with these faults, whose time is that of the wires, and a row that stays before its
-    first point: the test sends the edges. Sends the first one.
+    """Function that starts the program on a chip with these faults, and a row, and sends the first edge.
+
+    The stage stays before its first point, so that all edges come from the test. Time is that of the wires.
     """
 
     def in_row(rig, *faults):
@@ -81,7 +83,7 @@ def in_row(start, stage, hub, wires):
 
 
 def make_edge(t_us=1_000_000):
-    """An edge of the trigger; the first one is late enough on the wires to begin a row."""
+    """Return the rising and the falling change of a trigger edge; 1 s is late enough on the wires to begin a row."""
     return WireEdge(t_us * 1000, TRIGGER, 1), WireEdge(t_us * 1000 + 20_000, TRIGGER, 0)
 
 
@@ -104,8 +106,9 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
         # In real time a machine may be too busy for a row, which is then a fault.
         busy = (PiFault.EDGE_DURING_BURST, PiFault.PERIOD_TOO_SHORT, PiFault.EDGE_TIME)
         assert report.fault in busy, report.reason
-    memory = Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0]
-    assert int(memory) < 60_000, f"more than 60 MB: {memory} KB"
+    # The program needs 30 to 60 MB (`polysight_pi/system.py`). VmHWM: the most that was resident, in kB.
+    memory_kb = int(Path(f"/proc/{program.popen.pid}/status").read_text().partition("VmHWM:")[2].split()[0])
+    assert memory_kb < 60_000
     rises = wires.list_rises(SYNC)
     for c in captures:
         burst = rises[: c.pulses]
@@ -119,7 +122,7 @@ def test_a_row_is_answered_pulse_by_pulse(rig, start, stage, hub, wires, wire_ti
     wires.wait_until(lambda: wires.read_level(SYNC) == 0)
 
 
-def test_an_edge_during_a_burst_ends_the_row_alone(long_bursts, in_row, wires):
+def test_an_edge_during_a_burst_ends_the_row_but_not_the_run(long_bursts, in_row, wires):
     _, host = in_row(long_bursts)
     wires.drive(*make_edge(1_001_000))
     report = host.wait_for_event(m.RowFinished)
@@ -128,7 +131,7 @@ def test_an_edge_during_a_burst_ends_the_row_alone(long_bursts, in_row, wires):
     host.wait_for_state("ready")
 
 
-def test_a_chip_that_vanishes_is_fault_107(long_bursts, in_row, wires):
+def test_a_chip_that_vanishes_is_a_lasting_fault_of_the_trigger_line(long_bursts, in_row, wires):
     program, host = in_row(long_bursts)
     host.wait_for_event(m.Capture)
     program.popen.send_signal(gpio.VANISH_SIGNAL)
@@ -160,6 +163,8 @@ def test_outputs_are_low_after_a_signal_inside_a_pulse(rig, in_row, wires, numbe
     assert len(wires.list_rises(SYNC)) == 1
 
 
+# Opens the trigger line with a pull-up and debouncing, and prints the settings that the chip reports. Then it reads an
+# edge, waits for a level on the unused input (its argument) without reading, and prints the number of the next edge.
 CHIP_PROGRAM = """
 import os, sys, time
 from datetime import timedelta
@@ -186,29 +191,30 @@ lines.close()
 """
 
 
-def test_settings_reach_the_chip_and_glitches_do_not_reach_us(hub, wires, tmp_path):
+def test_settings_reach_the_chip_and_glitches_do_not_reach_the_program(hub, wires, tmp_path):
     """Bias, debouncing, clock, consumer: read back from the chip, which is found by its label.
 
     Of unread edges the kernel keeps the newest 1024; the number of the next one shows how many were lost.
     """
     environment = {**os.environ, **gpio.environment(tmp_path / "gpiochip0", hub)}
     process = subprocess.Popen(
-        [sys.executable, "-c", CHIP_PROGRAM, str(LEVEL)], stdout=subprocess.PIPE, text=True, cwd=REPO, env=environment
+        [sys.executable, "-c", CHIP_PROGRAM, str(UNUSED)], stdout=subprocess.PIPE, text=True, cwd=REPO, env=environment
     )
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "True polysight RISING PULL_UP MONOTONIC 0:00:00.002000\n"
         assert process.stdout.readline() == "True polysight OUTPUT\n"
         wires.drive(WireEdge(0, TRIGGER, 0))
-        # 0.5 ms: a glitch
+        # 0.5 ms is shorter than the debouncing of 2 ms: a glitch. 5 ms is a pulse.
         wires.drive(WireEdge(10_000_000, TRIGGER, 1), WireEdge(10_500_000, TRIGGER, 0))
-        # 5 ms
         wires.drive(WireEdge(20_000_000, TRIGGER, 1), WireEdge(25_000_000, TRIGGER, 0))
         assert process.stdout.readline() == "edge 1 None\n"
+        # 1100 edges that are not read.
         for k in range(1100):
             t_ns = 100_000_000 + k * 10_000_000
             wires.drive(WireEdge(t_ns, TRIGGER, 1), WireEdge(t_ns + 5_000_000, TRIGGER, 0))
-        wires.drive(WireEdge(t_ns + 10_000_000, LEVEL, 1))
+        wires.drive(WireEdge(t_ns + 10_000_000, UNUSED, 1))
+        # After edge 1, the oldest of the newest 1024.
         assert process.stdout.readline() == f"then {1 + 1100 - 1024 + 1}\n"
     finally:
         process.kill()
@@ -242,10 +248,10 @@ def start_homed(spi_rig, start):
 @pytest.mark.slow
 @pytest.mark.parametrize("real_hz", [250e6, 251e6])
 def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed, hub, wires, real_hz):
-    """Bits on MOSI with the widths and spacing of the real clock; the program believes 250 MHz.
+    """Pulses on MOSI have the widths and spacing of the controller's real clock; the program assumes 250 MHz.
 
-    The duration of the system call bounds how late the controller began. A fast clock shortens the transfer, which
-    hides as much of a late begin.
+    The duration of the system call bounds how late the controller began. A faster clock shortens the transfer, which
+    hides a late begin of up to that difference.
     """
     program, host = start_homed(hub, core_hz=f"250e6,{real_hz:g}")
     rate = 250e6 / real_hz
@@ -256,11 +262,13 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
     assert status == 0, err
     n = spi_rig.burst.pulses
     period_ns = spi_rig.burst.period_us * 1e3
+    # A rise and a fall for each pulse.
     wires.wait_until(lambda: len([e for e in wires.edges if e.line == MOSI]) == 2 * n * spi_rig.grid.columns)
     edges = [e for e in wires.edges if e.line == MOSI]
     rises = edges[::2]
     falls = edges[1::2]
     assert [e.value for e in edges] == [1, 0] * (n * spi_rig.grid.columns)
+    # Times are whole nanoseconds.
     assert all(abs(b.t_ns - a.t_ns - 1000 * rate) <= 1 for a, b in zip(rises, falls, strict=True))
     hidden_ns = (1 - rate) * n * period_ns
     for i, c in enumerate(host.list_events(m.Capture)):
@@ -272,8 +280,8 @@ def test_every_position_is_a_burst_by_the_controllers_clock(spi_rig, start_homed
 
 
 @pytest.mark.slow
-def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(start_homed, hub):
-    """A run whose bursts exceed spidev's `bufsiz` is refused immediately; the next one runs."""
+def test_a_run_with_bursts_longer_than_the_buffer_is_refused_and_the_next_one_runs(start_homed, hub):
+    """Two pulses 20 ms apart are 20,000 bits, 2.5 kB; spidev has a buffer of 640 bytes here."""
     _, host = start_homed(hub, bufsiz="640")
     refused = host.ask(msgspec.structs.replace(host.make_begin(), pulses=2, period_us=20_000.0, speed_mm_s=5.0))
     assert isinstance(refused, m.Refused)
@@ -284,6 +292,7 @@ def test_a_burst_longer_than_the_buffer_is_refused_and_the_lines_live_on(start_h
 @pytest.mark.slow
 def test_a_killed_program_leaves_the_line_low(spi_rig, start_homed, hub, wires, stage):
     """The kernel ends the transfer; its last bits are low."""
+    # The stage sends no edge itself.
     stage.skip = set(range(spi_rig.grid.columns))
     program, host = start_homed(hub, wire_time=False)
     host.start_row()
@@ -298,7 +307,7 @@ def test_a_killed_program_leaves_the_line_low(spi_rig, start_homed, hub, wires, 
 
 @pytest.mark.slow
 def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_rig, write_config, hub, wires):
-    """With the line low all the time."""
+    """It sends no pulse: the line is low all the time."""
 
     def read_findings(rig, **settings):
         environment = gpio.environment(rig.pi.gpio_chip, hub, spi=rig.pi.spi_device, exact="1", **settings)
@@ -317,32 +326,34 @@ def test_check_measures_the_clock_and_names_the_buffer_that_the_burst_needs(spi_
     assert not wires.list_rises(MOSI)
 
 
+# <linux/prctl.h> and <linux/capability.h>.
 PR_CAPBSET_DROP = 24
 CAP_IPC_LOCK = 14
 CAP_SYS_NICE = 23
 
 
 def may_schedule():
+    """True if this user may give a process real-time priority."""
     code = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
     return subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
 
 
 def read_priorities(pid):
-    """Names of the threads of a process that have real-time priority."""
+    """Return the real-time priorities of those threads of a process that have one."""
     tasks = [int(t.name) for t in Path(f"/proc/{pid}/task").iterdir()]
     return [os.sched_getparam(t).sched_priority for t in tasks if os.sched_getscheduler(t) == os.SCHED_FIFO]
 
 
-def test_all_threads_are_scheduled_and_the_trigger_thread_first(start, gpio_rig):
+def test_all_threads_have_real_time_priority_and_the_trigger_thread_the_highest(start, gpio_rig):
     """They share the interpreter's lock: a thread that holds it must not be preempted by other programs."""
     if not may_schedule():
         pytest.skip("SCHED_FIFO is not permitted here: run as root, or with RLIMIT_RTPRIO")
     program, _ = start(gpio_rig, **gpio.environment(gpio_rig.pi.gpio_chip))
-    # `ready` comes before the threads.
+    # The program is `ready` before its threads run.
     wait_for(lambda: TRIGGER_PRIORITY in read_priorities(program.popen.pid), "the trigger thread")
     thread_priorities = read_priorities(program.popen.pid)
     assert thread_priorities.count(TRIGGER_PRIORITY) == 1
-    # Main, stage, executor
+    # At least the threads of the program itself, the stage and the executor.
     assert thread_priorities.count(OTHERS_PRIORITY) >= 3
     assert "real-time" not in program.end()[2]
 
@@ -351,7 +362,7 @@ def test_rights_that_are_missing_are_reported_once_and_the_program_runs(start, g
     def without_rights():
         libc = ctypes.CDLL(None)
         for capability in (CAP_SYS_NICE, CAP_IPC_LOCK):
-            # A right of root; other users do not have it
+            # Root has these rights and drops them; other users have none, and the call does nothing.
             libc.prctl(PR_CAPBSET_DROP, capability, 0, 0, 0)
         for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
             resource.setrlimit(limit, (0, 0))

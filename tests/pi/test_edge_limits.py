@@ -6,14 +6,14 @@ import pytest
 
 from polysight_pi.edges import EdgeTimes, RowMotion, slowest_feed
 
-# Four points 400 steps apart at 4,000 steps/s: 100 ms each.
+# Four points 400 steps apart at 4,000 steps/s: 100 ms each. A step is 1/200 mm, so these are 2 mm at 20 mm/s.
 MOTION = RowMotion(x_start=10_000, step=400, points=4, y=500, feed=4000, accel=40_000, backlash=0)
 MS = 1_000_000
 BEGIN_NS = 5_000 * MS
 
 
 def note_edges(*intervals_ms: float, motion: RowMotion = MOTION) -> tuple[EdgeTimes, list[str]]:
-    """Edges with these times between them; return the check and what it says of each."""
+    """Give edges with these times between them to a check; return it, and the problem that it reports of each."""
     check = EdgeTimes(motion)
     edge_ns = BEGIN_NS
     problems = [check.note_edge(edge_ns)]
@@ -24,21 +24,31 @@ def note_edges(*intervals_ms: float, motion: RowMotion = MOTION) -> tuple[EdgeTi
 
 
 def test_lengths_of_a_row_are_its_ramp_and_its_points():
-    """4000^2 / (2 x 40000) = 200 steps of ramp, and a step of the row at full speed."""
-    assert (MOTION.ramp, MOTION.run_up, MOTION.length) == (200, 600, 3 * 400 + 2 * 600)
+    """The run-up at each end is a ramp of v^2 / 2a = 4000^2 / (2 x 40000) = 200 steps, and 400 steps at full speed."""
+    assert MOTION.ramp == 200
+    assert MOTION.run_up == 600
+    assert MOTION.length == 3 * 400 + 2 * 600
     assert MOTION.end == (10_000 + 3 * 400 + 600, 500)
     assert MOTION.distance(10_000) == 600
     assert MOTION.distance(10_050) == 650
-    back = MOTION._replace(step=-400)
-    assert (back.direction, back.length, back.end) == (-1, MOTION.length, (10_000 - 3 * 400 - 600, 500))
-    assert back.distance(9_950) == 650
+
+    backwards = MOTION._replace(step=-400)
+    assert backwards.direction == -1
+    assert backwards.length == MOTION.length
+    assert backwards.end == (10_000 - 3 * 400 - 600, 500)
+    assert backwards.distance(9_950) == 650
+
+    # Play longer than a step lengthens the run-up, and a ramp of 200.1 steps is rounded up.
     assert MOTION._replace(backlash=1000).run_up == 1200
     assert MOTION._replace(feed=4001).ramp == 201
 
 
 @pytest.mark.parametrize(("accel", "feed"), [(40_000, 141), (200, 31), (1921, 31), (2048, 32)])
 def test_a_speed_with_which_the_stage_may_start_needs_no_ramp(accel, feed):
-    """The first step takes sqrt(2 / accel) seconds, and at most 1 / 31."""
+    """From rest the first step takes sqrt(2 / accel) seconds, so that speed is sqrt(accel / 2), rounded down.
+
+    The firmware has no lower speed than 31 steps/s: 1921 / 2 is the last below 31^2, and 2048 / 2 is 32^2.
+    """
     assert slowest_feed(accel) == feed
     assert MOTION._replace(accel=accel, feed=feed).ramp == 0
     assert MOTION._replace(accel=accel, feed=feed + 1).ramp > 0
@@ -47,10 +57,13 @@ def test_a_speed_with_which_the_stage_may_start_needs_no_ramp(accel, feed):
 def test_points_of_a_row_pass_at_its_speed_between_two_ramps():
     points_s, end_s = MOTION.time_points([])
     assert [later_s - earlier_s for earlier_s, later_s in pairwise(points_s)] == pytest.approx([0.1] * 3)
-    # From rest to the first point as from the last one to rest: v / a of ramp, and 400 steps at full speed
+    # From rest to the first point: the ramp takes v / a = 0.1 s, and 400 steps at full speed 0.1 s. The firmware's ramp
+    # is made of whole steps, and so not exactly v / a: the tolerances here are chosen for that.
     assert points_s[0] == pytest.approx(0.1 + 0.1, rel=0.05)
     assert end_s - points_s[-1] == pytest.approx(points_s[0], rel=0.02)
-    # A stop between the second and third point costs two ramps: each takes v / a, half of it lost.
+
+    # A stop between the second and third point costs two ramps: each takes v / a = 0.1 s, for a way that takes half of
+    # that at full speed.
     stopped_s, stopped_end_s = MOTION.time_points([600 + 600])
     assert stopped_s[:2] == pytest.approx(points_s[:2], rel=0.03)
     assert stopped_end_s - end_s == pytest.approx(0.1, rel=0.1)
@@ -59,6 +72,7 @@ def test_points_of_a_row_pass_at_its_speed_between_two_ramps():
 @pytest.mark.parametrize(
     ("interval_ms", "problem"),
     [
+        # One percent is 1 ms; of two intervals together each has its 1 ms, and of three.
         (100.0, ""), (100.9, ""), (99.1, ""), (101.1, "a late edge, or lost ones"), (98.9, "a spurious or early edge"),
         (200.0, "1 edges lost"), (201.9, "1 edges lost"), (198.1, "1 edges lost"), (202.1, "a late edge, or lost ones"),
         (300.0, "2 edges lost"), (302.9, "2 edges lost"), (303.1, "a late edge, or lost ones"),
@@ -75,6 +89,7 @@ def test_an_interval_is_that_of_the_speed_within_one_percent(interval_ms, proble
 
 
 def test_after_a_hold_is_commanded_only_shorter_intervals_are_wrong_before_the_end():
+    """How long the stage rests is not known, so a longer interval is judged at the row's end."""
     check, _ = note_edges(100.0)
     check.note_hold()
     assert check.note_edge(BEGIN_NS + 900 * MS) == ""
@@ -85,23 +100,25 @@ def test_after_a_hold_is_commanded_only_shorter_intervals_are_wrong_before_the_e
     ("asked_ms", "points", "is_spurious"),
     [(0, 1, False), (0, 0, True), (-1, 0, False), (100, 2, False), (100, 1, True)],
 )
-def test_no_more_edges_than_points_come_before_a_status_is_asked_for(asked_ms, points, is_spurious):
+def test_more_edges_before_a_status_request_than_its_points_are_spurious(asked_ms, points, is_spurious):
+    # Edges at 0, 100 and 200 ms.
     check, _ = note_edges(100.0, 100.0)
     problem = check.note_status(points, BEGIN_NS + asked_ms * MS, BEGIN_NS + 10_000 * MS)
     assert ("spurious" in problem) == is_spurious
 
 
 @pytest.mark.parametrize(("written_ms", "is_late"), [(100, False), (81, False), (79, True)])
-def test_an_edge_comes_by_the_status_that_counts_its_point(written_ms, is_late):
-    """A fifth of an interval later at most."""
+def test_an_edge_may_follow_the_status_that_counts_its_point_by_a_fifth_of_an_interval(written_ms, is_late):
+    """The second edge is at 100 ms, and a status counts two points 20 ms before it, or earlier (`STATUS_TOLERANCE`)."""
     check, _ = note_edges(100.0, 100.0, 100.0)
-    check.note_status(2, BEGIN_NS - 1, BEGIN_NS + written_ms * MS)
+    check.note_status(points=2, asked_ns=BEGIN_NS - 1, written_ns=BEGIN_NS + written_ms * MS)
     problem = check.judge(was_held=False, done_ns=BEGIN_NS + 1000 * MS)
     assert ("1 edges had come" in problem) == is_late
     assert (problem == "") != is_late
 
 
-def test_the_stage_runs_on_after_the_last_point():
+def test_a_row_that_ends_too_soon_after_its_last_edge_is_a_fault():
+    """The stage needs its run-out for that, within one percent. Its report may come later: it is sent again if lost."""
     points_s, end_s = MOTION.time_points([])
     run_out_ms = 1e3 * (end_s - points_s[-1])
     for share, is_wrong in ((1.0, False), (0.991, False), (0.989, True), (5.0, False)):
@@ -113,12 +130,14 @@ def test_the_stage_runs_on_after_the_last_point():
 @pytest.mark.parametrize(
     ("x", "points", "waits"),
     [
-        # Between the second and the third point, at the third one, and outside the row
+        # Points are at 10,000, 10,400, 10,800 and 11,200. The stage rests between the second and the third point, at
+        # the second (then the interval after it is longer), at the third, and outside the row.
         (10_600, 2, {2}), (10_400, 2, {2}), (10_800, 2, {3}), (20_000, 2, set()), (10_000 - 600, 2, set()),
         (10_000 + 3 * 400 + 600, 4, set()),
     ],
 )  # fmt: skip
-def test_a_hold_lengthens_the_interval_in_which_the_stage_rests(x, points, waits):
+def test_a_hold_lengthens_the_interval_in_which_the_stage_rests_and_no_other(x, points, waits):
+    """`waits`: points before which the stage may have waited. It waits 7 s in each interval in turn."""
     for waiting_point in (1, 2, 3):
         check, _ = note_edges()
         check.note_hold()

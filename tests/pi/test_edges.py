@@ -1,4 +1,8 @@
-"""Edges of rows are checked by place and time: rows of the simulated stage (the sketch's arithmetic) with faults."""
+"""Edges of rows are checked by place and time: rows of the simulated stage (the sketch's arithmetic) with faults.
+
+A row is recorded once: what the Pi gets, in its order (edges, replies of the stage, commands of the host). Then it is
+replayed to the Pi's state machine with other edges, among them lost, spurious and shifted ones.
+"""
 
 import random
 from typing import Any, NamedTuple
@@ -19,18 +23,22 @@ from polysight_simulators.stage.python_stage import PythonStage, Rig
 POINTS = 60
 STEP_MM = 2.0
 ROW = Row(index=0, y_mm=0.0, x_start_mm=-300.0, step_mm=STEP_MM, points=POINTS)
+# mm/s and mm/s^2: the published rig, and faster and slower ones.
 SPEEDS_AND_ACCELERATIONS = [(20, 200), (60, 200), (20, 100), (100, 400)]
+# Interval of status requests: a quarter of the stage's heartbeat of 0.5 s.
 STATUS_S = 0.125
-# 107: edges are missing for two statuses, which also late edges after a hold may cause.
+# Faults with which a row with wrong edges may end. TRIGGER_LINE_LOST comes if edges are missing at two statuses, which
+# also late edges after a hold may cause.
 FAULTS = (PiFault.EDGE_TIME, PiFault.EDGE_DURING_BURST, PiFault.POINTS_MISMATCH, PiFault.TRIGGER_LINE_LOST)
-# The USB serial port; the time of the line's bytes is known and subtracted
+# Delay of the USB serial port; the time of the line's bytes is known, and the Pi subtracts it.
 LINK_S = 0.001
 
 
 class Happening(NamedTuple):
-    """An edge, a reply of the stage, or a command of the host, in the order in which the Pi gets them."""
+    """What the Pi gets: an edge of the trigger, a reply of the stage, or a command of the host."""
 
     t_ns: int
+    # "edge", the name of a command, or the reply.
     what: Any
 
 
@@ -73,7 +81,10 @@ class Recorder:
         return [w.t_ns for w in self._stage.wires if isinstance(w, WireEdge) and w.value]
 
     def run(self, holds: list[tuple[float, float]], early_hold_s: float | None = None) -> list[Happening]:
-        """Hold at these times after the first point, or so long after ROW, for this long each (seconds)."""
+        """Run the row with these holds: each a time after the first point and a duration, seconds.
+
+        `early_hold_s`: one hold of 0.6 s, so long after the command ROW, instead.
+        """
         commands: list[tuple[int, str]] = []
         if early_hold_s is not None:
             begin_ns = self._tick * NS_PER_TICK + round(early_hold_s * 1e9)
@@ -107,7 +118,7 @@ class Recorder:
                 self._stage.receive(Immediate.STATUS.sent)
 
     def _reply(self, reply: Reply, asked_ns: int, now_ns: int) -> None:
-        # The Pi is late at times, up to 30 ms.
+        # In a third of cases the Pi reads late, up to 30 ms.
         late_s = LINK_S + self._rng.choice([0.0, 0.0, 0.03]) * self._rng.random()
         written_ns = now_ns + round(late_s * 1e9)
         reply = msgspec.structs.replace(reply, asked_ns=asked_ns, written_ns=written_ns)
@@ -138,7 +149,7 @@ def give(bench: Bench, what: Any, t_ns: int) -> None:
 
 
 def replay(recorder: Recorder, edges_ns: list[int]) -> m.RowFinished:
-    """End of the row with these edges instead of the true ones."""
+    """Replay the row with these edges instead of the true ones; return how it ends."""
     bench = make_bench(recorder)
     other_happenings = [h for h in recorder.happenings if h.what != "edge"]
     edges = [Happening(t_ns, "edge") for t_ns in edges_ns]
@@ -159,6 +170,8 @@ def draw_fault(rng: random.Random, recorder: Recorder, interval_ns: int) -> tupl
     kind = rng.choice(kinds)
     first_ns = edges[0]
     last_ns = edges[-1]
+    # "One step" shifts the row by a point: the first edge is missing, and one follows the last, or the opposite. The
+    # added edge has the right interval within 0.8 %, inside the tolerance of 1 %, so that only the place is wrong.
     if kind == "one step late":
         del edges[0]
         edges.append(last_ns + round(interval_ns * rng.uniform(0.992, 1.008)))
@@ -171,6 +184,7 @@ def draw_fault(rng: random.Random, recorder: Recorder, interval_ns: int) -> tupl
         late_ns = 50_000_000 + round(0.5 * interval_ns * rng.random())
         edges[begin:] = [t_ns + late_ns for t_ns in edges[begin:]]
     elif kind == "shifted":
+        # From 2 %, twice the tolerance, to almost an interval.
         shift_ns = round(rng.choice([-1, 1]) * rng.uniform(0.02, 0.9) * interval_ns)
         edges[rng.randrange(len(edges))] += shift_ns
     if "lost" in kind:
@@ -181,11 +195,12 @@ def draw_fault(rng: random.Random, recorder: Recorder, interval_ns: int) -> tupl
 
 
 def are_equal(edges_ns: list[int], sound_ns: list[int], tolerance_ns: float) -> bool:
+    """True if these are the sound edges within a tolerance."""
     pairs = zip(edges_ns, sound_ns, strict=False)
     return len(edges_ns) == len(sound_ns) and all(abs(a - b) <= tolerance_ns for a, b in pairs)
 
 
-def has_interval_beside_holds(recorder: Recorder) -> bool:
+def has_no_hold_at_its_ends(recorder: Recorder) -> bool:
     """True if no hold is in the first or last interval: a wait there hides the shift of the outermost edge."""
     replies = [h.what for h in recorder.happenings if isinstance(h.what, Reply)]
     held_after = [int(r.fields["points"]) for r in replies if r.fields.get("state") == "hold"]
@@ -193,6 +208,10 @@ def has_interval_beside_holds(recorder: Recorder) -> bool:
 
 
 def draw_holds(rng: random.Random, interval_s: float) -> list[tuple[float, float]]:
+    """Draw one or two holds, each a time after the first point and a duration, seconds.
+
+    Some are so short that the stage is to continue before it rests.
+    """
     holds: list[tuple[float, float]] = []
     begin_s = 0.0
     for _ in range(rng.randint(1, 2)):
@@ -204,10 +223,11 @@ def draw_holds(rng: random.Random, interval_s: float) -> list[tuple[float, float
 
 
 def record(speed_mm_s: float, accel_mm_s2: float, rng: random.Random, is_held: bool) -> Recorder:
+    """Record a row, with holds in it if `is_held`."""
     while True:
         recorder = Recorder(speed_mm_s, accel_mm_s2, rng)
         recorder.run(draw_holds(rng, STEP_MM / speed_mm_s) if is_held else [])
-        if has_interval_beside_holds(recorder):
+        if has_no_hold_at_its_ends(recorder):
             return recorder
 
 
@@ -223,14 +243,14 @@ def test_drawn_edge_faults_are_found(speed_mm_s, accel_mm_s2, is_held, request):
         sound_ns = recorder.edges_ns
         assert len(sound_ns) == POINTS
         for _ in range(2):
-            # The kernel stamps an edge some time after it, never before.
+            # The kernel stamps an edge some time after it, never before: up to 0.6 % of an interval.
             jittered_ns = [t_ns + round(rng.uniform(0.0, 0.006) * interval_ns) for t_ns in sound_ns]
             finished = replay(recorder, jittered_ns)
             assert finished.status == "done", finished
         for _ in range(20):
             kind, edges_ns = draw_fault(rng, recorder, interval_ns)
+            # A spurious edge that happens to replace the lost one, just beyond the tolerance of 1 %, is no fault.
             if are_equal(edges_ns, sound_ns, 0.012 * interval_ns):
-                # A spurious edge in the place of the lost one
                 continue
             finished = replay(recorder, edges_ns)
             assert finished.status == "fault", (kind, [t_ns - sound_ns[0] for t_ns in edges_ns])
@@ -240,7 +260,7 @@ def test_drawn_edge_faults_are_found(speed_mm_s, accel_mm_s2, is_held, request):
 
 @pytest.mark.parametrize("early_hold_s", [0.01, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7])
 def test_a_row_that_was_held_before_its_first_point_is_sound(early_hold_s):
-    """In the travel to the row, where the stage may cross the row's places, or in the run-up."""
+    """The hold is in the travel to the row, where the stage may cross the row's places, or in the run-up."""
     recorder = Recorder(20, 200, random.Random(1))
     recorder.run([], early_hold_s)
     assert any(h.what.fields.get("state") == "hold" for h in recorder.happenings if isinstance(h.what, Reply))

@@ -36,24 +36,41 @@ def test_focus_of_a_too_narrow_scan_writes_figure_and_numbers_that_are_not_certa
 
 @pytest.mark.parametrize("by_columns", [False, True])
 def test_x_and_y_are_the_rigs_for_scans_by_rows_and_by_columns(tmp_path, capsys, monkeypatch, by_columns):
-    at_mm = (15.0, -9.0)
-    tilt = (2.0, -1.0)
-    scene = decode_scene({**SCENE, "points": [{"position_mm": at_mm}]}, "t").with_disturbances(ideal=True)
+    """A scan by columns is imaged as one of a rig with x and y swapped; numbers and figure are those of the rig."""
+    point_mm = (15.0, -9.0)
+    tilt_deg = (2.0, -1.0)
+    scene = decode_scene({**SCENE, "points": [{"position_mm": point_mm}]}, "t").with_disturbances(ideal=True)
     data = simulate(RIG, scene, tmp_path, layout="authors", by_columns=by_columns)
-    found_by_the_builder = tilt[::-1] if by_columns else tilt  # which images the rig mirrored in x = y
-    swept = Focus(np.linspace(-6, 6, 3), np.array([0.1, 1.0, 0.1]), 0.0, found_by_the_builder, 1.0)
-    drawn = []
-    monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: swept)
-    monkeypatch.setattr(report, "draw_focus_figure", lambda *given: drawn.append(given) or b"")
+    if by_columns:
+        swept_tilt_deg = tilt_deg[::-1]
+    else:
+        swept_tilt_deg = tilt_deg
+    sweep_result = Focus(
+        depths_mm=np.linspace(-6, 6, 3),
+        sharpness=np.array([0.1, 1.0, 0.1]),
+        depth_mm=0.0,
+        tilt_deg=swept_tilt_deg,
+        gain=1.0,
+    )
+    figures = []
+
+    def record_figure(*arguments):
+        figures.append(arguments)
+        return b""
+
+    monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: sweep_result)
+    monkeypatch.setattr(report, "draw_focus_figure", record_figure)
     assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
     output = capsys.readouterr().out
+    # The tilt along x is printed before that along y.
     assert 0 < output.index("+2.00") < output.index("-1.00")
     focus = json.loads((tmp_path / "focus" / "focus.json").read_text())
-    assert tuple(focus["tilt_deg"]) == tilt
-    ((sweep, *pictures, x_m, y_m, _),) = drawn
-    assert tuple(sweep["tilt_deg"]) == tilt
+    assert tuple(focus["tilt_deg"]) == tilt_deg
+    ((sweep, *pictures, x_m, y_m, _),) = figures
+    assert tuple(sweep["tilt_deg"]) == tilt_deg
     assert (x_m.size, y_m.size) == (24, 20)
     for picture in pictures:
         row, column = np.unravel_index(np.argmax(np.abs(picture)), (20, 24))
-        place_mm = 1e3 * np.array([x_m[column] - x_m.mean(), y_m[row] - y_m.mean()])
-        np.testing.assert_allclose(place_mm, at_mm, atol=6.0)
+        brightest_mm = 1e3 * np.array([x_m[column] - x_m.mean(), y_m[row] - y_m.mean()])
+        # Two pixels of 3 mm
+        np.testing.assert_allclose(brightest_mm, point_mm, atol=6.0)

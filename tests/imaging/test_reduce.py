@@ -11,24 +11,29 @@ from polysight.sync import block_frequencies_hz, decimation
 from polysight_shared.raster import plan_raster
 from polysight_shared.units import SPEED_OF_LIGHT_M_S as C
 
+# Paths of the echoes in excess of the direct path, metres: about those of the published scene.
 GATE = (0.30, 0.47)
 
 
 def _sweep(chirp):
+    """Frequencies of the samples, Hz."""
     return chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
 
 
 @given(st.floats(*GATE), st.floats(*GATE))
 def test_few_samples_give_every_matched_filter_output_of_all(rig, echo_m, pixel_m):
     chirp = rig.chirp
-    a, b = chirp.linear_samples
+    first, end = chirp.linear_samples
+    sweep_hz = _sweep(chirp)
     gate = reduction(chirp, GATE)
-    x = np.exp(2j * np.pi * _sweep(chirp) * echo_m / C)
-    weight = scipy.signal.get_window("hann", b - a + 2, fftbins=False)[1:-1]
-    all_samples = (weight / weight.sum() * x[a:b] * np.exp(-2j * np.pi * _sweep(chirp)[a:b] * pixel_m / C)).sum()
-    few = (gate.matrix @ x * np.exp(-2j * np.pi * gate.frequencies_hz * pixel_m / C)).sum()
-    # The echo leaks into the estimate of the direct path
-    assert abs(few - all_samples) < 1e-3
+    samples = np.exp(2j * np.pi * sweep_hz * echo_m / C)
+    window = scipy.signal.get_window("hann", end - first + 2, fftbins=False)[1:-1]
+    # The filter that is matched to an echo of the path `pixel_m`, over all samples and over the few of the gate
+    weighted = window / window.sum() * samples[first:end]
+    from_all = (weighted * np.exp(-2j * np.pi * sweep_hz[first:end] * pixel_m / C)).sum()
+    from_few = (gate.matrix @ samples * np.exp(-2j * np.pi * gate.frequencies_hz * pixel_m / C)).sum()
+    # An echo leaks a little into the estimate of the direct path, which the gate subtracts.
+    assert abs(from_few - from_all) < 1e-3
     assert len(gate.frequencies_hz) <= 10
 
 
@@ -52,25 +57,33 @@ def test_the_model_predicts_an_echo_after_the_gate(rig, echo_m):
 
 @pytest.mark.parametrize(("gate_m", "noise"), [(GATE, 5e-3), ((0.2, 0.9), 3e-2)])
 def test_decimated_samples_give_what_all_samples_give(rig, gate_m, noise):
-    """It holds for echoes in the gate, the direct path, clutter behind it and noise; other echoes are suppressed."""
-    a, b = rig.chirp.linear_samples
+    """It holds for echoes in the gate, the direct path, clutter behind it and noise; other echoes are suppressed.
+
+    The last row of the weights estimates the direct path, the others the samples of the gate. The limits are chosen.
+    """
+    first, end = rig.chirp.linear_samples
     gate = reduction(rig.chirp, gate_m)
-    sweep = _sweep(rig.chirp)[a:b]
-    all_weights = gate.maps(_sweep(rig.chirp))[:, a:b]
-    few = gate.maps(block_frequencies_hz(rig.chirp))
-    level = np.abs(all_weights[:-1] @ np.exp(2j * np.pi * gate_m[0] / C * sweep)).max()
-    # The middle of the band that noise and echoes give
-    for off_m in (-0.1, 0.0, 0.1):
-        middle_m = sum(gate_m) / 4 + off_m
-        decimated = decimation(b - a, middle_m * rig.chirp.hz_per_sample / C)
+    sweep_hz = _sweep(rig.chirp)[first:end]
+    all_weights = gate.maps(_sweep(rig.chirp))[:, first:end]
+    block_weights = gate.maps(block_frequencies_hz(rig.chirp))
+    nearest_echo = np.exp(2j * np.pi * gate_m[0] / C * sweep_hz)
+    level = np.abs(all_weights[:-1] @ nearest_echo).max()
+    # Decimation keeps a band around the echoes and the direct path (0 m): its middle is half of the gate's middle. It
+    # may be off: it is estimated from noisy samples.
+    for error_m in (-0.1, 0.0, 0.1):
+        middle_m = sum(gate_m) / 4 + error_m
+        decimated_weights = block_weights @ decimation(end - first, middle_m * rig.chirp.hz_per_sample / C)
+        difference = decimated_weights - all_weights
 
-        def off(path_m, blocks=few @ decimated):
-            return np.abs((blocks - all_weights) @ np.exp(2j * np.pi * path_m / C * sweep))
+        def find_errors(path_m, difference=difference):
+            return np.abs(difference @ np.exp(2j * np.pi * path_m / C * sweep_hz))
 
-        assert max(off(d).max() for d in (0.0, *np.linspace(*gate_m, 30))) < 6e-4
-        assert max(off(d).max() for d in (0.7, 0.9, 1.1)) < 2e-3
-        assert max(off(d)[:-1].max() for d in (1.5, 2.0, 2.5)) < 0.02 * level
-        assert np.linalg.norm((few @ decimated - all_weights)[:-1]) < noise * np.linalg.norm(all_weights[:-1])
+        direct_path_and_gate_m = (0.0, *np.linspace(*gate_m, 30))
+        assert max(find_errors(path_m).max() for path_m in direct_path_and_gate_m) < 6e-4
+        # Clutter behind the scene, then echoes far outside of the band
+        assert max(find_errors(path_m).max() for path_m in (0.7, 0.9, 1.1)) < 2e-3
+        assert max(find_errors(path_m)[:-1].max() for path_m in (1.5, 2.0, 2.5)) < 0.02 * level
+        assert np.linalg.norm(difference[:-1]) < noise * np.linalg.norm(all_weights[:-1])
 
 
 @pytest.mark.parametrize("window", ["hann", "boxcar"])
@@ -79,6 +92,7 @@ def test_the_direct_path_vanishes_and_is_measured(rig, window):
     direct = np.full(256, 3.0 + 4.0j)
     np.testing.assert_allclose(gate.matrix @ direct, 0, atol=1e-9)
     assert gate.direct @ direct == pytest.approx(3 + 4j)
+    # An echo in the gate hardly enters the estimate of the direct path.
     echo = np.exp(2j * np.pi * _sweep(rig.chirp) * 0.35 / C)
     assert abs(gate.direct @ echo) < 2e-3
 
@@ -91,9 +105,10 @@ def test_the_gate_contains_every_pixel_at_every_position(make_rig):
         antennas = Antennas.from_rig(rig, board)
         low, high = find_scene_gate_m((antennas,), plan, grid)
         rng = np.random.default_rng(0)
-        u = rng.uniform(-0.06, 0.06, (2, 500))
-        x = rng.choice(grid.x_m, 500) - u[0]
-        y = rng.choice(grid.y_m, 500) - u[1]
+        # Random pixels from random positions of the stage: 31 x 31 positions in steps of 4 mm reach 60 mm to each side.
+        stage_x_m, stage_y_m = rng.uniform(-0.06, 0.06, (2, 500))
+        x = rng.choice(grid.x_m, 500) - stage_x_m
+        y = rng.choice(grid.y_m, 500) - stage_y_m
         excess = antennas.excess_m(x, y, grid.z_m)
         assert low - 1e-4 <= excess.min()
         assert excess.max() <= high + 1e-9

@@ -13,6 +13,7 @@ from polysight_shared.geometry import specular_midpoint_m
 
 
 def _make_full_board(rig, **options):
+    """Samples of RH in which no position is missing."""
     board = ImageBuilder(rig, **options).boards["RH"]
     board.valid[:] = True
     return board
@@ -20,7 +21,8 @@ def _make_full_board(rig, **options):
 
 @pytest.mark.parametrize(("columns", "rows", "step"), [(41, 41, 4.0), (350, 200, 2.0)])
 def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, columns, rows, step):
-    board = _make_full_board(make_rig(columns, rows, step, step, pixels=(31, 31)), taper="boxcar")
+    rig = make_rig(columns, rows, step_x=step, step_y=step, pixels=(31, 31))
+    board = _make_full_board(rig, taper="boxcar")
     response = compute_point_response(board.aperture, board.weights)
     np.testing.assert_allclose(response.width_mm, response.limit_mm, rtol=0.08)
     # A sinc's first sidelobe is -13.3 dB
@@ -28,44 +30,52 @@ def test_without_a_taper_the_measured_response_is_the_geometrys_limit(make_rig, 
 
 
 def test_the_limit_is_that_of_the_plane_wave_formula_and_the_papers_is_not(make_rig):
-    board = _make_full_board(make_rig(41, 41, 4.0, 4.0, pixels=(31, 31)), taper="boxcar")
+    """0.886 lambda h / (2 L cos^3) in x and / (2 L cos) in y; the paper has lambda r / L for both."""
+    rig = make_rig(columns=41, rows=41, step_x=4.0, step_y=4.0, pixels=(31, 31))
+    board = _make_full_board(rig, taper="boxcar")
     response = compute_point_response(board.aperture, board.weights)
+    # Incidence angle of RH
     cos = np.cos(np.radians(54.93))
-    wave = 3.82
-    height = 488.0
-    length = 160.0
-    plane = (0.886 * wave * height / (2 * length * cos**3), 0.886 * wave * height / (2 * length * cos))
-    np.testing.assert_allclose(response.limit_mm, plane, rtol=0.1)
-    np.testing.assert_allclose(response.paper_mm, wave * 499 / length, rtol=0.03)
+    # About that of the middle of the sweep
+    wavelength_mm = 3.82
+    # From the antennas, which stand some 11 mm before the stage's plane; the paper's r is from the stage's plane.
+    height_mm = 488.0
+    distance_mm = 499.0
+    # 40 steps of 4 mm
+    length_mm = 160.0
+    limit_x = 0.886 * wavelength_mm * height_mm / (2 * length_mm * cos**3)
+    limit_y = 0.886 * wavelength_mm * height_mm / (2 * length_mm * cos)
+    np.testing.assert_allclose(response.limit_mm, (limit_x, limit_y), rtol=0.1)
+    np.testing.assert_allclose(response.paper_mm, wavelength_mm * distance_mm / length_mm, rtol=0.03)
 
 
 def test_the_published_scan_reaches_what_the_simulation_of_its_geometry_says(make_rig):
-    """5.4 x 3.6 mm without a taper; the paper's r lambda / L is 2.8 mm along its 0.7 m and 4.9 mm along its 0.4 m."""
-    board = _make_full_board(make_rig(350, 200, 2.0, 2.0, pixels=(150, 150)), taper="boxcar")
+    """5.4 x 3.6 mm without a taper; the paper's r lambda / L is 2.7 mm along its 0.7 m and 4.8 mm along its 0.4 m."""
+    rig = make_rig(columns=350, rows=200, step_x=2.0, step_y=2.0, pixels=(150, 150))
+    board = _make_full_board(rig, taper="boxcar")
     response = compute_point_response(board.aperture, board.weights)
     np.testing.assert_allclose(response.width_mm, (5.4, 3.6), atol=0.35)
     np.testing.assert_allclose(response.paper_mm, (2.7, 4.8), atol=0.15)
 
 
 def test_a_taper_trades_width_for_sidelobes(make_rig):
-    rig = make_rig(41, 41, 4.0, 4.0, pixels=(31, 31))
+    rig = make_rig(columns=41, rows=41, step_x=4.0, step_y=4.0, pixels=(31, 31))
 
-    def response_with(name):
-        board = _make_full_board(
-            msgspec.structs.replace(rig, image=msgspec.structs.replace(rig.image, apodisation=name))
-        )
+    def compute_response_with(taper):
+        image = msgspec.structs.replace(rig.image, apodisation=taper)
+        board = _make_full_board(msgspec.structs.replace(rig, image=image))
         return compute_point_response(board.aperture, board.weights)
 
-    none = response_with("none")
-    kaiser = response_with("kaiser")
-    taylor = response_with("taylor")
-    for tapered in (kaiser, taylor):
-        assert min(np.subtract(tapered.width_mm, none.width_mm)) > 0
-        assert max(tapered.sidelobe_db) < max(none.sidelobe_db) - 8
+    untapered = compute_response_with("none")
+    for taper in ("kaiser", "taylor"):
+        tapered = compute_response_with(taper)
+        assert min(np.subtract(tapered.width_mm, untapered.width_mm)) > 0
+        # Chosen; a sinc has -13 dB.
+        assert max(tapered.sidelobe_db) < max(untapered.sidelobe_db) - 8
 
 
 def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
-    rig = make_rig(31, 21, 4.0, 4.0, pixels=(9, 9))
+    rig = make_rig(columns=31, rows=21, step_x=4.0, step_y=4.0, pixels=(9, 9))
     point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     builder = ImageBuilder(rig, taper="boxcar")
     rng = np.random.default_rng(0)
@@ -76,11 +86,12 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
     facts = describe_board(board)
     assert facts.masked_positions == (~board.valid).sum() > 10
     assert facts.masked == pytest.approx(facts.masked_positions / facts.positions, abs=1e-6)
-    summed = np.abs(board.image()[0]).max() * float(board.count) / (board.valid.size * 4)
+    # An image is the mean over the samples that are there: a point of amplitude 1 has the peak 1.
     peak = np.abs(board.image()[0]).max()
-    assert -20 * np.log10(summed / peak) == pytest.approx(facts.loss_db, abs=1e-3)
-    # Image amplitudes do not change
     assert peak == pytest.approx(1, abs=0.03)
+    # The loss is that of the sum over the samples of all positions and all four RX, where missing ones are 0.
+    share_measured = float(board.count) / (board.valid.size * 4)
+    assert -20 * np.log10(share_measured) == pytest.approx(facts.loss_db, abs=1e-3)
 
 
 def test_notices_of_images_are_reported_if_there_are_any(make_rig):
@@ -99,7 +110,7 @@ def test_without_data_there_is_no_response(make_rig):
 @pytest.mark.parametrize(("columns", "rows"), [(2, 41), (41, 2), (1, 41), (41, 1)])
 def test_an_axis_on_which_nothing_is_resolved_has_no_figures(make_rig, columns, rows):
     """The figures hold for a small part of the plane: a cell wider than the image has none."""
-    board = _make_full_board(make_rig(columns, rows, 4.0, 4.0, pixels=(31, 31)))
+    board = _make_full_board(make_rig(columns, rows, step_x=4.0, step_y=4.0, pixels=(31, 31)))
     response = compute_point_response(board.aperture, board.weights)
     for figures in (response.width_mm, response.limit_mm, response.paper_mm, response.sidelobe_db):
         assert np.isinf(figures).tolist() == [columns < 3, rows < 3]

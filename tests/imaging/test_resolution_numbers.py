@@ -20,50 +20,65 @@ from polysight.imaging.resolution import (
 from polysight.planning import PlanChanges
 from polysight.polarimetry.fresnel import IncidenceChoice, _convolve, incidence_on_planes
 
+# Pixels of a cut through a point response, from its peak
 OFFSETS = np.arange(-60, 61)
 
 
 @pytest.mark.parametrize("half_px", [7.3, 10.0, 12.6])
 def test_a_width_is_that_between_the_points_of_half_power(half_px):
-    """A cut that falls by 1 - sqrt(1/2) over half of its width, on each side by itself."""
-    fall = (1 - 0.5**0.5) / half_px
-    assert _measure_width(np.maximum(1 - fall * abs(OFFSETS), 0)) == pytest.approx(2 * half_px)
-    skew = np.where(OFFSETS < 0, 1 - 2 * fall * abs(OFFSETS), 1 - fall * abs(OFFSETS))
-    assert _measure_width(skew) == pytest.approx(1.5 * half_px)
+    """Triangles, whose amplitude falls from 1 to sqrt(1/2), half of the power, within `half_px` pixels."""
+    fall_per_px = (1 - 0.5**0.5) / half_px
+    triangle = 1 - fall_per_px * abs(OFFSETS)
+    assert _measure_width(np.maximum(triangle, 0)) == pytest.approx(2 * half_px)
+    # Twice as steep to the left: half of `half_px` there, `half_px` to the right
+    skew_triangle = np.where(OFFSETS < 0, 1 - 2 * fall_per_px * abs(OFFSETS), triangle)
+    assert _measure_width(skew_triangle) == pytest.approx(1.5 * half_px)
 
 
-def test_a_width_that_is_not_reached_is_infinite():
+def test_the_width_of_a_cut_that_does_not_fall_to_half_power_is_infinite():
     assert _measure_width(np.ones(121)) == math.inf
-    assert _measure_width(np.where(OFFSETS < 0, 0.2, 1.0)) == math.inf
+    falls_to_the_left_only = np.where(OFFSETS < 0, 0.2, 1.0)
+    assert _measure_width(falls_to_the_left_only) == math.inf
 
 
 def test_a_uniform_aperture_has_the_width_and_sidelobe_of_a_sinc():
+    # First zeros 20 pixels from the peak
     cut = np.abs(np.sinc(OFFSETS / 20))
     assert _measure_width(cut) == pytest.approx(0.886 * 20, rel=2e-3)
     assert _measure_sidelobe_db(cut) == pytest.approx(-13.26, abs=0.05)
-    # The higher one of both sides; without a minimum, the level at the end
-    one_side = np.where(OFFSETS < 0, cut, np.minimum(cut, np.exp(-abs(OFFSETS) / 5)))
-    assert _measure_sidelobe_db(one_side) == pytest.approx(-13.26, abs=0.05)
+
+
+def test_the_sidelobe_is_the_higher_one_of_both_sides():
+    cut = np.abs(np.sinc(OFFSETS / 20))
+    weak_to_the_right = np.where(OFFSETS < 0, cut, np.minimum(cut, np.exp(-abs(OFFSETS) / 5)))
+    assert _measure_sidelobe_db(weak_to_the_right) == pytest.approx(-13.26, abs=0.05)
+
+
+def test_a_cut_without_a_minimum_has_the_level_at_its_end_as_sidelobe():
+    # A decade of amplitude, 20 dB, within 40 pixels: 30 dB within 60.
     assert _measure_sidelobe_db(10 ** (-abs(OFFSETS) / 40)) == pytest.approx(-30.0)
+    # The least level that is reported
     assert _measure_sidelobe_db(np.where(OFFSETS == 0, 1.0, 0.0)) == pytest.approx(-180.0)
 
 
 def make_aperture(rows: int, columns: int, step_m: float = 0.01) -> Aperture:
-    """Positions in a plane 0.5 m before the point, TX and RX at opposite sides of it."""
-    y_m, x_m = np.meshgrid(
-        (np.arange(rows) - (rows - 1) / 2) * step_m, (np.arange(columns) - (columns - 1) / 2) * step_m, indexing="ij"
-    )
+    """Positions in a plane 0.5 m before the image, TX and the first RX 0.3 m to either side of its middle."""
+    column_m = (np.arange(columns) - (columns - 1) / 2) * step_m
+    row_m = (np.arange(rows) - (rows - 1) / 2) * step_m
+    y_m, x_m = np.meshgrid(row_m, column_m, indexing="ij")
     rx_m = np.array([[0.3, 0.0, 0.0], [0.9, 0.9, 0.0]])
     tx_m = np.array([-0.3, 0.0, 0.0])
     antennas = Antennas(tx_m, rx_m)
-    grid = ImageGrid(np.linspace(-0.1, 0.1, 21), np.linspace(-0.1, 0.1, 21), 0.5, 0.01)
-    return Aperture(antennas, np.stack([x_m, y_m, 0 * x_m], axis=-1), np.array([77e9, 79e9]), grid)
+    grid = ImageGrid(x_m=np.linspace(-0.1, 0.1, 21), y_m=np.linspace(-0.1, 0.1, 21), z_m=0.5, pixel_m=0.01)
+    offsets_m = np.stack([x_m, y_m, 0 * x_m], axis=-1)
+    return Aperture(antennas, offsets_m, frequencies_hz=np.array([77e9, 79e9]), grid=grid)
 
 
 @pytest.mark.parametrize(
     ("shape", "blocks"), [((7, 9), (3, 4)), ((7, 9), (7, 9)), ((7, 9), (20, 20)), ((1, 9), (8, 2))]
 )
 def test_blocks_keep_the_weight_and_the_middle_of_their_positions(shape, blocks):
+    """Positions are combined to `blocks` (rows, columns) at most."""
     aperture = make_aperture(*shape)
     weights = np.random.default_rng(1).uniform(size=shape)
     combined, block_weights = _combine_positions(aperture, weights, blocks)
@@ -71,11 +86,9 @@ def test_blocks_keep_the_weight_and_the_middle_of_their_positions(shape, blocks)
     assert block_weights.shape == expected_shape
     assert block_weights.sum() == pytest.approx(weights.sum())
     assert combined.offsets_m.shape == (*expected_shape, 3)
-    rows = np.array_split(np.arange(shape[0]), expected_shape[0])
     if shape == expected_shape:
         np.testing.assert_allclose(combined.offsets_m, aperture.offsets_m)
         np.testing.assert_allclose(block_weights, weights)
-    assert len(rows) == expected_shape[0]
     # The first block has the positions before the second one begins.
     height = shape[0] // expected_shape[0]
     width = shape[1] // expected_shape[1]
@@ -85,27 +98,35 @@ def test_blocks_keep_the_weight_and_the_middle_of_their_positions(shape, blocks)
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_the_limit_of_the_geometry_is_that_of_the_range_of_directions(axis):
-    """0.886 over the range of sin(TX) + sin(RX) over the wavelength, of the middle line and the first RX."""
-    aperture = make_aperture(11, 21)
+    """0.886 wavelengths over the range of sin(theta_tx) + sin(theta_rx) from one end of the aperture to the other.
+
+    The ends are those of the middle row or column; the receiver is the first RX.
+    """
+    aperture = make_aperture(rows=11, columns=21)
     point = np.array([0.02, -0.01, 0.5])
-    ends = np.array([[-0.1, 0.0], [0.1, 0.0]]) if axis == 0 else np.array([[0.0, -0.05], [0.0, 0.05]])
-    sines = []
-    for x_m, y_m in ends:
-        total = 0.0
+    if axis == 0:
+        ends_m = ((-0.1, 0.0), (0.1, 0.0))
+    else:
+        ends_m = ((0.0, -0.05), (0.0, 0.05))
+    sums_of_sines = []
+    for x_m, y_m in ends_m:
+        sum_of_sines = 0.0
         for antenna_x_m in (-0.3, 0.3):
-            way = point - (x_m + antenna_x_m, y_m, 0.0)
-            total += way[axis] / np.linalg.norm(way)
-        sines.append(total)
+            from_antenna = point - (x_m + antenna_x_m, y_m, 0.0)
+            sum_of_sines += from_antenna[axis] / np.linalg.norm(from_antenna)
+        sums_of_sines.append(sum_of_sines)
+    # At the middle of the frequencies, 78 GHz
     wavelength_m = 299_792_458 / 78e9
-    assert compute_limit_m(aperture, point, axis) == pytest.approx(0.886 * wavelength_m / abs(sines[1] - sines[0]))
+    expected_m = 0.886 * wavelength_m / abs(sums_of_sines[1] - sums_of_sines[0])
+    assert compute_limit_m(aperture, point, axis) == pytest.approx(expected_m)
 
 
-def test_one_position_limits_nothing():
+def test_an_axis_with_one_position_has_an_infinite_limit():
     assert compute_limit_m(make_aperture(1, 5), np.array([0.0, 0.0, 0.5]), 1) == math.inf
     assert compute_limit_m(make_aperture(5, 1), np.array([0.0, 0.0, 0.5]), 0) == math.inf
 
 
-def test_numbers_that_are_not_finite_are_not_written():
+def test_numbers_that_are_not_finite_are_written_as_none():
     assert _round_pair((1.23456, math.inf)) == (1.235, None)
     assert _round_pair((math.nan, -2.0)) == (None, -2.0)
 
@@ -114,32 +135,44 @@ def test_numbers_that_are_not_finite_are_not_written():
 def test_the_mirror_zone_ends_where_the_phase_has_turned_by_half_a_circle(rig, axis):
     """Between a place and the specular point the phase is the integral of the slope."""
     slope = PhaseSlope(rig, axis)
+    # The linear part has 192 samples.
     middle_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 96
     zone_m = compute_field_limits(rig).mirror_zone_mm[axis] / 1e3
-    places = np.linspace(0, zone_m, 200)
-    phase = np.trapezoid([slope.slope(place, middle_hz) - slope.slope(0.0, middle_hz) for place in places], places)
-    assert phase == pytest.approx(np.pi, rel=0.05)
+    places_m = np.linspace(0, zone_m, 200)
+    slopes = [slope.slope(place_m, middle_hz) - slope.slope(0.0, middle_hz) for place_m in places_m]
+    phase_rad = np.trapezoid(slopes, places_m)
+    assert phase_rad == pytest.approx(np.pi, rel=0.05)
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
-def test_ghosts_are_nearer_with_wider_steps(rig, axis):
-    """Slopes that differ by a turn over a step cannot be told apart: half of the step is twice the difference."""
+def test_an_image_is_free_of_ghosts_up_to_where_slopes_differ_by_a_turn_over_a_step(rig, axis):
+    """Phase slopes (radians per metre of stage) that differ by a whole turn over a step have the same samples.
+
+    The echoes of two such places cannot be distinguished. Steps of 8 mm instead of 2 bring them into reach.
+    """
     number = "xy".index(axis)
     wide = PlanChanges(**{f"step_{axis}_mm": 8.0}).apply(rig)
     free_m = compute_field_limits(wide).alias_free_mm[number] / 1e3
     slope = PhaseSlope(rig, number)
-    high_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192
+    # Slopes are steepest at the end of the sweep.
+    highest_hz = rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192
     grid = wide.grid
-    size_m = ((grid.columns - 1) * grid.step_x_mm, (grid.rows - 1) * grid.step_y_mm)[number] / 1e3
-    apart = []
+    if axis == "x":
+        size_m = (grid.columns - 1) * grid.step_x_mm / 1e3
+    else:
+        size_m = (grid.rows - 1) * grid.step_y_mm / 1e3
+    distances_m = []
     for centre_m in np.linspace(-size_m / 4, size_m / 4, 5):
+        # Pairs of places at -p and +p about this centre: the nearest whose slopes differ by a turn over 8 mm
         place_m = np.linspace(-1.5, 1.5, 2001)
-        slopes = np.array([slope.slope(centre_m + place, high_hz) for place in place_m])
-        # The nearest pair of places about this centre whose slopes differ by a whole turn over the step
+        slopes = np.array([slope.slope(centre_m + place, highest_hz) for place in place_m])
         difference = slopes - slopes[::-1]
-        reached = place_m[np.flatnonzero(difference >= 2 * np.pi / 8e-3)]
-        apart.append(2 * reached.min() if reached.size else math.inf)
-    assert free_m == pytest.approx(min(apart), rel=0.02)
+        ambiguous_m = place_m[difference >= 2 * np.pi / 8e-3]
+        if ambiguous_m.size:
+            distances_m.append(2 * ambiguous_m.min())
+        else:
+            distances_m.append(math.inf)
+    assert free_m == pytest.approx(min(distances_m), rel=0.02)
 
 
 def test_a_convolution_is_the_full_linear_one():
@@ -151,7 +184,7 @@ def test_a_convolution_is_the_full_linear_one():
 
 
 def test_angles_on_a_plane_behind_are_smaller(rig):
-    """The antennas are as far apart: the tangents are as one over the distances."""
+    """TX and RX keep their distance from each other, so that the tangent of the angle is as one over the plane's."""
     angle = np.array([[0.5, 0.8]])
     assert incidence_on_planes(angle, None, rig) is angle
     z_m = rig.geometry.object_distance_mm / 1e3
@@ -160,18 +193,19 @@ def test_angles_on_a_plane_behind_are_smaller(rig):
 
 
 def test_both_kinds_of_angle_are_written_in_degrees():
-    one = np.full((2, 2), np.radians(44.0))
+    """One angle for the image, and one per pixel with its least, median and largest value."""
+    one_angle = np.full((2, 2), np.radians(44.0))
     by_pixel = np.radians([[40.0, 43.0], [45.0, 47.0]])
-    choice = IncidenceChoice("pixel", one, by_pixel)
+    choice = IncidenceChoice("pixel", one_angle, by_pixel)
     assert choice.used_rad is by_pixel
-    assert choice.other_rad is one
+    assert choice.other_rad is one_angle
     facts = choice.facts(np.ones((2, 2), bool))
     assert (facts.used, facts.one_deg, facts.pixel_deg) == ("by pixel", 44.0, (40.0, 44.0, 47.0))
     assert facts.largest_difference_deg == 4.0
-    lit = replace(choice, choice="one").facts(np.array([[False, True], [True, False]]))
-    assert (lit.used, lit.pixel_deg, lit.largest_difference_deg) == (
-        "one number for the image",
-        (43.0, 44.0, 45.0),
-        1.0,
-    )
+    # Two valid pixels, of 43 and 45 degrees
+    facts = replace(choice, choice="one").facts(np.array([[False, True], [True, False]]))
+    assert facts.used == "one number for the image"
+    assert facts.pixel_deg == (43.0, 44.0, 45.0)
+    assert facts.largest_difference_deg == 1.0
+    # Without valid pixels those of all are written.
     assert choice.facts(np.zeros((2, 2), bool)).pixel_deg == (40.0, 44.0, 47.0)

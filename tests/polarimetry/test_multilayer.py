@@ -24,22 +24,24 @@ frequency = st.floats(76e9, 81e9)
 
 def reflect_by_tmm(eps, thickness_m, frequency_hz, theta):
     """(r_s, r_p) in our signs, and the transmitted powers (T_s, T_p); a half space ends the stack."""
-    index = [1.0, *(np.conj(np.sqrt(complex(e))) for e in eps)]
-    inside = [np.inf, *thickness_m, np.inf]
-    wave = SPEED_OF_LIGHT_M_S / frequency_hz
-    s = tmm.coh_tmm("s", index, inside, theta, wave)
-    p = tmm.coh_tmm("p", index, inside, theta, wave)
+    # Air before the stack; `tmm` wants the thickness of both half spaces, too.
+    indices = [1.0, *(np.conj(np.sqrt(complex(e))) for e in eps)]
+    thicknesses_m = [np.inf, *thickness_m, np.inf]
+    wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
+    s = tmm.coh_tmm("s", indices, thicknesses_m, theta, wavelength_m)
+    p = tmm.coh_tmm("p", indices, thicknesses_m, theta, wavelength_m)
     return (np.conj(s["r"]), -np.conj(p["r"])), (s["T"], p["T"])
 
 
 @settings(max_examples=60)
 @given(st.lists(st.tuples(media, thickness), max_size=4), media, frequency, angle)
 def test_random_stacks_agree_with_tmm(layers, last, f, theta):
-    """The host sums echoes, the simulator calculates transmission lines in series."""
+    """Three ways to the same coefficients: the host sums echoes, the simulator chains transmission lines."""
     eps = [e for e, _ in layers] + [last]
-    inside = [d for _, d in layers]
-    expected, _ = reflect_by_tmm(eps, inside, f, theta)
-    np.testing.assert_allclose(multilayer(eps, inside, f, theta), expected, rtol=1e-8, atol=1e-10)
+    thickness_m = [d for _, d in layers]
+    expected, _ = reflect_by_tmm(eps, thickness_m, f, theta)
+    np.testing.assert_allclose(multilayer(eps, thickness_m, f, theta), expected, rtol=1e-8, atol=1e-10)
+    # The simulator's layers have the loss as a positive number, and millimetres.
     stack = [Layer((e.real, -e.imag), 1e3 * d) for e, d in layers] + [Layer((last.real, -last.imag))]
     np.testing.assert_allclose(reflect_layers(stack, f, theta), expected, rtol=1e-8, atol=1e-10)
 
@@ -47,22 +49,24 @@ def test_random_stacks_agree_with_tmm(layers, last, f, theta):
 @settings(max_examples=60)
 @given(media, thickness, frequency, angle)
 def test_interfaces_and_plates_of_the_simulator_agree_with_tmm(eps, d, f, theta):
-    np.testing.assert_allclose(half_space(eps, theta), reflect_by_tmm([eps], [], f, theta)[0], rtol=1e-8, atol=1e-10)
-    np.testing.assert_allclose(
-        slab(eps, d, f, theta), reflect_by_tmm([eps, 1.0], [d], f, theta)[0], rtol=1e-8, atol=1e-10
-    )
+    of_interface, _ = reflect_by_tmm([eps], [], f, theta)
+    np.testing.assert_allclose(half_space(eps, theta), of_interface, rtol=1e-8, atol=1e-10)
+    of_plate_in_air, _ = reflect_by_tmm([eps, 1.0], [d], f, theta)
+    np.testing.assert_allclose(slab(eps, d, f, theta), of_plate_in_air, rtol=1e-8, atol=1e-10)
 
 
 @settings(max_examples=40)
 @given(st.lists(st.tuples(lossless, thickness), min_size=1, max_size=4), frequency, angle)
 def test_energy_is_conserved_by_lossless_layers(layers, f, theta):
-    eps, inside = zip(*layers, strict=True)
-    # Air follows
-    r = multilayer(list(eps), list(inside), f, theta)
-    _, passed = reflect_by_tmm([*eps, 1.0], inside, f, theta)
-    np.testing.assert_allclose(np.abs(r) ** 2 + passed, 1.0, atol=1e-9)
-    mirrored = multilayer([*eps, 1 - 1e16j], list(inside), f, theta)
-    np.testing.assert_allclose(np.abs(mirrored), 1.0, atol=1e-6)
+    eps, thickness_m = zip(*layers, strict=True)
+    # As many thicknesses as media: air is behind them.
+    reflected = multilayer(list(eps), list(thickness_m), f, theta)
+    _, transmitted_power = reflect_by_tmm([*eps, 1.0], thickness_m, f, theta)
+    np.testing.assert_allclose(np.abs(reflected) ** 2 + transmitted_power, 1.0, atol=1e-9)
+    # A conductor behind the layers reflects all power.
+    conductor = 1 - 1e16j
+    with_conductor = multilayer([*eps, conductor], list(thickness_m), f, theta)
+    np.testing.assert_allclose(np.abs(with_conductor), 1.0, atol=1e-6)
 
 
 @settings(max_examples=40)
@@ -74,19 +78,24 @@ def test_a_passive_stack_reflects_at_most_all_power(layers, last, f, theta):
 
 @settings(max_examples=40)
 @given(media, media, frequency, angle)
-def test_an_infinite_or_invisible_second_medium_is_fresnel(eps, second, f, theta):
+def test_a_stack_of_one_visible_medium_reflects_by_fresnel(eps, second, f, theta):
+    """The first medium is infinite, or the second is the same, or cannot be seen."""
     for endless in (multilayer(eps, np.inf, f, theta), multilayer([eps], [], f, theta)):
         np.testing.assert_allclose(endless, fresnel(eps, theta), rtol=1e-12)
     np.testing.assert_allclose(multilayer([eps, eps], [1e-3], f, theta), fresnel(eps, theta), rtol=1e-9, atol=1e-12)
-    # A thick lossy layer hides the media behind it.
-    dark = complex(eps.real, min(eps.imag, -1.0))
-    np.testing.assert_allclose(multilayer([dark, second], [1.0], f, theta), fresnel(dark, theta), rtol=1e-9)
+    # A metre of a lossy medium hides the media behind it.
+    lossy = complex(eps.real, min(eps.imag, -1.0))
+    np.testing.assert_allclose(multilayer([lossy, second], [1.0], f, theta), fresnel(lossy, theta), rtol=1e-9)
 
 
 def test_water_behind_glass():
-    """Water at 75 GHz behind 3 mm of glass, 55 degrees, 78.6 GHz."""
-    expected, _ = reflect_by_tmm([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0))
-    assert multilayer([5.5 - 0.05j, 9.37 - 18j], [3e-3], 78.6e9, np.radians(55.0)) == pytest.approx(expected)
+    """Water behind 3 mm of glass, at the rig's angle and in its band."""
+    glass = 5.5 - 0.05j
+    # At 75 GHz
+    water = 9.37 - 18j
+    stack = ([glass, water], [3e-3], 78.6e9, np.radians(55.0))
+    expected, _ = reflect_by_tmm(*stack)
+    assert multilayer(*stack) == pytest.approx(expected)
 
 
 def test_shapes_broadcast():
@@ -97,6 +106,6 @@ def test_shapes_broadcast():
 @pytest.mark.parametrize(
     ("eps", "thickness_m"), [([2.0, 3.0], []), ([2.0], [1e-3, 1e-3]), ([2.0, 3.0], [np.inf]), ([2.0], [-1e-3])]
 )
-def test_invalid_stacks_are_refused(eps, thickness_m):
+def test_stacks_with_a_wrong_number_of_thicknesses_or_an_impossible_one_are_refused(eps, thickness_m):
     with pytest.raises(PolysightError):
         multilayer(eps, thickness_m, 78e9, 1.0)

@@ -29,7 +29,8 @@ def instrument(tmp_path: Path) -> Instrument:
         rig,
         grid=replace(rig.grid, columns=8, rows=4),
         burst=replace(rig.burst, pulses=4),
-        stage=replace(rig.stage, port=str(tmp_path / "no-stage"), heartbeat_ms=20_000),  # this process may be delayed
+        # A long heartbeat: this process may be delayed, and the stage must not stop for that.
+        stage=replace(rig.stage, port=str(tmp_path / "no-stage"), heartbeat_ms=20_000),
         pi=replace(
             rig.pi,
             command_address="tcp://127.0.0.1:*",
@@ -43,14 +44,14 @@ def instrument(tmp_path: Path) -> Instrument:
 
 @pytest.fixture
 def gpio_rig(instrument: Instrument, tmp_path: Path) -> Instrument:
-    """With SYNC_IN on a GPIO line of the stand-in chip (polysight_simulators/gpio) at `tmp_path / "chip"`."""
+    """The rig with SYNC_IN on a GPIO line of the stand-in chip (polysight_simulators/gpio), the file `chip`."""
     rig = time_by_the_program(instrument)
     return msgspec.structs.replace(rig, pi=msgspec.structs.replace(rig.pi, gpio_chip=str(tmp_path / "chip")))
 
 
 @pytest.fixture
 def write_config(tmp_path: Path) -> Callable[[Instrument], Path]:
-    """Writes a rig file."""
+    """Function that writes a rig file and returns its path."""
 
     def write(instrument: Instrument) -> Path:
         path = tmp_path / "rig.toml"
@@ -91,7 +92,7 @@ def stage(hub: Path, instrument: Instrument) -> Iterator[FakeStage]:
 def start(
     write_config: Callable[[Instrument], Path], request: pytest.FixtureRequest
 ) -> Iterator[Callable[..., tuple[Process, HostSide]]]:
-    """Starts `polysight-pi run` with these arguments and this environment; gives the process and its host.
+    """Function that starts `polysight-pi run` with these arguments and this environment; returns process and host.
 
     The stage is `stage`, unless the rig has a port of its own.
     """
@@ -128,7 +129,7 @@ def host(pi: Running) -> HostSide:
 
 @pytest.fixture
 def host_in_row(host: HostSide, stage: FakeStage) -> HostSide:
-    """The same during row 0; the stage stops after its second point until `stage.stays_after` changes."""
+    """The host of `pi` during row 0; the stage stops after its second point until `stage.stays_after` changes."""
     stage.stays_after = 2
     host.start_row()
     host.wait_for_event(m.Capture)

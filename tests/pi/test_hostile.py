@@ -34,11 +34,15 @@ from polysight_shared.stage_line import Reply
 
 NAN = float("nan")
 INF = float("inf")
-VALUES: tuple[Any, ...] = (
+# Values at the limits of number types, names that lead out of a folder or end a text early, and wrong types. \u202e
+# reverses the direction of the text after it.
+HOSTILE_VALUES: tuple[Any, ...] = (
     NAN, INF, -INF, -1, 0, 1, 2**31, 2**40, 2**63, 2**64 - 1, -(2**63), 1e308, -1e308, 5e-324, True, None, b"\0", "",
     "a\0b", "a\n", "..", "/etc/passwd", "../x", "x" * 300, "x" * 5000, "\u202e", [], [1], {}, {"a": 1}, [[[[[[]]]]]],
 )  # fmt: skip
-BOUND_BYTES = 24 << 20  # of resident memory; one message may hold 64 KiB
+# By so much the resident memory of the program may grow in an attack. Chosen: one message may have 64 KiB, and
+# hundreds are under way.
+BOUND_BYTES = 24 << 20
 BEGIN = m.BeginRun(
     scan_id="scan", plan=RasterPlan(8, 4, 2.0, 2.0), pulses=4, period_us=1500.0, width_us=1.0, speed_mm_s=20.0
 )
@@ -50,8 +54,12 @@ END = m.EndRun(scan_id="scan", exit_status="abort")
 JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=1.0, speed_mm_s=20.0, heartbeat_ms=100)
 
 
-def draw(rng: random.Random, valid: list[Any]) -> bytes:
-    """Draw a message with one or more errors; sometimes a correct one of a client that does not own the run."""
+def draw_message(rng: random.Random, valid: list[Any]) -> bytes:
+    """Draw a message with one or more errors; sometimes a correct one of a client that does not own the run.
+
+    The kinds: random bytes, a correct message, a cut one, one with changed bytes, and (two of six) one with hostile
+    values in some of its fields.
+    """
     kind = rng.randrange(6)
     if kind == 0:
         return rng.randbytes(rng.choice([0, 1, 5, 40, 400]))
@@ -71,7 +79,7 @@ def draw(rng: random.Random, valid: list[Any]) -> bytes:
             inner = node["plan"]
         else:
             inner = node
-        inner[rng.choice(sorted(inner) or ["x"])] = copy.deepcopy(rng.choice(VALUES))
+        inner[rng.choice(sorted(inner) or ["x"])] = copy.deepcopy(rng.choice(HOSTILE_VALUES))
     return msgpack.packb(node, use_bin_type=True) or b""
 
 
@@ -81,6 +89,7 @@ class Stranger:
     def __init__(self, address: str) -> None:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self.socket = self._context.socket(zmq.REQ)
+        # A request may follow one without reply; late replies to earlier ones are dropped.
         for option in (zmq.REQ_RELAXED, zmq.REQ_CORRELATE):
             self.socket.setsockopt(option, 1)
         self.socket.connect(address)
@@ -108,7 +117,9 @@ def stranger(pi):
         ((BEGIN, PULSE), "period_us", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN, PULSE), "width_us", (NAN, INF, -INF, 1e300, 1e70)),
         ((BEGIN, JOG), "speed_mm_s", (NAN, INF, -INF, 1e300, 1e70)),
-        ((BEGIN,), "heartbeat_ms", (2**40,)),  # it would block every other host for 35 years
+        # The run would belong to its host for 35 years of silence.
+        ((BEGIN,), "heartbeat_ms", (2**40,)),
+        # A jog is at most 100 mm.
         ((JOG,), "distance_mm", (NAN, INF, -INF, 100.1, -100.1)),
         ((JOG,), "from_mm", (NAN, INF, -INF, 1e70)),
         ((JOG,), "heartbeat_ms", (0, -1, 2**40)),
@@ -117,8 +128,8 @@ def stranger(pi):
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
-def test_an_impossible_value_is_not_a_command(commands, field, impossible_value):
-    """Invalid messages are refused; the fuzz test below shows that through the socket."""
+def test_a_message_with_an_impossible_value_is_refused(commands, field, impossible_value):
+    """By the decoder; `test_hostile_messages_disturb_nothing` shows it through the socket."""
     for command in commands:
         for value in impossible_value:
             raw = msgpack.packb(msgspec.to_builtins(command) | {field: value})
@@ -128,6 +139,7 @@ def test_an_impossible_value_is_not_a_command(commands, field, impossible_value)
 
 
 def test_nan_of_single_precision_is_refused_too():
+    # In MessagePack 0xcb is the type of a double, and 0xca that of a single precision number.
     raw = m.pack(PULSE).replace(b"\xcb" + struct.pack(">d", 1500.0), b"\xca" + struct.pack(">f", NAN))
     with pytest.raises(ProtocolError):
         m.unpack_command(raw)
@@ -141,13 +153,13 @@ def test_a_folder_in_the_journals_place_is_refused(pi, instrument):
 
 
 def test_a_message_of_64_mb_is_not_taken_into_memory(pi, stranger):
+    # Client and server run in this process, so that its memory has the client's message and a copy of it at least.
     bytes_before = read_resident_bytes()
     big = msgpack.packb({"type": "Hello", "version": "1.0", "host_release": "x" * (64 << 20)})
     bytes_taken = read_resident_bytes() - bytes_before
     assert stranger.ask(big, limit_s=1.0) is None
-    assert read_resident_bytes() - bytes_before < bytes_taken + BOUND_BYTES + (64 << 20), (
-        "the sender's own copy and no second one"
-    )
+    copy_of_sender_bytes = 64 << 20
+    assert read_resident_bytes() - bytes_before < bytes_taken + copy_of_sender_bytes + BOUND_BYTES
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
 
 
@@ -163,12 +175,15 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
         m.Hello(), m.Status(), ALIVE, m.Home(), JOG, RUN, PULSE, REPLAY, m.Hold(), m.Resume(), m.Abort(), END,
         host.make_begin("other"), host.make_begin(),
     ]  # fmt: skip
-    sent = rows_taken = bytes_before = 0
+    sent = 0
+    rows_taken = 0
+    bytes_before = 0
     stage.pace_s = 0.05
     host.start_row(owner="mine")
     while sent < amount or not rows_taken:
-        assert stranger.ask(draw(rng, valid)) is not None
+        assert stranger.ask(draw_message(rng, valid)) is not None
         sent += 1
+        # By then the program has allocated what it needs in normal work.
         if sent == 1_000:
             bytes_before = read_resident_bytes()
         if host.subscriber.poll(0):
@@ -189,20 +204,22 @@ def test_hostile_messages_disturb_nothing(pi, hub, stage, stranger, instrument, 
     n = instrument.burst.pulses
     period_ns = round(instrument.burst.period_us * 1e3)
     rises = wires.list_rises(instrument.pi.sync_out[0])
-    full_bursts = [burst for i in range(0, len(rises), n) if len(burst := rises[i : i + n]) == n]
+    # The abort may have cut the last burst.
+    full_bursts = [rises[i : i + n] for i in range(0, len(rises) - n + 1, n)]
     assert len(full_bursts) >= rows_taken * instrument.grid.columns
-    assert all(t - b[0] == k * period_ns for b in full_bursts for k, t in enumerate(b))
+    for burst in full_bursts:
+        assert burst == [burst[0] + k * period_ns for k in range(n)]
 
 
-# Lines
-FLOOD = 100_000
-# Ten digits, the most that a line may hold
+# Lines of the stage in the test of a flood.
+FLOOD_LINES = 100_000
+# Ten digits, the most that a number in a line may have.
 HUGE = 9_999_999_999
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_impossible_position_is_ignored(pi, stage, sign):
-    """Status and events can still be decoded; the position is the largest possible one."""
+    """The stage reports one of 50 km; status and events still have the last position that was possible."""
     stage.x = stage.y = sign * HUGE
     for alarm in (-HUGE, -1, 1000, HUGE):
         fields = {"state": "idle", "x": stage.x, "y": stage.y, "points": HUGE, "alarm": alarm}
@@ -213,7 +230,8 @@ def test_an_impossible_position_is_ignored(pi, stage, sign):
     assert pi.host.ask(m.Status()).x_mm == 0.0
 
 
-def test_impossible_lost_steps_and_points_spoil_no_journal(pi, stage):
+def test_impossible_lost_steps_and_points_leave_the_journal_readable(pi, stage):
+    """Lost steps are limited to the largest length that messages may have, 1 km."""
     stage.lost = (HUGE, -HUGE)
     pi.host.must_accept(pi.host.make_begin())
     pi.host.home()
@@ -236,11 +254,12 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
         Reply("banner", fields={"fw": "x" * 60, "proto": "2"}), Reply("alarm", number=999), Reply("alarm", number=15),
         Reply("done", 7), Reply("ok", 7), Reply("error", None, 1),
     )  # fmt: skip
+    # 98 lines.
     raw = b"".join(line.encode() for line in lines) * 14
     ended = threading.Event()
 
     def flood() -> None:
-        for _ in range(FLOOD // 98):
+        for _ in range(FLOOD_LINES // 98):
             stage.say_raw(raw)
         ended.set()
 
@@ -255,14 +274,18 @@ def test_a_flood_of_lines_keeps_commands_answered(pi, stage):
     assert isinstance(pi.host.ask(m.Abort()), m.Accepted)
 
 
+# Flags of a ZMTP frame: further frames follow, its length has eight bytes, it is a command.
 MORE = 1
 LONG = 2
 COMMAND = 4
-# A client that could send so much was not stopped
+# A client that could send so much was not stopped (chosen).
 ENOUGH_BYTES = 2 << 30
-TURNS_A_SECOND = 400  # of 600 kB: twice what a Pi's network carries; loopback fills a busy machine's memory immediately
-# MemoryMax of the unit is 512 MiB
+# Turns have 600 kB, 240 MB/s in all: twice what a Pi's network carries. Without a limit, loopback would fill the memory
+# of a busy machine before the program can act.
+TURNS_A_SECOND = 400
+# Chosen, below MemoryMax of the unit, 512 MiB.
 HIGHEST_BYTES = 400 << 20
+# Signature, version 3.0, and the mechanism NULL, as a client.
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
 
 
@@ -291,10 +314,12 @@ def is_cut(peer: socket.socket) -> bool:
 
 
 def wait_a_turn(frames: bytes) -> bytes:
+    """Return the frames after a pause: at most so many turns a second."""
     time.sleep(1 / TURNS_A_SECOND)
     return frames
 
 
+# For each attack: 0 for the address of commands or 1 for that of events, the kind of socket, and its endless messages.
 ATTACKS = {
     "a message of many frames": (
         0,
@@ -314,7 +339,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     host.must_accept(host.make_begin())
     host.home()
     pid = program.popen.pid
-    # As the program's own: with its memory locked it may hold more than the least limit from the start.
+    # The program's own limit: with its memory locked it may hold more than the least limit from the start.
     limit_bytes = max(MAX_BYTES, read_resident_bytes(pid) + SPARE_BYTES)
     highest = [0]
     ended = threading.Event()
@@ -328,7 +353,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     log = bytearray()
 
     def has_cut() -> bool:
-        """True once the program's log says so: ZeroMQ itself ends some of these connections."""
+        """True once the program's log says that it cut connections."""
         errors = program.popen.stderr.fileno()
         while select.select([errors], [], [], 0)[0]:
             log.extend(os.read(errors, 1 << 16))
@@ -338,7 +363,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     # ZeroMQ itself ends some of these connections: the client comes back until the program had to act.
     while highest[0] < limit_bytes and not has_cut() and sent < ENOUGH_BYTES:
         with connect_peer((program.ready[1], program.events[1])[endpoint], kind) as peer, suppress(ConnectionError):
-            # A connection that was cut may stall before it is closed
+            # A connection that was cut may take nothing for a while before it is closed.
             peer.settimeout(0.1)
             remaining = b""
             while sent < ENOUGH_BYTES and not is_cut(peer):
@@ -353,7 +378,7 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     watcher.join()
     assert 0 < sent < ENOUGH_BYTES
     assert highest[0] < HIGHEST_BYTES
-    # Events were cut off, too: they come again
+    # The program cuts all connections, also that of the host's events: it connects again.
     host.wait_for_event(m.Heartbeat, lambda beat: beat.t_mono_ns > cut_ns)
     # The remaining messages may cause another cut of the connections, with a command or an event.
     host.limit_s = 5.0
@@ -376,16 +401,18 @@ def test_a_queue_that_never_empties_is_not_a_hang(pi, monkeypatch):
     turns = itertools.count()
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: next(turns))
     queue_is_empty = threading.Event()
+    # Items that each last longer than a turn may.
     for _ in range(60):
         pi.service.executor.post(lambda: pi.clock.sleep(0.06))
     pi.service.executor.post(queue_is_empty.set)
     assert queue_is_empty.wait(HANG_S)
-    assert next(turns) >= 30, "a turn takes as long as it may, and the one under way"
+    # A turn ends with the item that exceeds its time: at most two items in each.
+    assert next(turns) >= 30
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
 
 
 def test_replays_do_not_keep_other_commands_waiting(pi):
-    """Only a few connections wait at a time; more are refused."""
+    """Only a few replays may wait at a time, more are refused; an abort is still taken."""
     slow = threading.Event()
     pi.service.executor.post(lambda: slow.wait(HANG_S))
     replay = m.Replay(scan_id="scan", from_seq=1)

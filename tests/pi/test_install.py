@@ -15,14 +15,18 @@ from tests.support.rigs import load_published_rig
 
 PI = REPO / "pi_controller"
 PROGRAM = "/opt/polysight/venv/bin/polysight-pi"
-# Replaces a command that would change this machine; its arguments are recorded.
+# Shell script in place of a command that would change this machine: it only records its arguments.
 STUB = '#!/bin/sh\necho "$(basename "$0") $*" >> "$LOG"\n'
 STUBS = {
     **dict.fromkeys(("groupadd", "useradd", "udevadm", "systemctl", "chown", "pip"), STUB),
+    # No such group or user yet.
     "getent": STUB + "exit 2\n",
+    # `python3 -m venv FOLDER`
     "python3": STUB + 'if [ "$2" = venv ]; then mkdir -p "$3/bin"; cp "$PIP" "$3/bin/python"; fi\n',
-    "python": STUB + 'mkdir -p "$7"; touch "$7/a.whl"\n',  # -m pip wheel --quiet --no-deps --wheel-dir FOLDER
-    "ssh": STUB + '[ "$1" = -t ] && shift; shift; cd "$PI_HOME" && sh -c "$*"\n',  # the Pi is a folder here
+    # `python -m pip wheel --quiet --no-deps --wheel-dir FOLDER`
+    "python": STUB + 'mkdir -p "$7"; touch "$7/a.whl"\n',
+    # The Pi is a folder of the test.
+    "ssh": STUB + '[ "$1" = -t ] && shift; shift; cd "$PI_HOME" && sh -c "$*"\n',
     "sudo": STUB + '"$@"\n',
 }
 
@@ -37,7 +41,7 @@ def unit():
 
 @pytest.fixture
 def analyze(tmp_path):
-    """Runs systemd-analyze on the unit; its program is replaced, because it is not installed here."""
+    """Function that runs systemd-analyze on the unit, whose program, not installed here, is replaced by another."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("no systemd-analyze: `apt-get install systemd` runs this test too")
     text = (PI / "polysight-pi.service").read_text()
@@ -49,13 +53,16 @@ def analyze(tmp_path):
     )
 
 
-def test_the_unit_is_what_systemd_accepts(analyze):
+def test_systemd_accepts_the_unit_without_a_warning(analyze):
     process = analyze("verify", "--man=no")
     assert "polysight-pi.service" not in process.stderr, process.stderr
     assert process.returncode == 0, process.stderr
 
 
-# As systemd does for RestrictAddressFamilies=: socket() of another family fails with EAFNOSUPPORT (seccomp(2)).
+# Program that allows itself only these address families and then binds a ZeroMQ socket. It does what systemd does for
+# RestrictAddressFamilies=, with a filter of system calls (seccomp(2)): if the call's number is that of socket() and its
+# first argument, the family, is not allowed, the call fails with error 97, EAFNOSUPPORT; everything else is allowed.
+# prctl 38 is PR_SET_NO_NEW_PRIVS, and 22 is PR_SET_SECCOMP.
 BIND = """
 import ctypes, os, struct, sys
 import zmq
@@ -85,19 +92,21 @@ def test_the_unit_leaves_the_address_families_that_zeromq_needs(unit):
 
 def test_the_unit_gives_what_the_program_asks_for(unit):
     service = unit["Service"]
+    # The highest priority of a thread (`TRIGGER_PRIORITY`).
     assert int(service["LimitRTPRIO"]) >= 50
     assert service["LimitMEMLOCK"] == "infinity"
     assert {"gpio", "spi", "dialout"} <= set(service["SupplementaryGroups"].split())
     rig = load_published_rig()
     assert Path(rig.pi.journal_dir).is_relative_to(service["ReadWritePaths"])
     assert Path(rig.pi.journal_dir).is_relative_to(Path("/var/lib") / service["StateDirectory"])
-    # The executor notifies the watchdog; a lost stage blocks it for 25 s.
     assert (service["Type"], service["Restart"]) == ("notify", "on-failure")
+    # The executor notifies the watchdog, and a lost stage blocks it for 25 s. More than a minute of hanging is too long
+    # (chosen).
     assert 25 < int(service["WatchdogSec"]) <= 60
 
 
 def test_the_unit_exposes_little(analyze):
-    """systemd's exposure level: 0 is a program without any rights, 10 one without any limit."""
+    """systemd's exposure level is 0 for a program without any rights, and 10 for one without any limit; 3 is chosen."""
     process = analyze("security", "--offline=yes", "--no-pager")
     exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", process.stdout)
     if exposure is None:
@@ -106,22 +115,25 @@ def test_the_unit_exposes_little(analyze):
 
 
 def test_pinned_versions_are_what_the_wheels_ask_for():
-    pins = dict(x.split("==") for x in (PI / "requirements.txt").read_text().split() if "==" in x)
+    words = (PI / "requirements.txt").read_text().split()
+    pins = dict(word.split("==") for word in words if "==" in word)
     projects = [(REPO / name / "pyproject.toml").read_text() for name in ("shared", "pi_controller")]
     required_pins = [
         pin for text in projects for pin in re.findall(r'"(\w+)>=([\d.]+)', text.partition("dependencies = [")[2])
     ]
     assert set(pins) == {name for name, _ in required_pins}
 
-    def key(version):
-        return [int(x) for x in version.split(".")]
+    def split_version(version):
+        return [int(part) for part in version.split(".")]
 
-    assert all(key(pins[name]) >= key(least) for name, least in required_pins)
+    for name, least_version in required_pins:
+        assert split_version(pins[name]) >= split_version(least_version), name
 
 
 def test_udev_rules_are_well_formed():
     lines = [x for x in (PI / "60-polysight.rules").read_text().splitlines() if x and not x.startswith("#")]
     assert len(lines) >= 4
+    # KEY=="value", KEY{attribute}=="value", or an assignment with = or +=.
     pair = r'[A-Z]+(\{[A-Za-z_]+\})?(==|=|\+=)"[^"]*"'
     for line in lines:
         assert re.fullmatch(rf"{pair}(, {pair})*", line), line
@@ -129,7 +141,7 @@ def test_udev_rules_are_well_formed():
 
 @pytest.fixture
 def install(bench, tmp_path):
-    """Runs install.sh as copied to the Pi; returns the ended process."""
+    """Function that runs install.sh as copied to the Pi; it returns the ended process."""
     copied = tmp_path / "copied"
     shutil.copytree(PI, copied)
     (copied / "a.whl").touch()
@@ -155,7 +167,7 @@ def bench(tmp_path):
     }  # fmt: skip
 
 
-def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_home(bench, tmp_path):
+def test_installing_twice_keeps_the_rig_file_and_other_files_in_the_users_home(bench, tmp_path):
     """`make pi-install` as a whole, with every command that changes a machine replaced."""
     root = tmp_path / "root"
     log = tmp_path / "log"
@@ -168,28 +180,29 @@ def test_installing_twice_keeps_the_rig_file_and_whatever_else_is_in_the_users_h
         process = subprocess.run(make, cwd=REPO, env=bench, capture_output=True, text=True, check=False)
         assert process.returncode == 0, process.stdout + process.stderr
         log_text = log.read_text()
-        assert log_text.count("-m venv") == (rig_file is None), "made once, and kept with its libraries"
-        order = [
-            log_text.index(w)
-            for w in ("pip wheel", "pip install --quiet --retries", "--force-reinstall", "try-restart")
-        ]
+        # The environment is made once, and kept with its libraries.
+        assert log_text.count("-m venv") == (rig_file is None)
+        steps = ("pip wheel", "pip install --quiet --retries", "--force-reinstall", "try-restart")
+        order = [log_text.index(step) for step in steps]
         assert order == sorted(order)
-        assert "--no-index" in log_text, "what was built on the host needs no internet here"
+        # The Pi needs no internet for the packages that were built on the host.
+        assert "--no-index" in log_text
     assert (tmp_path / "home/polysight/notes").read_text() == "mine"
     assert (root / "etc/polysight/instrument.toml").read_text() == "mine"
     assert (root / "etc/polysight/keys").stat().st_mode & 0o777 == 0o700
     for name in ("etc/systemd/system/polysight-pi.service", "etc/udev/rules.d/60-polysight.rules"):
         assert (root / name).read_text() == (PI / Path(name).name).read_text()
-    assert "--groups gpio,spi,dialout" in log_text, (
-        "by hand, `polysight-pi check` as this user has no group from the unit"
-    )
+    # The unit gives the service these groups; `polysight-pi check`, run by hand as this user, needs them too.
+    assert "--groups gpio,spi,dialout" in log_text
     for words in ("useradd --system", "systemctl enable"):
         assert words in log_text
     assert PROGRAM in process.stdout
     opt = root / "opt/polysight"
     assert (opt / "venv").readlink() == Path("releases/2")
-    back = [subprocess.run([PI / "install.sh", "--roll-back"], env=bench, check=False).returncode for _ in range(2)]
-    assert back == [0, 5], "to the first release, and no further"
+    roll_back = [PI / "install.sh", "--roll-back"]
+    statuses = [subprocess.run(roll_back, env=bench, check=False).returncode for _ in range(2)]
+    # The first one leads to the first release; there is none before that.
+    assert statuses == [0, 5]
     assert (opt / "venv").readlink() == Path("releases/1")
     assert (opt / "venv/bin/python").is_file()
 
@@ -200,7 +213,8 @@ def test_a_machine_that_is_not_a_pi_is_not_changed(install, bench, tmp_path):
     del bench["ROOT"]
     for arguments in ((), ("--roll-back",)):
         process = install(*arguments)
-        assert (process.returncode, "not a Raspberry Pi" in process.stderr) == (2, True)
+        assert process.returncode == 2
+        assert "not a Raspberry Pi" in process.stderr
     assert not (tmp_path / "log").exists(), "no command was run"
 
 
@@ -212,8 +226,10 @@ def test_a_release_that_cannot_be_installed_changes_nothing(install, tmp_path):
     (opt / "venv/bin/python").write_text(STUB + "exit 1\n")
     log.unlink()
     failed = install()
-    assert (failed.returncode, "internet" in failed.stderr) == (5, True)
-    assert "systemctl" not in log.read_text(), "the running service goes on"
+    assert failed.returncode == 5
+    assert "internet" in failed.stderr
+    # The running service is not touched.
+    assert "systemctl" not in log.read_text()
     assert (opt / "venv").readlink() == Path("releases/1")
     assert sorted(p.name for p in (opt / "releases").iterdir()) == releases_before
 
@@ -224,6 +240,7 @@ def test_an_unfinished_release_is_never_used(install, tmp_path):
     assert install().returncode == 0
     python = opt / "venv/bin/python"
     python_text = python.read_text()
+    # Kills the script that called it.
     python.write_text(STUB + "kill -9 $PPID\n")
     assert install().returncode == -9
     assert (opt / "venv").readlink() == Path("releases/1")

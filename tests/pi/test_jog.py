@@ -50,6 +50,7 @@ def test_the_command_prints_the_stage_position_and_its_limits(rig, write_config,
 
 def test_the_heartbeat_of_the_client_keeps_a_long_jog_moving(client, pi, stage):
     """The jog lasts many times longer than the timeout of a silent host; another client's abort ends it."""
+    # The stage reports the end of a motion after a minute.
     stage.pace_s = 60.0
 
     def abort_later() -> None:

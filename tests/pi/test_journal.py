@@ -1,4 +1,7 @@
-"""Laws of the journal: after any cut or damage, the records read back are a prefix of those written."""
+"""Laws of the journal: after any cut or damage, the records read back are a prefix of those written.
+
+The file is `MAGIC` and then records: each has a head of 12 bytes and its payload, one event.
+"""
 
 import errno
 import os
@@ -29,6 +32,8 @@ from polysight_shared.faults import PiFault
 from polysight_shared.messages import RunStopped, unpack_event
 from polysight_shared.raster import RasterPlan
 
+# Bytes of a record before its payload.
+HEAD_BYTES = 12
 payloads = st.lists(st.binary(max_size=40), max_size=12)
 
 
@@ -41,6 +46,7 @@ def write_records(path, records):
 
 
 def read_again(path):
+    """Open the journal as the next program does; return its records."""
     j = JournalFile(path)
     events = j.read(1, 10**6)
     j.close()
@@ -59,9 +65,10 @@ def no_waiting_for_the_disk():
 def test_cut_at_every_byte_leaves_the_whole_records_before_it(tmp_path_factory, records):
     path = tmp_path_factory.mktemp("j") / "a.journal"
     raw = write_records(path, records)
+    # Lengths of the file after the magic, and after each record.
     ends = [len(MAGIC)]
     for r in records:
-        ends.append(ends[-1] + 12 + len(r))
+        ends.append(ends[-1] + HEAD_BYTES + len(r))
     for cut in range(len(raw) + 1):
         path.write_bytes(raw[:cut])
         complete_records = max(0, sum(e <= cut for e in ends) - 1)
@@ -79,14 +86,16 @@ def test_a_damaged_byte_loses_only_the_events_after_it(tmp_path_factory, records
     path.write_bytes(raw)
     events = read_again(path)
     assert events == records[: len(events)]
-    assert len(MAGIC) + sum(12 + len(r) for r in records[: len(events)]) <= position
+    # The records that are left end before the damaged byte.
+    assert len(MAGIC) + sum(HEAD_BYTES + len(r) for r in records[: len(events)]) <= position
 
 
 def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
     published = []
     journal = Journal(tmp_path, published.extend)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
-    thread = JournalThread(journal)  # not started: its jobs are run here
+    # The thread is not started: the test runs its jobs.
+    thread = JournalThread(journal)
     for _ in range(2):
         thread.add(RunStopped, exit_status="abort")
     assert (journal.last_seq, journal.read("s", 1, 9)[0], published) == (0, [], [])
@@ -97,21 +106,24 @@ def test_a_batch_is_neither_stored_nor_published_until_committed(tmp_path):
     journal.close()
 
 
+# Bytes that the disk still takes of two records of 18 bytes: none, a part of the first head, a part of the first
+# payload, and the first record with a part of the second head.
 @pytest.mark.parametrize("room", [0, 1, 13, 25])
 def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path, monkeypatch, room):
     j = JournalFile(tmp_path / "a.journal")
     j.write([b"kept"])
-    real = os.pwrite
-    bytes_left = [room]
+    pwrite = os.pwrite
+    bytes_left = room
 
-    def full(fd, data, offset):
-        if not bytes_left[0]:
+    def fill_disk(fd, data, offset):
+        nonlocal bytes_left
+        if not bytes_left:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        n = real(fd, data[: bytes_left[0]], offset)
-        bytes_left[0] -= n
-        return n
+        written_bytes = pwrite(fd, data[:bytes_left], offset)
+        bytes_left -= written_bytes
+        return written_bytes
 
-    monkeypatch.setattr(journal_module.os, "pwrite", full)
+    monkeypatch.setattr(journal_module.os, "pwrite", fill_disk)
     with expect_refusal(ErrorCode.DISK_FULL, j.path, "No space left"):
         j.write([b"lost 1", b"lost 2"])
     assert (j.last_seq, j.read(1, 9)) == (1, [b"kept"])
@@ -130,7 +142,7 @@ def test_a_file_of_another_program_is_refused_and_kept(tmp_path):
     assert path.read_bytes() == b"somebody's notes"
 
 
-def test_one_process_a_folder(tmp_path):
+def test_only_one_process_uses_a_folder_of_journals(tmp_path):
     folder = Journal(tmp_path / "j")
     with expect_refusal(ErrorCode.BUSY, tmp_path / "j"):
         Journal(tmp_path / "j")
@@ -141,15 +153,18 @@ def test_one_process_a_folder(tmp_path):
         Journal(tmp_path / "file" / "j")
 
 
-@given(first=payloads, passed=st.integers(0, 40), second=payloads, seq=st.integers(1, 60), limit=st.integers(1, 30))
+@given(first=payloads, last_seq=st.integers(0, 40), second=payloads, seq=st.integers(1, 60), limit=st.integers(1, 30))
 @settings(max_examples=40, deadline=None)
-def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, passed, second, seq, limit):
-    """No number is used twice, even if the journal has lost events; replay works from any number."""
+def test_numbers_continue_after_the_hosts_last_event(tmp_path_factory, first, last_seq, second, seq, limit):
+    """No number is used twice, even if the journal has lost events that the host has; replay works from any number.
+
+    The journal has the events `first`, the host those up to number `last_seq`; then the events `second` are written.
+    """
     path = tmp_path_factory.mktemp("j") / "a.journal"
     write_records(path, first)
     j = JournalFile(path)
-    assert j.continue_after(passed) == max(0, passed - len(first))
-    begin = max(passed, len(first)) + 1
+    assert j.continue_after(last_seq) == max(0, last_seq - len(first))
+    begin = max(last_seq, len(first)) + 1
     j.write(second)
     j.close()
     j = JournalFile(path)
@@ -181,7 +196,7 @@ def test_damage_in_the_middle_is_reported_and_the_original_kept(tmp_path):
     path = tmp_path / "a.journal"
     raw = bytearray(write_records(path, [b"one", b"two", b"three", b"four"]))
     position = raw.index(b"two")
-    # A second damage does not replace the first one's copy
+    # The copy of a second damage has a name of its own.
     for number in ("", "2"):
         raw[position] ^= 1
         path.write_bytes(raw)
@@ -207,23 +222,24 @@ def test_a_torn_tail_is_not_damage(tmp_path_factory, records, data):
 
 
 def test_a_damaged_journal_is_logged(tmp_path):
-    said: list[str] = []
-    journal = Journal(tmp_path, warn=said.append)
+    warnings: list[str] = []
+    journal = Journal(tmp_path, warn=warnings.append)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
     journal.close()
     path = journal.journal_path("s")
     raw = write_records(path, [b"one", b"two", b"three"]).replace(b"one", b"0ne")
     path.write_bytes(raw)
-    journal = Journal(tmp_path, warn=said.append)
+    journal = Journal(tmp_path, warn=warnings.append)
     journal.open("s", RasterPlan(2, 2, 1.0, 1.0), 0)
-    assert len(said) == 1, "the log has a line of it"
-    assert DAMAGED_SUFFIX in said[0]
+    assert len(warnings) == 1
+    assert DAMAGED_SUFFIX in warnings[0]
     journal.close()
 
 
 def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
     folder = Journal(tmp_path)
     folder.check_room("scan", 70_000)
+    # Exactly what a scan of 70,000 positions needs.
     free = SPARE_BYTES + 70_000 * CAPTURE_BYTES
     monkeypatch.setattr(journal_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free))
     folder.check_room("scan", 70_000)
@@ -231,14 +247,15 @@ def test_no_scan_begins_without_space_for_its_journal(tmp_path, monkeypatch):
         folder.check_room("scan", 70_001)
     folder.journal_path("there").write_bytes(bytes(69_000 * CAPTURE_BYTES))
     free = SPARE_BYTES + 1_000 * CAPTURE_BYTES
-    # Only the rest needs space
+    # A scan that has a journal needs space only for the rest of it.
     folder.check_room("there", 70_000)
     with expect_refusal(ErrorCode.DISK_FULL):
         folder.check_room("another", 70_000)
     folder.close()
 
 
-def full(*_):
+def refuse_to_write(*_):
+    """Fail as on a full disk."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -254,13 +271,13 @@ ROW_DONE: dict[str, Any] = {
 
 
 def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
-    """This holds for the row whose end fails on the full disk, and for one that ends before the run is stopped."""
+    """Also a row that ends after the disk was full, before the run is stopped, is a fault."""
     published = []
     folder = Journal(tmp_path, published.extend)
     folder.open("scan", RasterPlan(2, 2, 1.0, 1.0), 0)
     end = NewEvent.now(m.RowFinished, **ROW_DONE)
     published.clear()
-    monkeypatch.setattr(journal_module.os, "pwrite", full)
+    monkeypatch.setattr(journal_module.os, "pwrite", refuse_to_write)
     with pytest.raises(JournalFullError):
         folder.write([end])
     folder.write([end])
@@ -276,7 +293,7 @@ def test_a_row_that_is_not_journalled_is_not_done(tmp_path, monkeypatch):
 def test_a_full_disk_stops_the_row(host_in_row, stage, monkeypatch):
     host = host_in_row
     last_seq = host.list_events(m.Capture)[0].seq
-    monkeypatch.setattr(journal_module.os, "pwrite", full)
+    monkeypatch.setattr(journal_module.os, "pwrite", refuse_to_write)
     # The row would be done before a slow disk says that it is full.
     stage.stays_after = 4
     fault = host.wait_for_event(m.Fault)
@@ -300,7 +317,7 @@ def test_a_full_disk_refuses_the_beginning_and_the_end_of_a_run(pi, monkeypatch)
     stop = m.EndRun(scan_id="scan", exit_status="success")
 
     def check_is_refused_when_full(command):
-        monkeypatch.setattr(journal_module.os, "pwrite", full)
+        monkeypatch.setattr(journal_module.os, "pwrite", refuse_to_write)
         assert host.must_refuse(command) == PiFault.JOURNAL_FULL
         monkeypatch.undo()
         assert host.ask(m.Status()).fault == PiFault.JOURNAL_FULL

@@ -14,7 +14,7 @@ PLAN = RasterPlan(3, 2, 1.0, 1.0)
 
 
 def make_events() -> list[tuple[type[m.AnyEvent], dict[str, Any]]]:
-    """Two rows, and the scan's end."""
+    """Return the events of a scan of two rows with three points each: types and fields."""
     scan: list[tuple[type[m.AnyEvent], dict[str, Any]]] = [(m.RunStarted, {"plan": PLAN})]
     for row in PLAN:
         scan.append((m.RowStarted, {"row": row, "take": 1}))
@@ -33,6 +33,10 @@ def is_same_event(event: m.AnyEvent, other: tuple[type[m.AnyEvent], dict[str, An
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
+    """Power is lost at the first disk operation, then at the second, until the scan comes to its end.
+
+    The disk keeps all that was synced, and a random part of what was written after it (`seed`).
+    """
     position = 0
     ended = False
     added = make_events()
@@ -51,7 +55,8 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
         except Killed:
             pass
         if not ended:
-            os.close(journal._lock)  # as its end would
+            # The end of the process would release its lock of the folder.
+            os.close(journal._lock)
         reopened = Journal(path)
         reopened.open("s", PLAN, 0)
         events_kept = [m.unpack_event(raw) for raw in reopened.read("s", 1, 1000)[0]]
@@ -62,4 +67,5 @@ def test_what_was_synced_survives_a_power_cut_at_any_moment(tmp_path, seed):
         reopened.write([NewEvent.now(added[-1][0], **added[-1][1])])
         assert reopened.last_seq == len(events_kept) + 1
         reopened.close()
+    # There are more operations than events: the cuts did come in the middle.
     assert position > 20

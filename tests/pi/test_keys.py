@@ -1,4 +1,7 @@
-"""CURVE keys: only allowed clients connect, keys are found by the rig file, and the Pi's secret stays on the Pi."""
+"""CURVE keys: only allowed clients connect, keys are found by the rig file, and the Pi's secret stays on the Pi.
+
+CURVE is ZeroMQ's encryption. Each end has a pair of keys: NAME.key is public, and NAME.key_secret has both.
+"""
 
 import shutil
 import threading
@@ -26,10 +29,11 @@ from polysight_shared.faults import PiFault
 from polysight_shared.sockets import HOST_KEYS, HandshakeMonitor, create_requester
 from polysight_shared.tables import decode, to_builtins
 
-ELSEWHERE = "tcp://192.0.2.1:5601"
+# An address that other machines can reach (192.0.2.0/24 is reserved for documentation).
+REMOTE_ADDRESS = "tcp://192.0.2.1:5601"
 
 
-class Door:
+class HelloExecutor:
     """A minimal executor that only answers Hello, for tests of connections."""
 
     crash = None
@@ -53,7 +57,7 @@ def served_pi(tmp_path):
     make_keys(tmp_path / "keys")
     make_keys(tmp_path / "other")
     server = Server("tcp://0.0.0.0:*", "tcp://0.0.0.0:*", tmp_path / "keys", 50)
-    thread = threading.Thread(target=server.run, args=(Door(),))
+    thread = threading.Thread(target=server.run, args=(HelloExecutor(),))
     thread.start()
     yield server
     server.stop()
@@ -70,13 +74,13 @@ def context():
 
 @pytest.fixture
 def make_client(context):
-    """Makes clients with these keys (own secret, Pi's public); returns the socket, and a function: True if refused."""
+    """Function that connects a client; it returns the socket, and a function that is True once its key was refused."""
     sockets = []
 
-    def make(kind, address, mine, pis):
+    def make(kind, address, secret_of_host, public_of_pi):
         socket = context.socket(kind)
-        socket.curve_publickey, socket.curve_secretkey = load_certificate(mine)
-        socket.curve_serverkey = load_certificate(pis)[0]
+        socket.curve_publickey, socket.curve_secretkey = load_certificate(secret_of_host)
+        socket.curve_serverkey = load_certificate(public_of_pi)[0]
         sockets.append((HandshakeMonitor(socket), socket))
         socket.connect(address.replace("0.0.0.0", "127.0.0.1"))
         return socket, sockets[-1][0].is_refused
@@ -87,19 +91,20 @@ def make_client(context):
         socket.close(linger=0)
 
 
+# The client's secret key, and the public key that it takes for the Pi's.
 KEYS = {
     "allowed": ("keys/host.key_secret", "keys/pi.key"),
     "another Pi's key": ("keys/host.key_secret", "other/pi.key"),
-    "a key that nobody allowed": ("other/host.key_secret", "keys/pi.key"),
+    "a key that was not allowed": ("other/host.key_secret", "keys/pi.key"),
 }
 
 
 @pytest.mark.parametrize("key_case", KEYS)
 def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, key_case):
-    host_keys, pis = (tmp_path / name for name in KEYS[key_case])
-    client, refused = make_client(zmq.REQ, served_pi.command_address, host_keys, pis)
+    secret_of_host, public_of_pi = (tmp_path / name for name in KEYS[key_case])
+    client, refused = make_client(zmq.REQ, served_pi.command_address, secret_of_host, public_of_pi)
     client.send(m.pack(m.Hello()))
-    listener, _ = make_client(zmq.SUB, served_pi.event_address, host_keys, pis)
+    listener, _ = make_client(zmq.SUB, served_pi.event_address, secret_of_host, public_of_pi)
     listener.subscribe(b"")
     if key_case == "allowed":
         assert client.poll(HANG_S * 1e3)
@@ -107,7 +112,8 @@ def test_only_allowed_keys_connect(tmp_path, served_pi, make_client, key_case):
         assert not refused()
         assert listener.poll(HANG_S * 1e3)
         return
-    if key_case != "another Pi's key":  # which cannot be distinguished from silence
+    # A Pi that cannot decrypt the greeting says nothing, which cannot be distinguished from a Pi that is off.
+    if key_case != "another Pi's key":
         wait_for(refused, "the refusal")
     assert not listener.poll(300)
     assert not client.poll(0)
@@ -146,6 +152,7 @@ def test_a_revoked_client_is_disconnected_immediately_and_the_others_stay(tmp_pa
 
 
 def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, served_pi, context):
+    # The Pi's public key, and a secret key of which the Pi knows nothing.
     (tmp_path / "mine").mkdir()
     shutil.copy(tmp_path / "keys" / "pi.key", tmp_path / "mine")
     shutil.copy(tmp_path / "other" / "host.key_secret", tmp_path / "mine")
@@ -162,8 +169,8 @@ def test_a_host_with_a_refused_key_gets_that_error_and_not_a_timeout(tmp_path, s
         client.hello()
 
 
-def test_a_server_without_keys_is_not_reported_as_refusing_this_hosts(tmp_path, context):
-    """Either end may notice first: if the server does, it only hangs up, and the client connects again."""
+def test_a_server_without_keys_is_not_reported_as_refusing_the_key_of_this_host(tmp_path, context):
+    """Either end may notice first: if the server does, it only disconnects, and the client connects again."""
     make_keys(tmp_path)
     rig = load_published_rig()
     replace = msgspec.structs.replace
@@ -173,14 +180,14 @@ def test_a_server_without_keys_is_not_reported_as_refusing_this_hosts(tmp_path, 
         client = PiClient(context, replace(rig, pi=pi, limits=replace(rig.limits, command_timeout_s=0.6)))
         codes = []
 
-        def is_told() -> bool:
+        def is_reported() -> bool:
             with pytest.raises(DeviceError) as caught:
                 client.hello()
             codes.append(caught.value.code)
             return codes[-1] is ErrorCode.MISMATCH
 
         with client:
-            wait_for(is_told, "that it has no keys")
+            wait_for(is_reported, "that it has no keys")
         assert ErrorCode.REFUSED_BY_PEER not in codes
 
 
@@ -198,7 +205,8 @@ def test_the_files_to_copy_are_enough_for_the_host(tmp_path, served_pi, context)
     for name in HOST_KEYS:
         shutil.copy(tmp_path / "keys" / name, tmp_path / "host")
     port = served_pi.command_address.rpartition(":")[2]
-    # The kernel takes any of this machine's own addresses; 0.0.0.0 is not one of the loopback addresses.
+    # A client uses keys for addresses other than loopback. The kernel connects 0.0.0.0, which is not one, to this
+    # machine.
     client = create_requester(context, f"tcp://0.0.0.0:{port}", tmp_path / "host")
     client.send(m.pack(m.Hello()))
     assert client.poll(HANG_S * 1e3)
@@ -235,6 +243,7 @@ def test_keys_of_another_user_are_an_error_with_its_remedy(config, monkeypatch, 
     messages = capsys.readouterr().err
     assert "Permission denied" in messages
     assert "sudo -u polysight" in messages
-    finding = run_check("keys", checks._check_keys, config.parent / "keys", (ELSEWHERE,))
-    assert (finding.level, "sudo -u polysight" in finding.do) == ("error", True)
+    finding = run_check("keys", checks._check_keys, config.parent / "keys", (REMOTE_ADDRESS,))
+    assert finding.level == "error"
+    assert "sudo -u polysight" in finding.do
     assert "pi.key_secret: Permission denied" in finding.what

@@ -24,6 +24,7 @@ from polysight_shared.faults import PiFault, StageError
 from polysight_shared.raster import MIN_PERIOD_US, WIDTH_US, Burst, plan_raster
 from polysight_shared.stage_line import Immediate, Reply
 
+# After the loss of host, stage or chip the stage begins to stop within this time (docs/spec/wire.md).
 SAFE_WITHIN_S = 0.5
 ROW_STATES = ("running", "held", "stopping", "done", "ending")
 SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## State machine\n")[1].split("\n## ")[0]
@@ -32,11 +33,15 @@ SPEC_PAGE = (REPO / "docs/spec/wire.md").read_text(encoding="utf-8").split("## S
 def test_a_fresh_machine_has_no_fault_and_nothing_to_wait_for():
     machine = Bench().machine
     assert (machine.state, machine.fault, machine.reason) == ("idle", 0, "")
-    assert (machine.homed, machine.in_run, machine.row, machine.lost_mm) == (False, False, None, (0.0, 0.0))
+    assert not machine.homed
+    assert not machine.in_run
+    assert machine.row is None
+    assert machine.lost_mm == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("motion", ["homing", "row before its first point"])
-def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
+def test_a_reset_of_the_stage_whose_banner_was_lost_is_noticed_in_time(motion):
+    """The stage prints a banner when it starts; without it the reset shows in statuses: it is idle, not moving."""
     bench = Bench().begin_and_home()
     if motion == "homing":
         bench.machine.command("Home")
@@ -44,13 +49,14 @@ def test_a_reset_whose_banner_was_lost_is_noticed_in_time(motion):
         bench.send_reply(Reply("ok", bench.stage.number))
     else:
         bench.start()
-    for _ in range(2 * STATUS_PER_HEARTBEAT * 2):  # of two seconds
+    # The statuses of two seconds, with a heartbeat of half a second.
+    for _ in range(2 * STATUS_PER_HEARTBEAT * 2):
         bench.send_status(0, state="idle")
     assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
     assert not bench.machine.homed
 
 
-def test_a_row_that_does_not_end_is_given_up_after_half_a_minute_and_three_times_its_duration():
+def test_a_row_that_does_not_end_is_a_fault_after_half_a_minute_and_three_times_its_duration():
     long_row = msgspec.structs.replace(ROW, points=400)
     for row in (ROW, long_row):
         bench = Bench().begin_and_home()
@@ -62,6 +68,7 @@ def test_a_row_that_does_not_end_is_given_up_after_half_a_minute_and_three_times
         assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
 
 
+# x and y in motor steps.
 @pytest.mark.parametrize("place", [(500, 0), (0, -1)])
 def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
     bench = Bench().begin_and_home()
@@ -74,7 +81,8 @@ def test_a_homing_that_does_not_end_at_zero_is_a_fault(place):
     assert not bench.machine.homed
 
 
-def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
+def test_after_the_end_of_the_motion_a_missing_edge_is_awaited_for_a_limited_time():
+    """The row has three points, and its last edge may be read after the report of the stage."""
     bench = Bench().begin_and_home()
     bench.start()
     bench.send_edge()
@@ -88,8 +96,8 @@ def test_the_last_edge_is_awaited_in_done_and_then_no_longer():
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(0, 1), (1, 0), (0, 20_000), (-4000, 0)])
-def test_a_row_that_ends_elsewhere_is_not_counted(dx, dy):
-    """The Pi does not rely on the stage's report: the position is compared with the command."""
+def test_a_row_that_ends_at_another_position_is_a_fault(dx, dy):
+    """The stage says "done"; the Pi compares the position in that report with its command. `dx`, `dy`: motor steps."""
     bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
@@ -97,32 +105,33 @@ def test_a_row_that_ends_elsewhere_is_not_counted(dx, dy):
     bench.end_row(dx, dy)
     finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.status, finished.fault) == ("fault", PiFault.POSITION)
-    assert bench.machine.state == "idle", "its position is not known"
+    # The position of the stage is not known any more: it has to be homed.
+    assert bench.machine.state == "idle"
 
 
 @pytest.mark.parametrize(
     "event",
     [("Abort", "by hand"), ("row fault", PiFault.HOST_LOST, "silent"), ("lasting fault", PiFault.JOURNAL_FULL, "full")],
 )
-def test_stop_does_not_wait_for_the_burst_under_way(event, monkeypatch):
+def test_the_stage_is_stopped_before_the_burst_under_way_is_awaited(event, monkeypatch):
     """A call that sets a line may hang, and with it every thread that waits for the burst's end."""
     bench = Bench().begin_and_home()
     bench.start()
     bench.send_edge()
-    sent: list[Immediate] = []
+    sent_before_disarming: list[Immediate] = []
     disarm = bench.loop.disarm
 
     def note_and_disarm():
-        sent.extend(bench.stage.sent)
+        sent_before_disarming.extend(bench.stage.sent)
         return disarm()
 
     monkeypatch.setattr(bench.loop, "disarm", note_and_disarm)
     bench.machine.handle_event(*event)
-    assert sent[-1:] == [Immediate.STOP]
+    assert sent_before_disarming[-1:] == [Immediate.STOP]
 
 
 @pytest.mark.parametrize("extra_pulses", [1, -1])
-def test_a_row_whose_stage_counts_other_trigger_pulses_is_not_counted(extra_pulses):
+def test_a_row_whose_stage_counts_other_trigger_pulses_is_a_fault(extra_pulses):
     bench = Bench().begin_and_home()
     bench.start()
     for _ in range(3):
@@ -135,19 +144,23 @@ def test_a_row_whose_stage_counts_other_trigger_pulses_is_not_counted(extra_puls
 @pytest.mark.parametrize("is_held", [False, True])
 @given(beats=st.integers(0, 30), heartbeat_ms=st.integers(10, 100))
 def test_a_host_that_falls_silent_ends_the_row_in_time(is_held, beats, heartbeat_ms):
-    """Virtual time from its last sign of life until the outputs are off and the stage has been sent a stop."""
+    """From its last sign of life at most half a second passes until no edge is answered and STOP was sent.
+
+    Time is virtual.
+    """
     bench = Bench().begin_and_home()
     bench.machine.command("BeginRun", heartbeat_ms)
     bench.start()
-    bench.machine.command("Hold") if is_held else None
+    if is_held:
+        bench.machine.command("Hold")
     for _ in range(beats):
         bench.let_time_pass(heartbeat_ms / 1e3)
         bench.machine.note_host_alive()
     assert bench.armed, "a host that is heard is not lost"
-    last = bench.t
+    last_sign_s = bench.t
     while bench.armed:
         bench.let_time_pass(0.001)
-    assert bench.t - last <= SAFE_WITHIN_S
+    assert bench.t - last_sign_s <= SAFE_WITHIN_S
     assert bench.stage.sent[-1] == Immediate.STOP
     bench.send_reply(Reply("alarm", number=StageError.STOPPED))
     finished = bench.list_events(m.RowFinished)[-1]
@@ -168,12 +181,13 @@ def test_a_host_that_falls_silent_ends_its_homing():
     bench.machine.command("Home")
     bench.run_posted()
     bench.send_reply(Reply("ok", bench.stage.number))
+    # A person at the Pi homes without a host: nothing ends it.
     bench.let_time_pass(200.0)
-    assert bench.machine.state == "homing", "a person at the Pi homes without a host"
+    assert bench.machine.state == "homing"
 
 
-def test_a_held_row_continues_when_the_stage_rests():
-    """Then the place of the hold is known, and with it the times of the edges around it."""
+def test_resume_is_sent_to_a_held_stage_only_when_it_rests():
+    """Then the place of the hold is known, and with it the times of the edges before and after it."""
     bench = Bench().begin_and_home()
     bench.start()
     bench.machine.command("Hold")
@@ -182,11 +196,12 @@ def test_a_held_row_continues_when_the_stage_rests():
     assert bench.stage.sent == [Immediate.HOLD]
     bench.send_status(0, state="hold", x=70_000)
     assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME]
+    # A second status of this kind does not send it again.
     bench.send_status(0, state="hold", x=70_000)
-    assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME], "once"
+    assert bench.stage.sent == [Immediate.HOLD, Immediate.RESUME]
 
 
-def test_a_host_without_a_heartbeat_is_not_watched():
+def test_a_host_that_announced_no_heartbeat_may_be_silent_in_a_row():
     bench = Bench().begin_and_home()
     bench.start()
     bench.let_time_pass(20.0)
@@ -199,65 +214,83 @@ def test_a_host_without_a_heartbeat_is_not_watched():
     heartbeat_ms=st.integers(200, 500),
 )
 def test_a_stage_that_falls_silent_is_noticed_in_time(phase, answer_s, heartbeat_ms):
-    """The link's loop in virtual time: it polls every slice; from some moment on no answer comes."""
+    """The loop of the link in virtual time, until it notices that no answer comes any more.
+
+    The stage is dead from some moment within a heartbeat on (`phase`); an answer takes `answer_s`.
+    """
     heartbeat_s = heartbeat_ms / 1e3
     watch = StatusWatch(heartbeat_s, 0.0)
     watch.interval_s = heartbeat_s / STATUS_PER_HEARTBEAT
     dead_s = 2.0 + phase * heartbeat_s
-    t = 0.0
-    answers = []
+    now_s = 0.0
+    # Times at which answers come that are under way.
+    answers_s = []
     while True:
-        t += watch.look_s
-        if answers and answers[0] <= t:
-            answers.pop(0)
+        now_s += watch.look_s
+        if answers_s and answers_s[0] <= now_s:
+            answers_s.pop(0)
             watch.note_answer()
-        elif watch.silent_s(t):
+        elif watch.silent_s(now_s):
             break
-        if watch.is_due(t) and t + answer_s < dead_s:
-            answers.append(t + answer_s)
-        assert t < 10
-    assert dead_s < t + 1e-9, "a stage that answers is not lost"
-    assert t - dead_s <= SAFE_WITHIN_S
+        if watch.is_due(now_s) and now_s + answer_s < dead_s:
+            answers_s.append(now_s + answer_s)
+        assert now_s < 10
+    # A stage that answers is not lost; sums of seconds are rounded.
+    assert dead_s < now_s + 1e-9
+    assert now_s - dead_s <= SAFE_WITHIN_S
 
 
 def test_a_stage_at_rest_may_answer_late():
-    """A scan continues if a busy machine delays the answer between two rows; a moving stage would count as lost."""
+    """A scan continues if a busy machine delays the answer between two rows; a moving stage would count as lost.
+
+    When it moves, its time begins again, and is half of its heartbeat of 1 s; it is looked at every 50 ms.
+    """
     watch = StatusWatch(1.0, 0.0)
     watch.ask_every(IDLE_STATUS_S, 0.0)
-    t = 0.0
-    while t < IDLE_STATUS_S + SILENT_AT_REST_S - 0.1:
-        t += watch.look_s
-        assert not watch.silent_s(t)
-        watch.is_due(t)
-    watch.ask_every(1.0 / STATUS_PER_HEARTBEAT, t)
-    row_begins_s = t
-    while not watch.silent_s(t):
-        t += watch.look_s
-    assert 0.5 < t - row_begins_s < 0.6
+    now_s = 0.0
+    while now_s < IDLE_STATUS_S + SILENT_AT_REST_S - 0.1:
+        now_s += watch.look_s
+        assert not watch.silent_s(now_s)
+        watch.is_due(now_s)
+    watch.ask_every(1.0 / STATUS_PER_HEARTBEAT, now_s)
+    row_begins_s = now_s
+    while not watch.silent_s(now_s):
+        now_s += watch.look_s
+    assert 0.5 < now_s - row_begins_s < 0.6
 
 
-@pytest.mark.parametrize("lasting", [True, False])
-def test_a_lost_trigger_line_stops_every_motion_immediately(lasting):
-    """The loop notices within its look-up time; the machine acts in the same turn."""
+@pytest.mark.parametrize("is_lasting", [True, False])
+def test_a_lost_trigger_line_or_edge_stops_the_motion_immediately(is_lasting):
+    """The trigger loop notices it within its look-up time, and the machine acts in the same turn.
+
+    A lost edge is a fault of its row. A lost line lasts: no motion is accepted after it.
+    """
     assert LOOK_UP_S <= SAFE_WITHIN_S / 2
     bench = Bench().begin_and_home()
     bench.start()
     bench.send_edge()
-    job = None if lasting else bench.machine.row.job  # type: ignore[union-attr]
-    number = PiFault.TRIGGER_LINE_LOST if lasting else PiFault.EDGE_LOST
+    if is_lasting:
+        job = None
+        number = PiFault.TRIGGER_LINE_LOST
+    else:
+        job = bench.machine.row.job  # type: ignore[union-attr]
+        number = PiFault.EDGE_LOST
     bench.machine.on_loop_fault(LoopFault(job, number, "gone"))
     assert not bench.armed
     assert bench.stage.sent == [Immediate.STOP]
     bench.send_reply(Reply("alarm", number=StageError.STOPPED))
     assert bench.list_events(m.RowFinished)[-1].fault == number
-    assert bench.machine.state == ("fault" if lasting else "ready")
-    if lasting:
+    assert bench.machine.state == ("fault" if is_lasting else "ready")
+    if is_lasting:
         with pytest.raises(RefusedError):
             bench.machine.command("Home")
 
 
-def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
-    """Points are passed without an edge: a fault after two more statuses, a quarter of the heartbeat apart."""
+def test_a_trigger_wire_that_comes_off_is_noticed_while_the_row_runs():
+    """The stage passes points without an edge: that is a fault at the second status after the first such one.
+
+    Statuses are a quarter of the heartbeat of 0.5 s apart.
+    """
     assert 3 * 0.5 / STATUS_PER_HEARTBEAT <= SAFE_WITHIN_S
     bench = Bench().begin_and_home()
     bench.start()
@@ -275,22 +308,22 @@ def test_a_wire_that_comes_off_is_noticed_while_the_row_runs():
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), max_size=30))
 def test_a_wire_with_edges_is_never_reported_off(steps):
-    """Statuses and edges in any order, statuses up to three points ahead of the edges seen when one follows soon."""
+    """Between two statuses at least one edge comes; a status may count up to three points whose edges come later."""
     watch = TriggerWatch()
     edges = 0
-    for ahead, later_ns in steps:
-        edges += later_ns + 1  # between two statuses at least one edge came
-        assert not watch.is_silent(edges + ahead, edges)
+    for points_ahead, more_edges in steps:
+        edges += 1 + more_edges
+        assert not watch.is_silent(edges + points_ahead, edges)
 
 
-def test_the_first_fault_wins():
+def test_the_first_of_two_faults_is_that_of_the_row_and_both_are_reported():
     bench = Bench().begin_and_home()
     bench.start()
     bench.machine.on_loop_fault(LoopFault(bench.machine.row.job, PiFault.EDGE_LOST, "2 edges lost"))  # type: ignore[union-attr]
     bench.machine.handle_event("stage lost", PiFault.STAGE_LOST, "silent")
     bench.run_posted()
     assert (bench.machine.fault, bench.machine.reason) == (PiFault.EDGE_LOST, "2 edges lost")
-    assert [e.number for e in bench.list_events(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST], "both are told"
+    assert [e.number for e in bench.list_events(m.Fault)] == [PiFault.EDGE_LOST, PiFault.STAGE_LOST]
     finished = bench.list_events(m.RowFinished)[-1]
     assert (finished.fault, finished.reason) == (PiFault.EDGE_LOST, "2 edges lost")
     bench.machine.command("Home")
@@ -301,6 +334,7 @@ JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=10.0, speed_mm_s=20.0, heartbeat_
 
 
 def test_a_jog_without_its_host_stops_in_time_and_keeps_the_position():
+    """A host may be silent for four of its heartbeats, 0.4 s here."""
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
     bench.let_time_pass(0.3)
@@ -318,6 +352,7 @@ def test_a_stage_that_does_not_stop_its_jog_is_lost():
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
     bench.machine.command("Abort", "requested")
+    # From STOP to standstill the stage has 3 s.
     bench.let_time_pass(3.1)
     assert (bench.machine.state, bench.machine.homed) == ("fault", False)
     assert bench.list_events(m.Jogged)[-1].status == "aborted"
@@ -326,20 +361,24 @@ def test_a_stage_that_does_not_stop_its_jog_is_lost():
 def test_the_end_of_the_program_stops_a_jog_and_reports_it():
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
-    assert not bench.machine.terminate(), "no row is waited for"
+    # False: there is no row whose end the program has to wait for.
+    assert not bench.machine.terminate()
     assert bench.stage.sent == [Immediate.STOP]
     ended = bench.list_events(m.Jogged)[-1]
     assert (ended.status, ended.fault) == ("aborted", PiFault.ABORTED)
 
 
+# Motor steps; the jog of 10 mm ends at x 2000.
 @pytest.mark.parametrize(("x", "y"), [(2001, 0), (2000, 1), (0, 0)])
-def test_a_jog_that_ends_elsewhere_loses_the_position(x, y):
+def test_after_a_jog_that_ends_at_another_position_the_stage_has_to_be_homed(x, y):
     bench = Bench().begin_and_home()
     bench.machine.command("Jog", JOG)
     bench.send_reply(Reply("done", bench.stage.number, fields={"x": str(x), "y": str(y)}))
     assert (bench.machine.state, bench.machine.fault, bench.machine.homed) == ("fault", PiFault.POSITION, False)
 
 
+# What may happen to the machine: commands, edges, replies of the stage, losses, and time that passes. 0.45 s is longer
+# than the host may be silent with the heartbeat of 100 ms.
 ACTIONS: dict[str, Callable[[Bench], object]] = {
     "home": lambda b: b.machine.command("Home"),
     "begin": lambda b: b.machine.command("BeginRun", 100),
@@ -367,8 +406,8 @@ ACTIONS: dict[str, Callable[[Bench], object]] = {
 
 @settings(max_examples=300)
 @given(st.sampled_from(["cold", "homed", "in a row"]), st.lists(st.sampled_from(sorted(ACTIONS)), max_size=40))
-def test_any_order_of_events(start, actions):
-    """Only moves of the table, the first fault is kept, rows end once, and only a row is armed."""
+def test_in_any_order_of_events_rows_end_once_and_the_first_fault_is_kept(start, actions):
+    """Edges are answered only during a row."""
     bench = Bench() if start == "cold" else Bench().begin_and_home()
     machine = bench.machine
     if start == "in a row":
@@ -378,7 +417,7 @@ def test_any_order_of_events(start, actions):
         with suppress(RefusedError):
             ACTIONS[action](bench)
             bench.run_posted()
-            # These clear it
+            # Only these commands clear a fault.
             if fault_before[0] and action not in ("home", "row", "jog"):
                 assert (machine.fault, machine.reason) == fault_before, "the first fault wins"
             assert bench.armed <= (machine.row is not None), "edges are answered only during a row"
@@ -388,66 +427,69 @@ def test_any_order_of_events(start, actions):
             )
         assert (machine.jog is not None) == (machine.state == "jogging")
     if machine.row is not None:
-        # A held row waits for a person
+        # A held row waits for a person without limit.
         machine.handle_event("Resume")
         bench.let_time_pass(400.0)
         assert machine.row is None, "every row ends"
 
 
-# --- the table and its page -------------------------------------------------------------------------------------------
+# --- the rules of the machine and their page, docs/spec/wire.md -------------------------------------------------------
 
 
 def find_code_words_of_cells(row: str) -> list[list[str]]:
-    """Words in backquotes of each cell of a table's row."""
+    """Return the words in backquotes of each cell of a table's row."""
     return [re.findall(r"`([^`]+)`", cell) for cell in row.strip("|").split("|")]
 
 
 def test_the_page_shows_the_rules():
-    table_rows = [find_code_words_of_cells(row) for row in SPEC_PAGE.splitlines() if row.startswith("| `")]
-    rules = [(e[0], tuple(s), tuple(next_states)) for e, s, next_states, *_ in (r for r in table_rows if len(r) == 4)]
+    """One table has the rules in four columns: event, states, next states, action. Another has the states in three.
+
+    Those are: the state, its name in messages if that is another one, and its time limit.
+    """
+    rules = []
+    names_in_messages = {}
+    limits_s = {}
+    for line in SPEC_PAGE.splitlines():
+        if not line.startswith("| `"):
+            continue
+        cells = find_code_words_of_cells(line)
+        if len(cells) == 4:
+            events, states, next_states, _ = cells
+            rules.append((events[0], tuple(states), tuple(next_states)))
+        elif len(cells) == 3:
+            states, names, _ = cells
+            names_in_messages[states[0]] = names[0] if names else states[0]
+            limit_s = re.search(r"(\d+(?:\.\d+)?) s\b", line.split("|")[3])
+            if limit_s:
+                limits_s[states[0]] = float(limit_s[1])
+
     assert rules == [(r.event, tuple(r.states.split()), tuple(r.leads_to.split())) for r in RULES]
-    answer = {
-        s[0]: (next_states[0] if next_states else s[0]) for s, next_states, *_ in (r for r in table_rows if len(r) == 3)
-    }
-    assert answer == {s: WIRE_STATE.get(s, s) for s in get_args(State)}
-    limits = {
-        row[0][0]: float(n[0])
-        for row in table_rows
-        if len(row) == 3
-        for n in [read_row_seconds(SPEC_PAGE, row[0][0])]
-        if n
-    }
-    assert limits == TIMEOUTS_S
+    assert names_in_messages == {state: WIRE_STATE.get(state, state) for state in get_args(State)}
+    assert limits_s == TIMEOUTS_S
 
 
-def read_row_seconds(page: str, state: str) -> list[str]:
-    line = next(x for x in page.splitlines() if x.startswith(f"| `{state}` |") and x.count("|") == 4)
-    return re.findall(r"(\d+(?:\.\d+)?) s\b", line.split("|")[3])
-
-
-def test_the_rules_are_whole():
-    """Every state can be reached and left, an event has one rule in a state, and rules name only existing states."""
+def test_every_state_can_be_reached_and_left_and_an_event_has_one_rule_in_it():
     states = set(get_args(State))
-    named = [(s, r.event) for r in RULES for s in r.states.split()]
-    assert len(set(named)) == len(named)
-    assert {s for s, _ in named} == states
-    assert {s for r in RULES for s in r.leads_to.split()} <= states | {"same"}
+    rules_of_states = [(state, rule.event) for rule in RULES for state in rule.states.split()]
+    assert len(set(rules_of_states)) == len(rules_of_states)
+    assert {state for state, _ in rules_of_states} == states
+    assert {state for rule in RULES for state in rule.leads_to.split()} <= states | {"same"}
+
+    # Follow the rules from the first state.
     reached = set()
-    todo = ["idle"]
-    while todo:
-        state = todo.pop()
-        if state not in reached:
-            reached.add(state)
-            todo += [
-                next_state
-                for r in RULES
-                if state in r.states.split()
-                for next_state in r.leads_to.split()
-                if next_state != "same"
-            ]
+    to_visit = ["idle"]
+    while to_visit:
+        state = to_visit.pop()
+        if state in reached:
+            continue
+        reached.add(state)
+        for rule in RULES:
+            if state in rule.states.split():
+                to_visit += [next_state for next_state in rule.leads_to.split() if next_state != "same"]
     assert reached == states
-    lasting = {s for r in RULES if r.event == "stage lost" for s in r.states.split()}
-    assert lasting == states, "losing the stage is answered in every state"
+
+    states_that_may_lose_the_stage = {s for rule in RULES if rule.event == "stage lost" for s in rule.states.split()}
+    assert states_that_may_lose_the_stage == states
 
 
 RIG = load_published_rig()
@@ -455,7 +497,7 @@ replace = msgspec.structs.replace
 
 
 def find_broken_rule(make: Callable[[], object]) -> str:
-    """The violated rule of the rig file; "" if there is none."""
+    """Return the rule of the rig file that this violates; "" if it violates none."""
     try:
         make()
     except ValueError as e:
@@ -472,7 +514,7 @@ def find_broken_rule(make: Callable[[], object]) -> str:
     centre=st.integers(300, 500),
 )
 @settings(max_examples=200, deadline=None)
-def test_the_pi_takes_a_raster_when_the_rig_file_is_taken(columns, rows, speed, accel, backlash, centre):
+def test_the_pi_accepts_a_raster_exactly_if_the_rig_file_is_accepted(columns, rows, speed, accel, backlash, centre):
     """BeginRun accepts exactly the rig files that `config` and the doctor accept."""
     stage = replace(
         RIG.stage, speed_mm_s=float(speed), accel_mm_s2=float(accel), backlash_mm=float(backlash),
@@ -492,8 +534,8 @@ def test_the_pi_takes_a_raster_when_the_rig_file_is_taken(columns, rows, speed, 
     assert (refused.value.number, refused.value.what) == (PiFault.BAD_REQUEST, broken)
 
 
-def test_the_run_up_is_what_the_host_counts_with():
-    """A row from rest to rest: its points and the run-up at both ends, at a speed that is reached."""
+def test_the_host_forecasts_rows_with_the_run_up_of_the_pi():
+    """From rest to rest: the points and the run-up at both ends. A ramp takes v / a, for v^2 / 2a of way."""
     grid = RIG.grid
     stage = RIG.stage
     v = stage.speed_mm_s
@@ -503,16 +545,18 @@ def test_the_run_up_is_what_the_host_counts_with():
     assert stage.run_up_mm(2.0, 20.0) == pytest.approx(20.0**2 / (2 * a) + 2.0)
 
 
-@given(period=st.floats(1, 1000), width=st.floats(0.001, 10))
+@given(period_us=st.floats(1, 1000), width_us=st.floats(0.001, 10))
 @settings(max_examples=100, deadline=None)
-def test_the_pi_sends_the_pulses_that_the_rig_file_may_hold(period, width):
-    def sent() -> bool:
+def test_the_pi_accepts_the_pulses_that_the_rig_file_may_have(period_us, width_us):
+    def is_accepted() -> bool:
         try:
-            return bool(read_burst(m.Pulse(pulses=1, period_us=period, width_us=width)))
+            return bool(read_burst(m.Pulse(pulses=1, period_us=period_us, width_us=width_us)))
         except RefusedError:
             return False
 
-    edges = (MIN_PERIOD_US, *WIDTH_US)
-    # The Pi counts in whole nanoseconds
-    if min(abs(x - e) for e in edges for x in (period, width)) > 1e-3:
-        assert sent() == (not find_broken_rule(lambda: Burst(pulses=1, period_us=period, width_us=width)))
+    # The Pi counts in whole nanoseconds, so that a value within one of a limit may be rounded to the other side.
+    limits_us = (MIN_PERIOD_US, *WIDTH_US)
+    distances_us = [abs(value_us - limit_us) for limit_us in limits_us for value_us in (period_us, width_us)]
+    if min(distances_us) > 1e-3:
+        broken_rule = find_broken_rule(lambda: Burst(pulses=1, period_us=period_us, width_us=width_us))
+        assert is_accepted() == (not broken_rule)

@@ -34,11 +34,12 @@ from polysight_shared.raster import RasterPlan
 from polysight_shared.stage_line import Reply
 
 HEARTBEAT_S = 0.1
+# A host is lost after a silence of four of its heartbeats.
 LIMIT_S = 4 * HEARTBEAT_S
 
 
 class SlowDriver(FakeDriver):
-    """A stage whose serial line loses an answer: the line is sent again after a while."""
+    """A stage that takes `row_takes_s` to accept a row, as when the serial line loses its answer."""
 
     def __init__(self, bench: Bench) -> None:
         super().__init__()
@@ -51,15 +52,17 @@ class SlowDriver(FakeDriver):
 
 
 class Bench:
-    """An executor whose turns the test runs."""
+    """An executor whose turns the test runs, with a clock that it sets."""
 
     def __init__(self, folder: Path) -> None:
+        # The clock, seconds.
         self.t = 100.0
         self.events: list[Any] = []
         self.stage = SlowDriver(self)
-        loop = TriggerLoop(FakeLines(), lambda _: None, lambda: None)  # not started: no edge comes
+        # The trigger loop is not started, so that no edge comes; nor is the journal, whose jobs run between turns.
+        loop = TriggerLoop(FakeLines(), lambda _: None, lambda: None)
         self.journal = Journal(folder, lambda raws: self.events.extend(map(m.unpack_event, raws)))
-        self.journal_thread = JournalThread(self.journal)  # not started: its jobs are run between turns
+        self.journal_thread = JournalThread(self.journal)
         stage: Any = self.stage
         self.executor = Executor(stage, loop, self.journal_thread)
         self.executor._machine._clock = lambda: self.t
@@ -67,9 +70,9 @@ class Bench:
     def run_turn(self, *items: Any) -> None:
         for item in items:
             self.executor.post(item)
-        # A command that the journal answers
+        # A command that the journal answers needs a second turn. An item in the queue keeps a turn from waiting.
         for _ in range(2):
-            self.executor.post(lambda: None)  # so that no turn waits
+            self.executor.post(lambda: None)
             self.executor._turn()
             self.journal_thread.do_waiting()
 
@@ -111,7 +114,7 @@ def bench(tmp_path):
 
 
 def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
-    """A line to the stage is sent again: nothing else is executed meanwhile, so that no `Alive` can be sent."""
+    """While a line to the stage is sent again nothing else is executed, and the host cannot send `Alive`."""
     bench.make_ready()
     bench.stage.row_takes_s = LIMIT_S + 0.15
     assert isinstance(bench.run_row(), m.Accepted)
@@ -119,18 +122,20 @@ def test_a_host_that_waits_for_its_row_to_begin_is_not_silent(bench):
     assert (bench.state, bench.list_events(m.Fault)) == ("running", [])
     bench.t += LIMIT_S + 0.001
     bench.run_turn()
-    assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST, "from then on it is watched"
+    # From the begin of the row on it is watched.
+    assert bench.list_events(m.Fault)[0].number == PiFault.HOST_LOST
 
 
 @given(every_s=st.floats(0.01, 0.2), client=st.sampled_from(["events", "another's"]))
 @settings(max_examples=20, deadline=None)
-def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory, every_s, client):
+def test_questions_of_other_clients_are_no_sign_of_life_of_the_host(tmp_path_factory, every_s, client):
     bench = Bench(tmp_path_factory.mktemp("j"))
     bench.make_ready()
     bench.run_row()
-    last = bench.t
+    row_begun_s = bench.t
     while not bench.list_events(m.Fault):
-        assert bench.t - last <= LIMIT_S + 2 * every_s
+        # The fault comes with the first question after the limit; a question takes two turns.
+        assert bench.t - row_begun_s <= LIMIT_S + 2 * every_s
         bench.t += every_s
         if client == "events":
             bench.ask(m.Replay(scan_id="s", from_seq=1))
@@ -141,21 +146,25 @@ def test_another_clients_questions_do_not_keep_a_dead_hosts_row(tmp_path_factory
     bench.journal.close()
 
 
-def test_another_machine_does_not_take_a_pi_whose_host_lives(bench):
+def test_another_host_cannot_begin_a_run_while_the_first_one_lives(bench):
     bench.make_ready()
     bench.t += HEARTBEAT_S
     refusal = bench.begin_run("other")
-    assert (refusal.number, bool(refusal.remedy)) == (PiFault.NOT_READY, True)
-    assert (bench.state, bench.executor.status.scan_id) == ("ready", "s"), "nothing has changed"
-    assert isinstance(bench.begin_run("s"), m.Accepted), "its own host may begin again"
+    assert refusal.number == PiFault.NOT_READY
+    assert refusal.remedy
+    # Nothing has changed, and its own host may begin again.
+    assert (bench.state, bench.executor.status.scan_id) == ("ready", "s")
+    assert isinstance(bench.begin_run("s"), m.Accepted)
+    # After its silence another one may.
     bench.t += LIMIT_S
-    assert isinstance(bench.begin_run("other"), m.Accepted), "a host that died keeps nobody out"
+    assert isinstance(bench.begin_run("other"), m.Accepted)
 
 
-def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
+def test_replays_have_few_events_while_a_row_runs_and_many_before_and_after(bench):
+    """A client that asks for one part after another gets all events. Other scans are replayed only between rows."""
     bench.make_ready()
     for _ in range(60):
-        # Each adds an event
+        # Each adds an event.
         bench.begin_run()
     assert len(bench.ask(m.Replay(scan_id="s", from_seq=1)).events) == 61
     bench.run_row()
@@ -163,9 +172,11 @@ def test_replies_are_short_while_a_row_runs_and_whole_before_and_after(bench):
     while (reply := bench.ask(m.Replay(scan_id="s", from_seq=len(numbers) + 1))).events:
         assert len(reply.events) <= REPLAYED_IN_A_ROW
         numbers += [e.seq for e in reply.events]
-    assert numbers == list(range(1, reply.last_seq + 1)), "who pages gets them all"
+    assert numbers == list(range(1, reply.last_seq + 1))
     refusal = bench.ask(m.Replay(scan_id="earlier", from_seq=1))
     assert refusal.number == PiFault.NOT_READY
+
+    # The row ends because its host is silent; alarm 15 is the stage's report that it was stopped.
     bench.t += LIMIT_S
     bench.run_turn()
     bench.run_turn(Reply("alarm", number=15))
@@ -189,7 +200,7 @@ def owner_in_row(pi, stage):
 
 @pytest.fixture
 def hang(pi):
-    """Lets the executor hang, until the returned event is set."""
+    """Function that lets the executor hang until the returned event is set."""
     is_hanging = threading.Event()
     released = threading.Event()
 
@@ -211,33 +222,37 @@ def test_only_the_owner_commands_a_run(owner_in_row, stage):
             m.RunRow(scan_id="scan", row_index=1, take=1, owner=owner), m.Home(owner=owner),
         ):  # fmt: skip
             assert host.must_refuse(command) == PiFault.NOT_OWNER, command
-        assert host.must_refuse(host.make_begin(owner=owner)) == PiFault.NOT_READY, "its host is alive"
+        # No other run begins while the host of this one lives.
+        assert host.must_refuse(host.make_begin(owner=owner)) == PiFault.NOT_READY
     stage.stays_after = None
     assert host.wait_for_event(m.RowFinished).status == "done"
-    assert host.must_refuse(m.Home(owner="other")) == PiFault.NOT_OWNER, "between two rows as well"
+    # The rule holds between two rows as well.
+    assert host.must_refuse(m.Home(owner="other")) == PiFault.NOT_OWNER
     host.must_accept(m.EndRun(scan_id="scan", exit_status="success", owner="mine"))
 
 
-def test_an_old_row_does_not_move_the_stage_again(host, stage):
-    """A late copy of a command, or one of a confused program: takes of a row only increase."""
+def test_a_command_for_an_earlier_take_of_a_row_does_not_move_the_stage(host, stage):
+    """It may be a late copy, or come from a faulty program: takes of a row only increase.
+
+    The last command may be repeated, if its answer was lost; it acts once.
+    """
     for row, take in ((1, 1), (2, 1), (1, 2), (1, 4)):
         assert host.run_row(row, take).status == "done"
     for row, take in ((1, 1), (1, 2), (1, 3), (2, 1)):
         earlier_row = m.RunRow(scan_id="scan", row_index=row, take=take)
         assert host.must_refuse(earlier_row) == PiFault.BAD_REQUEST
-    # Repeated: it was the last one
+    # The last command again.
     host.must_accept(m.RunRow(scan_id="scan", row_index=1, take=4))
     assert stage.rows_run == 4
     assert sum(isinstance(e, m.RowStarted) for e in host.replay()) == 4
+    # A new run of the same scan continues its takes.
     host.must_accept(host.make_begin())
-    assert host.must_refuse(m.RunRow(scan_id="scan", row_index=1, take=4)) == PiFault.BAD_REQUEST, (
-        "the scan is the same"
-    )
+    assert host.must_refuse(m.RunRow(scan_id="scan", row_index=1, take=4)) == PiFault.BAD_REQUEST
     assert host.run_row(1, 5).status == "done"
 
 
 def test_takes_increase_across_a_restart_of_the_pi(instrument, stage, hub):
-    """The journal has these events."""
+    """The journal has the earlier ones."""
     rig = set_stage_port(instrument, stage.port)
     for first_take in (1, 2):
         with closing(Running(rig, hub)) as running:
@@ -258,8 +273,10 @@ def test_a_jog_moves_once_and_within_its_limits(host, stage):
     host.must_accept(make_jog(0, 10))
     assert host.wait_for_event(m.Jogged).end_mm == 10.0
     host.wait_for_state("ready")
+    # The same jog again is a copy of the command: it begins at 0, and the stage is at 10 mm, 2000 steps.
     host.must_accept(make_jog(0, 10))
-    assert [c.args[0] for c in stage.seen if c.verb == "MOVE"] == [2000], "sent again, moved once"
+    assert [c.args[0] for c in stage.seen if c.verb == "MOVE"] == [2000]
+    # From another place than the stage's, beyond a limit, too long, without length, and speeds out of range.
     for invalid_jog in (
         make_jog(0, 20), make_jog(10, -10.1), make_jog(10, 100, "y"), make_jog(10, 0), make_jog(10, 5, speed_mm_s=1e5),
         make_jog(10, 5, speed_mm_s=5e-324), make_jog(10, 100, speed_mm_s=1),
@@ -270,7 +287,7 @@ def test_a_jog_moves_once_and_within_its_limits(host, stage):
     assert host.run_row(0).status == "done"
 
 
-def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_in_row, stage):
+def test_a_jog_is_refused_in_a_row_and_to_other_clients_while_the_host_lives(owner_in_row, stage):
     host = owner_in_row
     assert host.must_refuse(make_jog(0, 10, owner="mine")) == PiFault.NOT_READY
     assert host.must_refuse(make_jog(0, 10, owner="other")) == PiFault.NOT_OWNER
@@ -281,7 +298,8 @@ def test_a_jog_is_refused_in_a_row_and_to_strangers_while_the_host_lives(owner_i
 
 def test_a_jog_outside_of_a_run_is_watched_and_aborted(pi, stage):
     host = pi.host
-    assert host.must_refuse(make_jog(0, 10)) == PiFault.NOT_READY, "not homed"
+    # The stage is not homed.
+    assert host.must_refuse(make_jog(0, 10)) == PiFault.NOT_READY
     host.must_accept(m.Home())
     host.wait_for_state("homed")
     stage.pace_s = 60.0
@@ -301,16 +319,17 @@ def test_a_host_of_an_older_release_homes_in_its_own_run(pi):
 
 
 def test_a_person_at_the_pi_takes_over(pi, owner_in_row, instrument):
+    # Who can read this file on the Pi may command a run that another host owns.
     key = Path(instrument.pi.journal_dir) / TAKE_OVER_KEY
     assert stat.S_IMODE(key.stat().st_mode) == 0o600
     replace = msgspec.structs.replace
-    second_host = replace(instrument, pi=replace(instrument.pi, command_address=pi.service.server.command_address))
-    assert take_over(second_host, "hold") == "held"
-    assert take_over(second_host, "resume") == "running"
-    take_over(second_host, "abort")
+    rig_on_pi = replace(instrument, pi=replace(instrument.pi, command_address=pi.service.server.command_address))
+    assert take_over(rig_on_pi, "hold") == "held"
+    assert take_over(rig_on_pi, "resume") == "running"
+    take_over(rig_on_pi, "abort")
     assert owner_in_row.wait_for_event(m.RowFinished).status == "aborted"
     owner_in_row.wait_for_state("ready")
-    assert take_over(second_host, "end") == "homed"
+    assert take_over(rig_on_pi, "end") == "homed"
 
 
 def test_the_commands_on_the_pi_wait_for_a_service_that_answers_late(rig):
@@ -337,15 +356,20 @@ def test_a_run_without_a_heartbeat_can_be_replaced(pi):
     host.must_accept(m.Abort(owner="another"))
 
 
-def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
-    """Commands are refused and no heartbeat is sent, until it runs again."""
+def test_while_the_executor_hangs_commands_are_refused_and_no_heartbeat_is_sent(pi, hang, monkeypatch):
     host = pi.host
     monkeypatch.setattr("polysight_pi.service.HUNG_S", 0.5)
     monkeypatch.setattr(executors, "TURN_S", 0.05)
 
     def ask_until(kind):
+        """Ask for the status until the reply is of this kind; return it."""
         replies = []
-        wait_for(lambda: isinstance(replies.append(host.ask(m.Status())) or replies[-1], kind), kind.__name__)
+
+        def is_of_kind() -> bool:
+            replies.append(host.ask(m.Status()))
+            return isinstance(replies[-1], kind)
+
+        wait_for(is_of_kind, kind.__name__)
         return replies[-1]
 
     released = hang()
@@ -354,7 +378,7 @@ def test_a_hanging_executor_does_not_look_alive(pi, hang, monkeypatch):
     def is_silent() -> bool:
         if not host.subscriber.poll(300):
             return True
-        # An event that was on its way
+        # An event that was sent before.
         host.subscriber.recv_multipart()
         return False
 
@@ -370,11 +394,12 @@ def test_a_command_that_fails_in_the_program_is_a_refusal(pi, monkeypatch, capfd
     monkeypatch.setattr(pi.service.executor, "_replay", fail)
     assert pi.host.must_refuse(m.Replay(scan_id="scan", from_seq=1)) == PiFault.PROGRAM
     assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
-    assert "ZeroDivisionError" in capfd.readouterr().err, "the log has the trace"
+    # The log has the traceback.
+    assert "ZeroDivisionError" in capfd.readouterr().err
 
 
-def test_the_watchdog_is_fed_by_the_executor_alone(pi, hang, monkeypatch, tmp_path):
-    """One datagram per turn, none while the executor hangs (sd_notify(3))."""
+def test_only_the_executor_notifies_the_watchdog(pi, hang, monkeypatch, tmp_path):
+    """One datagram per turn, and none while the executor hangs, although the server still answers (sd_notify(3))."""
     monkeypatch.setattr(executors, "TURN_S", 0.2)
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
@@ -387,7 +412,6 @@ def test_the_watchdog_is_fed_by_the_executor_alone(pi, hang, monkeypatch, tmp_pa
         while select.select([listener], [], [], 0)[0]:
             listener.recv(100)
         listener.settimeout(2 * executors.TURN_S)
-        # The server still answers
         pi.host.ask(m.Status())
         with pytest.raises(TimeoutError):
             listener.recv(100)

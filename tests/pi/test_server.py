@@ -16,7 +16,8 @@ from polysight_shared.messages import is_simulated
 from polysight_shared.stage_line import Immediate
 from polysight_shared.wires import WireClient, WireEdge
 
-RUN_0 = m.RunRow(scan_id="scan", row_index=0, take=1)
+# The first row of the scan, for the first time.
+RUN_FIRST_ROW = m.RunRow(scan_id="scan", row_index=0, take=1)
 
 
 def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
@@ -25,6 +26,7 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     hello = host.ask(m.Hello())
     assert (hello.backend, hello.firmware, hello.state) == ("wires", "fake", "ready")
     assert hello.stage == instrument.stage.placement_settings
+    # Nanoseconds since 1970: after 2020.
     assert hello.t_unix_ns > 1_600_000_000 * 10**9
     row_finished = host.run_row(1)
     burst = instrument.burst
@@ -45,23 +47,25 @@ def test_a_row_is_captured_completely_and_in_order(host, hub, instrument):
     edges = [radar.receive(HANG_S) for _ in range(2 * row_finished.pulses)]
     rises = [e.t_ns for e in edges if isinstance(e, WireEdge) and e.value]
     falls = [e.t_ns for e in edges if isinstance(e, WireEdge) and not e.value]
+    # Each pulse lasts 1 us.
     assert {b - a for a, b in zip(rises, falls, strict=True)} == {1000}
     assert rises[:: burst.pulses] == [c.first_pulse_ns for c in captures]
     radar.close()
 
 
-def test_only_pins_count_as_hardware():
+def test_only_backends_that_drive_pins_count_as_hardware():
     assert [is_simulated(kind.name) for kind in (GpiodLines, SpiLines, WireLines)] == [False, False, True]
     assert all(is_simulated(unknown) for unknown in ("", "fake", "gpio", "GPIOD", "lgpio"))
 
 
-def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
+def test_the_stage_gets_its_settings_and_the_row_in_motor_steps(instrument, stage, hub):
     rig = msgspec.structs.replace(instrument, stage=msgspec.structs.replace(instrument.stage, heartbeat_ms=1000))
     with closing(Running(set_stage_port(rig, stage.port), hub)) as pi:
         pi.host.must_accept(pi.host.make_begin())
         pi.host.home()
         stage.stays_after = 2
         pi.host.start_row()
+        # Statuses are published again and again while the stage moves.
         pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
         pi.host.wait_for_event(m.StageStatus, lambda e: e.state == "row" and e.points == 2)
         stage.stays_after = None
@@ -71,12 +75,13 @@ def test_stage_gets_the_row_in_steps_and_a_heartbeat(instrument, stage, hub):
     half = 3.5 * 2 * 200
     y = 250 * 200 - 1.5 * 2 * 200
     assert row.args == (400 * 200 - half, 400, 8, y, 4000)
+    # Values of the stage's parameters by their number (docs/spec/stage-line.md).
     sets = {c.args[0]: c.args[1] for c in stage.seen if c.verb == "SET"}
     assert sets == {0: 40000, 1: 1000, 2: 20, 3: 160000, 4: 100000, 5: 8000, 6: 0, 7: 0}
 
 
 def test_homing_reports_lost_steps(host, stage):
-    """The check after a scan: home again, with the switches."""
+    """Homing after a scan shows how far the switches are from where the stage counted them, in motor steps."""
     status = host.ask(m.Status())
     assert (status.lost_x_mm, status.lost_y_mm) == (0, 0)
     stage.lost = (-7, 12)
@@ -88,12 +93,12 @@ def test_homing_reports_lost_steps(host, stage):
 def test_repeated_requests_act_once(host, stage):
     host.must_accept(host.make_begin())
     stage.stays_after = 2
-    assert host.must_accept(RUN_0).state == "running"
-    assert host.must_accept(RUN_0).state == "running"
+    assert host.must_accept(RUN_FIRST_ROW).state == "running"
+    assert host.must_accept(RUN_FIRST_ROW).state == "running"
     stage.stays_after = None
     host.wait_for_event(m.RowFinished)
     host.wait_for_state("ready")
-    assert host.must_accept(RUN_0).state == "ready"
+    assert host.must_accept(RUN_FIRST_ROW).state == "ready"
     assert stage.rows_run == 1
     assert host.run_row(0, take=2).status == "done"
     assert stage.rows_run == 2
@@ -103,12 +108,12 @@ def test_repeated_requests_act_once(host, stage):
     assert sum(isinstance(e, m.RunStopped) for e in host.replay()) == 1
 
 
-def test_refusals_have_their_number(pi):
+def test_each_refusal_has_the_fault_number_of_its_cause(pi):
     host = pi.host
     plan = host.make_begin().plan
     replace = msgspec.structs.replace
     # No run has begun.
-    assert host.must_refuse(RUN_0) == PiFault.NOT_READY
+    assert host.must_refuse(RUN_FIRST_ROW) == PiFault.NOT_READY
     assert host.must_refuse(host.make_begin(period_us=299.0)) == PiFault.PERIOD_TOO_SHORT
     assert host.must_refuse(host.make_begin(width_us=4.5)) == PiFault.PULSE_TOO_LONG
     for impossible_values in (
@@ -120,14 +125,15 @@ def test_refusals_have_their_number(pi):
     host.must_accept(host.make_begin())
     assert host.must_refuse(host.make_begin(plan=replace(plan, rows=3))) == PiFault.BAD_REQUEST
     # The stage is not homed.
-    assert host.must_refuse(RUN_0) == PiFault.NOT_READY
+    assert host.must_refuse(RUN_FIRST_ROW) == PiFault.NOT_READY
     host.home()
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=4, take=1)) == PiFault.BAD_REQUEST
     assert host.must_refuse(m.RunRow(scan_id="other", row_index=0, take=1)) == PiFault.NOT_READY
     assert host.must_refuse(m.Hold()) == PiFault.NOT_READY
     assert host.must_refuse(b"\x93nonsense") == PiFault.BAD_REQUEST
     refused = host.ask(m.Hello(version="2.0"))
-    assert (refused.number, "2.0" in refused.problem) == (PiFault.VERSION, True)
+    assert refused.number == PiFault.VERSION
+    assert "2.0" in refused.problem
 
 
 def test_hold_and_resume_lose_nothing(host_in_row, stage):
@@ -168,7 +174,7 @@ def test_stage_alarm_in_a_row_is_a_fault_until_homed(host, stage):
     stage.alarm_at = {3: StageError.LIMIT_SWITCH}
     row_finished = host.run_row(0)
     assert (row_finished.status, row_finished.fault) == ("fault", PiFault.STAGE_ALARM)
-    # Edges still under way at the alarm are not answered
+    # The alarm is at the third point; edges that are still under way then get no burst.
     assert row_finished.bursts == len(host.list_events(m.Capture)) <= 3
     assert not host.wait_for_state("fault").homed
     assert host.must_refuse(m.RunRow(scan_id="scan", row_index=0, take=2)) == PiFault.NOT_READY
@@ -186,7 +192,7 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     beats = HostHeartbeat(host.context, msgspec.structs.replace(instrument, pi=pi_settings), "scan", 0.05)
     host.start_row()
     host.wait_for_event(m.Capture)
-    # Three times the allowed silence in a row
+    # Three times the allowed silence, four heartbeats of 0.1 s.
     pi.clock.sleep(1.2)
     assert host.ask(m.Status()).state == "running"
     beats.stop()
@@ -199,7 +205,7 @@ def test_a_host_whose_heartbeat_ends_ends_the_row(pi, stage, instrument):
     assert host.run_row(0, take=2).status == "done"
 
 
-def test_a_heartbeat_counts_for_its_run_alone(pi):
+def test_a_heartbeat_counts_only_for_the_run_that_it_names(pi):
     host = pi.host
     alive = m.Alive(scan_id="scan")
     assert host.must_refuse(alive) == PiFault.NOT_READY
@@ -210,7 +216,7 @@ def test_a_heartbeat_counts_for_its_run_alone(pi):
     assert host.must_refuse(alive) == PiFault.NOT_READY
 
 
-def test_lost_and_damaged_lines_do_not_matter(pi, stage):
+def test_lost_and_damaged_lines_of_the_stage_are_repeated_and_spoil_no_row(pi, stage):
     host = pi.host
     host.must_accept(host.make_begin())
     stage.damage = 2
@@ -239,11 +245,12 @@ def test_an_exception_in_the_executor_ends_the_program_with_the_outputs_low(pi, 
     raised = []
     monkeypatch.setattr("threading.excepthook", lambda args: raised.append(args.exc_type))
     monkeypatch.setattr("polysight_pi.machine.Machine.on_burst", fail)
-    # The reply to the row is sent before its first edge comes
+    # The row is accepted before its first edge comes.
     stage.stays_after = 0
     host.start_row()
     stage.stays_after = None
     pi.thread.join(HANG_S)
-    assert raised == [ZeroDivisionError, DeviceError], "in the executor's thread, and out of `serve`"
+    # The first ends the executor's thread, the second the service, which watches it.
+    assert raised == [ZeroDivisionError, DeviceError]
     pi.service._loop.stop()
     assert not pi.service._loop._lines._active

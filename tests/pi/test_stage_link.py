@@ -27,6 +27,7 @@ from polysight_simulators.builds import sketch_compiler
 
 @pytest.fixture
 def dry_stage():
+    """A stage without wires."""
     stage = FakeStage(None)
     yield stage
     stage.close()
@@ -34,7 +35,7 @@ def dry_stage():
 
 @pytest.fixture
 def connect(dry_stage):
-    """Opens the link; returns it and the queue of its unsolicited replies."""
+    """Function that opens the link; it returns the link and the queue of its unsolicited replies."""
     links = []
 
     def connect(**options):
@@ -47,13 +48,14 @@ def connect(dry_stage):
         link.close()
 
 
-def test_the_banner_is_awaited_and_greeted(dry_stage, connect):
+def test_the_link_waits_for_the_banner_and_then_greets_the_stage(dry_stage, connect):
     link, _ = connect()
     assert link.firmware == "fake"
     assert [c.verb for c in dry_stage.seen] == ["HELLO"]
 
 
 def test_a_stage_without_banner_is_greeted_after_the_limit(dry_stage, connect):
+    """A stage whose port was open already does not restart, and so prints none."""
     dry_stage.banner = False
     link, _ = connect(banner_timeout_s=0.05)
     assert link.request("SET", 1, 500).kind == "ok"
@@ -61,6 +63,7 @@ def test_a_stage_without_banner_is_greeted_after_the_limit(dry_stage, connect):
 
 def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage, connect):
     link, _ = connect()
+    # The next line arrives damaged; then the answer to one is lost.
     dry_stage.damage = 1
     link.request("SET", 1, 500)
     dry_stage.lose = 1
@@ -68,13 +71,13 @@ def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage, connect):
     assert [(c.sequence, c.verb) for c in dry_stage.seen] == [(0, "HELLO"), (1, "SET"), (2, "SET")]
 
 
-def test_a_lost_answer_leaves_a_stop_its_time():
+def test_waiting_for_a_lost_answer_leaves_time_for_a_stop():
     """The thread that waits for an answer sends the stops, within half a second; a busy machine has 2 s to answer."""
     assert stage.ANSWER_TIMEOUT_S <= 0.5 / 3
     assert stage.ANSWER_TIMEOUT_S * stage.TRIES >= 2.0
 
 
-def test_refusals_carry_the_table(connect):
+def test_a_refusal_of_the_stage_has_its_number_explanation_and_remedy(connect):
     link, _ = connect()
     with pytest.raises(StageRefusedError) as e:
         link.request("MOVE", 1, 2, 3)
@@ -83,7 +86,7 @@ def test_refusals_carry_the_table(connect):
     assert e.value.remedy
 
 
-def test_numbers_wrap(connect):
+def test_numbers_of_lines_begin_again_after_65535(connect):
     link, _ = connect()
     link._sequence = 65535
     assert link.request("SET", 1, 500).sequence == 65535
@@ -98,6 +101,7 @@ def test_answers_are_distinguished_from_spontaneous_lines(dry_stage, connect):
     link.send_byte(Immediate.STATUS)
     kinds = [news.get(timeout=HANG_S).kind for _ in range(3)]
     assert sorted(kinds) == ["alarm", "ok", "status"]
+    # One with characters that do not belong to a line, and one that is too long.
     assert link.bad_lines == 2
 
 
@@ -105,6 +109,7 @@ def test_silence_after_a_status_byte_is_a_lost_stage(dry_stage, connect):
     link, news = connect(heartbeat_s=0.2)
     link.ask_status_every(0.02)
     assert news.get(timeout=HANG_S).kind == "status"
+    # From now on it answers nothing.
     dry_stage.deaf = True
     while not isinstance(stage_lost := news.get(timeout=HANG_S), StageLost):
         pass
@@ -161,7 +166,7 @@ def test_a_pulled_cable_is_a_lost_stage(dry_stage, connect):
         link.send_byte(Immediate.STOP)
 
 
-def test_no_port_and_another_protocol(tmp_path, monkeypatch, connect):
+def test_a_missing_port_and_another_version_of_the_protocol_are_refused(tmp_path, monkeypatch, connect):
     with expect_refusal(ErrorCode.FILE_UNREADABLE, tmp_path / "none"):
         StageLink(str(tmp_path / "none"), 115200, lambda _: None)
     monkeypatch.setattr("polysight_pi.stage.PROTOCOL_VERSION", 9)
@@ -187,10 +192,11 @@ def test_jog_and_home_by_hand(dry_stage, instrument):
 
 
 @pytest.mark.slow
-def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys):
-    """This holds until another program lowers DTR by closing the port."""
+def test_after_a_home_each_further_command_may_jog(write_config, instrument, tmp_path, capsys):
+    """Each command opens the port again, which resets the stage only if another program has closed it with DTR low."""
     port = tmp_path / "ttySTAGE"
-    pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")  # no service
+    # No service listens there, so that the command uses the stage itself.
+    pi = msgspec.structs.replace(instrument.pi, command_address="tcp://127.0.0.1:9")
     arguments = ["--config", str(write_config(msgspec.structs.replace(instrument, pi=pi))), "--stage-port", str(port)]
 
     def run_and_read_place(*command):
@@ -203,7 +209,7 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
         assert run_and_read_place("jog", "--dx", "-4", "--dy", "1.5") == {"x_mm": 6.0, "y_mm": 1.5}
 
         def is_lost() -> bool:
-            """The stand-in sees how its port was closed only if it polls before the next program opens it."""
+            """True if the jog is refused; the stand-in may miss how its port was closed, if it polls too late."""
             subprocess.run(["stty", "-F", port, "hupcl"], check=True)
             return main(["jog", *arguments, "--dx", "1"]) != 0
 
@@ -213,7 +219,7 @@ def test_a_jog_after_a_home_is_obeyed(write_config, instrument, tmp_path, capsys
 
 @pytest.mark.parametrize(("number", "tries"), [(StageError.BUSY, 7), (StageError.LIMIT_SWITCH, 1)])
 def test_a_moving_stage_is_asked_again_to_clear_its_alarm_for_three_seconds(number, tries, monkeypatch):
-    """Another refusal is final. The clock stands half a second later at each look."""
+    """Another refusal is final. The clock advances by half a second each time it is read: 0, 0.5, ... 3.0 s."""
     requests = []
     stops = []
 

@@ -37,7 +37,7 @@ def list_moves(stage) -> list[object]:
 
 
 @pytest.mark.parametrize("command", ["look", "home", "stop", "jog"])
-def test_without_the_token_the_stage_is_neither_seen_nor_moved(view, stage, command):
+def test_without_the_token_nothing_of_the_stage_is_shown_or_moved(view, stage, command):
     seen_before = list(stage.seen)
     status, _ = post(view, f"/api/stage/{command}", {"axis": "x", "distance_mm": 1.0}, token="wrong")
     assert status == 403
@@ -45,6 +45,7 @@ def test_without_the_token_the_stage_is_neither_seen_nor_moved(view, stage, comm
 
 
 def test_a_jog_before_homing_past_a_limit_or_too_far_is_refused_and_moves_nothing(view, pi, stage):
+    # 409: the rig does not allow it now; 400: the request is invalid in itself. A jog is at most 100 mm.
     jog = {"axis": "x", "distance_mm": 1.0}
     assert post(view, "/api/stage/jog", jog)[0] == 409
     home(view, pi)
@@ -54,7 +55,7 @@ def test_a_jog_before_homing_past_a_limit_or_too_far_is_refused_and_moves_nothin
     assert not list_moves(stage)
 
 
-def test_a_jog_is_stopped_by_another_request_and_a_second_one_waits(view, pi, stage):
+def test_a_jog_is_stopped_by_another_request_and_a_second_one_is_refused(view, pi, stage):
     home(view, pi)
     stage.pace_s = 60.0
     answers = []

@@ -25,8 +25,9 @@ from polysight_shared import messages as m
 from polysight_shared.faults import PiFault
 from polysight_shared.stage_line import Immediate
 
+# After the loss of the host the stage begins to stop within this time (docs/spec/wire.md).
 SAFE_WITHIN_S = 0.5
-# Instead of 3 s, so that the tests are short
+# Silence after which a part of the program counts as hanging, in these tests; 3 s in the program.
 LATE_S = 0.6
 OWNER = "mine"
 
@@ -39,9 +40,9 @@ class FrozenDisk:
         self._thawed = threading.Event()
         self.blocked = threading.Event()
         for name in ("fsync", "pwrite"):
-            patch.setattr(os, name, self._behind_ice(getattr(os, name)))
+            patch.setattr(os, name, self._make_freezable(getattr(os, name)))
 
-    def _behind_ice(self, call: Callable[..., Any]) -> Callable[..., Any]:
+    def _make_freezable(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def wait_and_call(*args: Any) -> Any:
             if self._frozen:
                 self.blocked.set()
@@ -98,12 +99,15 @@ def test_abort_stops_and_is_answered_while_the_disk_hangs(owned_run, stage, disk
     assert len(owned_run.journalled) > events_before
 
 
-@pytest.mark.parametrize("beats", [True, False])
-def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, stage, monkeypatch, beats):
-    """A lost host is handled as always. With a living host the disk ends the row, and the watchdog expires."""
+@pytest.mark.parametrize("host_lives", [True, False])
+def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, stage, monkeypatch, host_lives):
+    """The silence of a host ends the row as always. With a living host the disk ends it, and the watchdog expires.
+
+    A host that announced no heartbeat (0) counts as living.
+    """
     monkeypatch.setattr("polysight_pi.service.LATE_S", LATE_S)
     host = pi.host
-    host.must_accept(host.make_begin(heartbeat_ms=0 if beats else 100, owner=OWNER))
+    host.must_accept(host.make_begin(heartbeat_ms=0 if host_lives else 100, owner=OWNER))
     host.home(OWNER)
     stage.stays_after = 2
     pi.clock.stands = True
@@ -112,14 +116,15 @@ def test_a_hanging_disk_ends_the_row_whether_its_host_lives_or_not(disk, pi, sta
     stage.stays_after = 4
     pi.clock.stands = False
     wait_for(lambda: stop_is_sent(stage), "STOP")
-    number = PiFault.PROGRAM_LATE if beats else PiFault.HOST_LOST
+    number = PiFault.PROGRAM_LATE if host_lives else PiFault.HOST_LOST
     assert host.wait_for_state("ready").fault == number
     fed: list[bool] = []
     monkeypatch.setattr(pi.service.executor, "_turned", lambda: fed.append(True))
     wait_for(lambda: pi.service._find_late() != "", "that the journal is late")
     fed.clear()
     pi.clock.sleep(3 * executors.TURN_S)
-    assert not fed, "the watchdog is fed for each part or not at all"
+    # The watchdog is notified only if every part of the program is in time.
+    assert not fed
     disk.thaw()
     assert host.wait_for_event(m.RowFinished).fault == number
     wait_for(lambda: bool(fed), "that the watchdog is fed again")
@@ -137,8 +142,8 @@ def test_sockets_are_served_between_rare_heartbeats(instrument, stage, hub):
         wait_for(lambda: pi.service.server.find_late(LATE_S) == "", "that each socket is served")
 
 
-def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, monkeypatch):
-    """As on a busy machine without processor time: the executor, which judges, is as late as the others."""
+def test_after_a_pause_of_the_whole_program_the_fault_does_not_name_one_part_only(host_in_row, pi, monkeypatch):
+    """On a busy machine the executor, which judges the others, is as late as they are."""
     monkeypatch.setattr(executors, "LATE_S", LATE_S)
 
     def pause() -> None:
@@ -151,8 +156,8 @@ def test_a_program_that_was_paused_blames_no_part_of_it_alone(host_in_row, pi, m
     assert "served, nor has the executor turned for" in finished.reason
 
 
-def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
-    """For the host a run begins, a row starts and a run ends only when that is on the disk."""
+def test_a_command_of_a_run_is_accepted_only_when_its_event_is_on_the_disk(disk, pi):
+    """Begin a run, start a row, end the run; other commands are answered meanwhile."""
     host = pi.host
     commands: list[Any] = [host.make_begin(), m.RunRow(scan_id="scan", row_index=0, take=1)]
     commands.append(m.EndRun(scan_id="scan", exit_status="success"))
@@ -162,7 +167,7 @@ def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
         assert pi.service.executor.submit(command, answers.append)
         assert disk.blocked.wait(HANG_S)
         kinds = {type(e) for e in host.journalled}
-        assert isinstance(host.ask(m.Status()), m.StatusReply), "others are answered"
+        assert isinstance(host.ask(m.Status()), m.StatusReply)
         assert not answers
         disk.thaw()
         wait_for(lambda: bool(answers), "an answer")  # noqa: B023
@@ -175,8 +180,9 @@ def test_nothing_is_acknowledged_that_is_not_journalled(disk, pi):
 
 
 @pytest.mark.usefixtures("host")
-def test_a_full_queue_loses_no_reply(pi, stage):
+def test_a_full_queue_of_the_journal_loses_no_reply(pi, stage):
     """Requests that wait for the journal are answered once there is room."""
+    # The first job of the journal waits, and the queue behind it is filled.
     go_on = threading.Event()
     pi.service._journal.call(lambda _: go_on.wait(HANG_S), lambda _: None)
     for _ in range(journals.JOBS_WAITING + 1):
@@ -189,8 +195,8 @@ def test_a_full_queue_loses_no_reply(pi, stage):
     assert isinstance(answers[0], m.Accepted), answers
 
 
-def test_a_full_queue_keeps_its_bound(tmp_path):
-    """Events for a hanging disk are dropped, with an error, before they fill the memory."""
+def test_events_beyond_the_queue_of_a_hanging_disk_are_dropped_with_one_error(tmp_path):
+    """They must not fill the memory."""
     journal = journals.JournalThread(journals.Journal(tmp_path))
     errors: list[Any] = []
     for _ in range(journals.JOBS_WAITING + journals.EVENTS_WAITING + 10):
@@ -203,7 +209,7 @@ def test_a_full_queue_keeps_its_bound(tmp_path):
 
 
 def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
-    """Status requests of the polling thread are not a sign of life of the executor."""
+    """Another thread requests the status, which is no sign of life of the executor: it ends that, and sends STOP."""
     monkeypatch.setattr(stages, "CALLER_LATE_S", LATE_S)
     host = pi.host
     host.must_accept(host.make_begin())
@@ -216,7 +222,8 @@ def test_an_executor_that_hangs_stops_the_stage(pi, stage, monkeypatch):
     wait_for(lambda: stop_is_sent(stage), "STOP")
     status_requests = stage.bytes_seen.count(Immediate.STATUS)
     pi.clock.sleep(LATE_S)
-    assert stage.bytes_seen.count(Immediate.STATUS) == status_requests, "its own heartbeat stops it as well"
+    # Without requests the stage's own heartbeat would stop it as well.
+    assert stage.bytes_seen.count(Immediate.STATUS) == status_requests
     go_on.set()
     assert host.wait_for_event(m.RowFinished).fault == PiFault.STAGE_LOST
 
@@ -232,15 +239,23 @@ def test_sockets_that_hang_stop_the_motion(pi, stage, monkeypatch, socket):
     stage.stays_after = 2
     host.start_row()
     host.wait_for_event(m.Capture)
-    busy = "_send_replies" if socket == "command" else "_publish_heartbeat"
-    real = getattr(server, busy)
-    monkeypatch.setattr(server, busy, lambda *a: (go_on.wait(HANG_S), real(*a))[1])
+    method_name = "_send_replies" if socket == "command" else "_publish_heartbeat"
+    method = getattr(server, method_name)
+
+    def hang_and_call(*arguments):
+        go_on.wait(HANG_S)
+        return method(*arguments)
+
+    monkeypatch.setattr(server, method_name, hang_and_call)
     wait_for(lambda: stop_is_sent(stage), "STOP")
     go_on.set()
     row_finished = host.wait_for_event(m.RowFinished)
-    assert (row_finished.fault, socket in row_finished.reason) == (PiFault.PROGRAM_LATE, True)
+    assert row_finished.fault == PiFault.PROGRAM_LATE
+    assert socket in row_finished.reason
 
 
+# Program of subscribers to events that all disconnect together. Arguments: the address, the number of subscribers, and
+# the number of topics of each.
 LEAVE = """
 import random, sys, time, zmq
 address, subscribers, topics = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
@@ -259,7 +274,9 @@ context.term()
 """
 
 
-def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, request, record_testsuite_property):
+def test_subscribers_that_disconnect_together_delay_no_command(
+    start, instrument, hub, request, record_testsuite_property
+):
     """libzmq cleans up after them inside the publisher's next send, which then lasts long."""
     is_campaign = request.config.getoption("--long")
     program, host = start(instrument, "--wires", hub)
@@ -277,11 +294,14 @@ def test_leaving_subscribers_keep_no_command_waiting(start, instrument, hub, req
                 left_s = min(left_s, time.monotonic())
     record_testsuite_property("longest_answer_to_alive_ms", longest_s * 1e3)
     assert leaving.returncode == 0
+    # 0.1 s is chosen: a quarter of the time for which a host of 100 ms may be silent.
     assert longest_s < (0.1 if is_campaign else HANG_S)
 
 
 @pytest.mark.slow
-def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, request, record_testsuite_property):
+def test_whenever_the_disk_hangs_the_stage_is_stopped_in_time(
+    disk, pi, stage, instrument, request, record_testsuite_property
+):
     """From the last heartbeat, or the command to abort, to STOP: within half a second, wherever the disk hangs.
 
     In a third of the moments the stage's answer is lost, so that the row's command is sent again while it runs.
@@ -294,7 +314,7 @@ def test_a_hundred_moments_of_a_hanging_disk(disk, pi, stage, instrument, reques
     host = pi.host
     rng = random.Random(36)
     longest_s = 0.0
-    # Silent for four of these
+    # The host may be silent for four of these, 0.36 s; the rest of half a second is for the program.
     heartbeat_ms = 90
     stage.pace_s = 0.02
     stage.stays_after = instrument.grid.columns

@@ -1,4 +1,8 @@
-"""When a stage counts as silent, and when the counts of a row agree, at each limit."""
+"""When a stage counts as silent, and when the counts of a row agree, at each limit.
+
+A moving stage is asked for its status every 0.125 s here, a quarter of its heartbeat, and has 0.25 s to answer, half of
+it. At rest it is asked every second and has 3 s.
+"""
 
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +26,7 @@ def make_watch(interval_s: float = 0.125) -> StatusWatch:
 
 
 def look(watch: StatusWatch, begin_s: float, end_s: float) -> float:
-    """Look every 50 ms as the reader does; return what the watch says at the end."""
+    """Look every 50 ms as the reader does; return the silence at the end, 0 while it is within the timeout."""
     silent_s = 0.0
     steps = round((end_s - begin_s) / 0.05)
     for step in range(steps + 1):
@@ -39,6 +43,8 @@ def test_a_request_is_due_once_an_interval():
         False,
         True,
     ]
+
+    # 0: the status is not requested any more.
     watch.ask_every(0.0, 101.0)
     assert not watch.is_due(200.0)
     assert not watch.is_at_rest
@@ -71,7 +77,7 @@ def test_time_in_which_the_reader_itself_was_late_does_not_count():
     assert watch.silent_s(100.125) == 0.0
     # It slept for ten seconds; twice its interval of 50 ms is usual.
     assert watch.silent_s(110.125) == 0.0
-    # Half of a heartbeat
+    # From then on the usual timeout counts, half of a heartbeat.
     timeout_s = 0.25
     assert look(watch, 110.175, 110.025 + timeout_s) == 0.0
     assert look(watch, 110.075 + timeout_s, 110.125 + timeout_s) == pytest.approx(timeout_s + 0.1)
@@ -93,22 +99,23 @@ def make_row(**changes: Any) -> RunningRow:
     return RunningRow(**(fields | changes))
 
 
-WHOLE = Counts(50, 50, 800)
+# Edges, bursts and pulses of a complete row.
+COMPLETE = Counts(50, 50, 800)
 
 
 @pytest.mark.parametrize(
     ("changes", "counts", "status", "fault"),
     [
-        ({}, WHOLE, "done", 0), ({"was_held": True}, WHOLE, "done", 0),
-        ({"points": 49}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
-        ({"points": 51}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
-        ({"triggers": 49}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
-        ({"points": 51, "triggers": 51}, WHOLE, "fault", PiFault.POINTS_MISMATCH),
+        ({}, COMPLETE, "done", 0), ({"was_held": True}, COMPLETE, "done", 0),
+        ({"points": 49}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
+        ({"points": 51}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
+        ({"triggers": 49}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
+        ({"points": 51, "triggers": 51}, COMPLETE, "fault", PiFault.POINTS_MISMATCH),
         ({}, Counts(49, 50, 800), "fault", PiFault.POINTS_MISMATCH),
         ({}, Counts(50, 51, 800), "fault", PiFault.POINTS_MISMATCH),
         ({}, Counts(50, 50, 799), "fault", PiFault.POINTS_MISMATCH),
         ({}, Counts(50, 50, 801), "fault", PiFault.POINTS_MISMATCH),
-        ({"edges": SimpleNamespace(judge=lambda *_: "late")}, WHOLE, "fault", PiFault.EDGE_TIME),
+        ({"edges": SimpleNamespace(judge=lambda *_: "late")}, COMPLETE, "fault", PiFault.EDGE_TIME),
     ],
 )  # fmt: skip
 def test_a_row_is_done_when_all_counts_are_those_requested(changes, counts, status, fault):
@@ -125,5 +132,6 @@ def test_a_row_is_done_when_all_counts_are_those_requested(changes, counts, stat
 
 
 def test_a_row_is_expected_to_last_as_long_as_its_travel_points_and_ramps():
+    """The longest travel, one axis after the other; 50 points of 2 mm; two ramps of the travel and two of the row."""
     stage = Stage("x", travel_x_mm=800.0, travel_y_mm=500.0, travel_speed_mm_s=40.0, accel_mm_s2=200.0)
     assert estimate_row_duration_s(ROW, stage, 20.0) == pytest.approx(1300 / 40 + 50 * 2 / 20 + 4 * 20 / 200)

@@ -23,33 +23,38 @@ ANGLES = (55.0, 60.0)
 @pytest.fixture(scope="module")
 def powders():
     """A fitted library of four materials under two angles, drawn pixel by pixel."""
-    drawn = [draw(groups()["powders"].materials, a, Errors(0.03, 0.05), 3, 4, 6).library() for a in ANGLES]
-    entries = [replace(e, scan=f"{e.scan} at {e.incidence_deg:g}") for lib in drawn for e in lib.entries]
+    materials = groups()["powders"].materials
+    errors = Errors(amplitude=0.03, phase_rad=0.05)
+    entries = []
+    for angle in ANGLES:
+        drawn = draw(materials, angle, errors, seed=3, scans=4, pixels=6).library()
+        # A scan has one angle: those of the second angle get names of their own.
+        entries += [replace(entry, scan=f"{entry.scan} at {entry.incidence_deg:g}") for entry in drawn.entries]
     return fit_library(Library(tuple(entries), {}, "drawn"))
 
 
 @pytest.fixture(scope="module")
 def two_angles(synthetic, analyse_placement):
-    """Nine plates under both angles: a library of two placements, and the patches file of one to name, by angle."""
-    entries = [
-        entry
-        for angle in ANGLES
-        for seed in range(1000, 1002)
-        for entry in make_entries(TrainingScan(f"{angle:g}-{seed}", analyse_placement(seed, angle), True))
-    ]
-    scene = synthetic(1)
-    packed = {
-        angle: pack_patches(analyse_placement(1, angle), scene.x_m, scene.y_m, simulated=True) for angle in ANGLES
-    }
-    return Library(tuple(entries)), packed
+    """Return a library of nine plates in two placements under both angles, and a third placement's patches by angle."""
+    entries = []
+    for angle in ANGLES:
+        for seed in (1000, 1001):
+            scan = TrainingScan(f"{angle:g}-{seed}", analyse_placement(seed, angle), simulated=True)
+            entries += make_entries(scan)
+    scene = synthetic(seed=1)
+    packed_patches = {}
+    for angle in ANGLES:
+        result = analyse_placement(1, angle)
+        packed_patches[angle] = pack_patches(result, scene.x_m, scene.y_m, simulated=True)
+    return Library(tuple(entries)), packed_patches
 
 
 @pytest.fixture
 def folders(two_angles, tmp_path):
-    """Those files of `polysight process` for the two scans that naming needs."""
-    library, packed = two_angles
+    """Folder with library.npz and, for each angle, the file of `polysight process` that naming needs."""
+    library, packed_patches = two_angles
     library.save(tmp_path / "library.npz")
-    for angle, content in packed.items():
+    for angle, content in packed_patches.items():
         (tmp_path / f"{angle:g}").mkdir()
         (tmp_path / f"{angle:g}" / PATCHES_FILE).write_bytes(content)
     return tmp_path
@@ -61,13 +66,14 @@ def scans(folders):
     return [read_patches(folders / f"{angle:g}" / PATCHES_FILE) for angle in ANGLES]
 
 
-def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabilities_names(powders, tmp_path):
+def test_models_are_judged_for_each_angle_and_for_both_and_the_discriminant_is_used(powders, tmp_path):
     powders.save(tmp_path / "powders.npz")
     library = Library.load(tmp_path / "powders.npz")
     assert set(library.fit["angles"]) == {"55", "60", "55+60"}
     for fit in library.fit["angles"].values():
         assert fit["model"] == DISCRIMINANT_MODEL
         assert set(fit["judged"]) == set(MODELS)
+        # Mean difference of confidence and share of right names; the limit is chosen.
         assert 0 <= fit["calibration_error"] < 0.2
         assert fit["pixel_accuracy"] == fit["judged"][fit["model"]]["pixels"]
         assert "4 scans" in fit["split"]
@@ -83,19 +89,25 @@ def test_models_are_judged_for_each_angle_and_for_both_and_the_one_with_probabil
 
 
 def test_two_scans_are_enough_to_learn_from():
-    drawn = draw(groups()["powders"].materials, 60.0, Errors(0.003, 0.005), 3, scans=2, pixels=6)
+    errors = Errors(amplitude=0.003, phase_rad=0.005)
+    drawn = draw(groups()["powders"].materials, 60.0, errors, seed=3, scans=2, pixels=6)
     library = fit_library(drawn.library())
+    # Four materials: chance is 0.25.
     assert library.fit_for([60.0])["pixel_accuracy"] > 0.8
-    named = Classifier(library).scan([s.x for s in [drawn.samples().take(drawn.samples().patches == 1)]])
-    assert named[0].patch_name.name == drawn.materials[1].name
+    # Patches are numbered like the materials.
+    pixels = drawn.samples()
+    pixels_of_second_patch = pixels.take(pixels.patches == 1)
+    (named,) = Classifier(library).scan([pixels_of_second_patch.x])
+    assert named.patch_name.name == drawn.materials[1].name
 
 
 def test_another_model_can_be_chosen_and_the_report_names_it(powders):
     knn = Classifier(powders, model="knn", angles_deg=[60.0])
     assert knn.model == PAPER_MODEL
     assert describe_classifier(knn).startswith(PAPER_MODEL)
-    earlier = Classifier(powders, model="linear discriminant", angles_deg=[60.0])
-    assert earlier.model == DISCRIMINANT_MODEL
+    # The name of the discriminant in libraries of earlier releases.
+    of_earlier_release = Classifier(powders, model="linear discriminant", angles_deg=[60.0])
+    assert of_earlier_release.model == DISCRIMINANT_MODEL
     with expect_refusal(ErrorCode.VALUE_INVALID, "guess"):
         Classifier(powders, model="guess", angles_deg=[60.0])
 
@@ -107,7 +119,8 @@ def test_an_angle_the_library_does_not_hold_is_refused(powders):
         Classifier(powders)
 
 
-def test_angles_up_to_a_degree_apart_are_one(powders):
+def test_scans_whose_angles_differ_by_up_to_a_degree_are_of_one_angle(powders):
+    """The angle of a group is the mean of its scans' angles: 55 and 56 are one group, 57.1 is another."""
     entries = [replace(powders.entries[0], incidence_deg=angle) for angle in (55.0, 56.0, 57.1)]
     library = Library(tuple(entries), {}, "drawn")
     assert library.angles_deg == (55.5, 57.1)
@@ -118,38 +131,39 @@ def test_angles_up_to_a_degree_apart_are_one(powders):
 def test_patches_under_two_angles_are_named_together(two_angles, scans, model):
     matched = match_patches(scans)
     assert len(matched) == 9
-    named = Classifier(two_angles[0], model=model, angles_deg=ANGLES).scan([m.features for m in matched])
+    library, _ = two_angles
+    named = Classifier(library, model=model, angles_deg=ANGLES).scan([m.features for m in matched])
     assert sum(n.patch_name.name == m.truth for n, m in zip(named, matched, strict=True)) >= 8
     for n in named:
         assert 0 < n.patch_name.confidence <= 1
         assert sum(n.patch_name.votes.values()) == pytest.approx(1)
 
 
-def test_patches_match_by_place_alone(scans):
+def test_patches_of_two_scans_are_paired_by_their_place_alone(scans):
     second_scan = scans[1]
     reordered = replace(second_scan, patches=second_scan.patches[::-1])
     assert [m.label for m in match_patches([scans[0], reordered])] == [m.label for m in match_patches(scans)]
-    moved_scan = replace(
-        second_scan, patches=tuple(replace(p, centre_mm=(p.centre_mm[0] + 300, 0.0)) for p in second_scan.patches)
-    )
-    assert match_patches([scans[0], moved_scan]) == []
-    without = replace(second_scan, patches=second_scan.patches[1:])
-    assert len(match_patches([scans[0], without])) == 8
+    # 300 mm is the width of the whole image.
+    moved_patches = tuple(replace(p, centre_mm=(p.centre_mm[0] + 300, 0.0)) for p in second_scan.patches)
+    assert match_patches([scans[0], replace(second_scan, patches=moved_patches)]) == []
+    scan_without_first_patch = replace(second_scan, patches=second_scan.patches[1:])
+    assert len(match_patches([scans[0], scan_without_first_patch])) == 8
 
 
-def test_a_pixel_that_cannot_be_used_is_unknown_and_an_empty_patch_too(two_angles, scans):
-    classifier = Classifier(two_angles[0], model="discriminant", angles_deg=[55.0])
-    x = scans[0].patches[0].features.copy()
-    x[0, 2] = np.nan
-    broken, empty, all_nan = classifier.scan([x, np.zeros((0, 4)), np.full((2, 4), np.nan)])
-    assert broken.pixel_names[0] == UNKNOWN
-    assert np.isinf(broken.distance[0])
-    assert broken.patch_name.pixels == len(x) - 1
+def test_a_pixel_that_is_not_finite_is_unknown_and_so_is_a_patch_without_usable_pixels(two_angles, scans):
+    library, _ = two_angles
+    classifier = Classifier(library, model="discriminant", angles_deg=[55.0])
+    features = scans[0].patches[0].features.copy()
+    features[0, 2] = np.nan
+    first_is_nan, empty, all_nan = classifier.scan([features, np.zeros((0, 4)), np.full((2, 4), np.nan)])
+    assert first_is_nan.pixel_names[0] == UNKNOWN
+    assert np.isinf(first_is_nan.distance[0])
+    assert first_is_nan.patch_name.pixels == len(features) - 1
     assert empty.patch_name.name == all_nan.patch_name.name == UNKNOWN
     assert all_nan.pixel_names.tolist() == [UNKNOWN] * 2
 
 
-def test_two_scans_as_typed(folders, capsys):
+def test_the_command_names_the_patches_of_two_scans(folders, capsys):
     arguments = ["classify", str(folders / "55"), str(folders / "60"), "--library", str(folders / "library.npz")]
     assert main([*arguments, "--model", "discriminant", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
@@ -165,41 +179,40 @@ def test_two_scans_as_typed(folders, capsys):
 
 
 def test_patches_exchanged_between_two_angles_are_reported(folders, scans, capsys):
-    second_scan = scans[1]
-    angle = "60"
-    truths = {"wood": "ceramic", "ceramic": "wood"}
-    patch_by_truth = {p.truth: p for p in second_scan.patches}
-    swap = {
-        a: b
-        for a in patch_by_truth
-        for key, other_truth in truths.items()
-        if a and key in a
-        for b in patch_by_truth
-        if b and other_truth in b
-    }
-    assert len(swap) == 2
-    with np.load(folders / angle / PATCHES_FILE) as stored:
+    """The wood and the ceramic plate lie in each other's place in the second scan: no material fits both angles."""
+    path = folders / "60" / PATCHES_FILE
+    with np.load(path) as stored:
         content = dict(stored)
     features = content["features"].copy()
-    first = np.cumsum([0, *[len(p.features) for p in second_scan.patches]])
-    rows_of_patch = {p.truth: np.arange(first[i], first[i + 1]) for i, p in enumerate(second_scan.patches)}
-    first_truth, other_truth = swap
-    middle = {name: np.median(features[rows_of_patch[name]], axis=0) for name in swap}
-    features[rows_of_patch[first_truth]] = middle[other_truth]
-    features[rows_of_patch[other_truth]] = middle[first_truth]
+
+    # The file has the pixels of all patches one after the other.
+    rows_by_truth = {}
+    first_row = 0
+    for patch in scans[1].patches:
+        rows_by_truth[patch.truth] = slice(first_row, first_row + len(patch.features))
+        first_row += len(patch.features)
+    wood_rows = rows_by_truth["wood (thin)"]
+    ceramic_rows = rows_by_truth["ceramic"]
+
+    # The patches differ in their number of pixels: every pixel gets the median of the other patch.
+    wood_median = np.median(features[wood_rows], axis=0)
+    ceramic_median = np.median(features[ceramic_rows], axis=0)
+    features[wood_rows] = ceramic_median
+    features[ceramic_rows] = wood_median
     content["features"] = features
-    np.savez(folders / angle / PATCHES_FILE, **content)
-    command = ["classify", str(folders / "55"), str(folders / angle), "--library", str(folders / "library.npz")]
+    np.savez(path, **content)
+
+    command = ["classify", str(folders / "55"), str(folders / "60"), "--library", str(folders / "library.npz")]
     assert main([*command, "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
-    unknown = [p for p in answer["patches"] if p["truth"] in swap]
-    assert [p["name"] for p in unknown] == ["unknown", "unknown"]
+    exchanged = [p for p in answer["patches"] if p["truth"] in ("wood (thin)", "ceramic")]
+    assert [p["name"] for p in exchanged] == ["unknown", "unknown"]
     assert len(answer["contradictions"]) == 2
     assert main(command) == 0
     assert capsys.readouterr().out.count("contradicts itself") == 2
 
 
-def test_one_scan_and_wrong_folders_as_typed(folders, capsys):
+def test_the_command_names_one_scan_and_refuses_folders_without_processed_patches(folders, capsys):
     library = ["--library", str(folders / "library.npz")]
     assert main(["classify", str(folders / "60"), *library]) == 0
     assert "9 patches at 60.0 degrees" in capsys.readouterr().out
@@ -211,11 +224,13 @@ def test_one_scan_and_wrong_folders_as_typed(folders, capsys):
 
 
 def test_the_discriminant_starts_without_scikit_learn(powders, tmp_path):
-    """It takes a second or two to load, and is loaded only when it is used."""
-    powders.save(tmp_path / "l.npz")
+    """scikit-learn takes a second or two to load, and is loaded only when it is used."""
+    path = tmp_path / "l.npz"
+    powders.save(path)
+    # The exit status is 1 if scikit-learn was loaded.
     code = (
         "import sys; from pathlib import Path; from polysight.materials import Classifier, Library;"
-        f"Classifier(Library.load(Path({str(tmp_path / 'l.npz')!r})), model='discriminant', angles_deg=[55.0]);"
+        f"Classifier(Library.load(Path({str(path)!r})), model='discriminant', angles_deg=[55.0]);"
         "sys.exit('sklearn' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -11,22 +11,32 @@ from polysight.materials import Entry, Library
 from polysight_shared.errors import ErrorCode
 
 
-def test_a_report_of_images_alone_lists_the_missing_results(tmp_path):
+def test_a_report_of_a_folder_with_images_alone_is_refused(tmp_path):
     (tmp_path / "image.npz").touch()
     with expect_refusal(ErrorCode.FILE_MISSING, "report.html"):
         report(tmp_path)
 
 
-def test_classifiers_are_judged_under_both_splits_as_typed(tmp_path, capsys):
+def test_the_command_judges_classifiers_by_scans_left_out_and_by_pixels_left_out(tmp_path, capsys):
+    """A library of two materials that are far from each other, in three scans."""
     rng = np.random.default_rng(4)
 
-    def make_entry(scan: int, name: str, q: complex) -> Entry:
-        inverse = q + 0.01 * (rng.standard_normal(12) + 1j * rng.standard_normal(12))
+    def make_entry(scan: int, name: str, v_over_h: complex) -> Entry:
+        drawn_v_over_h = v_over_h + 0.01 * (rng.standard_normal(12) + 1j * rng.standard_normal(12))
         h = (0.7 + 0.01 * rng.standard_normal(12)).astype(np.float32)
-        p = (1 / inverse).astype(np.complex64)
-        return Entry(name, f"scan {scan}", h, np.abs(h * inverse).astype(np.float32), p, 55.0, simulated=True)
+        return Entry(
+            name=name,
+            scan=f"scan {scan}",
+            h=h,
+            v=np.abs(h * drawn_v_over_h).astype(np.float32),
+            p=(1 / drawn_v_over_h).astype(np.complex64),
+            incidence_deg=55.0,
+            simulated=True,
+        )
 
-    entries = [make_entry(i, name, q) for i in range(3) for name, q in (("near", 0.2), ("far", 0.4 + 0.1j))]
+    entries = []
+    for scan in range(3):
+        entries += [make_entry(scan, "near", 0.2), make_entry(scan, "far", 0.4 + 0.1j)]
     Library(tuple(entries)).save(tmp_path / "two.npz")
     assert main(["classify", str(tmp_path / "two.npz"), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)

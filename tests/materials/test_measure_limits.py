@@ -18,13 +18,16 @@ from polysight.materials.measure import (
 )
 from polysight.materials.segment import Patch
 
+# Images of 30 rows and 40 columns of pixels of 2 mm. Numbers in the cases of this file lie just on either side of a
+# limit of `measure.py`.
 SHAPE = (30, 40)
 X_M = np.arange(40) * 2e-3
 Y_M = np.arange(30) * 2e-3
-# 20 x 10 pixels
+# A patch of 20 x 10 pixels
 INSIDE = np.zeros(SHAPE, bool)
 INSIDE[10:20, 10:30] = True
 ROWS, COLUMNS = np.nonzero(INSIDE)
+# +1 and -1 in turn, as on a chessboard: half of the pixels in any part of the image have either value.
 CHEQUERED = np.where((np.add.outer(np.arange(30), np.arange(40)) % 2) == 0, 1.0, -1.0)
 
 
@@ -37,7 +40,11 @@ def make_patch(interior: np.ndarray = INSIDE, **changes: Any) -> Patch:
 
 
 def explain(h: Any, v: Any, dark: tuple[float, float] = (np.nan, np.nan), uneven: float = 0.0, **changes: Any) -> str:
-    """Why an image of H and V is not that of a plate; "" if it may be one."""
+    """Return why an image of H and V is not that of a plate; "" if it may be one.
+
+    `dark` is the amplitude of the background in H and in V, NaN if it is not known. `uneven` is how much V / H of the
+    metal's two halves differs.
+    """
     ones = np.ones(SHAPE, complex)
     finding = check_patch(make_patch(**changes), h * ones, v * ones, dark, uneven)
     return "" if finding is None else f"{finding.what}: {finding.why}"
@@ -72,82 +79,101 @@ def test_a_plate_varies_in_brightness_by_less_than_two_fifths(contrast, is_flat)
 
 @pytest.mark.parametrize(("background", "is_bright"), [(0.49, True), (0.51, False)])
 def test_a_plate_is_twice_as_bright_as_the_background(background, is_bright):
-    assert ("as dark as" in explain(1.0, 0.8, (background, np.nan))) != is_bright
+    is_called_dark = "as dark as" in explain(1.0, 0.8, dark=(background, np.nan))
+    assert is_called_dark != is_bright
 
 
 @pytest.mark.parametrize(
     ("coherence", "level", "noise", "agrees"),
     [
         (0.71, 0.8, 0.0, True), (0.69, 0.8, 0.0, False),
-        # Where V nearly vanishes, or is hardly above its noise, its phase says nothing.
+        # Where V is below 0.12 of H, or below twice its noise (0.8 < 2 * 0.401), its phase is not used.
         (0.1, 0.119, 0.0, True), (0.1, 0.121, 0.0, False), (0.1, 0.8, 0.401, True), (0.1, 0.8, 0.399, False),
     ],
 )  # fmt: skip
 def test_h_and_v_of_a_plate_agree_in_phase(coherence, level, noise, agrees):
+    # Half of the pixels are turned one way and half the other: the mean of exp(+- j phi) is cos(phi).
     v = level * np.exp(1j * np.arccos(coherence) * CHEQUERED)
-    assert ("H and V do not agree" in explain(1.0, v, (0.0, noise))) != agrees
+    is_refused = "H and V do not agree" in explain(1.0, v, dark=(0.0, noise))
+    assert is_refused != agrees
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(
-    ("step", "uneven", "is_one"),
+    ("step", "uneven", "is_accepted"),
     [
-        # 0.07 x (1 + 2 x 0.5)
+        # Allowed is 0.07 * (1 + 2 |V / H|) = 0.07 * (1 + 2 * 0.5) = 0.14,
         (0.139, 0.0, True), (0.141, 0.0, False),
-        # As much as the metal's own halves differ, if that is more
+        # or as much as the metal's own halves differ, times the same factor 2, if that is more.
         (0.199, 0.1, True), (0.201, 0.1, False), (0.141, 0.06, False),
     ],
 )  # fmt: skip
-def test_halves_of_a_plate_have_one_ratio(axis, step, uneven, is_one):
-    place = np.broadcast_to((np.arange(30) >= 15)[:, None] if axis == 0 else np.arange(40) >= 20, SHAPE)
-    # The median of |V| is 0.5 as half of the pixels have it.
-    v = 0.5 * np.exp(2j * np.where(place, 1, -1) * np.arcsin(step) / 2)
+def test_halves_of_a_plate_have_one_ratio(axis, step, uneven, is_accepted):
+    if axis == 0:
+        is_second_half = (np.arange(30) >= 15)[:, None]
+    else:
+        is_second_half = np.arange(40) >= 20
+    sign = np.broadcast_to(np.where(is_second_half, 1, -1), SHAPE)
+    # V / H is 0.5 exp(+- j phi) in the two halves: they differ by 2 * 0.5 * sin(phi).
+    v = 0.5 * np.exp(1j * sign * np.arcsin(step))
     assert measure_difference_of_halves(np.ones(SHAPE, complex), v, INSIDE) == pytest.approx(step)
-    assert ("halves have different ratios" in explain(1.0, v, uneven=uneven)) != is_one
+    is_refused = "halves have different ratios" in explain(1.0, v, uneven=uneven)
+    assert is_refused != is_accepted
 
 
 def test_halves_may_differ_by_noise():
-    """22 times the noise over the root of 200 pixels: 0.156 for a tenth; without noise 0.14 are too much."""
-    v = 0.5 * np.exp(1j * np.where(np.arange(40) >= 20, 1, -1) * np.arcsin(0.2))
+    """Allowed are 0.14 without noise, as above, and in addition 22 times the noise over the root of 200 pixels.
+
+    That is sqrt(0.14^2 + 0.156^2) = 0.209 with a noise of 0.1, and 0.198 with 0.09.
+    """
+    sign = np.where(np.arange(40) >= 20, 1, -1)
+    v = 0.5 * np.exp(1j * sign * np.arcsin(0.2))
     assert measure_difference_of_halves(np.ones(SHAPE, complex), v * np.ones(SHAPE), INSIDE) == pytest.approx(0.2)
     allowed = np.hypot(0.14, 22 * 0.1 / 200**0.5)
     assert allowed > 0.2
-    assert explain(1.0, v, (0.0, 0.1)) == ""
-    assert "halves" in explain(1.0, v, (0.0, 0.09))
+    assert explain(1.0, v, dark=(0.0, 0.1)) == ""
+    assert "halves" in explain(1.0, v, dark=(0.0, 0.09))
 
 
-def test_few_pixels_have_no_halves():
-    values = np.ones(SHAPE, complex)
-    v = values * np.where(np.arange(40) >= 12, 2, 1)
-    few = np.zeros(SHAPE, bool)
-    few[3, 6:17] = True
-    assert measure_difference_of_halves(values, v, few) == 0.0
-    few[3, 17] = True
-    assert measure_difference_of_halves(values, v, few) == pytest.approx(1.0)
-    assert measure_difference_of_halves(values, v, np.zeros(SHAPE, bool)) == 0.0
-    assert measure_difference_of_halves(0 * values, v, few) == 0.0
+def test_halves_are_compared_from_twelve_pixels_on():
+    h = np.ones(SHAPE, complex)
+    # V / H is 1 left of column 12 and 2 right of it, in the middle of columns 6 to 17.
+    v = h * np.where(np.arange(40) >= 12, 2, 1)
+    few_pixels = np.zeros(SHAPE, bool)
+    few_pixels[3, 6:17] = True
+    assert measure_difference_of_halves(h, v, few_pixels) == 0.0
+    few_pixels[3, 17] = True
+    assert measure_difference_of_halves(h, v, few_pixels) == pytest.approx(1.0)
+    # No pixels, and none with a signal
+    assert measure_difference_of_halves(h, v, np.zeros(SHAPE, bool)) == 0.0
+    assert measure_difference_of_halves(0 * h, v, few_pixels) == 0.0
 
 
 @pytest.mark.parametrize(
-    ("odd_pixels", "ratio_of_odd", "noise", "is_one"),
+    ("odd_pixels", "ratio_of_odd", "noise", "is_accepted"),
     [
-        # Of 200 pixels 15 % may be odd, by 0.15 or half of the usual ratio.
+        # Of 200 pixels 15 %, 30, may be odd. The usual ratio is 0.3: a pixel is odd that differs by more than half of
+        # it, 0.15,
         (30, 0.0, 0.0, True), (31, 0.0, 0.0, False), (60, 0.151, 0.0, True), (60, 0.149, 0.0, False),
-        # And twice the noise
+        # or with noise by more than sqrt(0.15^2 + (2 * 0.1)^2) = 0.25.
         (60, 0.06, 0.1, True), (60, 0.04, 0.1, False),
     ],
 )  # fmt: skip
-def test_a_plate_has_few_odd_pixels(odd_pixels, ratio_of_odd, noise, is_one):
+def test_a_plate_has_few_odd_pixels(odd_pixels, ratio_of_odd, noise, is_accepted):
     v = np.full(SHAPE, 0.3, complex)
-    # Every third pixel, so that halves are alike
-    v[ROWS[::3][:odd_pixels], COLUMNS[::3][:odd_pixels]] = ratio_of_odd
-    assert ("pixels have another ratio" in explain(1.0, v, (0.0, noise))) != is_one
+    # Every third pixel is odd, so that both halves of the patch are alike.
+    odd_rows = ROWS[::3][:odd_pixels]
+    odd_columns = COLUMNS[::3][:odd_pixels]
+    v[odd_rows, odd_columns] = ratio_of_odd
+    is_refused = "pixels have another ratio" in explain(1.0, v, dark=(0.0, noise))
+    assert is_refused != is_accepted
 
 
 def draw_ratio(amplitude: float, phase: float, slope: tuple[complex, complex] = (0.0, 0.0)) -> np.ndarray:
-    """V / H of 0.5 with this scatter of its logarithm, and a change per metre along x and y."""
+    """Return V / H of 0.5 with this scatter of its logarithm, which changes by `slope` per metre along x and y."""
     rng = np.random.default_rng(3)
     noise = amplitude * rng.standard_normal(SHAPE) + 1j * phase * rng.standard_normal(SHAPE)
+    # The middle of the image is at 39 and 29 mm.
     return 0.5 * np.exp(noise + slope[0] * (X_M - 0.039) + slope[1] * (Y_M[:, None] - 0.029))
 
 
@@ -155,16 +181,17 @@ def test_scatter_is_that_of_amplitude_and_phase():
     everywhere = np.ones(SHAPE, bool)
     scatter = measure_scatter(everywhere, np.ones(SHAPE, complex), draw_ratio(0.03, 0.05), X_M, Y_M)
     assert scatter is not None
+    # The scatter of 1200 pixels, from the median deviation, has an error of 1.17 / sqrt(1200) = 3.4 %.
     assert (scatter.amplitude, scatter.phase) == pytest.approx((0.03, 0.05), rel=0.08)
-    # 1200 pixels of 4 mm^2 in places of 12 mm
+    # Independent places of 12 x 12 mm: 1200 pixels of 4 mm^2
     assert scatter.blocks == pytest.approx(1200 * 4 / 144)
     assert scatter.centre_m == pytest.approx((0.039, 0.029))
     assert scatter.level == pytest.approx(0.5, rel=0.01)
     assert scatter.relief_rad == pytest.approx(0.0, abs=1e-9)
-    # A slope's error from so many independent places, each with the scatter
+    # Error of the slope of a straight line through so many independent values with this scatter
     for axis_m, std in ((X_M, scatter.slope_std[0]), (Y_M, scatter.slope_std[1])):
-        expected = 1 / np.sqrt(scatter.blocks) / np.std(axis_m)
-        assert (std.real, std.imag) == pytest.approx((0.03 * expected, 0.05 * expected), rel=0.1)
+        std_per_scatter = 1 / np.sqrt(scatter.blocks) / np.std(axis_m)
+        assert (std.real, std.imag) == pytest.approx((0.03 * std_per_scatter, 0.05 * std_per_scatter), rel=0.1)
 
 
 def test_a_slope_over_a_plate_is_found():
@@ -176,39 +203,47 @@ def test_a_slope_over_a_plate_is_found():
 
 def test_a_plate_of_few_or_dark_pixels_has_no_scatter():
     ones = np.ones(SHAPE, complex)
-    few = np.zeros(SHAPE, bool)
-    few[4, :11] = True
-    assert measure_scatter(few, ones, 0.5 * ones, X_M, Y_M) is None
-    few[4, 11] = True
-    scatter = measure_scatter(few, ones, 0.5 * ones, X_M, Y_M)
+    pixels = np.zeros(SHAPE, bool)
+    pixels[4, :11] = True
+    assert measure_scatter(pixels, ones, 0.5 * ones, X_M, Y_M) is None
+    # Twelve pixels are enough, 48 mm^2: less than an independent place of 144 mm^2 counts as one.
+    pixels[4, 11] = True
+    scatter = measure_scatter(pixels, ones, 0.5 * ones, X_M, Y_M)
     assert scatter is not None
-    # One place at least
     assert scatter.blocks == 1.0
-    assert measure_scatter(few, ones, 0 * ones, X_M, Y_M) is None
-    assert measure_scatter(few, 0 * ones, ones, X_M, Y_M) is None
+    assert measure_scatter(pixels, ones, 0 * ones, X_M, Y_M) is None
+    assert measure_scatter(pixels, 0 * ones, ones, X_M, Y_M) is None
 
 
-def test_a_tilt_is_no_relief():
+def test_the_phase_of_a_tilted_plane_is_not_relief():
     places = np.stack([X_M[COLUMNS], Y_M[ROWS]], axis=1)
     places -= places.mean(axis=0)
-    phase = places @ (10.0, -5.0)
-    assert _measure_relief(np.exp(1j * (phase + 2)), places) == pytest.approx(0.0, abs=1e-9)
-    wavy = 0.2 * CHEQUERED[INSIDE]
-    assert _measure_relief(np.exp(1j * (phase + wavy)), places) == pytest.approx(0.2, rel=0.01)
+    # Radians per metre along x and y, and any constant
+    tilt_phase = places @ (10.0, -5.0) + 2
+    assert _measure_relief(np.exp(1j * tilt_phase), places) == pytest.approx(0.0, abs=1e-9)
+    relief_phase = 0.2 * CHEQUERED[INSIDE]
+    assert _measure_relief(np.exp(1j * (tilt_phase + relief_phase)), places) == pytest.approx(0.2, rel=0.01)
 
 
 def make_scatter(amplitude: float, phase: float, blocks: float) -> Scatter:
+    """Return the scatter of a plate without slopes, with this number of independent places (`blocks`)."""
     zero = np.zeros(2, complex)
     return Scatter(amplitude, phase, blocks, zero, zero, (0.0, 0.0))
 
 
 def test_errors_of_a_mean_fall_with_the_places_of_a_plate():
-    """A plate's scatter counts as often as it has places, the usual one twice."""
-    assert relative_errors(None, (0.04, 0.08)) == pytest.approx((0.85 * 0.04, 0.75 * 0.08))
-    amplitude, phase = relative_errors(make_scatter(0.01, 0.02, 8.0), (0.04, 0.08))
+    """The variance is a mean: the plate's own counts once for each of its places, the usual one of all plates twice."""
+    usual = (0.04, 0.08)
+    # 0.85 and 0.75 are measured factors of the error of a mean over its scatter (`measure.py`).
+    assert relative_errors(None, usual) == pytest.approx((0.85 * 0.04, 0.75 * 0.08))
+    amplitude, phase = relative_errors(make_scatter(amplitude=0.01, phase=0.02, blocks=8.0), usual)
     variance = (2 * 0.04**2 + 8 * 0.01**2) / 10
     assert amplitude == pytest.approx(0.85 * (variance / 8) ** 0.5)
+    # All phases here are twice the amplitudes: four times the variance.
     assert phase == pytest.approx(0.75 * (4 * variance / 8) ** 0.5)
+
+
+def test_the_usual_scatter_is_the_median_over_the_plates():
     plates = [make_scatter(0.01, 0.05, 1), make_scatter(0.02, 0.01, 1), make_scatter(0.09, 0.02, 1)]
     assert find_usual_scatter(plates) == (0.02, 0.02)
     assert find_usual_scatter([]) == (0.0, 0.0)
@@ -219,26 +254,34 @@ def test_a_patch_is_measured_with_all_its_errors():
     h = np.full(SHAPE, 0.8 + 0j)
     plain = measure_patch(make_patch(), h, v, theta_rad=0.7)
     assert plain.inverse_ratio == pytest.approx((0.5 - 0.1j) / 0.8)
-    assert (plain.relative_std, plain.rise) == ((0.0, 0.0), (0.0, 0.0))
+    assert plain.relative_std == (0.0, 0.0)
+    assert plain.rise == (0.0, 0.0)
+
+    # ln(V / H) is known to be wrong by 0.2 + 0.1j, with errors of 0.03 and 0.05.
     changed = measure_patch(
         make_patch(), h, v, theta_rad=0.7, usual=(0.04, 0.08), change=(0.2 + 0.1j, (0.03, 0.05)), local_std=(0.01, 0.02)
     )
     assert changed.inverse_ratio == pytest.approx((0.5 - 0.1j) / 0.8 * np.exp(-0.2 - 0.1j))
-    assert (changed.std, changed.theta_rad, changed.brightness) == pytest.approx((0.6e-3, 0.7, 0.8))
-    assert changed.relative_std == pytest.approx(
-        (
-            (0.034**2 + 0.03**2 + 0.01**2) ** 0.5,
-            (0.06**2 + 0.05**2 + 0.02**2) ** 0.5,
-        )
-    )
+    # All pixels are equal: `std` has its least value.
+    assert changed.std == pytest.approx(0.6e-3)
+    assert changed.theta_rad == pytest.approx(0.7)
+    assert changed.brightness == pytest.approx(0.8)
+    # The squares add up of: the usual scatter times 0.85 and 0.75 as above, the error of the change, and `local_std`.
+    amplitude_std = ((0.85 * 0.04) ** 2 + 0.03**2 + 0.01**2) ** 0.5
+    phase_std = ((0.75 * 0.08) ** 2 + 0.05**2 + 0.02**2) ** 0.5
+    assert changed.relative_std == pytest.approx((amplitude_std, phase_std))
 
 
-def test_the_error_of_a_ratio_is_that_of_the_background_and_what_is_systematic():
-    """d(1/P) of noise in V and H, each part, and dP = P^2 d(1/P)."""
+def test_the_error_of_a_ratio_is_that_of_the_background_and_the_systematic_one():
+    """1 / P = V / H has an error of (dV - V/H dH) / H. That of P is |P|^2 times as large.
+
+    The amplitudes of the background are 0.1 in H and 0.2 in V; each of two parts has 1 / sqrt(2) of that.
+    """
     h = np.array([[2.0, 2.0, 2.0, np.nan, 1.0]], complex)
     v = np.array([[1.0, 1.0j, 4.0, 1.0, np.inf]], complex)
     systematic = np.array([[0.0, 0.03, 0.0, 0.0, 0.0]])
     sigma = ratio_sigma(h, v, (0.1, 0.2), systematic)
+    # The first two pixels have |V / H| = 0.5 and |H| = 2, so |P|^2 = 4; the third has |V / H| = 2 and |P|^2 = 1 / 4.
     noise = np.hypot(0.2, 0.5 * 0.1) / 2 / 2**0.5
     assert sigma[0, 0] == pytest.approx(noise * 4)
     assert sigma[0, 1] == pytest.approx(np.hypot(noise, 0.03) * 4)

@@ -23,7 +23,9 @@ from polysight.radar.messages import ANALOG_FAULT, FRAME_END, MAIN_CPU_FAULT, RF
 from polysight_shared.errors import ErrorCode
 from polysight_simulators.radars import Fault, board as simulated, cores, make_image
 
+# Frames of a row, each started by a pulse: fewer than in a scan, for a fast test.
 FRAMES = 32
+# Period of the published rig's pulses.
 PERIOD_S = 1.5e-3
 
 
@@ -38,7 +40,7 @@ def send_pulses(board: simulated.RadarBoard, clock, count: int, period_s: float 
         clock.sleep(period_s)
 
 
-def test_from_off_to_done(radar, board, clock):
+def test_a_board_goes_from_off_to_done_with_the_last_pulse_of_a_row(radar, board, clock):
     assert radar.state is State.OFF
     radar.configure()
     assert radar.state is State.CONFIGURED
@@ -66,27 +68,35 @@ def test_frames_of_a_software_trigger_without_number_run_until_they_are_stopped(
     assert radar.link.wait_for((FRAME_END,), 1.0, lambda _: None).id == FRAME_END
 
 
-def test_every_step_is_reported_once_in_order(radar, board):
+def test_every_message_of_bring_up_and_arming_is_sent_once_in_order(radar, board):
+    """Numbers of messages are those of TI's interface control document (docs/spec/mmwavelink.md).
+
+    The frequencies of the profile are codes: 76.01 GHz and the board's offset in steps of 53.6 Hz, 38.8 MHz/us in steps
+    of 48.3 kHz/us.
+    """
     radar.configure()
     radar.arm(FRAMES)
     expected = [0x404C, 0x4000, 0x0220, 0x40E0, 0x0080, 0x0082, 0x02CC, 0x4041, 0x0083, 0x008D, 0x0086, 0x00C0]
     expected += [0x0100, 0x0101, 0x4042, 0x4044, 0x0085, 0x4043, 0x4045, 0x0223, 0x02EA, 0x0102, 0x40C0, 0x0140]
     assert board.executed == expected
-    start = struct.unpack_from("<I", board.settings[0x0100], 4)[0]
-    slope = struct.unpack_from("<h", board.settings[0x0100], 28)[0]
-    assert (start, slope) == (1416929098, 804)
+    (start_code,) = struct.unpack_from("<I", board.settings[0x0100], 4)
+    (slope_code,) = struct.unpack_from("<h", board.settings[0x0100], 28)
+    assert (start_code, slope_code) == (1416929098, 804)
     assert struct.unpack_from("<H", board.settings[0x0102], 8)[0] == FRAMES
 
 
 def test_only_the_transmitter_transmits(rig):
     for position in rig.boards:
         messages = make_program(rig, position)
+        # Two messages have a bit for each of the three transmitters: the second one is used, and only by one board.
         masks = [c.tx for c in (*messages.basic, *messages.waveform) if hasattr(c, "tx")]
         assert masks == ([0b010] * 2 if position.role == "transmit" else [0, 0])
 
 
 def test_a_board_is_armed_only_after_the_radar_reported_it(radar, monkeypatch):
+    """Event 0x100B: ready for triggers."""
     radar.configure()
+    # The simulated board needs that many seconds to become ready.
     monkeypatch.setattr(cores, "READY_S", 1e9)
     with expect_refusal(ErrorCode.NO_ANSWER, "0x100B"):
         radar.arm(FRAMES)
@@ -113,6 +123,7 @@ def test_remaining_frames_are_stopped_before_arming_again(radar, board, clock):
 
 def test_a_stop_is_never_sent_during_a_frame(radar, board, clock):
     radar.arm(FRAMES)
+    """Arming stops waiting frames; it is asked for at five moments of a frame, which lasts 0.23 ms, and after it."""
     for n in range(5):
         board.trigger()
         clock.sleep(n * 3e-4)
@@ -130,8 +141,9 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
 
 
 @pytest.mark.parametrize(
-    ("number", "data", "words_of_it"),
+    ("number", "data", "reason"),
     [
+        # Faults of a core: code, code of an error, line of the firmware. Groups of error signals. Faults of the supply.
         (RF_CPU_FAULT, struct.pack("<BBH", 3, 1, 4711) + bytes(28), "not triggered by a pulse, firmware line 4711"),
         (RF_CPU_FAULT, struct.pack("<BBH", 2, 0, 0) + bytes(28), "data access abort"),
         (RF_ESM_FAULT, struct.pack("<II", 0, 1), "group 2 0x00000001"),
@@ -143,19 +155,20 @@ def test_the_frame_configuration_is_sent_only_when_it_changes(radar, board, cloc
         (RF_ESM_FAULT, bytes(4), "only 4 bytes"),
     ],
 )
-@pytest.mark.parametrize("running", [False, True])
-def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, words_of_it, running):
+@pytest.mark.parametrize("is_running", [False, True])
+def test_fatal_events_are_faults_with_their_reason(radar, board, number, data, reason, is_running):
     radar.arm(FRAMES)
-    if running:
+    if is_running:
         radar.note_pulses()
     board.send_event(number, data)
     assert radar.poll() is State.FAULT
-    assert words_of_it in radar.reason
+    assert reason in radar.reason
 
 
 @pytest.mark.parametrize(
     ("number", "data"),
     [
+        # Kinds of these events that are not fatal, a report of a calibration, and an unknown event.
         (RF_ESM_FAULT, struct.pack("<II", 1, 0)),
         (RF_ERROR, struct.pack("<II", 7, 0)),
         (0x1012, bytes(20)),
@@ -169,8 +182,9 @@ def test_other_events_are_not_faults(radar, board, number, data):
 
 
 def test_an_early_pulse_is_fatal_and_the_next_arming_resets_the_board(radar, board, clock):
+    # The second pulse comes 0.1 ms after the first, within its frame.
     radar.arm(FRAMES)
-    send_pulses(board, clock, 2, 1e-4)
+    send_pulses(board, clock, 2, period_s=1e-4)
     assert radar.poll() is State.FAULT
     assert "not triggered" in radar.reason
     radar.arm(FRAMES)
@@ -197,10 +211,12 @@ def test_the_report_has_versions_temperatures_calibration_and_every_byte_sent(ra
     radar.configure()
     radar.arm(FRAMES)
     result = radar.report()
-    assert (result["rf_firmware"], result["main_firmware"]) == ("2.2.1.7 patch 2.2.4.0", "2.2.1.7 patch 2.2.2.0")
+    assert result["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
+    assert result["main_firmware"] == "2.2.1.7 patch 2.2.2.0"
     assert result["die_id"] == "5eed0001-00000d1e-000008c3-00000001"
     assert result["temperatures_c"]["tx2"] == 46
     assert result["calibration"]["temperature_c"] == 41
+    # The host's first words ask to read the power-up event; the first command is the configuration of the device.
     assert result["sent"][0].startswith("78566587")
     first = next(raw for raw in result["sent"] if not raw.startswith("78566587"))
     assert first == "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"
@@ -230,7 +246,8 @@ def test_one_pulse_starts_a_frame_of_many_chirps(rig, words, clock, board):
     assert radar.poll() is State.DONE
 
 
-def test_the_main_core_s_fault_is_ignored_only_until_the_board_is_configured(rig, words, clock, board):
+def test_a_fault_of_the_main_core_is_ignored_only_until_the_board_is_configured(rig, words, clock, board):
+    """AWR2243 boards may report one at their start, which then succeeds (docs/spec/mmwavelink.md)."""
     radar = RadarBoard("LS", words, clock, make_program(rig, rig.by_name("LS")))
     radar.configure()
     assert any("main core fault" in line for line in radar.report()["events"])
@@ -252,6 +269,8 @@ def test_a_board_that_restarts_by_itself_is_a_fault_and_recovers(radar, board, c
 IMAGE = check_image(make_image(), "image.bin")
 
 
+# Commands of a bring-up and an arming: 25 with firmware in the flash, and 60 with those that load it into the RAM, of
+# which every seventh is tried.
 @pytest.mark.parametrize(("flash", "commands", "step"), [(make_image(), 25, 1), (b"", 60, 7)], ids=["flash", "RAM"])
 def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, commands, step):
     """The restart replaces each answer of a bring-up and an arming: it is the cause, not the rig file or the image."""
@@ -259,42 +278,45 @@ def test_a_restart_at_any_command_is_reported_as_such(rig, clock, flash, command
         board = simulated.RadarBoard(lambda: clock.time, flash=flash)
         words = Restarts(board, clock, command_of_restart)
         radar = RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE)
-        began = clock.time
+        begun_s = clock.time
         with expect_refusal(ErrorCode.RADAR_RESTARTED, "RH"):
             radar.arm(FRAMES)
-        assert clock.time - began < 8.0, command_of_restart
+        # The longest timeout of a message is not waited for several times (virtual time, chosen).
+        assert clock.time - begun_s < 8.0, command_of_restart
         assert radar.state is State.FAULT
         radar.arm(FRAMES)
         assert radar.state is State.ARMED
+    # The number of commands is the right one: without a restart so many are sent.
     words = Restarts(simulated.RadarBoard(lambda: clock.time, flash=flash), clock, 1000)
     RadarBoard("RH", words, clock, make_program(rig, rig.by_name("RH")), IMAGE).arm(FRAMES)
     assert 1000 - words.left == commands
 
 
 def test_a_refusal_just_after_a_restart_is_reported_as_a_restart(radar, board, monkeypatch):
-    """The ROM answers before it reports its power-up."""
+    """After a restart the ROM refuses a setting before it reports its power-up (event 0x5000)."""
     execute = board.cores.execute
 
-    def restarting(number, data, remaining):
+    def restart_at_data_format(number, data, remaining):
         if number == 0x0082:
             board.cores.event(0x5000, struct.pack("<IQQ", 371_216, 0, 0), 0.03)
             return 6, b"", 0.0
         return execute(number, data, remaining)
 
-    monkeypatch.setattr(board.cores, "execute", restarting)
+    monkeypatch.setattr(board.cores, "execute", restart_at_data_format)
     with expect_refusal(ErrorCode.RADAR_RESTARTED, "LS"):
         radar.configure()
 
 
 def test_frames_that_end_right_after_arming_are_an_error(radar, board, monkeypatch):
+    """The board reports 0x100F, the end of the frames, together with 0x100B, ready for triggers."""
     event = board.cores.event
 
-    def both(number, data, delay_s):
+    def send_with_end(number, data, delay_s):
         event(number, data, delay_s)
         if number == 0x100B:
             event(0x100F, b"", delay_s)
 
-    monkeypatch.setattr(board.cores, "event", both)
+    monkeypatch.setattr(board.cores, "event", send_with_end)
     with expect_refusal(ErrorCode.OTHER, "LS"):
         radar.arm(FRAMES)
 
@@ -315,6 +337,7 @@ def test_a_cable_unplugged_before_the_power_up_event_is_not_reported_as_wrong_ju
     [([Fault.REFUSE], ErrorCode.REFUSED_BY_PEER), ([Fault.NO_ANSWER] * 3, ErrorCode.NO_ANSWER)],
 )
 def test_an_ignored_fault_is_named_after_the_cause_of_a_failure(radar, board, faults, code):
+    """The fault that boards report at their start is not the cause, but may help: it is not first in the text."""
     board.inject(*faults)
     with expect_refusal(code) as caught:
         radar.configure()
@@ -325,9 +348,10 @@ def test_events_without_end_delay_a_poll_only_briefly(radar, board, clock):
     radar.arm(FRAMES)
     for _ in range(5000):
         board.send_event(0x1012, bytes(20))
-    began = clock.time
+    begun_s = clock.time
     assert radar.poll() is State.ARMED
-    assert clock.time - began < 0.5
+    # Virtual time; the limit is chosen.
+    assert clock.time - begun_s < 0.5
     assert any("without a pause" in line for line in radar.warnings)
     for _ in range(200):
         radar.poll()

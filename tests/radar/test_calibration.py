@@ -28,11 +28,12 @@ def make_board(rig, words, clock):
     return make
 
 
-def test_settings_are_read_back_as_sent(make_board, board):
+def test_settings_are_read_back_and_a_difference_is_reported(make_board, board):
     radar = make_board()
     radar.configure()
     radar.arm(FRAMES)
     assert radar.read_back() == []
+    # One byte of the profile is another one in the board.
     board.cores.profiles[0] = board.cores.profiles[0][:4] + b"\0" + board.cores.profiles[0][5:]
     (difference,) = radar.read_back()
     assert difference.startswith("0x0100: sent ")
@@ -49,13 +50,17 @@ def test_a_calibration_is_saved_and_restored_at_the_next_start(make_board, board
     restored_board = make_board(files)
     restored_board.configure()
     assert restored_board.facts.calibration_restored is True
+    # The saved calibration has three parts.
     assert board.executed.count(RestoreCalibration.ID) == 3
-    mask = struct.unpack_from("<I", board.settings[InitCalibrations.ID])[0]
+    # The board makes the other calibrations by itself, and not the restored ones.
+    (mask,) = struct.unpack_from("<I", board.settings[InitCalibrations.ID])
     assert mask & RESTORED_CALIBRATIONS == 0
     assert mask | RESTORED_CALIBRATIONS == ALL_CALIBRATIONS
     assert restored_board.state is State.CONFIGURED
 
 
+# Bits of the calibrations that a board reports (ICD 217, docs/spec/mmwavelink.md): those that each board needs, and
+# those of the transmitters.
 NEEDED = {1: "clock PLL", 2: "VCO1", 3: "VCO2", 4: "LO", 5: "ADC", 6: "high-pass", 7: "low-pass", 10: "gain", 12: "I/Q"}
 OF_TX = {8: "peak", 9: "TX power", 11: "TX phase"}
 
@@ -63,7 +68,8 @@ OF_TX = {8: "peak", 9: "TX power", 11: "TX phase"}
 @pytest.mark.parametrize("name", ["LS", "RH"])
 @pytest.mark.parametrize(("bit", "text"), (NEEDED | OF_TX).items())
 def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp_path, name, bit, text):
-    """Bits of ICD 217; those of the transmitters are needed by the board that transmits."""
+    """Calibrations of the transmitters are needed only by the board that transmits, LS."""
+    # All of bits 1 to 12 but this one.
     board.cores.passing_calibrations = 0x1FFE & ~(1 << bit)
     files = CalibrationFiles(tmp_path / "kept", b"settings")
     radar = RadarBoard(name, words, clock, make_program(rig, rig.by_name(name)), calibration=files)
@@ -73,6 +79,7 @@ def test_a_failed_rf_init_is_refused_and_not_saved(rig, words, clock, board, tmp
     with expect_refusal(ErrorCode.RADAR_FAULT, text):
         radar.configure()
     assert not (tmp_path / "kept").exists()
+    # No profile was sent after it.
     assert 0x0100 not in board.executed
 
 
@@ -90,6 +97,7 @@ def test_other_settings_and_other_dies_have_their_own_calibration(make_board, bo
     assert len(list(tmp_path.iterdir())) == 3
 
 
+# A file that was cut, one whose checksum is another one, and one that is no table.
 @pytest.mark.parametrize(
     "spoil", [lambda t: t[: len(t) // 2], lambda t: t.replace('"crc32": ', '"crc32": 1'), lambda t: t[:0] + "[]"]
 )

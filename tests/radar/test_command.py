@@ -21,6 +21,7 @@ from polysight_simulators.radars import RadarBoard, make_image
 from polysight_simulators.radars.__main__ import replay
 from polysight_simulators.radars.cores import BOOT_S, FAULT_DATA
 
+# Steps of `polysight radar check`, in order.
 STEPS = ["USB", "reset", "power rails", "firmware", "RF power-up", "versions", "settings", "RF init", "chirp", "die id"]
 STEPS += ["one frame", "read back"]
 
@@ -37,7 +38,7 @@ def rig_file(rig, tmp_path):
 
 @pytest.fixture
 def opened_boards(words, clock, monkeypatch):
-    """The command reaches the simulated board `RH`, in virtual time."""
+    """Connect the command to the simulated board `RH`, in virtual time; places and speeds of opened boards."""
     places = []
 
     def open_board(place, slow):
@@ -57,6 +58,7 @@ def test_the_plan_lists_every_message_of_every_board(rig, rig_file, capsys):
     assert run(rig_file(), "plan") == 0
     out = capsys.readouterr().out
     assert "BROKEN" not in out
+    # 34122143: the sync word of the host's messages.
     sent = [decode(bytes.fromhex(line.split()[-1])).blocks for line in out.splitlines() if "34122143" in line]
     expected = []
     for board in rig.boards:
@@ -77,6 +79,7 @@ def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
 @pytest.mark.parametrize(
     ("spoil", "step", "text"),
     [
+        # The jumpers of a board select how it starts.
         (lambda board: setattr(board, "functional_jumpers", False), "reset", ("SOP0 set", "[ o=o ]", "5 V")),
         (lambda board: board.switch_power(False), "reset", ("no power",)),
         (lambda board: setattr(board.cores, "flash", b""), "versions", ("no patch", "radar.firmware")),
@@ -85,7 +88,7 @@ def test_a_sound_board_passes_every_step(rig_file, opened_boards, capsys):
     ],
 )
 @pytest.mark.usefixtures("opened_boards")
-def test_a_failed_step_has_the_expected_outcome_and_a_remedy(rig_file, board, capsys, spoil, step, text):
+def test_a_failed_step_is_reported_with_what_was_expected_and_a_remedy(rig_file, board, capsys, spoil, step, text):
     spoil(board)
     assert run(rig_file(), "check", "RH") == 1
     out = capsys.readouterr().out
@@ -121,7 +124,7 @@ def test_a_plan_with_a_broken_constraint_fails_without_opening_a_board(
 
 
 @pytest.mark.usefixtures("opened_boards")
-def test_firmware_goes_to_ram_and_to_the_flash_only_with_flash(rig_file, words, board, capsys, tmp_path):
+def test_firmware_goes_to_ram_and_to_the_flash_only_with_the_option_flash(rig_file, words, board, capsys, tmp_path):
     board.cores.flash = b""
     image = tmp_path / "image.bin"
     image.write_bytes(make_image())
@@ -155,6 +158,7 @@ def test_a_rig_without_native_boards_is_refused(rig, rig_file, capsys):
         assert "usb_serial" in capsys.readouterr().err
 
 
+# Changes of a board: none, firmware that is missing, and wrong jumpers.
 SPOILT = [
     lambda board: setattr(board, "plugged", True),
     lambda board: setattr(board.cores, "flash", b""),
@@ -182,20 +186,20 @@ def test_an_event_at_any_time_after_power_up_replays(
 ):
     """A trace counts queries, because each takes time over USB: in a replay the line rises at the same query."""
     del opened_boards
-    look = words.interrupt
+    read_line = words.interrupt
     boot = board.cores.boot
 
-    def slow_look():
+    def read_line_slowly():
         clock.sleep(look_s)
-        return look()
+        return read_line()
 
-    def booting():
+    def boot_with_event():
         boot()
         board.cores.event(0x5002, FAULT_DATA, BOOT_S + after_s)
 
     board.cores.fault_at = "never"
-    words.interrupt = slow_look
-    board.cores.boot = booting
+    words.interrupt = read_line_slowly
+    board.cores.boot = boot_with_event
     trace = str(tmp_path / "day.jsonl")
     assert run(rig_file(), "check", "RH", "--trace", trace) == 0
     result = [line for line in capsys.readouterr().out.splitlines() if line.startswith("RH")]
@@ -209,10 +213,12 @@ def test_a_trace_has_both_directions_and_every_change_of_a_line(rig_file, tmp_pa
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
     lines = [json.loads(line) for line in trace.read_text().splitlines()]
     assert (lines[0]["trace"], lines[0]["board"], lines[0]["place"]) == (1, "RH", "FTRH")
+    # NRST, the reset, is low while it is held. HOST_INTR is high while the board has a message.
     assert [r["level"] for r in lines if r.get("line") == "NRST"] == [0, 1]
     levels = [r["level"] for r in lines if r.get("line") == "HOST_INTR"]
-    # Each a change
+    # Only changes are in the trace, so the levels alternate.
     assert levels == [n % 2 for n in range(len(levels))]
+    # Each rise of the line is one message, which begins with the device's sync word.
     text = "".join(r.get("in", "") for r in lines)
     assert text.count("badccdab") == levels.count(1)
     assert all(a["t"] <= b["t"] for a, b in pairwise(lines[1:]))
@@ -246,6 +252,8 @@ def test_a_file_that_is_not_a_trace_is_refused(rig_file, capsys, tmp_path, text)
 
 
 HEAD = '{"trace": 1, "board": "RH"}\n'
+# Too deep; times that are negative, infinite, too large or missing; values of the wrong type; and times that run
+# backwards.
 BAD_LINES = ["[" * 100_000, '{"t": -5, "out": ""}', '{"t": Infinity, "out": ""}', '{"t": 1e9, "out": ""}', '{"t": 1}']
 BAD_LINES += [
     '{"t": 1, "line": "HOST_INTR"}',
@@ -303,6 +311,7 @@ def test_an_interrupted_flash_write_reports_the_parts_written(rig_file, words, b
     calls = []
 
     def stop_at_part_7(sent):
+        # A command begins with this word of its sync word. The first command is the question for the version.
         calls.extend(w for w in sent[:1] if w == 0x1234)
         if len(calls) == 8:
             raise KeyboardInterrupt
@@ -330,7 +339,7 @@ def test_a_truncated_trace_replays_to_its_end(rig_file, capsys, tmp_path):
 def test_a_trace_is_replayed_to_a_simulated_board(rig_file, tmp_path):
     trace = tmp_path / "day.jsonl"
     assert run(rig_file(), "check", "RH", "--trace", str(trace)) == 0
-    same = replay(trace, lambda now: RadarBoard(now, flash=make_image()))
-    assert same == []
-    empty_board = replay(trace, RadarBoard)  # its flash is empty
-    assert empty_board
+    differences_of_equal_board = replay(trace, lambda now: RadarBoard(now, flash=make_image()))
+    assert differences_of_equal_board == []
+    differences_of_board_without_firmware = replay(trace, RadarBoard)
+    assert differences_of_board_without_firmware

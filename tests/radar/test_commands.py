@@ -11,6 +11,7 @@ from polysight.radar.calibration_data import InitCalibrations, RestoreCalibratio
 from polysight.radar.firmware import split_into_chunks
 from polysight.radar.messages import command, decode, encode
 
+# The chirp of the published rig, and one with other values in every field that may differ.
 PUBLISHED = c.Profile(
     start_hz=76.01e9,
     slope_hz_per_s=38.816929e12,
@@ -38,7 +39,8 @@ OTHER = c.Profile(
     rf_gain_target_db=36,
     tx_backoff_db=3,
 )
-# What TI's mmWaveLink library writes to its SPI driver for these parameters (run apart from this project).
+# What TI's mmWaveLink library writes to its SPI driver for these parameters (run apart from this project). The messages
+# request an acknowledgement, as this project's do.
 VECTORS: list[tuple[c.Command, str]] = [
     (c.DEVICE_CONFIGURATION, "3412214385802000000400000100597b4c401000010000000000000000000000bf4a972a"),
     (c.RF_POWER_UP, "3412214305801400001400000100e56b00400400f1e663c9"),
@@ -85,7 +87,8 @@ VECTORS: list[tuple[c.Command, str]] = [
 ]
 
 
-# The same without the request of an acknowledgement.
+# The library's bytes without that request: only the sub-block and the message id are compared. The profile is given by
+# the library's codes.
 _PROFILE = c.Profile(
     start_hz=1435384036 * c.START_HZ_PER_CODE,
     slope_hz_per_s=414 * c.SLOPE_HZ_PER_S_PER_CODE,
@@ -139,13 +142,16 @@ def test_bytes_are_those_of_ti_s_library(sent: c.Command, expected: str):
 
 
 def test_parts_of_an_image_are_those_of_the_reference_encoder():
-    """The same image of 1000 bytes, in the reference's messages: the first (by its digest) and the last."""
+    """TI's library sent an image of 1000 bytes: the first message is compared by its digest, and the last one whole.
+
+    The image has these bytes at its begin and end, and zeros between them.
+    """
     image = bytes(range(8, 232)) + bytes(1000 - 224 - 80) + bytes(200 - n for n in range(80))
     parts = split_into_chunks(image)
-    first, last = (
-        encode(command((chunk.block(),), sequence=sequence, remaining=remaining))
-        for (chunk, remaining), sequence in ((parts[0], 14), (parts[-1], 15))
-    )
+    encoded_messages = []
+    for (chunk, remaining), sequence in ((parts[0], 14), (parts[-1], 15)):
+        encoded_messages.append(encode(command((chunk.block(),), sequence=sequence, remaining=remaining)))
+    first, last = encoded_messages
     assert hashlib.sha256(first).hexdigest() == "24b45224df911dc384cd26e20ed5b00c5316b83765837a66500c679835f06942"
     assert last.hex() == (
         "341221430581640000f400000100948a80405400c8c7c6c5c4c3c2c1c0bfbebdbcbbbab9b8b7b6b5b4b3b2b1b0afaead"
@@ -155,7 +161,7 @@ def test_parts_of_an_image_are_those_of_the_reference_encoder():
 
 
 @given(st.integers(0x5471C71C, 0x5A000000), st.integers(-5510, 5510))
-def test_codes_are_the_nearest(start: int, slope: int):
+def test_a_frequency_or_slope_gets_the_nearest_code(start: int, slope: int):
     assert c.start_code(start * c.START_HZ_PER_CODE) == start
     assert c.slope_code(slope * c.SLOPE_HZ_PER_S_PER_CODE) == slope
     assert c.start_code((start + 0.49) * c.START_HZ_PER_CODE) == start
@@ -165,9 +171,12 @@ def test_codes_are_the_nearest(start: int, slope: int):
 def test_frames_can_be_decoded_from_their_bytes(frames: int, period_us: float, loops: int):
     data = c.Frame(frames, period_us, 256, loops).data()
     assert len(data) == 24
-    fields = struct.unpack("<6HIHHI", data)
-    assert (fields[3], fields[4], fields[7]) == (loops, frames, 2)
-    assert fields[6] * 0.005 == pytest.approx(period_us, abs=0.0026)
+    _, _, _, decoded_loops, decoded_frames, _, period_ticks, trigger, _, _ = struct.unpack("<6HIHHI", data)
+    assert (decoded_loops, decoded_frames) == (loops, frames)
+    # 2: frames are started by the hardware trigger.
+    assert trigger == 2
+    # Ticks of 5 ns, rounded to the nearest.
+    assert period_ticks * 0.005 == pytest.approx(period_us, abs=0.0026)
 
 
 def test_a_value_that_exceeds_its_field_is_refused():

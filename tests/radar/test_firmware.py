@@ -14,6 +14,7 @@ from polysight_shared.errors import ConfigError, DeviceError, ErrorCode
 from polysight_simulators.radars import Fault, RadarBoard as Simulated, make_image
 
 RIG = make_native_rig()
+# An image of firmware in TI's format, 7940 bytes (docs/spec/mmwavelink.md), and one for the ROM of an AWR1243.
 DATA = make_image()
 IMAGE = check_image(DATA, "image.bin")
 FIRST_GENERATION = make_image(rom=bytes((1, 2, 5, 0, 18, 1, 1)))
@@ -34,6 +35,7 @@ def append_crc(data: bytes) -> bytes:
         (DATA + b"\0", "7940"),
         (DATA[:-4], "CRC"),
         (DATA[:5000] + bytes((DATA[5000] ^ 4,)) + DATA[5001:], "CRC-32"),
+        # Right checksums, but headers of parts that are missing, of another kind, or for another chip.
         (append_crc(DATA[:92] + b"ENDE" + DATA[96:-4]), "no program part"),
         (append_crc(DATA[:128] + b"CPRR" + DATA[132:-4]), "no program part"),
         (FIRST_GENERATION, "AWR1243"),
@@ -80,7 +82,7 @@ def test_the_parts_of_an_image_are_the_whole_image(size):
 
 
 def test_the_first_part_is_that_of_a_user_s_log():
-    """TI E2E 1267477: 35 parts, the first with type 0, length 7940 and the magic."""
+    """A log in TI's forum (E2E 1267477) has 35 parts, the first with type 0, length 7940 and the magic "MSTR"."""
     first, remaining = split_into_chunks(DATA, TO_RAM)[0]
     assert remaining == 0x22
     assert first.part[:12].hex() == "00000000041f00004d535452"
@@ -94,6 +96,7 @@ class PowerCut(BoardWords):
         self.messages_left = after
 
     def write(self, words):
+        # A message begins with this word.
         if words[0] == 0x1234:
             self.messages_left -= 1
             if self.messages_left == 0:
@@ -105,12 +108,13 @@ def make_board(board: Simulated, clock: VirtualClock, firmware=None, words=None)
     return RadarBoard("RH", words or BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("RH")), firmware)
 
 
-def ignore(sent: int, of: int) -> None: ...
+def ignore(sent: int, of: int) -> None:
+    """Take no notice of the progress."""
 
 
 @pytest.fixture
 def new(clock) -> Simulated:
-    """A new board: its flash is empty, and it reports the harmless fault."""
+    """A new board: its flash is empty, and at its start it reports a fault of its main core that is harmless."""
     return Simulated(lambda: clock.time)
 
 
@@ -123,8 +127,8 @@ def test_a_new_board_runs_from_ram_and_its_flash_stays_empty(clock, fault_at):
     assert board.cores.flash == b""
     assert board.cores.ram == DATA
     radar.arm(4)
+    # After a fault arming resets the board, which empties its RAM: the image is sent again (0x4080 is a part of it).
     radar.fail("asked to")
-    # A reset empties the RAM
     radar.arm(4)
     assert board.executed.count(0x4080) == 2 * len(split_into_chunks(DATA))
 
@@ -133,7 +137,8 @@ def test_without_an_image_a_new_board_is_refused(new, clock):
     radar = make_board(new, clock)
     with expect_refusal(ErrorCode.RADAR_NO_FIRMWARE) as caught:
         radar.configure()
-    assert "image header" in caught.value.why  # from its boot status
+    # The reason comes from the board's boot status.
+    assert "image header" in caught.value.why
 
 
 def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
@@ -145,10 +150,10 @@ def test_an_image_in_the_flash_is_not_downloaded_again(board, clock):
 def test_a_flash_write_is_verified_by_a_start_from_the_flash(clock, fault_at):
     board = Simulated(lambda: clock.time, fault_at=fault_at)
     radar = make_board(board, clock)
-    result: list[tuple[int, int]] = []
-    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: result.append((sent, of)))
+    progress: list[tuple[int, int]] = []
+    assert "2.2.2.0 from flash" in radar.write_flash(IMAGE, lambda sent, of: progress.append((sent, of)))
     assert board.cores.flash == DATA
-    assert result[-1] == (35, 35)
+    assert progress[-1] == (35, 35)
     radar.configure()
     assert radar.state is State.CONFIGURED
 
@@ -168,6 +173,7 @@ def test_a_board_that_reports_a_hardware_fault_is_refused_after_any_download(clo
     board.cores.hardware_bits = 1 << bit
     with pytest.raises(DeviceError):
         make_board(board, clock, image).configure()
+    # The RF core was not powered up.
     assert 0x4000 not in board.executed
     with pytest.raises(DeviceError):
         make_board(board, clock).write_flash(IMAGE, ignore)
@@ -175,7 +181,8 @@ def test_a_board_that_reports_a_hardware_fault_is_refused_after_any_download(clo
 
 
 @pytest.mark.parametrize("use", [lambda radar: radar.write_flash(IMAGE, ignore), lambda radar: radar.configure()])
-def test_the_rf_part_of_another_board_is_not_configured(clock, use):
+def test_a_board_whose_die_id_is_that_of_another_board_is_not_configured(clock, use):
+    """The rig file names the chip that is expected at this USB address."""
     board = Simulated(lambda: clock.time, flash=DATA)
     radar = RadarBoard(
         "LS", BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("LS")), die_id="5eed0002-0-0-0"
@@ -185,13 +192,22 @@ def test_the_rf_part_of_another_board_is_not_configured(clock, use):
     assert 0x0080 not in board.executed
 
 
+# 27 self-tests, a bit for each that passed.
 @pytest.mark.parametrize(("tests", "text"), [(0, "0x7FFFFFF"), (0x07FFFFFE, "0x0000001"), (0x07FFFFFF, None)])
 def test_failed_self_tests_of_the_rf_core_are_reported(board, clock, tests, text):
     board.cores.passing_rf_tests = tests
     radar = make_board(board, clock)
-    result = []
-    radar.configure(lambda step, came: result.append(came) if step.name == "RF power-up" else None)
-    assert (text in result[0]) if text else result == ["RF core is up"]
+    outcomes = []
+
+    def note_step(step, outcome):
+        if step.name == "RF power-up":
+            outcomes.append(outcome)
+
+    radar.configure(note_step)
+    if text:
+        assert text in outcomes[0]
+    else:
+        assert outcomes == ["RF core is up"]
     assert radar.facts.rf_tests_passed == tests
 
 
@@ -219,6 +235,7 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
     setattr(board.cores, core, rom)
     with expect_refusal(ErrorCode.MISMATCH, text):
         make_board(board, clock, image).configure()
+    # Configuration of the device, power-up of the RF core, and the questions for the versions.
     assert set(board.executed) <= {0x404C, 0x4000, 0x0220, 0x40E0}
 
 
@@ -226,17 +243,22 @@ def test_a_device_other_than_awr2243_is_refused_before_any_setting(clock, core, 
 def test_another_patch_of_the_rf_core_is_a_warning(clock, monkeypatch, flash):
     board = Simulated(lambda: clock.time, flash=flash)
     execute = board.cores._apply_setting_or_query
+    # The answer to the question for the version has the ROM's in its first 10 bytes, and then that of the patch.
     old_version = bytes((2, 1, 20, 1, 1, 0))
-    monkeypatch.setattr(
-        board.cores,
-        "_apply_setting_or_query",
-        lambda n, d: execute(n, d)[:10] + old_version if n == 0x0220 else execute(n, d),
-    )
+
+    def answer_with_old_version(number, data):
+        answer = execute(number, data)
+        if number == 0x0220:
+            return answer[:10] + old_version
+        return answer
+
+    monkeypatch.setattr(board.cores, "_apply_setting_or_query", answer_with_old_version)
     radar = make_board(board, clock, IMAGE)
     radar.configure()
-    (result,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
-    assert "2.2.4.0" in result
-    assert ("--flash" in result) is bool(flash)
+    (warning,) = [line for line in radar.warnings if "RF core reports patch 2.1.0.0" in line]
+    assert "2.2.4.0" in warning
+    # Firmware in the flash is replaced with this option.
+    assert ("--flash" in warning) is bool(flash)
 
 
 @pytest.mark.parametrize("broken", [b"", DATA[:100], DATA[:-1], bytes(9000), DATA[:400] + b"\xff" + DATA[401:]])
@@ -248,14 +270,15 @@ def test_a_download_repairs_any_content_of_the_flash(clock, broken):
 
 @pytest.mark.parametrize("part", range(1, 37))
 def test_a_power_failure_at_any_part_is_recoverable(clock, part):
-    """Part 36 is the version question after the last part; the first two messages are questions, too."""
+    """Message 36 is the question for the version after the 35 parts; one question is sent before them."""
     board = Simulated(lambda: clock.time, flash=make_image(4000))
     radar = make_board(board, clock, words=PowerCut(board, clock, part + 1))
     with pytest.raises(DeviceError):
         radar.write_flash(IMAGE, ignore)
     board.switch_power(True)
     rescued = make_board(board, clock, IMAGE)
-    rescued.configure()  # from RAM, with any content of the flash
+    # From RAM it starts with any content of its flash.
+    rescued.configure()
     assert rescued.state is State.CONFIGURED
     make_board(board, clock).write_flash(IMAGE, ignore)
     make_board(board, clock).configure()
@@ -268,6 +291,7 @@ def test_a_restart_during_a_download_ends_it_immediately(clock, part):
     words = Restarts(board, clock, part + 1)
     with expect_refusal(ErrorCode.RADAR_RESTARTED, f"part {part} of 35"):
         make_board(board, clock, words=words).write_flash(IMAGE, ignore)
+    # No message was sent after the restart; virtual time, with a limit that is chosen.
     assert words.later == 0
     assert clock.time < 5.0
 
@@ -278,7 +302,10 @@ def test_a_refused_part_is_an_error_with_its_number(new, clock, monkeypatch):
 
     def refuse_seventh(data, remaining):
         calls.append(remaining)
-        return (7, b"", 0.0) if len(calls) == 7 else download(data, remaining)
+        if len(calls) == 7:
+            # Error number 7, no data, no delay.
+            return 7, b"", 0.0
+        return download(data, remaining)
 
     monkeypatch.setattr(new.cores, "_download", refuse_seventh)
     with expect_refusal(ErrorCode.REFUSED_BY_PEER, "part 7 of 35 of image.bin", "error 7"):

@@ -13,18 +13,18 @@ from polysight.radar.commands import Channels, DataFormat, Profile, direct_if_hz
 from polysight_shared.errors import ProtocolError
 from polysight_shared.geometry import direct_path_m
 
-# A message of an empty body, 4 bytes of sync word, 12 of header and 4 of CRC, holds at most 236 bytes of body.
+# A message has at most 256 bytes (docs/spec/mmwavelink.md): 4 of sync word, 12 of header, 4 of CRC, and the body.
 LARGEST_BODY = 256 - 20
 
 
 def make_command(*sizes: int, **values: int) -> m.Message:
-    """A command of sub-blocks with this many bytes of data each."""
+    """Return a command of sub-blocks with so many bytes of data each; `values` replace fields of its header."""
     blocks = tuple(m.SubBlock(0x4000, bytes(range(1, size + 1))) for size in sizes)
     return replace(m.command(blocks), **values)
 
 
 def build_device_message(body: bytes, block_count: int) -> bytes:
-    """An event of the RF core with a body as given, valid but for it, and a CRC of 16 bits."""
+    """Return an event of the RF core with this body, in all else valid, and a CRC of 16 bits."""
     opcode = m.Direction.RF_TO_HOST | m.Kind.EVENT << 4 | 0x80 << 6
     head = struct.pack("<5H", opcode, 12 + len(body) + 2, 0, 0, block_count)
     head += m.checksum(head).to_bytes(2, "little")
@@ -36,14 +36,14 @@ def test_a_body_is_padded_with_ff_to_four_bytes(size):
     message = make_command(size)
     raw = m.encode(message)
     body = raw[16:-4]
-    # Four bytes of a sub-block's own header
+    # A sub-block has a header of four bytes.
     padding = -(4 + size) % 4
     assert len(body) == 4 + size + padding
     assert body[4 + size :] == padding * b"\xff"
     assert m.decode(raw).blocks == message.blocks
 
 
-def test_a_message_holds_as_much_as_a_chunk():
+def test_a_message_has_at_most_256_bytes():
     largest = make_command(LARGEST_BODY - 4)
     raw = m.encode(largest)
     assert len(raw) == 256
@@ -60,7 +60,7 @@ def test_a_message_holds_as_much_as_a_chunk():
         ({"message_id": -1}, False),
     ],
 )  # fmt: skip
-def test_fields_of_a_header_have_their_bits(values, is_taken):
+def test_values_that_exceed_the_bits_of_their_header_field_are_refused(values, is_taken):
     message = make_command(4, **values)
     if not is_taken:
         with pytest.raises(ValueError, match="must be"):
@@ -80,7 +80,10 @@ def test_sub_blocks_of_a_command_share_one_message_id():
 
 
 def block(number: int, data: bytes, length: int | None = None) -> bytes:
-    return struct.pack("<2H", number, len(data) + 4 if length is None else length) + data
+    """Return a sub-block as bytes; the length in its header of four bytes is the right one, or `length`."""
+    if length is None:
+        length = len(data) + 4
+    return struct.pack("<2H", number, length) + data
 
 
 @pytest.mark.parametrize(
@@ -90,7 +93,8 @@ def block(number: int, data: bytes, length: int | None = None) -> bytes:
         (block(1, b"abc") + b"\xff", 1, [b"abc"]),
         (block(1, b"a") + 3 * b"\xff", 1, [b"a"]),
         (block(1, b"") + block(2, b"xy") + 2 * b"\xff", 2, [b"", b"xy"]),
-        # Four bytes after the last, shorter than its own header, longer than the body, and missing
+        # Four bytes after the last sub-block; a length below that of its header; one longer than the body; and a second
+        # sub-block that is missing, without and with padding in its place.
         (block(1, b"abcd") + 4 * b"\xff", 1, None),
         (block(1, b"abcd", length=3) + b"", 1, None),
         (block(1, b"abcd", length=9), 1, None),
@@ -98,7 +102,7 @@ def block(number: int, data: bytes, length: int | None = None) -> bytes:
         (block(1, b"abcd") + b"\xff" * 3, 2, None),
     ],
 )
-def test_a_body_holds_the_sub_blocks_announced_and_up_to_three_bytes(body, count, data):
+def test_a_body_has_the_announced_sub_blocks_and_up_to_three_bytes_of_padding(body, count, data):
     raw = build_device_message(body, count)
     if data is None:
         with pytest.raises(ProtocolError, match="sub-block"):
@@ -112,6 +116,7 @@ def test_a_message_shorter_or_longer_than_its_header_says_is_refused():
     for wrong in (raw[:-1], raw + b"\0"):
         with pytest.raises(ProtocolError):
             m.decode(wrong)
+    # The length counts header, body and CRC: at least 14 bytes with a CRC of 16 bits, and at most 252.
     for length in (13, 253):
         head = struct.pack("<5H", m.Direction.RF_TO_HOST | m.Kind.EVENT << 4, length, 0, 0, 0)
         with pytest.raises(ProtocolError, match="invalid length"):
@@ -119,7 +124,7 @@ def test_a_message_shorter_or_longer_than_its_header_says_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("event", "kind", "fatal", "words"),
+    ("number", "kind", "is_fatal", "words"),
     [
         (m.RF_CPU_FAULT, 3, True, "firmware line 300"),
         (m.RF_CPU_FAULT, 2, True, "data access abort"),
@@ -129,31 +134,38 @@ def test_a_message_shorter_or_longer_than_its_header_says_is_refused():
         (m.RF_CPU_FAULT, 255, False, "no fault"),
     ],
 )
-def test_only_a_fatal_error_of_the_firmware_has_a_line(event, kind, fatal, words):
-    found = m.decode_event(m.SubBlock(event, struct.pack("<BBH", kind, 1, 300)))
-    assert (found.fatal, words in found.detail) == (fatal, True)
-    assert ("firmware line" in found.detail) == ("line" in words)
+def test_only_a_fatal_error_of_the_firmware_has_a_line(number, kind, is_fatal, words):
+    """The event has a kind, an error code and the line of the firmware, which counts only for kind 3 of the RF core."""
+    event = m.decode_event(m.SubBlock(number, struct.pack("<BBH", kind, 1, 300)))
+    assert event.fatal is is_fatal
+    assert words in event.detail
+    assert ("firmware line" in event.detail) == ("line" in words)
 
 
 def test_times_of_power_up_are_ticks_of_5_ns():
-    found = m.decode_event(m.SubBlock(m.RF_POWER_UP_DONE, struct.pack("<II", 0xFFFFFFFF, 200_000)))
-    assert found.values["power_up_us"] == pytest.approx(1000.0)
-    assert found.detail == ""
-    found = m.decode_event(m.SubBlock(m.MAIN_POWER_UP, struct.pack("<IQQ", 200_000, 0, 0)))
-    assert found.values["power_up_us"] == pytest.approx(1000.0)
+    event = m.decode_event(m.SubBlock(m.RF_POWER_UP_DONE, struct.pack("<II", 0xFFFFFFFF, 200_000)))
+    assert event.values["power_up_us"] == pytest.approx(1000.0)
+    assert event.detail == ""
+    event = m.decode_event(m.SubBlock(m.MAIN_POWER_UP, struct.pack("<IQQ", 200_000, 0, 0)))
+    assert event.values["power_up_us"] == pytest.approx(1000.0)
 
 
 @pytest.mark.parametrize("names", [("LS", "RH", "RV"), ("M", "A", "Z")])
-def test_the_transmitting_board_alone_has_a_transmitter(names):
+def test_only_the_transmitting_board_switches_a_transmitter_on(names):
+    """Whatever the boards are called."""
     rig = make_native_rig()
     boards = tuple(msgspec.structs.replace(board, name=name) for board, name in zip(rig.boards, names, strict=True))
     native = dict(zip(names, rig.radar.native.values(), strict=True))
     rig = msgspec.structs.replace(rig, boards=boards, radar=msgspec.structs.replace(rig.radar, native=native))
     for board in boards:
         program = make_program(rig, board)
-        tx = 1 << board.tx_antenna if board == rig.transmitter else 0
-        assert (Channels(0b1111, tx) in program.basic, program.transmits) == (True, tx > 0)
+        transmitters = 0
+        if board == rig.transmitter:
+            transmitters = 1 << board.tx_antenna
+        # All four receivers are on.
+        assert Channels(0b1111, transmitters) in program.basic
         assert DataFormat(0b1111) in program.basic
+        assert program.transmits is (transmitters > 0)
 
 
 def test_a_profile_has_the_chirp_of_the_rig_file_and_the_offset_of_its_board():
@@ -163,20 +175,23 @@ def test_a_profile_has_the_chirp_of_the_rig_file_and_the_offset_of_its_board():
     assert profile.start_hz == rig.chirp.start_hz + rig.boards[1].start_offset_hz
     assert rig.boards[1].start_offset_hz > 0
     assert (profile.hpf1_khz, profile.hpf2_khz) == (rig.chirp.hpf1_khz, rig.chirp.hpf2_khz)
-    # A simulated rig without filters: the radar has the lowest corners.
-    without = msgspec.structs.replace(rig, chirp=chirp)
-    (profile,) = [part for part in make_program(without, rig.boards[1]).waveform if isinstance(part, Profile)]
+
+    # For a simulated rig without filters the radar is set to its lowest corners.
+    unfiltered_rig = msgspec.structs.replace(rig, chirp=chirp)
+    (profile,) = [part for part in make_program(unfiltered_rig, rig.boards[1]).waveform if isinstance(part, Profile)]
     assert (profile.hpf1_khz, profile.hpf2_khz) == (175.0, 350.0)
-    # Samples a second in thousands, in bytes 34 and 35
+
+    # The sample rate in thousands a second is in bytes 34 and 35, rounded.
     assert struct.unpack_from("<H", profile.data(), 34) == (2150,)
     assert struct.unpack_from("<H", replace(profile, sample_rate_hz=2_150_900.0).data(), 34) == (2151,)
 
 
-def test_the_direct_path_is_the_mean_over_the_antennas():
-    """Codes of the radar are 53.6 Hz and 48.3 kHz/us wide."""
+def test_the_expected_frequency_of_the_direct_path_is_the_mean_over_the_antennas():
+    """The slope is that of the radar's nearest code, in steps of 48.3 kHz/us; frequencies are in steps of 53.6 Hz."""
     rig = make_native_rig()
     for board in rig.receivers:
         paths_m = direct_path_m(rig, board)
         slope = round(rig.chirp.slope_hz_per_s / 48.2797623e9) * 48.2797623e9
+        # 60 Hz: a step of the frequency, and rounding.
         expected = slope * sum(paths_m) / len(paths_m) / 299_792_458 + board.start_offset_hz
         assert direct_if_hz(rig, board) == pytest.approx(expected, abs=60.0)

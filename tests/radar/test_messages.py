@@ -27,7 +27,7 @@ def draw_message(draw) -> m.Message:
 
 
 @given(draw_message())
-def test_round_trip(original: m.Message):
+def test_a_message_is_decoded_from_its_bytes(original: m.Message):
     raw = m.encode(original)
     assert len(raw) % 4 == 0
     assert m.decode(raw) == original
@@ -44,19 +44,19 @@ def test_any_flipped_bit_is_detected(original: m.Message, data):
 
 
 @given(st.binary(max_size=300))
-def test_noise_is_refused(noise: bytes):
+def test_noise_after_a_sync_word_is_refused(noise: bytes):
     with pytest.raises(ProtocolError):
         m.decode(m.DEVICE_SYNC + noise[: len(noise) // 2] + b"\0")
 
 
 def test_checksum_of_the_control_document():
-    """Flags of the document's table 2.6."""
+    """The example of its table 2.6: five words of a header and their checksum."""
     words = struct.pack("<5H", 0x0281, 0x0800, 0x040C, 0x0000, 0x0001)
     assert m.checksum(words) == 0xF171
 
 
 def test_the_16_bit_crc_is_ccitt_false():
-    """The check value of the CRC; messages with it are in test_received.py."""
+    """Its published check value is the CRC of "123456789"; messages of real devices are in test_received.py."""
     assert m.crc(b"123456789", 2) == bytes.fromhex("b129")
 
 

@@ -1,4 +1,8 @@
-"""The byte stream for the FT4232H."""
+"""The byte stream for the FT4232H, the USB chip of a board that makes its SPI signals.
+
+Commands of the chip (FTDI AN 108): 80 VALUE DIRECTION sets pins; 11 and 20 write and read bytes, with their number less
+one; 87 sends what was read; 8a, 97, 8d, 86 and 85 configure the clock and the connection.
+"""
 
 import pytest
 from hypothesis import given, strategies as st
@@ -19,7 +23,11 @@ def usb(chip, clock) -> UsbWords:
     return UsbWords(*(chip.channel(n) for n in "ABCD"), sleep=clock.sleep)
 
 
-def test_a_word_is_selected_swapped_and_deselected():
+def test_a_word_is_sent_with_the_high_byte_first_and_its_own_chip_select():
+    """Pin 3 is the chip select: low (c0, c2) for a word, high (c8) between words.
+
+    Pins are set several times because one command holds them for two clocks, the least that TI's ICD allows.
+    """
     assert encode_writes([0x1234]).hex(" ") == "80 c0 4b 80 c0 4b 11 01 00 12 34 80 c8 4b 80 c8 4b 80 c8 4b 87"
     assert encode_reads(1).hex(" ") == "80 c2 4b 80 c2 4b 20 01 00 80 c8 4b 80 c8 4b 80 c8 4b 87"
 
@@ -52,7 +60,7 @@ def test_a_stream_may_be_split_anywhere(words, data):
 
 @pytest.mark.parametrize("byte", [0, 1, 3, 4, 8])
 def test_an_invalid_stream_is_detected(chip, byte):
-    """The simulated chip detects violations of the SPI protocol, so that its silence above counts."""
+    """The simulated chip detects violations of the SPI protocol: that it reports none in the tests above counts."""
     stream = bytearray(encode_writes([0x1234, 0x5678]))
     stream[byte] ^= 0x09
     chip.take("A", bytes(stream))
@@ -60,6 +68,7 @@ def test_an_invalid_stream_is_detected(chip, byte):
 
 
 def test_the_reset_is_released_in_functional_mode_only(board, chip):
+    # Channel D selects the mode of the start, not the functional one here; channel C releases the reset.
     chip.take("D", b"\x1c")
     for pins in (0x80, 0xC0):
         chip.take("C", bytes((pins,)))
@@ -67,7 +76,7 @@ def test_the_reset_is_released_in_functional_mode_only(board, chip):
     assert board.executed == []
 
 
-def test_a_short_read_is_an_error(chip, usb, monkeypatch):
+def test_an_answer_with_too_few_bytes_is_an_error(chip, usb, monkeypatch):
     monkeypatch.setattr(chip, "give", lambda name, size: b"\0" * (size - 1))  # noqa: ARG005
     with expect_refusal(ErrorCode.NO_ANSWER, "3 of 4 bytes"):
         usb.read(2)

@@ -17,7 +17,9 @@ from polysight_shared.errors import DeviceError, ErrorCode
 from polysight_shared.tables import decode, to_builtins
 from polysight_simulators.radars import RadarBoard, make_image
 
+# Period of the published rig's pulses.
 PERIOD_S = 1.5e-3
+# Frames of a row, each started by a pulse: fewer than in a scan, for a fast test.
 FRAMES = 24
 
 
@@ -70,6 +72,7 @@ class Usb:
         self.back_at = self.clock.now() + for_s
 
     def pulses(self, count: int, but: str = "") -> None:
+        """Send pulses to all boards but one."""
         for _ in range(count):
             for serial, board in self.boards.items():
                 if serial != but:
@@ -91,8 +94,9 @@ def radars(rig, usb, clock):
 def test_each_board_is_identified_by_its_serial_number(rig, radars, usb):
     assert radars.states() == {}
     for board in rig.boards:
-        tx = usb.boards[f"FT{board.name}"].settings[0x0101][18]
-        assert tx == (0b010 if board.role == "transmit" else 0)
+        # Byte 18 of the chirp (message 0x0101) has a bit for each transmitter.
+        transmitters = usb.boards[f"FT{board.name}"].settings[0x0101][18]
+        assert transmitters == (0b010 if board.role == "transmit" else 0)
 
 
 def test_a_row_is_done_when_every_board_reports_it(radars, usb):
@@ -119,21 +123,28 @@ def test_a_board_that_missed_a_pulse_is_not_done(radars, usb):
 
 
 def test_two_names_for_one_board_are_refused(rig, usb, clock):
+    # The chip at RV's serial number says that it is the one at RH's.
     usb.boards["FTRV"].cores.die_number = 2
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "RH and RV"):
         NativeRadars(rig, usb.open, clock)
 
 
-@pytest.mark.parametrize("die", ["zero", "not told"])
-def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path, monkeypatch, die):
+@pytest.mark.parametrize("die_id", ["zero", "refused"])
+def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock, tmp_path, monkeypatch, die_id):
     """Two boards would share a file, but gains and filters differ between boards."""
 
     def refuse_die_id(execute):
-        return lambda number, *rest: (6, b"", 0.0) if number == GET_DIE_ID.ID else execute(number, *rest)
+        def execute_or_refuse(number, *rest):
+            if number == GET_DIE_ID.ID:
+                # Error number 6, no data, no delay.
+                return 6, b"", 0.0
+            return execute(number, *rest)
+
+        return execute_or_refuse
 
     for board in usb.boards.values():
         board.cores.die_number = 0
-        if die == "not told":
+        if die_id == "refused":
             monkeypatch.setattr(board.cores, "execute", refuse_die_id(board.cores.execute))
     rig_with_calibration = change_radar_table(rig, calibration_dir=str(tmp_path))
     with NativeRadars(rig_with_calibration, usb.open, clock) as radars:
@@ -143,15 +154,17 @@ def test_the_calibration_of_boards_without_a_die_id_is_not_saved(rig, usb, clock
 
 def test_after_a_fault_the_next_row_resets_only_that_board(radars, usb):
     radars.arm(FRAMES)
-    bad = usb.boards["FTRH"]
-    bad.trigger()
-    bad.trigger()
+    # The second pulse comes within the first one's frame.
+    faulty_board = usb.boards["FTRH"]
+    faulty_board.trigger()
+    faulty_board.trigger()
     states = radars.states()
     assert states["RH"].state is RadarState.FAULT
     assert "not triggered by a pulse" in states["RH"].detail
     assert states["RV"].state is RadarState.ARMED
     radars.arm(FRAMES)
-    assert bad.executed.count(0x4000) == 2
+    # 0x4000: power-up of the RF core.
+    assert faulty_board.executed.count(0x4000) == 2
     assert usb.boards["FTRV"].executed.count(0x4000) == 1
     usb.pulses(FRAMES)
     assert {s.state for s in radars.states().values()} == {RadarState.DONE}
@@ -168,6 +181,7 @@ def test_the_report_fits_the_manifest_and_is_returned_once(radars):
     assert result["boards"]["RV"]["rf_firmware"] == "2.2.1.7 patch 2.2.4.0"
     assert set(result["boards"]["RV"]["temperatures_c"]) >= {"rx1", "tx3"}
     assert len(result["boards"]["RV"]["sent"]) > 40
+    # The receivers' offset centres the direct path, at 0.45 of the sample rate of 2.15 MHz: 0.97 MHz.
     assert 0.9e6 < result["direct_if_hz"]["RH"] < 1.05e6
     assert any(c.startswith("IF budget of RV") for c in result["constraints"])
     second_report = radars.report()
@@ -176,12 +190,12 @@ def test_the_report_fits_the_manifest_and_is_returned_once(radars):
 
 
 def test_a_broken_constraint_is_refused_before_anything_is_sent(rig, usb, clock):
-    def never(serial: str) -> BoardWords:
+    def fail_to_open(serial: str) -> BoardWords:
         raise AssertionError(f"{serial} was opened")
 
     invalid_rig = change_radar_table(rig, rx_gain_db=31)
     with expect_refusal(ErrorCode.VALUE_INVALID, "RX gain step"):
-        NativeRadars(invalid_rig, never, clock)
+        NativeRadars(invalid_rig, fail_to_open, clock)
     with NativeRadars(rig, usb.open, clock) as native_radars, expect_refusal(ErrorCode.VALUE_INVALID, "frames"):
         native_radars.arm(65536)
 
@@ -208,6 +222,7 @@ def test_the_rig_file_must_have_every_board_and_each_serial_once(rig):
 
 
 def run_row(radars, usb) -> dict[str, RadarState]:
+    """Arm the radars and send the pulses of a row; return the state of each board."""
     radars.arm(FRAMES)
     usb.pulses(FRAMES)
     return {name: s.state for name, s in radars.states().items()}
@@ -276,13 +291,13 @@ def test_a_fatal_event_during_arming_is_retried(radars, usb, monkeypatch):
     arm = boards.RadarBoard.arm
     failed = []
 
-    def once(board, frames) -> None:
+    def fail_once(board, frames) -> None:
         if board.name == "RV" and not failed:
             failed.append(board.name)
             board.fail("RF core fault")
             raise DeviceError("RV: RF core fault")
         arm(board, frames)
 
-    monkeypatch.setattr(boards.RadarBoard, "arm", once)
+    monkeypatch.setattr(boards.RadarBoard, "arm", fail_once)
     assert run_row(radars, usb) == ALL_DONE
     assert failed == ["RV"]

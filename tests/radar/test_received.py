@@ -1,6 +1,6 @@
-"""Every known message of a real device is decoded.
+"""Messages of real devices, whose bytes users have published in TI's E2E forum, are decoded with their meaning.
 
-Bytes of real devices, published by their users (TI E2E forum), with their meaning.
+"E2E 1096533" is the number of a thread in that forum.
 """
 
 import struct
@@ -43,8 +43,11 @@ RECEIVED = {
 }
 
 
-class Sent:
-    """A device that sends given messages: one after each command, or all together."""
+class ScriptedDevice:
+    """A device that sends given messages: one after each command, or all together.
+
+    The host writes commands, and the word 0x5678 0x8765 before it reads a message.
+    """
 
     def __init__(self, *messages: bytes) -> None:
         self.messages = list(messages)
@@ -76,9 +79,10 @@ class Sent:
     def close(self) -> None: ...
 
 
-def connect(*messages: bytes) -> tuple[Link, Sent]:
-    sent_words = Sent(*messages)
-    return Link("RH", sent_words, VirtualClock(), [].append), sent_words
+def connect(*messages: bytes) -> tuple[Link, ScriptedDevice]:
+    """Return a link to a device that sends these messages, and the device."""
+    device = ScriptedDevice(*messages)
+    return Link("RH", device, VirtualClock(), [].append), device
 
 
 @pytest.mark.parametrize("raw", RECEIVED.values(), ids=RECEIVED.keys())
@@ -103,12 +107,11 @@ def test_a_message_without_a_body_is_an_error_by_its_kind_alone(raw, error):
 @pytest.mark.parametrize("raw", [AWR1243_UP_EMPTY, AWR1243_UP_WRITTEN])
 def test_power_up_events_of_either_length_report_no_boot_error(raw):
     event = m.decode_event(m.decode(raw).blocks[0])
-    assert (event.id, event.fatal, event.values["boot_errors"], event.values["tests_failed"]) == (
-        m.MAIN_POWER_UP,
-        False,
-        0,
-        0,
-    )
+    assert event.id == m.MAIN_POWER_UP
+    assert not event.fatal
+    assert event.values["boot_errors"] == 0
+    assert event.values["tests_failed"] == 0
+    # The two devices took 4.1 and 1.9 ms.
     assert 1000 < event.values["power_up_us"] < 5000
 
 
@@ -121,23 +124,23 @@ def test_the_fault_during_loading_is_a_register_read_back_error():
 @pytest.mark.parametrize("sequence", range(16))
 def test_a_refusal_without_a_body_ends_a_command_of_any_sequence_number_immediately(sequence):
     """The known answer has number 0; it is not known if such a device repeats the command's number."""
-    line, sent_words = connect(AWR1243_ERROR)
+    line, device = connect(AWR1243_ERROR)
     line.sequence = sequence
     with expect_refusal(ErrorCode.REFUSED_BY_PEER, "LowPower"):
         line.call(LOW_POWER_OFF)
-    assert len([w for w in sent_words.written if w[:4] == bytes.fromhex("34122143")]) == 1
+    assert len([w for w in device.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 
 def test_a_refusal_with_message_id_0_is_the_answer_to_its_sequence():
-    line, sent_words = connect(AWR2243_ERROR)
+    line, device = connect(AWR2243_ERROR)
     line.sequence = 10
     with expect_refusal(ErrorCode.REFUSED_BY_PEER, "LowPower", "error 62", "0x0105"):
         line.call(LOW_POWER_OFF)
-    assert len([w for w in sent_words.written if w[:4] == bytes.fromhex("34122143")]) == 1
+    assert len([w for w in device.written if w[:4] == bytes.fromhex("34122143")]) == 1
 
 
 @pytest.mark.parametrize(("direction", "kind"), [(2, 1), (5, 1), (1, 1), (6, 0)])
-def test_a_response_of_another_core_is_not_an_answer(direction, kind):
+def test_a_response_of_another_core_or_an_event_is_not_an_answer(direction, kind):
     line, _ = connect(
         *[encode_message(direction=direction, kind=kind, number=0x202, body=b"", count=0, sequence=0, wide=True)] * 3
     )

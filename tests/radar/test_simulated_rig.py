@@ -18,6 +18,7 @@ from polysight_simulators.radars import RadarBoard as Simulated, RadarSocket, ma
 from polysight_simulators.rig import derive
 from polysight_simulators.scene import decode_scene
 
+# A scene without objects.
 EMPTY = decode_scene({"name": "the direct path alone"}, "test")
 
 

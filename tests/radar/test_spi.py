@@ -48,7 +48,8 @@ def decode_commands(sent: list[bytes]):
     return [decode(raw) for raw in sent if raw != READY_TO_READ]
 
 
-def test_sequence_numbers_count_on_and_wrap(link, sent):
+def test_sequence_numbers_count_up_and_begin_again_after_15(link, sent):
+    """The link's first two commands, in its fixture, had the numbers 0 and 1."""
     for _ in range(20):
         link.call(GET_TEMPERATURES)
     assert [m.sequence for m in decode_commands(sent)] == [(2 + n) % 16 for n in range(20)]
@@ -67,14 +68,14 @@ def test_a_lost_answer_is_retried_with_the_same_sequence_number(link, board, sen
     board.inject(fault)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in decode_commands(sent)] == [(2, False), (2, True)]
-    # Executed once
+    # The board executed it once: it recognizes the retry by its number.
     assert board.executed == [*executed_before, LOW_POWER_OFF.ID]
     assert "sent 2 times" in link.warnings[-1]
     link.call(LOW_POWER_OFF)
     assert decode_commands(sent)[-1].sequence == 3
 
 
-def test_a_nack_is_retried_with_a_new_sequence_number_without_the_flag(link, board, sent):
+def test_a_command_that_was_received_damaged_is_sent_with_a_new_sequence_number(link, board, sent):
     board.inject(Fault.NACK)
     link.call(LOW_POWER_OFF)
     assert [(m.sequence, m.retry) for m in decode_commands(sent)] == [(2, False), (3, False)]
@@ -110,17 +111,18 @@ def test_a_refusal_is_an_error_without_a_retry(link, board, sent):
 
 def test_retries_are_limited(link, board, sent, clock):
     board.inject(*[Fault.NO_ANSWER] * ATTEMPTS)
-    began = clock.time
+    begun_s = clock.time
     with expect_refusal(ErrorCode.NO_ANSWER):
         link.call(LOW_POWER_OFF)
     assert [m.retry for m in decode_commands(sent)] == [False, True, True]
-    assert clock.time - began == pytest.approx(ATTEMPTS * 1.0, rel=0.05)
+    # Each attempt waits for a second (virtual time).
+    assert clock.time - begun_s == pytest.approx(ATTEMPTS * 1.0, rel=0.05)
 
 
 @pytest.mark.parametrize(
     "fault", [f for f in Fault if f not in (Fault.BAD_SYNC, Fault.EVENT_BETWEEN, Fault.REFUSE, Fault.REFUSE_BARE)]
 )
-def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
+def test_the_command_of_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     link = Link("RH", words, clock, sent.append)
     words.reset(held=True)
     words.reset(held=False)
@@ -131,7 +133,7 @@ def test_rf_power_up_is_never_sent_twice(words, clock, board, sent, fault):
     assert len(decode_commands(sent)) == 1
 
 
-def test_what_comes_while_the_program_is_held_is_read_though_the_time_is_over(words, clock, sent, monkeypatch):
+def test_a_message_that_came_while_the_program_was_delayed_is_read_after_the_timeout(words, clock, sent, monkeypatch):
     """The host polls without result and is delayed for 100 s: after the RF power-up's request, before its event."""
     link = Link("RH", words, clock, sent.append)
     words.reset(held=True)
@@ -180,19 +182,24 @@ def _draw_faults_of_one_command() -> st.SearchStrategy[list[Fault]]:
 @settings(deadline=None)
 @given(st.lists(_draw_faults_of_one_command(), min_size=1, max_size=8))
 def test_commands_are_executed_once_in_order_although_messages_are_lost(faults_of_each: list[list[Fault]]):
-    """Twice only if the answer was lost and its retry was damaged, because a NACK requires a new sequence number."""
+    """A command is executed twice only if its answer was lost and then its retry arrived damaged.
+
+    The board then answers with a NACK, which requires a new sequence number, and so does not recognize the command.
+    """
     clock = VirtualClock()
     board = Simulated(lambda: clock.time, flash=make_image())
     radar = RadarBoard("RH", BoardWords(board, clock), clock, make_program(RIG, RIG.by_name("RH")))
     radar.configure()
     board.executed.clear()
     link: Link = radar.link
-    result = []
+    expected = []
     for n, faults in enumerate(faults_of_each):
-        sent = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]
+        command = (LOW_POWER_OFF, LdoBypass(), Chirp(0))[n % 3]
         board.inject(*faults)
-        link.call(sent)
-        unheard = (Fault.NACK, Fault.NO_ANSWER)
-        twice = len(faults) > 1 and faults[0] not in unheard and faults[1] is Fault.NACK
-        result += [sent.ID] * (2 if twice else 1)
-    assert board.executed == result
+        link.call(command)
+        expected.append(command.ID)
+        # With these faults the board has not executed the command.
+        not_executed = (Fault.NACK, Fault.NO_ANSWER)
+        if len(faults) > 1 and faults[0] not in not_executed and faults[1] is Fault.NACK:
+            expected.append(command.ID)
+    assert board.executed == expected

@@ -19,7 +19,7 @@ FRAMES = 4
 
 @pytest.fixture
 def bus(monkeypatch):
-    """An empty simulated bus, with pyftdi's caches as they are in a new process."""
+    """An empty simulated USB bus in place of the real one, with pyftdi's caches as they are in a new process."""
     usb = usb_bus.Bus()
     monkeypatch.setattr(usb_bus, "BUS", usb)
     monkeypatch.setattr(UsbTools, "BACKENDS", ("tests.support.radar.usb_bus",))
@@ -41,8 +41,9 @@ def plugged_chip(bus, board) -> usb_bus.Chip:
     return usb_chip
 
 
-def test_four_channels_in_their_modes(plugged_chip):
+def test_opening_a_chip_sets_the_mode_of_its_four_channels(plugged_chip):
     words = open_usb("FT1234")
+    # Mode and directions of each channel: 2 is the serial engine (MPSSE), 1 sets pins directly; a 1 is an output.
     assert plugged_chip.modes == {1: (2, 0x4B), 2: (2, 0x5B), 3: (1, 0xF9), 4: (1, 0xFF)}
     assert set(plugged_chip.latency_ms.values()) == {1}
     assert not words.interrupt()
@@ -50,15 +51,17 @@ def test_four_channels_in_their_modes(plugged_chip):
     assert plugged_chip.errors == plugged_chip.chip.errors == []
 
 
+# Bytes of a USB packet: 510 is the most that the chip sends in one.
 @pytest.mark.parametrize("packet", [1, 2, 3, 7, 61, 510])
 @pytest.mark.usefixtures("plugged_chip")
-def test_split_answers_are_joined(bus, clock, packet):
+def test_an_answer_in_several_usb_packets_is_joined(bus, clock, packet):
     bus.packet = packet
     words = open_usb("FT1234")
     words.reset(held=True)
     words.reset(held=False)
     clock.sleep(0.1)
     assert words.interrupt()
+    # The host asks to read; the board's message begins with its sync word.
     words.write([0x5678, 0x8765] + [0xFFFF] * 6)
     clock.sleep(0.1)
     assert words.read(2) == [0xDCBA, 0xABCD]
@@ -116,7 +119,7 @@ def test_a_missing_chip_is_an_error_with_its_serial_number():
 
 
 def test_a_chip_that_is_plugged_in_later_is_found(bus, board):
-    """pyftdi caches what it has enumerated, an empty bus, too."""
+    """pyftdi caches what it has enumerated, also an empty bus."""
     with pytest.raises(DeviceError):
         open_usb("FT7")
     bus.plug(make_chip(board, "FT7"))
@@ -142,7 +145,7 @@ def test_a_replugged_chip_is_found_and_the_old_one_closed(bus, plugged_chip, clo
     assert UsbTools.Devices == {}
 
 
-def test_unplugged_at_any_transfer_of_opening_and_back_again(bus, plugged_chip):
+def test_a_chip_that_is_unplugged_while_it_is_opened_can_be_opened_later(bus, plugged_chip):
     """At each transfer of an opening, the error names the chip, no handle stays open, and a chip opens again."""
     words = open_usb("FT1234")
     transfers = plugged_chip.transfers

@@ -14,11 +14,12 @@ from polysight_shared.config import Instrument, NativeRadar
 from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.geometry import direct_path_m
 
+# Frames of a row: 350 positions with 16 pulses each.
 FRAMES = 5600
 
 
 def change_rig(rig: Instrument, table: str, **values) -> Instrument:
-    """A rig with values that the rig file's types might refuse."""
+    """Return the rig with other values in a table, without the checks of the rig file's types."""
     part = msgspec.structs.replace(getattr(rig, table))
     for key, value in values.items():
         msgspec.structs.force_setattr(part, key, value)
@@ -84,8 +85,8 @@ def test_a_broken_constraint_is_reported_with_formula_limits_and_value(rig, name
     assert result.remedy in str(caught.value)
 
 
-def test_76_ghz_is_inside_the_band_to_the_code(rig):
-    """The ICD's lowest code stands for a little less than 76 GHz."""
+def test_the_lowest_start_frequency_is_the_lowest_code_of_the_radar(rig):
+    """The ICD's lowest code, 0x5471C71B, stands for a little less than 76 GHz: code x 3.6 GHz / 2^26."""
     transmitter = msgspec.structs.replace(rig.transmitter, start_offset_hz=0.0)
     for start, holds in ((76e9, True), (0x5471C71B * 3.6e9 / 2**26, True), (0x5471C71A * 3.6e9 / 2**26, False)):
         changed_rig = change_rig(rig, "chirp", start_hz=start)
@@ -98,6 +99,7 @@ def test_only_simulated_radars_may_have_no_filters(rig):
     assert list_broken_constraints(change_rig(served, "chirp", hpf1_khz=0.0, hpf2_khz=0.0)) == set()
 
 
+# Numbers of the rig file: table and key.
 FLOATS = [("chirp", key) for key in ("start_hz", "slope_hz_per_s", "adc_start_us", "sample_rate_hz", "ramp_end_us")]
 FLOATS += [("burst", "period_us"), ("burst", "width_us"), ("burst", "chirp_us"), ("radar", "idle_us")]
 INTS = [
@@ -118,7 +120,7 @@ ANY_INT = st.one_of(st.integers(-70_000, 70_000), st.integers())
     st.one_of(st.just(790e3), ANY_FLOAT),
     st.integers(-1, 70_000),
 )
-# The sum is infinite
+# The start frequency and the offset together are infinite.
 @example({("chirp", "start_hz"): 9e307}, {}, 9e307, 0)
 def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, frames):
     rig = change_receiver(make_native_rig(), start_offset_hz=offset_hz)
@@ -137,21 +139,21 @@ def test_any_rig_file_is_refused_or_can_be_encoded(floats, ints, offset_hz, fram
 
 
 @pytest.mark.parametrize(("frames", "holds"), [(0, False), (1, True), (65535, True), (65536, False)])
-def test_frame_counts(rig, frames, holds):
-    """The value 0 would mean endless frames."""
+def test_a_row_has_1_to_65535_frames(rig, frames, holds):
+    """The radar's field has 16 bits, and its value 0 would mean endless frames."""
     assert ("frames" not in list_broken_constraints(rig, frames)) is holds
 
 
-def test_pulse_gap(rig, monkeypatch):
+def test_too_little_time_between_the_pulses_of_the_published_burst_is_a_broken_constraint(rig, monkeypatch):
     monkeypatch.setattr("polysight.radar.commands.TRIGGER_MARGIN_US", 149.0)
     assert list_broken_constraints(rig) == {"pulse gap"}
 
 
 def test_the_shortest_burst_period_leaves_300_us_after_the_chirps(rig):
-    """idle + ramp + 0.01 + 300 us, and 200 us to the next pulse."""
-    edge = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
-    assert "inter-frame time" not in list_broken_constraints(change_rig(rig, "burst", period_us=edge + 1e-6))
-    assert "inter-frame time" in list_broken_constraints(change_rig(rig, "burst", period_us=edge - 1e-3))
+    """A frame is idle time, ramp and 10 ns; 300 us follow (the radar's least), and 200 us to the next pulse."""
+    shortest_us = 100.0 + 128.5 + 0.01 + 300.0 + 200.0
+    assert "inter-frame time" not in list_broken_constraints(change_rig(rig, "burst", period_us=shortest_us + 1e-6))
+    assert "inter-frame time" in list_broken_constraints(change_rig(rig, "burst", period_us=shortest_us - 1e-3))
 
 
 @pytest.mark.parametrize(("chirp_us", "holds"), [(228.51, True), (228.5, False), (300.0, False)])
@@ -161,34 +163,34 @@ def test_the_chirp_spacing_must_be_that_of_the_radar(rig, chirp_us, holds):
     many = msgspec.structs.replace(rig, burst=burst)
     assert ("chirp spacing" not in list_broken_constraints(many)) is holds
     result = next(c for c in list_constraints(many, FRAMES) if c.name == "chirp spacing")
-    idle = float(result.remedy.split()[3].strip(","))
-    mended = change_radar_table(many, idle_us=idle)
-    assert "chirp spacing" not in list_broken_constraints(mended)
+    # The idle time that the remedy advises keeps the constraint.
+    idle_us = float(result.remedy.split()[3].strip(","))
+    changed_rig = change_radar_table(many, idle_us=idle_us)
+    assert "chirp spacing" not in list_broken_constraints(changed_rig)
 
 
 def test_a_frame_of_many_chirps_needs_a_longer_period(rig):
-    chirps = 16 * 228.51
-    for period, holds in ((chirps + 500.0 + 1e-3, True), (chirps + 499.0, False)):
+    # As for one chirp, 300 and 200 us follow.
+    chirps_us = 16 * 228.51
+    for period, holds in ((chirps_us + 500.0 + 1e-3, True), (chirps_us + 499.0, False)):
         burst = msgspec.structs.replace(rig.burst, pulses=1, chirps=16, chirp_us=228.51, period_us=period)
         assert ("inter-frame time" not in list_broken_constraints(msgspec.structs.replace(rig, burst=burst))) is holds
 
 
-def test_a_usb_path_does_not_acknowledge_ldo_bypass(rig):
+def test_the_bypass_of_a_boards_regulators_has_to_be_confirmed_by_its_serial_number(rig):
+    """With the usual 1.3 V on its RF supplies the bypass may destroy a chip, and a USB path does not name the board."""
     native = {**rig.radar.native, "RH": NativeRadar(usb_path="1-4.2", ldo_bypass=True)}
     invalid_rig = change_radar_table(rig, native=native)
     assert list_broken_constraints(invalid_rig) == {"LDO bypass of RH"}
 
 
-def test_ldo_bypass_needs_this_boards_serial(rig):
+def test_the_serial_number_of_another_board_does_not_confirm_the_bypass(rig):
     def acknowledge_bypass(acknowledged: str) -> Instrument:
         native = {**rig.radar.native, "RH": NativeRadar("FTRH", True, acknowledged)}
         return change_radar_table(rig, native=native)
 
-    assert (
-        list_broken_constraints(acknowledge_bypass(""))
-        == list_broken_constraints(acknowledge_bypass("FTRV"))
-        == {"LDO bypass of RH"}
-    )
+    for serial in ("", "FTRV"):
+        assert list_broken_constraints(acknowledge_bypass(serial)) == {"LDO bypass of RH"}
     assert list_broken_constraints(acknowledge_bypass("FTRH")) == set()
     with expect_refusal(ErrorCode.VALUE_INVALID, "LDO bypass"):
         check_constraints(acknowledge_bypass("yes"), FRAMES)
@@ -199,7 +201,7 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
         board = rig.by_name(name)
         mean_m = math.fsum(direct_path_m(rig, board)) / 4
         expected = rig.chirp.slope_hz_per_s * mean_m / 299_792_458 + board.start_offset_hz
-        # Two roundings of 53.6 Hz
+        # Two frequencies are rounded to codes of 53.6 Hz.
         assert direct_if_hz(rig, board) == pytest.approx(expected, abs=120.0)
 
 
@@ -207,7 +209,8 @@ def test_expected_if_is_slope_times_path_plus_offset(rig):
     ("complex1x", 0.0, False), ("complex1x", 790e3, True), ("complex1x", 1.7e6, False),
     ("complex2x", 0.0, True), ("complex2x", -1.1e6, False), ("complex2x", 700e3, False),
 ])  # fmt: skip
-def test_if_budget(rig, mode, offset, holds):
+def test_the_direct_path_lies_within_the_sampled_band(rig, mode, offset, holds):
+    """From 0 to the sample rate, 2.15 MHz, in complex1x; in complex2x half of it to either side of 0, with a margin."""
     changed_rig = change_rig(change_receiver(rig, start_offset_hz=offset), "chirp", if_mode=mode, ramp_end_us=128.4)
     assert ("IF budget of RH" not in list_broken_constraints(changed_rig)) is holds
 
@@ -216,16 +219,17 @@ def test_the_remedy_of_the_if_budget_centres_the_direct_path(rig):
     changed_rig = change_receiver(rig, start_offset_hz=0.0)
     result = next(c for c in list_constraints(changed_rig, FRAMES) if c.name == "IF budget of RH")
     offset = float(re.findall(r"[\d.]+", result.remedy)[-1])
-    mended = change_receiver(rig, start_offset_hz=offset)
-    assert direct_if_hz(mended, mended.by_name("RH")) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
+    changed_rig = change_receiver(rig, start_offset_hz=offset)
+    # 0.45 of the sample rate; codes of frequencies are 53.6 Hz wide.
+    expected_hz = pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=60.0)
+    assert direct_if_hz(changed_rig, changed_rig.by_name("RH")) == expected_hz
 
 
 def test_every_constraint_is_tested(rig):
-    tested = {
-        c
-        for mark in test_a_broken_constraint_is_reported_with_formula_limits_and_value.pytestmark
-        for c, *_ in mark.args[1]
-    }
+    # The cases of that test, and constraints with a test of their own.
+    tested = set()
+    for mark in test_a_broken_constraint_is_reported_with_formula_limits_and_value.pytestmark:
+        tested |= {name for name, *_ in mark.args[1]}
     tested |= {"frames", "pulse gap", "LDO bypass of RH", "IF budget of RH"}
     general = {c.name for c in list_constraints(rig, FRAMES) if not c.name.endswith((" of LS", " of RV"))}
     assert general == tested
@@ -233,7 +237,7 @@ def test_every_constraint_is_tested(rig):
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("size", "is_usable"), [(1e29, True), (1.1e30, False), (math.inf, False), (math.nan, False)])
-def test_a_number_that_no_radar_has_is_named_alone(rig, sign, size, is_usable):
+def test_of_an_extreme_number_only_the_number_is_reported(rig, sign, size, is_usable):
     receiver = rig.receivers[0]
     extreme_receiver = msgspec.structs.replace(receiver, start_offset_hz=sign * size)
     boards = tuple(extreme_receiver if b is receiver else b for b in rig.boards)

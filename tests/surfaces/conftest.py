@@ -11,10 +11,13 @@ from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import ShapeNuisances, reference_sphere, scan_offsets, scan_shapes
 from polysight_worlds.shapes import Shape
 
-# Paths from TX to RX within which specular points are looked for.
+# Paths from TX over a point to RX within which specular points are searched: a mirror on the object plane has 1.7 m.
 GATE_M = (1.5, 1.85)
-# Fewer than a scan's, for speed: they hold paths of 0.7 m.
+# Fewer than a scan's, for speed. Steps of 433 MHz: paths that differ by less than c / 433 MHz = 0.7 m are
+# distinguished.
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 9)
+
+# Positions of a scan, 2 mm apart: 158 x 110 mm, less than the published scan, for speed.
 COLUMNS = 80
 ROWS = 56
 See = Callable[..., SeenEchoes]
@@ -25,11 +28,14 @@ def make_nominal_optics() -> Optics:
     boards = published_boards()
     middle = {name: np.mean([rx.position for rx in rxs], axis=0) for name, rxs in boards.receivers().items()}
     tx_m = boards.tx.position
+    # Distance of the object plane
+    plane_m = 0.499
+    # Parts of s and p: TX sends both with half of the power each, H receives s, V receives p.
     half = float(np.sqrt(0.5))
     return Optics(
-        tx=aim_antenna(tx_m, boards.tx.boresight, middle["h"], 0.499, (half, half)),
-        h=aim_antenna(middle["h"], boards.h[0].boresight, tx_m, 0.499, (1.0, 0.0)),
-        v=aim_antenna(middle["v"], boards.v[0].boresight, tx_m, 0.499, (0.0, 1.0)),
+        tx=aim_antenna(tx_m, boards.tx.boresight, middle["h"], plane_m, (half, half)),
+        h=aim_antenna(middle["h"], boards.h[0].boresight, tx_m, plane_m, (1.0, 0.0)),
+        v=aim_antenna(middle["v"], boards.v[0].boresight, tx_m, plane_m, (0.0, 1.0)),
         wave_number=2 * np.pi * float(FREQUENCIES_HZ.mean()) / SPEED_OF_LIGHT_M_S,
     )
 
@@ -66,8 +72,8 @@ def see(optics) -> See:
 
 @pytest.fixture(scope="session")
 def metal(see):
-    """Points of a metal sphere of 125 mm."""
-    return see([reference_sphere()], COLUMNS + 10, ROWS + 10)
+    """Points of the reference sphere: metal, radius 125 mm; its scan shows more directions than those of the tests."""
+    return see([reference_sphere()], columns=COLUMNS + 10, rows=ROWS + 10)
 
 
 @pytest.fixture(scope="session")

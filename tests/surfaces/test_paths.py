@@ -1,4 +1,9 @@
-"""The path of an echo over a window is recovered."""
+"""The path of an echo is recovered: its length, its slope and its bend over a window.
+
+A window is a part of the positions of a scan. Over it, the path from TX over a point of the surface to RX is a
+polynomial of second degree of the stage's offset; slope and bend are its first and second derivatives. They give the
+point, the normal and the curvature of the surface.
+"""
 
 from dataclasses import replace
 
@@ -22,6 +27,8 @@ from polysight_worlds.rig import published_boards
 from polysight_worlds.shape_scenes import scan_offsets
 
 C = SPEED_OF_LIGHT_M_S
+
+# The linear part of the published sweep
 FREQUENCIES_HZ = np.linspace(76.282e9, 79.749e9, 12)
 
 
@@ -39,35 +46,42 @@ def _normalise(vectors: np.ndarray) -> np.ndarray:
 
 
 def add_sphere_echo(scan: Samples, point_m: np.ndarray, radius_m: float, amplitude: complex) -> Samples:
-    """Add a metal sphere's specular path, found by minimising over its surface with Newton's method."""
+    """Add the echo of a metal sphere whose front is at `point_m`, in ray optics.
+
+    At the specular point the normal halves the angle between the directions to TX and RX. The iteration takes as normal
+    the bisector at the last point; it ends far below a micrometre.
+    """
     centre = point_m + np.array([0.0, 0.0, radius_m])
     tx = scan.tx_m + scan.offsets_m
     rx = scan.rx_m[:, None, None] + scan.offsets_m
     normal = np.array([0.0, 0.0, -1.0])
     for _ in range(12):
-        p = centre + radius_m * normal
-        way = _normalise(tx - p) + _normalise(rx - p)
-        normal = _normalise(way)
-    p = centre + radius_m * normal
-    paths = np.linalg.norm(p - tx, axis=-1) + np.linalg.norm(p - rx, axis=-1)
-    excess = paths - scan.direct_m[:, None, None]
-    turns = scan.frequencies_hz[None, :, None, None] * excess[:, None] / C
+        specular_point = centre + radius_m * normal
+        bisector = _normalise(tx - specular_point) + _normalise(rx - specular_point)
+        normal = _normalise(bisector)
+    specular_point = centre + radius_m * normal
+    paths_m = np.linalg.norm(specular_point - tx, axis=-1) + np.linalg.norm(specular_point - rx, axis=-1)
+    excess_m = paths_m - scan.direct_m[:, None, None]
+    turns = scan.frequencies_hz[None, :, None, None] * excess_m[:, None] / C
     return replace(scan, cube=scan.cube + amplitude * np.exp(2j * np.pi * turns))
 
 
 def add_mirror_echo(scan: Samples, z_m: float, amplitude: complex) -> Samples:
     """Add the echo of a level mirror, the same for all stage positions."""
-    image = scan.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
-    excess = np.linalg.norm(scan.rx_m - image, axis=1) - scan.direct_m
-    echo = amplitude * np.exp(2j * np.pi / C * np.outer(excess, scan.frequencies_hz))
+    mirrored_tx_m = scan.tx_m * [1, 1, -1] + [0, 0, 2 * z_m]
+    excess_m = np.linalg.norm(scan.rx_m - mirrored_tx_m, axis=1) - scan.direct_m
+    echo = amplitude * np.exp(2j * np.pi / C * np.outer(excess_m, scan.frequencies_hz))
     return replace(scan, cube=scan.cube + echo[:, :, None, None])
 
 
+# Direction away from the stage
 BEHIND = np.array([0.0, 0.0, 1.0])
+
+# Front of the spheres: in the middle between TX and H, half a metre before the stage
 FRONT_M = np.array([-0.01, 0.104, 0.5])
 
 
-def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
+def test_a_sphere_is_found_with_points_normals_and_radius():
     scan = add_sphere_echo(make_empty_scan(), FRONT_M, 0.12, 0.5 * np.exp(0.3j))
     echoes = find_echoes(scan, (1.4, 2.0))
     points = locate(echoes.path_m, echoes.slope, echoes.at_m, scan.tx_m, scan.middle_m)
@@ -81,12 +95,16 @@ def test_a_sphere_of_rays_is_found_with_point_normal_and_radius():
 
 
 def test_a_weak_echo_is_found_near_a_strong_one():
-    strong = add_mirror_echo(make_empty_scan(), 0.65, 1.0)
-    both_echoes = add_sphere_echo(strong, FRONT_M, 0.1, 0.16)
-    echoes = find_echoes(both_echoes, (1.4, 2.1))
-    points = locate(echoes.path_m, echoes.slope, echoes.at_m, both_echoes.tx_m, both_echoes.middle_m)
-    from_weak = np.abs(np.linalg.norm(points - (FRONT_M + 0.1 * BEHIND), axis=1) - 0.1)
-    assert (from_weak < 1e-3).sum() >= len(np.unique(echoes.at_m, axis=0))
+    """A sphere of 0.16 of the amplitude of a mirror that lies 150 mm behind its front."""
+    radius_m = 0.1
+    mirror = add_mirror_echo(make_empty_scan(), z_m=0.65, amplitude=1.0)
+    both = add_sphere_echo(mirror, FRONT_M, radius_m, amplitude=0.16)
+    echoes = find_echoes(both, (1.4, 2.1))
+    points = locate(echoes.path_m, echoes.slope, echoes.at_m, both.tx_m, both.middle_m)
+    from_sphere_m = np.abs(np.linalg.norm(points - (FRONT_M + radius_m * BEHIND), axis=1) - radius_m)
+    # One point of the sphere or more for each window
+    windows = len(np.unique(echoes.at_m, axis=0))
+    assert (from_sphere_m < 1e-3).sum() >= windows
 
 
 def test_the_path_of_a_point_gives_the_point_back():
@@ -96,24 +114,29 @@ def test_the_path_of_a_point_gives_the_point_back():
     points = rng.uniform([-0.1, 0.0, 0.4], [0.1, 0.2, 0.6], (n, 3))
     at_m = np.stack([rng.uniform(-0.05, 0.05, n), rng.uniform(-0.05, 0.05, n), np.zeros(n)], axis=1)
     normals, _ = find_normals(points, at_m, scan.tx_m, scan.middle_m)
+    # Curvatures from hollow (radius 0.5 m) to a radius of 67 mm, 1 / m
     bends = rng.uniform(-2, 15, (n, 2, 2))
     bends = (bends + np.swapaxes(bends, 1, 2)) / 2
     path, slope, bend = predict_echo(points, normals, bends, at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(locate(path, slope, at_m, scan.tx_m, scan.middle_m), points, atol=1e-8)
     assert np.allclose(find_curvature(points, normals, at_m, scan.tx_m, scan.middle_m, bend), bends, atol=1e-4)
+    # The search begins 22 mm away from the position that sees the point.
     seen_from = find_offset_that_sees(points, normals, at_m + np.array([0.01, 0.02, 0]), scan.tx_m, scan.middle_m)
     assert np.allclose(seen_from, at_m, atol=1e-8)
 
 
-def test_a_mirror_spreads_as_its_path():
+def test_the_echo_of_a_mirror_falls_with_the_length_of_its_path():
+    """A mirror 0.5 m before the stage: its point lies where the line from RX to the mirrored TX crosses it."""
     scan = make_empty_scan()
     at_m = np.zeros((1, 3))
-    image = scan.tx_m * [1, 1, -1] + [0, 0, 1.0]
-    share = (0.5 - scan.middle_m[2]) / (image[2] - scan.middle_m[2])
-    point = (scan.middle_m + share * (image - scan.middle_m))[None]
+    mirror_z_m = 0.5
+    mirrored_tx_m = scan.tx_m * [1, 1, -1] + [0, 0, 2 * mirror_z_m]
+    share = (mirror_z_m - scan.middle_m[2]) / (mirrored_tx_m[2] - scan.middle_m[2])
+    point = (scan.middle_m + share * (mirrored_tx_m - scan.middle_m))[None]
     normals, _ = find_normals(point, at_m, scan.tx_m, scan.middle_m)
     _, _, out_m, back_m = compute_unit_legs(point, at_m, scan.tx_m, scan.middle_m)
-    factors = compute_spreading(point, normals, np.zeros((1, 2, 2)), at_m, scan.tx_m, scan.middle_m)
+    flat = np.zeros((1, 2, 2))
+    factors = compute_spreading(point, normals, flat, at_m, scan.tx_m, scan.middle_m)
     assert np.allclose(normals, [[0, 0, -1]], atol=1e-9)
     assert factors[0] == pytest.approx(1 / float(out_m[0] + back_m[0]), rel=1e-6)
 
@@ -129,17 +152,24 @@ def test_a_known_path_is_measured_without_the_gain_of_a_search():
     count = len(slope)
     path = np.full(count, find_mirror_path(scan, 0.5))
     echoes, inside = measure_echoes(noisy, np.zeros((count, 3)), path, slope, np.zeros((count, 2, 2)))
+    # The noise has the power 2 (1 in each part) in each sample of a window: four RX, all frequencies and positions.
     height, width = scan.window_shape()
-    expected = 2 / (len(scan.rx_m) * FREQUENCIES_HZ.size * height * width)
+    mean_power = 2 / (len(scan.rx_m) * FREQUENCIES_HZ.size * height * width)
     assert inside.all()
-    assert np.mean(np.abs(echoes.amplitude) ** 2) / expected == pytest.approx(1, abs=0.6)
+    # 36 echoes: their mean power scatters by a sixth.
+    assert np.mean(np.abs(echoes.amplitude) ** 2) / mean_power == pytest.approx(1, abs=0.6)
 
 
-def test_an_amplitude_is_that_of_the_place_asked_not_of_the_window():
-    """Places between stage positions: |V| changes by a per cent a millimetre near Brewster's angle."""
-    level = 2 + 40 * make_empty_scan().offsets_m[..., 0] - 30 * make_empty_scan().offsets_m[..., 1]
-    mirror = add_mirror_echo(make_empty_scan(), 0.5, 1.0)
-    scan = replace(mirror, cube=mirror.cube * level)
+def test_an_amplitude_is_that_at_the_requested_place_and_not_the_mean_of_the_window():
+    """Near Brewster's angle |V| changes by a per cent a millimetre; here the amplitude, 2 + 40 / m * x, grows by
+    2 % a millimetre along x.
+
+    The places are within a step of the stage, between its positions.
+    """
+    mirror = add_mirror_echo(make_empty_scan(), z_m=0.5, amplitude=1.0)
+    x_m = mirror.offsets_m[..., 0]
+    y_m = mirror.offsets_m[..., 1]
+    scan = replace(mirror, cube=mirror.cube * (2 + 40 * x_m - 30 * y_m))
     at_m = np.array([[0.0, 0.0, 0.0], [0.0009, -0.0007, 0.0], [-0.0004, 0.0008, 0.0]])
     path = np.full(3, find_mirror_path(scan, 0.5))
     echoes, inside = measure_echoes(scan, at_m, path, np.zeros((3, 2)), np.zeros((3, 2, 2)))

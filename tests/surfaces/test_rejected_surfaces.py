@@ -38,8 +38,13 @@ from polysight_shared.errors import DataError
 from polysight_worlds.media import Stack
 from polysight_worlds.shapes import cylinder, plate
 
+# A rig that stands as its file says: only noise and the method's own errors remain.
 EXACT = Uncertainty(leakage=1e-4, axis_rad=1e-4, place_m=1e-6)
+
+# In the middle between TX and the receivers, half a metre before the stage
 CENTRE_M = (-0.01, 0.104, 0.5)
+
+# Permittivity of the objects
 MEDIUM = 4.2 - 0.4j
 
 
@@ -53,10 +58,10 @@ def test_the_sharp_edges_of_a_tilted_plate_are_not_a_surface(see, gains, optics)
     assert np.median(np.degrees(turns)) < 0.5
     for segment in surface.segments:
         if segment.permittivity is not None:
-            miss = segment.permittivity - MEDIUM
-            d = np.array([miss.real, miss.imag])
-            # 99.9 %
-            assert d @ np.linalg.inv(np.array(segment.covariance)) @ d < 13.8
+            error = segment.permittivity - MEDIUM
+            parts = np.array([error.real, error.imag])
+            # 99.9 % of chi squared with two degrees of freedom
+            assert parts @ np.linalg.inv(np.array(segment.covariance)) @ parts < 13.8
 
 
 def test_edges_alone_give_no_permittivity(see, gains, optics):
@@ -67,13 +72,17 @@ def test_edges_alone_give_no_permittivity(see, gains, optics):
     assert all(s.reason for s in surface.segments)
 
 
-def test_an_edge_has_no_level_of_its_own(metal, gains, optics):
-    """The diffraction of an edge falls as 1 / angle from the border of the zone that its surface reflects to."""
+def test_echoes_whose_amplitude_falls_as_that_of_an_edge_are_not_a_reflection(metal, gains, optics):
+    """The diffraction of an edge falls as 1 / angle from the border of the zone into which its surface reflects.
+
+    A surface has the same level everywhere. Here the echoes of the metal sphere are changed to those of such an edge.
+    """
     voltages = find_voltages(metal, optics)
     amplitude = np.abs(metal.h.amplitude)
     number = np.zeros(len(metal), int)
     learnt = gains(optics)
     assert find_reflecting(voltages, amplitude, number, learnt).mean() > 0.9
+    # From 0.02 rad beyond the border on, where it is 1
     angle = metal.h.slope[:, 0] - metal.h.slope[:, 0].min() + 0.02
     fall = 0.02 / angle
     edge = replace(voltages, voltage=voltages.voltage * fall[:, None])
@@ -84,80 +93,99 @@ def test_a_reflection_weaker_than_of_any_medium_is_not_a_surface(metal, gains, o
     voltages = find_voltages(metal, optics)
     amplitude = np.abs(metal.h.amplitude)
     number = np.zeros(len(metal), int)
-    of_foam = find_reflecting(
-        replace(voltages, voltage=0.05 * voltages.voltage), 0.05 * amplitude, number, gains(optics)
-    )
-    of_edge = find_reflecting(
-        replace(voltages, voltage=0.02 * voltages.voltage), 0.02 * amplitude, number, gains(optics)
-    )
-    assert of_foam.mean() > 0.9
-    assert not of_edge.any()
+
+    def find_reflecting_points(reflection):
+        """Points that count as a surface if it reflects this much of what metal does."""
+        weaker = replace(voltages, voltage=reflection * voltages.voltage)
+        return find_reflecting(weaker, reflection * amplitude, number, gains(optics))
+
+    # Foam, and an edge
+    assert find_reflecting_points(0.05).mean() > 0.9
+    assert not find_reflecting_points(0.02).any()
 
 
 def test_a_thin_wall_gives_no_permittivity(see, gains, optics, request):
-    for wall_mm in (0.7, 1.6) if request.config.getoption("--long") else (0.7,):
+    thicknesses_mm = [0.7]
+    if request.config.getoption("--long"):
+        thicknesses_mm.append(1.6)
+    for wall_mm in thicknesses_mm:
         check_a_thin_wall(see, gains, optics, wall_mm)
 
 
 def check_a_thin_wall(see, gains, optics, wall_mm):
+    """A tube with a radius of 70 mm, air inside: its points have a place, but no permittivity and a reason why."""
     wall = Stack(((MEDIUM, wall_mm / 1000),), 1.0)
     tube = cylinder("tube", wall, (CENTRE_M[0], CENTRE_M[1], 0.57), 0.07, 0.3)
     surface = analyse_surface(see([tube], 64, 44), optics, gains, uncertainty=EXACT)
     assert len(surface.points_m)
     assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
     assert all(s.reason for s in surface.segments)
-    # Both faces make one echo: points lie millimetres off, which their errors say.
+    # Both faces make one echo: points lie millimetres away from the outer one, as their errors say.
     away_m = np.abs(tube.project(surface.points_m)[0])
     assert np.mean(away_m < 1.96 * surface.position_std_m) >= 0.9
 
 
 def test_it_is_reported_whether_one_medium_explains_a_small_body(metal, gains, optics):
-    """Below 40 mm no segment has a permittivity; the points of a wall are still displaced, and its reason says so."""
+    """A radius below 40 mm gives no permittivity. If no single medium reflects so, that is reported instead.
+
+    Then the body may be a thin wall, whose points are displaced.
+    """
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
     gain = np.exp(learnt.level(voltages))[:, None]
     gain = gain * np.stack([np.ones(len(metal)), 1 / learnt.ratio(voltages.arrival)], axis=1)
     received = gain * predict_voltages(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     ball = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=30.0)
+    # A medium; a level that rises by 10 % over the band; a level 20 % too high
     for level, rise, reason in ((1.0, 0.0, "below 40 mm"), (1.0, 0.1, NO_SINGLE_MEDIUM), (1.2, 0.0, NO_SINGLE_MEDIUM)):
         band_rise = np.tile(learnt.band_rise + rise, (len(metal), 1))
         changed = replace(voltages, voltage=level * received, band_rise=band_rise)
         judged, fit = judge_segment(ball, changed, learnt, [], optics.wave_number)
         assert reason in judged.reason
         assert fit is None
-    # Far from the directions of the reference, as beside a flat plate, the level of the gains is not known.
-    elsewhere = replace(learnt, covered=tuple(border + 0.5 for border in learnt.covered))
+    # Outside of the directions that the reference covers the level of the gains is uncertain: 10 % more may be an
+    # error.
+    for_other_directions = replace(learnt, covered=tuple(border + 0.5 for border in learnt.covered))
     brighter = replace(voltages, voltage=1.1 * received, band_rise=np.tile(learnt.band_rise, (len(metal), 1)))
     reasons = [
         judge_segment(ball, brighter, known_gains, [], optics.wave_number)[0].reason
-        for known_gains in (learnt, elsewhere)
+        for known_gains in (learnt, for_other_directions)
     ]
     assert reasons[0] == NO_SINGLE_MEDIUM
     assert "below 40 mm" in reasons[1]
 
 
 def receive_wall(voltages, wave_numbers, medium, wall_m):
-    """Voltages [n, 2] of a wall in ray optics, its echo taken where the matched filter finds it, and their rise."""
+    """Voltages [n, 2] of a wall in ray optics, and their rise over the band.
+
+    The echo of both faces is taken at the path where the matched filter over the band is largest.
+    """
     sine = np.sin(voltages.theta)[..., None]
     cos = np.cos(voltages.theta)[..., None]
     inner = np.sqrt(medium - sine**2)
     through = np.exp(-2j * wave_numbers * wall_m * inner)
     faces = np.stack([(cos - inner) / (cos + inner), (medium * cos - inner) / (medium * cos + inner)])
+    # All echoes between the two faces added up (Airy)
     r_s, r_p = faces * (1 - through) / (1 - faces**2 * through)
-    # The host's p is that of metal, -1, as s is.
+    # Here metal has r_p = +1; in the host's signs it is -1.
     echoes = voltages.response[..., :1] * r_s - voltages.response[..., 1:2] * r_p
     paths_m = np.linspace(-0.02, 0.06, 161)
     matched = np.exp(1j * np.outer(paths_m, wave_numbers - wave_numbers.mean()))
-    echoes = echoes * matched[np.abs(echoes[:, 0] @ matched.T).mean(axis=0).argmax()]
+    level_of_paths = np.abs(echoes[:, 0] @ matched.T).mean(axis=0)
+    echoes = echoes * matched[level_of_paths.argmax()]
     half = len(wave_numbers) // 2
     upper = np.abs(echoes[..., half:].mean(axis=2))
     lower = np.abs(echoes[..., :half].mean(axis=2))
     return echoes.mean(axis=2), np.log(upper / lower)
 
 
-def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, optics):
-    """Walls with a weak back face: with limits of 10 and 2 % some had a permittivity, wrong by 7 to 15 %."""
+def test_a_random_wall_has_no_permittivity_or_that_of_its_medium(metal, gains, optics):
+    """Walls with a weak echo of the back face are nearly a half space.
+
+    With limits of 10 % for the level and 2 % for the rise some had a permittivity, which was wrong by 7 to 15 %.
+    """
     learnt = gains(optics)
+    # Every fourth point, for speed
     voltages = find_voltages(metal[np.arange(0, len(metal), 4)], optics)
     flat = 0 * voltages.bend_inside
     voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
@@ -167,10 +195,11 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
     plane = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=None)
     rng = np.random.default_rng(7)
 
-    def judge(medium, wall_m):
-        b, rise = receive_wall(voltages, wave_numbers, medium, wall_m)
-        noise = 0.01 * (rng.standard_normal(b.shape) + 1j * rng.standard_normal(b.shape))
-        changed = replace(voltages, voltage=gain * b * (1 + noise), band_rise=rise + learnt.band_rise)
+    def find_error(medium, wall_m):
+        """Relative error of a wall's permittivity; None if it has none."""
+        received, rise = receive_wall(voltages, wave_numbers, medium, wall_m)
+        noise = 0.01 * (rng.standard_normal(received.shape) + 1j * rng.standard_normal(received.shape))
+        changed = replace(voltages, voltage=gain * received * (1 + noise), band_rise=rise + learnt.band_rise)
         judged, fit = judge_segment(plane, changed, learnt, [], optics.wave_number)
         if fit is None:
             return None
@@ -178,43 +207,53 @@ def test_no_drawn_wall_gets_a_permittivity_that_is_not_its_own(metal, gains, opt
         return abs(fit.eps - medium) / abs(medium)
 
     media = [complex(rng.uniform(2, 9), -rng.uniform(0.5, 1)) for _ in range(80)]
-    errors = [judge(medium, rng.uniform(1.5e-3, 3e-3)) for medium in media]
+    errors = [find_error(medium, rng.uniform(1.5e-3, 3e-3)) for medium in media]
     assert max((error for error in errors if error is not None), default=0.0) < 0.03
-    # The same media as half spaces.
+    # A wall of 0.1 m of these lossy media is a half space.
     for medium in media[:20]:
-        error = judge(medium, 0.1)
+        error = find_error(medium, 0.1)
         assert error is not None
         assert error < 0.02
 
 
 def test_points_behind_a_body_may_be_echoes_from_inside(metal, gains, optics):
     def add_echo(path_m, shift_m=0.0):
-        """Points of the front, and an echo of each later by `path_m`, seen from `shift_m` farther away in x."""
+        """The points of the metal sphere as segment 0, and an echo of each as segment 1.
+
+        The echo's path is `path_m` longer, and it is received `shift_m` farther away in x.
+        """
         later = replace(metal.h, path_m=metal.h.path_m + path_m, at_m=metal.h.at_m + np.array([shift_m, 0.0, 0.0]))
         echoes = [{f.name: getattr(h, f.name) for f in fields(h)} for h in (metal.h, later)]
         h = replace(metal.h, **{name: np.concatenate([part[name] for part in echoes]) for name in echoes[0]})
         segment = np.repeat([0, 1], len(metal))
         return SeenEchoes(h, h, segment), find_shape(h, optics)
 
-    # 53 degrees of incidence: an echo 1.2 times the depth later.
-    assert find_depth_behind(*add_echo(0.2), 1) == pytest.approx(0.166, rel=0.05)
-    assert find_depth_behind(*add_echo(0.2), 0) is None
+    # At 53 degrees of incidence a point at the depth d has a path 2 d cos(53 degrees) = 1.2 d longer.
+    echoes, shape = add_echo(0.2)
+    assert find_depth_behind(echoes, shape, 1) == pytest.approx(0.166, rel=0.05)
+    # Nothing is before the front.
+    assert find_depth_behind(echoes, shape, 0) is None
+    # 20 mm are not resolved.
     assert find_depth_behind(*add_echo(0.02), 1) is None
+    # Half a metre aside the echo is not behind the body.
     assert find_depth_behind(*add_echo(0.2, shift_m=0.5), 1) is None
 
-    # It looks like an echo of a small ball, so its shape must not count as reliable.
-    echoes, shape = add_echo(0.2)
+    # Such an echo looks like that of a small ball, but its shape must not count as reliable.
     front, echo = (describe_segment(number, shape[echoes.segment == number]) for number in (0, 1))
     echo = replace(echo, radius_mm=18.0, reason="radius 18 mm: below 40 mm only the shape is reliable")
     judged, unknown_m = doubt_places([front, echo], echoes, shape, find_voltages(echoes, optics, shape), gains(optics))
     assert [segment.reason for segment in judged] == ["", BEHIND_ANOTHER_REASON]
     assert judged[1].radius_std_mm >= 18.0
     assert not unknown_m[: len(metal)].any()
+    # The standard deviation of an error that is uniform within the depth to either side
     assert unknown_m[-1] == pytest.approx(0.166 / np.sqrt(3), rel=0.05)
 
 
 def test_points_near_the_border_of_a_segment_are_reported_but_not_at_the_end_of_the_scan():
-    """A segment that fills the scan in y, and ends within it in x."""
+    """A segment that fills the scan in y, and ends within it in x.
+
+    A window is 34 mm wide: points nearer than about half of it to the border may be wrong.
+    """
     x, y = np.meshgrid(np.arange(0.1, 0.3, 0.008), np.arange(0.0, 0.2, 0.008))
     at_m = np.stack([x.ravel(), y.ravel()], axis=1)
     extent_m = np.array([0.0, 0.0]), np.array([0.5, float(y.max())])
@@ -226,9 +265,9 @@ def test_points_near_the_border_of_a_segment_are_reported_but_not_at_the_end_of_
 
 @pytest.fixture
 def rippled_plane(metal, gains, optics):
-    """Voltages of a plane that ends 10 mm beyond its points, their shares, and the ripple by its edges [n].
+    """Voltages of a plane that ends 10 mm beyond its points, weights of the points, and the ripple by its edges [n].
 
-    The ripple is the chirp of a half plane by each edge.
+    Each edge adds a wave that is weaker, and changes faster, with the distance from it, as of a half plane.
     """
     learnt = gains(optics)
     voltages = find_voltages(metal, optics)
@@ -236,17 +275,17 @@ def rippled_plane(metal, gains, optics):
     voltages = replace(voltages, bend_inside=flat, bend_across=flat, twist=flat)
     gain = np.exp(learnt.level(voltages))
     gain = np.stack([gain, gain / learnt.ratio(voltages.arrival)], axis=1)
-    b = gain * predict_voltages(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
+    received = gain * predict_voltages(voltages, reflect_points(MEDIUM, voltages, optics.wave_number))
     low = voltages.at_m.min(axis=0)
     high = voltages.at_m.max(axis=0)
     from_edges_m = np.concatenate([voltages.at_m - low, high - voltages.at_m], axis=1) + 0.01
     ripple = 0.003 / from_edges_m * np.exp(-1j * optics.wave_number * from_edges_m**2 / 0.9)
     share = find_shares(voltages.at_m, np.zeros(len(metal), int), (low - 0.1, high + 0.1))
     band_rise = np.tile(learnt.band_rise, (len(metal), 1))
-    return replace(voltages, voltage=b, band_rise=band_rise), share, ripple.sum(axis=1)
+    return replace(voltages, voltage=received, band_rise=band_rise), share, ripple.sum(axis=1)
 
 
-# Phases of the ripple.
+# Six phases of the ripple relative to the plane's echo
 TURNS = np.exp(2j * np.pi * np.arange(6) / 6)
 
 
@@ -254,9 +293,10 @@ def test_ripples_of_edges_average_where_points_near_them_count_less(rippled_plan
     voltages, share, ripple = rippled_plane
     errors = []
     for turn in TURNS:
-        of_both = np.stack([np.ones(len(ripple)), 1 + turn * ripple], axis=1)
-        rippled = replace(voltages, voltage=voltages.voltage * of_both)
-        fits = [fit_permittivity(rippled, gains(optics), optics.wave_number, counted) for counted in (1.0, share)]
+        # Of V only
+        factors = np.stack([np.ones(len(ripple)), 1 + turn * ripple], axis=1)
+        rippled = replace(voltages, voltage=voltages.voltage * factors)
+        fits = [fit_permittivity(rippled, gains(optics), optics.wave_number, weight) for weight in (1.0, share)]
         errors.append([abs(fit.eps - MEDIUM) for fit in fits])
     error_of_equal_weights, error_of_reduced_weights = np.sqrt(np.mean(np.square(errors), axis=0))
     assert error_of_reduced_weights < 0.6 * error_of_equal_weights
@@ -265,21 +305,23 @@ def test_ripples_of_edges_average_where_points_near_them_count_less(rippled_plan
 def test_ripples_of_edges_do_not_make_a_plate_a_wall(rippled_plane, metal, gains, optics):
     voltages, share, ripple = rippled_plane
     plane = replace(describe_segment(0, find_shape(metal.h, optics)), radius_mm=None)
-    reasons = []
+    reasons_with_equal_weights = []
+    reasons_with_reduced_weights = []
     for turn in TURNS:
         rippled = replace(voltages, voltage=voltages.voltage * (1 + 1.5 * turn * ripple)[:, None])
-        for counted in (1.0, share):
-            judged, _ = judge_segment(plane, rippled, gains(optics), [], optics.wave_number, share=counted)
+        for weight, reasons in ((1.0, reasons_with_equal_weights), (share, reasons_with_reduced_weights)):
+            judged, _ = judge_segment(plane, rippled, gains(optics), [], optics.wave_number, share=weight)
             reasons.append(judged.reason)
-    assert any(reasons[::2])
-    assert not any(reasons[1::2])
+    assert any(reasons_with_equal_weights)
+    assert not any(reasons_with_reduced_weights)
 
 
 @pytest.mark.parametrize(("least", "most"), [(0.1, 0.25), (0.25, 0.4), (0.4, 0.55), (0.55, 0.9)])
 def test_points_of_a_wall_have_the_error_of_their_position(least, most):
-    """Drawn walls: the path by the matched filter over the band, by the sum of both faces' echoes at 53 degrees.
+    """300 random walls whose level (reflection relative to metal) is between `least` and `most`.
 
-    Among them are thick walls, whose faces one window just does not resolve.
+    The echoes of both faces add up, at 53 degrees of incidence; the path is that where the matched filter over the band
+    is largest. Among them are thick walls, whose faces one window just does not resolve.
     """
     rng = np.random.default_rng(1)
     wave_numbers = 2 * np.pi * np.linspace(76.282e9, 79.749e9, 24) / 299792458
@@ -288,19 +330,27 @@ def test_points_of_a_wall_have_the_error_of_their_position(least, most):
     matched = np.exp(1j * np.outer(paths_m, wave_numbers - wave_numbers.mean()))
     inside = []
     while len(inside) < 300:
-        inner = np.sqrt(rng.uniform(2, 9) - 1j * 10 ** rng.uniform(-3, 0) - 1 + cos**2)
-        r = (cos - inner) / (cos + inner)
-        through = np.exp(-2j * wave_numbers * 10 ** rng.uniform(-3.3, -1.6) * inner)
-        echo = r * (1 - through) / (1 - r**2 * through)
-        level = np.abs(matched @ echo) / len(wave_numbers)
-        if least < level.max() < most:
-            placed = echo * matched[level.argmax()]
-            rise = np.log(np.abs(placed[12:].mean()) / np.abs(placed[:12].mean()))
-            away_m = paths_m[level.argmax()] / (2 * cos)
-            inside.append(abs(away_m) < 1.96 * estimate_wall_std(level.max(), rise))
-    # The more both faces cancel, the rarer are thick walls, whose errors count for all.
+        eps = rng.uniform(2, 9) - 1j * 10 ** rng.uniform(-3, 0)
+        # eps - sin^2 of the incidence angle
+        inner = np.sqrt(eps - 1 + cos**2)
+        r_s = (cos - inner) / (cos + inner)
+        # 0.5 to 25 mm
+        wall_m = 10 ** rng.uniform(-3.3, -1.6)
+        through = np.exp(-2j * wave_numbers * wall_m * inner)
+        echo = r_s * (1 - through) / (1 - r_s**2 * through)
+        level_of_paths = np.abs(matched @ echo) / len(wave_numbers)
+        level = level_of_paths.max()
+        if least < level < most:
+            at_its_path = echo * matched[level_of_paths.argmax()]
+            rise = np.log(np.abs(at_its_path[12:].mean()) / np.abs(at_its_path[:12].mean()))
+            away_m = paths_m[level_of_paths.argmax()] / (2 * cos)
+            # 95 % of a normal distribution
+            inside.append(abs(away_m) < 1.96 * estimate_wall_std(level, rise))
     assert np.mean(inside) > 0.9
-    assert least < 0.4 or np.mean(inside) < 0.99
+    # The error must not be far too large, either. It is for weak echoes: the more both faces cancel, the rarer are the
+    # thick walls, whose errors count for all.
+    if least >= 0.4:
+        assert np.mean(inside) < 0.99
 
 
 @pytest.mark.parametrize(
@@ -309,6 +359,7 @@ def test_points_of_a_wall_have_the_error_of_their_position(least, most):
         (NO_SINGLE_MEDIUM, "", 80.0, None, "wall"),
         (NO_SINGLE_MEDIUM, "metal", 80.0, None, "surface"),
         (NO_SINGLE_MEDIUM, "", 80.0, 0.03, "behind"),
+        # A radius below 40 mm, 30 mm behind another surface
         ("", "", 39.9, 0.03, "behind"),
         ("", "", 40.1, 0.03, "surface"),
         ("", "", 39.9, None, "surface"),
@@ -320,6 +371,7 @@ def test_a_place_is_doubted_for_a_wall_and_for_an_echo_behind_another_surface(
 ):
     """A small radius alone is no reason to doubt a place: only with another surface in front of it."""
 
+    # Stands for `SeenEchoes`: two points of segment 1 and one of segment 2.
     class ThreePoints(list):
         segment = np.array([1, 1, 2])
 
@@ -337,33 +389,45 @@ def test_a_place_is_doubted_for_a_wall_and_for_an_echo_behind_another_surface(
         name=name,
     )
     voltages = SimpleNamespace(band_rise=np.full((3, 2), 0.1))
-    (judged,), unknown_m = doubt_places(
-        [segment], ThreePoints([0, 0, 0]), None, voltages, SimpleNamespace(band_rise=np.zeros(2))
-    )
-    expected_m = {"surface": 0.0, "wall": estimate_wall_std(0.3, 0.1), "behind": 0.03 / np.sqrt(3)}[judged_as]
+    gains = SimpleNamespace(band_rise=np.zeros(2))
+    no_shape = None
+    (judged,), unknown_m = doubt_places([segment], ThreePoints([0, 0, 0]), no_shape, voltages, gains)
+    if judged_as == "wall":
+        # Of the reflection of 0.3 and the rise of 0.1 above
+        expected_m = estimate_wall_std(0.3, 0.1)
+    elif judged_as == "behind":
+        # Uniform within the depth of 30 mm to either side
+        expected_m = 0.03 / np.sqrt(3)
+    else:
+        expected_m = 0.0
     np.testing.assert_allclose(unknown_m, [expected_m, expected_m, 0])
     assert judged.reason == (BEHIND_ANOTHER_REASON if judged_as == "behind" else reason)
     assert (judged.radius_std_mm > 1) is (judged_as != "surface")
 
 
 def test_a_radius_is_reported_where_curvatures_and_normals_disagree(metal, optics):
-    """A wall's two faces bend paths otherwise than they turn normals: one gave 75 mm for 42 mm without a warning."""
+    """The radius is known from the curvature of each point, and from how the normals turn from point to point.
+
+    At a wall with two faces they disagree: one of 42 mm had 75 mm, without a large error.
+    """
     shape = find_shape(metal.h, optics)
-    sound = describe_segment(0, shape)
-    assert sound.radius_mm == pytest.approx(125, rel=0.02)
-    assert sound.radius_std_mm < 0.05 * sound.radius_mm
-    flatter_segment = describe_segment(0, replace(shape, curvature=shape.curvature / 1.5))
-    assert (
-        abs(1 / flatter_segment.radius_mm - 1 / 125)
-        < 1.96 * flatter_segment.radius_std_mm / flatter_segment.radius_mm**2
-    )
+    sphere = describe_segment(0, shape)
+    assert sphere.radius_mm == pytest.approx(125, rel=0.02)
+    assert sphere.radius_std_mm < 0.05 * sphere.radius_mm
+    flatter = describe_segment(0, replace(shape, curvature=shape.curvature / 1.5))
+    # The true curvature is within two standard deviations; that of 1 / radius is std / radius^2.
+    curvature_std = flatter.radius_std_mm / flatter.radius_mm**2
+    assert abs(1 / flatter.radius_mm - 1 / 125) < 1.96 * curvature_std
     flat = describe_segment(0, replace(shape, curvature=0 * shape.curvature))
     assert flat.radius_mm is None
     assert flat.radius_std_mm is None
 
 
 def see_sphere(optics, radius_m: float = 0.125) -> SeenEchoes:
-    """Return noiseless echoes, of amplitude 1, of a sphere under the directions that a whole scan shows."""
+    """Return noiseless echoes, of amplitude 1, of a sphere with the normals that a whole scan shows.
+
+    They are tilted by up to 14 degrees along x and 17 degrees along y.
+    """
     x, y = np.meshgrid(np.linspace(-0.25, 0.25, 24), np.linspace(-0.3, 0.3, 24))
     normals = np.stack([x.ravel(), y.ravel(), -np.sqrt(1 - x.ravel() ** 2 - y.ravel() ** 2)], axis=1)
     centre = np.array(CENTRE_M) + radius_m * np.eye(3)[2]
@@ -404,19 +468,23 @@ def test_a_sphere_that_is_not_of_metal_is_not_a_reference(medium, optics):
         check_is_metal(Path("scan"), learn(medium))
 
 
-def test_a_permittivity_at_the_end_of_the_fit_is_none():
-    segment = Segment(0, 100, CENTRE_M, (0.0, 0.0, -1.0), None, 55.0)
+def test_a_permittivity_at_the_end_of_the_range_of_the_fit_is_not_reported():
+    """The fit ends at a real part of 39 to 40."""
+    segment = Segment(
+        number=0, points=100, centre_m=CENTRE_M, normal=(0.0, 0.0, -1.0), radius_mm=None, incidence_deg=55.0
+    )
     sources = {"scatter": np.eye(2)}
     assert add_permittivity(segment, 38.0 - 9j, sources).permittivity == 38.0 - 9j
     assert add_permittivity(segment, 40.0 - 9j, sources).reason == NO_SINGLE_MEDIUM
 
 
 @pytest.mark.parametrize(("missing_columns", "pieces"), [(1, 1), (3, 2), (9, 2)])
-def test_a_gap_of_one_window_does_not_part_a_surface_and_a_wider_one_does(metal, optics, missing_columns, pieces):
+def test_a_gap_of_one_window_does_not_divide_a_surface_and_a_wider_one_does(metal, optics, missing_columns, pieces):
     x_m = metal.h.at_m[:, 0]
-    column = x_m[np.argmin(np.abs(x_m - np.median(x_m)))]
-    is_kept = np.abs(x_m - column) > (missing_columns / 2) * STRIDE_M
+    middle_column_m = x_m[np.argmin(np.abs(x_m - np.median(x_m)))]
+    is_kept = np.abs(x_m - middle_column_m) > (missing_columns / 2) * STRIDE_M
     groups = group_echoes(metal.h[is_kept], optics)
-    is_right = x_m[is_kept] > column
     assert set(groups) == set(range(pieces))
-    assert set(groups[is_right]).isdisjoint(groups[~is_right]) is (pieces == 2)
+    is_right = x_m[is_kept] > middle_column_m
+    are_divided = set(groups[is_right]).isdisjoint(groups[~is_right])
+    assert are_divided is (pieces == 2)

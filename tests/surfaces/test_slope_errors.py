@@ -1,4 +1,9 @@
-"""Errors of slopes: windows that overlap share data, so a fit to neighbours takes part of their common errors."""
+"""Errors of the slopes of echoes' paths.
+
+Windows overlap and share data, so that neighbours have common errors. The curvature is fitted to neighbouring slopes
+and takes a part of these errors; it must not be missing in the estimate of the slopes' errors. A *ripple* is an error
+that the windows do not account for, as by edges.
+"""
 
 from dataclasses import replace
 
@@ -12,8 +17,13 @@ from polysight.surfaces.paths import STRIDE_M
 from polysight.surfaces.result import EDGE_SLOPE_STD
 from polysight.surfaces.window import WINDOW_M, make_empty_echoes
 
+# True standard deviations of the slopes along x and y
 SLOPE_STD = (0.004, 0.002)
+
+# Windows along each axis
 SIDE = 60
+
+# Second derivatives of the path, 1 / m
 PLANE = np.zeros((2, 2))
 BENT = np.array([[1.2, 0.2], [0.2, 0.4]])
 
@@ -22,7 +32,9 @@ def draw_ripple(rng: np.random.Generator) -> np.ndarray:
     """Normal errors [SIDE, SIDE] that windows share as far as they overlap, with a variance of 1."""
     steps = np.arange(SIDE)
     distance = np.abs(steps[:, None] - steps) * STRIDE_M / WINDOW_M
-    factor = np.linalg.cholesky(np.maximum(0, 1 - distance) + 1e-9 * np.eye(SIDE))
+    # The correlation is the share by which windows overlap; its root makes it of independent errors, along either axis.
+    correlation = np.maximum(0, 1 - distance) + 1e-9 * np.eye(SIDE)
+    factor = np.linalg.cholesky(correlation)
     return factor @ rng.standard_normal((SIDE, SIDE)) @ factor.T
 
 
@@ -32,13 +44,17 @@ def draw_noise(rng: np.random.Generator, axis: int) -> np.ndarray:
     stride = round(STRIDE_M / 0.002)
     white = rng.standard_normal((SIDE * stride + samples,) * 2)
     patches = np.lib.stride_tricks.sliding_window_view(white, (samples, samples))[::stride, ::stride][:SIDE, :SIDE]
+    # The slope of a straight line that is fitted to the samples of a window: their sum weighted with the place.
     ramp = np.arange(samples) - (samples - 1) / 2
     sums = np.tensordot(patches.sum(axis=3 - axis), ramp, 1)
     return sums / np.sqrt(samples * np.sum(ramp**2))
 
 
 def make_echoes(bend: np.ndarray, errors: np.ndarray, slope_std: tuple[float, float]) -> Echoes:
-    """Echoes of a path with a curvature and errors [2, SIDE, SIDE] of its slopes, of which windows know `slope_std`."""
+    """Echoes of a path with second derivatives `bend`, whose slopes have errors [2, SIDE, SIDE] times `SLOPE_STD`.
+
+    `slope_std` is the error that the windows report.
+    """
     x, y = np.meshgrid(np.arange(SIDE) * STRIDE_M, np.arange(SIDE) * STRIDE_M)
     at_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     count = len(at_m)
@@ -53,6 +69,7 @@ def make_echoes(bend: np.ndarray, errors: np.ndarray, slope_std: tuple[float, fl
 
 
 def estimate_slope_std(echoes: Echoes) -> np.ndarray:
+    """The root mean square of the slopes' errors along x and y, as estimated from their neighbours."""
     smooth = smooth_bends(echoes, np.zeros(len(echoes), int))
     return np.sqrt(np.mean(smooth.slope_std**2, axis=0))
 
@@ -69,14 +86,17 @@ def test_ripple_is_estimated_though_overlapping_windows_share_it(bend):
 def test_noise_that_windows_account_for_is_not_a_ripple(bend):
     rng = np.random.default_rng(7)
     noise = np.stack([draw_noise(rng, 0), draw_noise(rng, 1)])
-    wider = estimate_slope_std(make_echoes(bend, noise, SLOPE_STD)) / SLOPE_STD
-    # Its variance scatters about zero, and only what lies above counts.
-    assert np.all((wider >= 1) & (wider < 1.35))
+    estimated_over_reported = estimate_slope_std(make_echoes(bend, noise, SLOPE_STD)) / SLOPE_STD
+    # The variance of the ripple, 0 here, is estimated with some error; it is added where it is positive.
+    assert np.all((estimated_over_reported >= 1) & (estimated_over_reported < 1.35))
 
 
 @pytest.mark.parametrize("period_m", [0.08, 0.1])
 def test_ripple_of_a_straight_edge_is_estimated_though_the_curvature_takes_it(period_m):
-    """It is the same all along the edge, and across it nearly as long as the neighbourhood of the curvature."""
+    """The ripple is the same all along the edge. Across it, a period is nearly as long as the fit of the curvature.
+
+    The limits are chosen: a part of it cannot be distinguished from a curvature.
+    """
     wave = np.sqrt(2) * np.cos(2 * np.pi * np.arange(SIDE) * STRIDE_M / period_m)
     ripple = np.stack([np.tile(wave, (SIDE, 1)), np.zeros((SIDE, SIDE))])
     estimated = estimate_slope_std(make_echoes(PLANE, ripple, (1e-9, 1e-9)))
@@ -84,10 +104,11 @@ def test_ripple_of_a_straight_edge_is_estimated_though_the_curvature_takes_it(pe
 
 
 def test_a_curvature_that_changes_is_not_a_ripple():
-    """The path over a cone, whose curvature falls from 2 to 1 / m within the scan."""
+    """The path over a cone, whose curvature falls from 2 to 1 / m within the scan: x^2 + change x^2 y / 2."""
     steps = np.arange(SIDE) * STRIDE_M
     x, y = np.meshgrid(steps, steps)
     change = -1 / steps[-1]
+    # First and second derivatives of that path
     bent = make_echoes(PLANE, np.zeros((2, SIDE, SIDE)), (1e-9, 1e-9))
     slope = np.stack([2 * x + change * x * y, change * x**2 / 2], axis=-1).reshape(-1, 2)
     bend_xx = (2 + change * y).ravel()
@@ -98,14 +119,17 @@ def test_a_curvature_that_changes_is_not_a_ripple():
 
 @pytest.mark.parametrize("path_bend", [3.0, 6.0, 10.0])
 def test_slopes_near_the_border_of_a_zone_are_wrong_by_what_an_edge_diffracts(path_bend):
-    """Half a plane. `path_bend` (1 / m): curvature of the edge's path over that of the surface's.
+    """Half a plane, whose field is given by Fresnel's integrals of the distance from the border of its zone.
 
-    Windows that have more than 0.7 of the level inside the zone, up to 20 mm from the first of them.
+    `path_bend` (1 / m) is the curvature of the path over the edge minus that of the path over the surface. The error of
+    the slope counts for windows within 20 mm of the first one that has more than 0.7 of the level inside the zone.
     """
+    # At the middle of the rig's band, 1 / m
     wave_number = 1634.0
     x = np.linspace(-WINDOW_M / 2, WINDOW_M / 2, 35)
     slopes = np.linspace(-0.04, 0.04, 161)
     bends = np.linspace(-4, 4, 41)
+    # A window's slope is that of the wave, of all with these slopes and bends, that fits its samples best.
     trials = np.exp(1j * wave_number * (slopes[:, None, None] * x + bends[:, None] * x**2 / 2))
     errors = []
     for at_m in np.arange(0.0, 0.04, 0.001):
@@ -114,5 +138,7 @@ def test_slopes_near_the_border_of_a_zone_are_wrong_by_what_an_edge_diffracts(pa
         level = np.abs(trials @ wave) / x.size
         if level.max() > 0.7:
             errors.append(slopes[level.max(axis=1).argmax()])
-    assert np.sqrt(np.mean(np.square(errors[:21]))) == pytest.approx(EDGE_SLOPE_STD, rel=0.25)
+    # Windows are 1 mm apart: the first 21 are within 20 mm.
+    near_border = np.array(errors[:21])
+    assert np.sqrt(np.mean(near_border**2)) == pytest.approx(EDGE_SLOPE_STD, rel=0.25)
     assert np.abs(errors[21:]).max() < 2 * EDGE_SLOPE_STD

@@ -1,4 +1,4 @@
-"""Drawn shapes: place, normal and permittivity are within the required errors, or no value is given."""
+"""Simulated shapes: place, normal and permittivity are within the required errors, or no value is given."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +31,11 @@ from polysight_worlds.shapes import cylinder, sphere
 
 # A rig that stands as its file says: only noise and the method's own errors remain.
 EXACT = Uncertainty(leakage=1e-4, axis_rad=1e-4, place_m=1e-6)
+
+# At the middle of the rig's band, 1 / m
+WAVE_NUMBER = 1634.0
+
+# Front of the objects: in the middle between TX and the receivers, half a metre before the stage
 CENTRE_M = (-0.01, 0.104, 0.5)
 
 
@@ -67,11 +72,11 @@ def test_the_surface_of_a_sphere_changes_only_on_purpose(glass_ball):
 def test_the_permittivity_of_a_sphere_is_found_within_its_error(glass_ball):
     scene, _, surface = glass_ball
     main = surface.segments[0]
-    miss = main.permittivity - scene.permittivity
-    d = np.array([miss.real, miss.imag])
-    assert abs(miss) < 0.03 * abs(scene.permittivity)
-    # 99 %
-    assert d @ np.linalg.inv(np.array(main.covariance)) @ d < 9.2
+    error = main.permittivity - scene.permittivity
+    assert abs(error) < 0.03 * abs(scene.permittivity)
+    parts = np.array([error.real, error.imag])
+    # 99 % of chi squared with two degrees of freedom
+    assert parts @ np.linalg.inv(np.array(main.covariance)) @ parts < 9.2
 
 
 def test_a_cylinder_of_50_mm_is_measured(see, gains, optics):
@@ -93,9 +98,9 @@ def test_metal_is_metal_and_has_no_permittivity(metal, gains, optics):
 
 
 def test_below_40_mm_the_shape_alone_is_given_and_why(see, gains, optics):
-    surface = analyse_surface(
-        see(make_sphere_scene(0.03, Stack(below=4 - 0.4j)).shapes, 64, 44), optics, gains, uncertainty=EXACT
-    )
+    scene = make_sphere_scene(0.03, Stack(below=4 - 0.4j))
+    seen = see(scene.shapes, columns=64, rows=44)
+    surface = analyse_surface(seen, optics, gains, uncertainty=EXACT)
     assert len(surface.points_m)
     assert [s.permittivity for s in surface.segments] == [None] * len(surface.segments)
     assert all(s.reason for s in surface.segments)
@@ -111,8 +116,13 @@ def test_without_a_reference_the_shape_alone_is_given(glass_ball, optics):
 def test_the_error_grows_with_what_is_not_known(glass_ball, gains, optics):
     _, surface, exact = glass_ball
     traces = [np.trace(exact.segments[0].covariance)]
-    unsure = [Uncertainty(0.02, 1e-4, 1e-6), Uncertainty(0.02, 0.02, 1e-6), Uncertainty(0.02, 0.02, 1e-3)]
-    for uncertainty in unsure:
+    # Leakage, then the antennas' axes, then their places are known less well.
+    uncertainties = [
+        Uncertainty(leakage=0.02, axis_rad=1e-4, place_m=1e-6),
+        Uncertainty(leakage=0.02, axis_rad=0.02, place_m=1e-6),
+        Uncertainty(leakage=0.02, axis_rad=0.02, place_m=1e-3),
+    ]
+    for uncertainty in uncertainties:
         judged = analyse_surface(surface, optics, gains, uncertainty=uncertainty).segments[0]
         traces.append(np.trace(judged.covariance))
     assert traces == sorted(traces)
@@ -122,36 +132,41 @@ def test_the_error_grows_with_what_is_not_known(glass_ball, gains, optics):
 def test_scans_of_a_turntable_are_joined_where_the_object_stood(glass_ball):
     """The same ball, scanned on a table that was turned by 40 degrees, is moved back to its place."""
     _, _, surface = glass_ball
+    # x and z of the vertical axis of the table, metres
     axis = (0.03, 0.55)
     angle = np.radians(40.0)
     # A positive angle turns +z towards +x.
     turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    about = np.array([axis[0], 0.0, axis[1]])
-    rotated_surface = replace(
-        surface, points_m=(surface.points_m - about) @ turn.T + about, normals=surface.normals @ turn.T
-    )
+    on_axis = np.array([axis[0], 0.0, axis[1]])
+    rotated_points_m = (surface.points_m - on_axis) @ turn.T + on_axis
+    rotated_surface = replace(surface, points_m=rotated_points_m, normals=surface.normals @ turn.T)
     joined = join_turned([surface, rotated_surface], [0.0, 40.0], axis)
+    # The points and segments of the second scan follow those of the first.
     count = len(surface.points_m)
+    of_second_scan = joined.segments[len(surface.segments) :]
     assert np.allclose(joined.points_m[count:], surface.points_m, atol=1e-9)
     assert np.allclose(joined.normals[count:], surface.normals, atol=1e-9)
     assert [s.number for s in joined.segments] == list(range(2 * len(surface.segments)))
-    assert set(joined.segment[count:]) <= {s.number for s in joined.segments[len(surface.segments) :]}
-    assert [s.turned_deg for s in joined.segments[len(surface.segments) :]] == [40.0] * len(surface.segments)
+    assert set(joined.segment[count:]) <= {s.number for s in of_second_scan}
+    assert [s.turned_deg for s in of_second_scan] == [40.0] * len(surface.segments)
 
 
-def test_surfaces_whose_numbers_have_gaps_stay_apart_when_joined(glass_ball):
-    """An edge that was dropped leaves a gap in the numbers, which must not give two surfaces one number."""
+def test_surfaces_whose_numbers_have_gaps_keep_different_numbers_when_joined(glass_ball):
+    """An edge that was dropped leaves a gap in the numbers, here 0 and 2; no two surfaces may get the same number."""
     _, _, surface = glass_ball
-    half = np.arange(len(surface.points_m)) < len(surface.points_m) // 2
+    is_first_half = np.arange(len(surface.points_m)) < len(surface.points_m) // 2
     segments = (surface.segments[0], replace(surface.segments[0], number=2))
-    gapped = replace(surface, segment=np.where(half, 0, 2), segments=segments)
-    joined = join_turned([gapped, gapped], [0.0, 40.0], (0.03, 0.55))
+    with_gap = replace(surface, segment=np.where(is_first_half, 0, 2), segments=segments)
+    joined = join_turned([with_gap, with_gap], [0.0, 40.0], (0.03, 0.55))
     assert len({s.number for s in joined.segments}) == 4
-    numbers = [int(n) for part in np.split(joined.segment, 2) for n in dict.fromkeys(part)]
+    # Numbers of the points, in the order in which they first occur, scan by scan
+    numbers = []
+    for numbers_of_scan in np.split(joined.segment, 2):
+        numbers.extend(int(number) for number in dict.fromkeys(numbers_of_scan))
     assert numbers == [s.number for s in joined.segments]
 
 
-def test_files_hold_what_was_found(glass_ball, tmp_path):
+def test_a_surface_that_is_written_and_read_again_is_the_same(glass_ball, tmp_path):
     _, _, surface = glass_ball
     write_surface(tmp_path, surface)
     read = read_surface(tmp_path / SURFACE)
@@ -164,7 +179,7 @@ def test_files_hold_what_was_found(glass_ball, tmp_path):
 @pytest.mark.parametrize(
     "content", [None, b"", b"not an archive", {"points_m": np.zeros((1, 3))}, {"segments": "[{}]"}]
 )
-def test_a_file_that_is_not_a_surface_is_refused_by_name(content: Any, tmp_path):
+def test_the_error_of_a_file_that_is_not_a_surface_names_the_file(content: Any, tmp_path):
     path = tmp_path / SURFACE
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -180,30 +195,37 @@ def test_the_point_cloud_is_a_ply_of_all_points(glass_ball):
     head, _, body = point_cloud(surface).partition(b"end_header\n")
     assert head.startswith(b"ply\nformat binary_little_endian 1.0\n")
     assert f"element vertex {len(surface.points_m)}".encode() in head
+    # Each property is a number of four bytes.
     properties = head.count(b"\nproperty ")
     assert len(body) == 4 * properties * len(surface.points_m)
-    first = np.frombuffer(body[:12], "<f4")
-    assert np.allclose(first, 1e3 * surface.points_m[0], atol=1e-3)
+    # x, y and z of the first point, millimetres
+    first_point_mm = np.frombuffer(body[:12], "<f4")
+    assert np.allclose(first_point_mm, 1e3 * surface.points_m[0], atol=1e-3)
 
 
 def test_a_surface_without_curvature_reflects_by_fresnel():
     theta = np.radians([40.0, 55.0, 62.0])
     flat = reflect_flat(4 - 0.3j, theta)
-    curved = reflect_curved(4 - 0.3j, theta, np.zeros(3), np.zeros(3), 1634.0)
+    no_bend = np.zeros(3)
+    curved = reflect_curved(4 - 0.3j, theta, no_bend, no_bend, WAVE_NUMBER)
     assert np.allclose(flat, curved, atol=1e-9)
 
 
-def test_metal_of_curvature_turns_p_by_the_known_phase():
-    """A metal sphere: r_p / r_s turns by sin^2 / (k R cos^3), 0.02 rad at 100 mm and 55 degrees."""
+def test_curved_metal_turns_p_by_the_known_phase():
+    """A metal sphere: r_p / r_s turns by sin^2 / (k R cos^3), 0.02 rad at a radius of 100 mm and 55 degrees."""
     theta = np.radians([55.0])
-    bend = np.array([10.0])
-    r_s, r_p = reflect_curved(np.inf, theta, bend, bend, 1634.0)
-    expected = np.sin(theta) ** 2 / (163.4 * np.cos(theta) ** 3)
+    radius_m = 0.1
+    bend = np.array([1 / radius_m])
+    r_s, r_p = reflect_curved(np.inf, theta, bend, bend, WAVE_NUMBER)
+    expected = np.sin(theta) ** 2 / (WAVE_NUMBER * radius_m * np.cos(theta) ** 3)
     assert np.angle(r_p / r_s) == pytest.approx(expected, rel=0.05)
 
 
 def test_the_published_grid_shows_normals_of_15_and_22_degrees():
-    """As the grid's reach and the distance say: 0.349 m and 0.199 m at half a metre, 55 degrees of incidence."""
+    """The grid reaches 0.349 m in x and 0.199 m in y to each side, at half a metre and 55 degrees of incidence.
+
+    The alias angle is that from which on echoes fold onto other directions; with steps of 2 mm it is far away.
+    """
     normals_deg = visible_normals(load_instrument(find_packaged(Path("instrument.toml"))))
     assert normals_deg.x_deg == pytest.approx(15, abs=1)
     assert normals_deg.y_deg == pytest.approx(22, abs=1)

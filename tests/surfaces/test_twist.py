@@ -11,12 +11,17 @@ from polysight_worlds.zones import spread_of_ray
 
 FREQUENCY_HZ = 78e9
 WAVE_NUMBER = 2 * np.pi * FREQUENCY_HZ / 299792458
-# At a finite distance both differ by a term of 1 / (k distance) that no curvature has a part in.
+# Of the antennas. At a finite distance the series has one more term of 1 / (k distance), here 1e-4, which does not
+# depend on the curvature.
 DISTANCE_M = 5.0
 
 
 def mix_by_series(eps: complex | None, theta: float, radius_m: float) -> complex:
-    """Echo of s in p relative to the ray's spreading, of a cylinder at 45 degrees to the plane of incidence, y = 0."""
+    """Echo that is sent in s and received in p, over the amplitude of a ray, of a cylinder by its exact series.
+
+    Its axis is at 45 degrees to the plane of incidence, y = 0.
+    """
+    # Metal has no stack of layers; for the shape's geometry any medium will do.
     stack = Stack(below=4.0) if eps is None else Stack(below=eps)
     solid = cylinder("solid", stack, (0.0, 0.0, radius_m), radius_m, 10.0, axis=(1.0, 1.0, 0.0))
     ray = np.array([np.sin(theta), 0.0, np.cos(theta)])
@@ -44,14 +49,17 @@ def test_a_twisted_surface_mixes_s_and_p_as_the_series_does(eps, angle_deg):
     theta = np.radians(angle_deg)
     radius_m = 0.2
     expected = mix_by_series(eps, float(theta), radius_m)
-    # The cylinder bends across its axis, (1, -1): along x and y by half, and twisted by half.
+    # The cylinder is curved along (1, -1), across its axis: 1 / radius. Along x and along y it is half of that, and so
+    # is the mixed term, the twist.
     ray_across = np.cross([0.0, 0.0, -1.0], [1.0, 0.0, 0.0])
     bent_along = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)
     twist = bent_along[0] * (bent_along @ ray_across) / radius_m
-    mixed = mix_twisted(np.inf if eps is None else eps, np.array([theta]), np.array([twist]), WAVE_NUMBER)[0]
+    permittivity = np.inf if eps is None else eps
+    mixed = mix_twisted(permittivity, np.array([theta]), np.array([twist]), WAVE_NUMBER)[0]
+    # The limits are chosen.
     assert mixed == pytest.approx(expected, rel=0.08)
     assert abs(expected) > 1e-4
 
 
-def test_only_a_twist_mixes():
+def test_without_a_twist_s_and_p_do_not_mix():
     assert mix_twisted(4 - 0.3j, np.array([0.9]), np.zeros(1), WAVE_NUMBER) == 0

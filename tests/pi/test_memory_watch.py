@@ -1,0 +1,70 @@
+"""What the watch of the Pi's memory does where a client fills it: drawn sizes, no clients and no waits."""
+
+import os
+from typing import Any
+
+import pytest
+
+from polysight_pi.system import CHECK_INTERVAL_S, CUTTING_TIME_S, MAX_BYTES, SPARE_BYTES, MemoryWatch
+
+
+class Ended:
+    """Stands for the event that ends the watch, after so many waits."""
+
+    def __init__(self, waits: int) -> None:
+        self.left = waits
+        self.waited_s: list[float] = []
+
+    def wait(self, seconds: float) -> bool:
+        self.waited_s.append(seconds)
+        self.left -= 1
+        return self.left < 0
+
+
+class DrawnWatch(MemoryWatch):
+    """Uses `sizes` bytes at its checks, the last one then on; each cut finds two connections."""
+
+    def __init__(self, sizes: list[int], waits: int) -> None:
+        self.sizes = [0, *sizes]
+        self.cuts = 0
+        self.said: list[str] = []
+        super().__init__({5601}, self.said.append)
+        self._ended: Any = Ended(waits)
+
+    def resident_bytes(self) -> int:
+        return self.sizes.pop(0) if len(self.sizes) > 1 else self.sizes[0]
+
+    def _cut_connections(self) -> int:
+        self.cuts += 1
+        return 2
+
+    def watch(self) -> None:
+        self.run()
+        os.close(self._statm)
+
+
+@pytest.mark.parametrize(("above_bytes", "is_cut"), [(0, False), (1, True)])
+def test_connections_are_cut_beyond_the_limit_alone(above_bytes, is_cut):
+    watch = DrawnWatch([MAX_BYTES + above_bytes, 0], waits=2)
+    watch.watch()
+    assert (watch.cuts > 0, bool(watch.said)) == (is_cut, is_cut)
+
+
+def test_connections_that_come_again_are_cut_for_half_a_second():
+    watch = DrawnWatch([MAX_BYTES + (9 << 20), 30 << 20], waits=11)
+    watch.watch()
+    assert CUTTING_TIME_S == 0.5
+    # The first cut, and one after each interval.
+    assert watch.cuts == 1 + 10
+    assert watch._ended.waited_s[:11] == [CHECK_INTERVAL_S] * 11
+    used_mib = (MAX_BYTES >> 20) + 9
+    assert watch.said == [f"{used_mib} MiB in memory: 22 connections were cut, 30 MiB are left"]
+
+
+def test_memory_that_stays_in_use_after_a_cut_raises_the_limit():
+    left_bytes = MAX_BYTES + 1
+    watch = DrawnWatch([left_bytes, left_bytes, left_bytes + SPARE_BYTES, left_bytes + SPARE_BYTES + 1, 0], waits=24)
+    watch.watch()
+    assert len(watch.said) == 2
+    # The second time at the check that found more, not at the one that found as much.
+    assert watch.said[1].endswith(", 0 MiB are left")

@@ -2,42 +2,23 @@
 
 import threading
 from os import PRIO_PROCESS, getpriority
-from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
+from tests.support.acquisition.takes import BYTES, PULSES, ROW, make_capture, make_end
 from tests.support.rigs import load_published_rig
 
 from polysight.acquisition.progress import NICE, ProcessingQueue
-from polysight.acquisition.pulse_times import ReceivedCapture
+from polysight.acquisition.pulse_times import PlacedFrames, ReceivedCapture
 from polysight.acquisition.ready import list_stage_differences
 from polysight.acquisition.row import FaultKind, Take, TakeFault
-from polysight.capture import RowCapture
-from polysight.capture.placement import Losses, PacketCounts
+from polysight.capture.placement import PacketCounts
+from polysight.radar import BoardState, RadarState
 from polysight_shared.faults import PiFault, explain
-from polysight_shared.messages import Capture, HelloReply, RowFinished
-from polysight_shared.raster import Row
+from polysight_shared.messages import Capture, HelloReply
 
-ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
-PULSES = 2
 ABORTED = TakeFault(FaultKind.RADAR_STOPPED, "the radar has stopped", "RV")
-BYTES = 480
-
-
-def make_end(**fields: Any) -> RowFinished:
-    """The Pi's report of a row that ended as planned, with other `fields`."""
-    planned = {"status": "done", "points": 3, "edges": 3, "bursts": 3, "pulses": 3 * PULSES}
-    return RowFinished(scan_id="s", seq=1, t_mono_ns=1, row_index=0, take=1, **planned | fields)
-
-
-def make_capture(**fields: Any) -> RowCapture:
-    """A board's whole row, with other `fields`."""
-    whole = {
-        "row": 0, "take": 1, "expected": BYTES, "bytes": BYTES, "missing": [], "located": True, "reason": "",
-        "counts": PacketCounts(placed=4), "losses": Losses(), "strangers": 0, "stale": 0, "kernel_drops": 0,
-        "first_arrival_ns": 1, "last_arrival_ns": 2, "crc32": 1, "index_crc32": 1,
-    }  # fmt: skip
-    return RowCapture(**whole | fields)
 
 
 def list_kinds(take: Take) -> list[FaultKind]:
@@ -113,6 +94,56 @@ def test_packets_that_differ_but_were_masked_nowhere_are_no_fault():
     assert list_kinds(Take(ROW, 1, finished=make_end(), captures={"RV": capture})) == []
 
 
+NOT_LOCATED = {"located": False, "slipped": True, "reason": "a frame is missing"}
+HELD = "; the row was held, and a card ends its record after 2 s without data"
+
+
+@pytest.mark.parametrize(
+    ("slots", "note", "kind"),
+    [
+        (np.arange(5), "", FaultKind.PULSES_MISSED),
+        (np.full(6, -1), "", FaultKind.SLIPPED),
+        (np.arange(5), "held", FaultKind.HELD),
+    ],
+)
+def test_frames_at_other_pulses_are_missed_pulses_only_if_there_are_fewer(slots, note, kind):
+    frames = {"RV": PlacedFrames(slots, [], 6, contradicted=slots.size == 6)}
+    end = make_end(reason=note)
+    (fault,) = Take(ROW, 1, finished=end, captures={"RV": make_capture(**NOT_LOCATED)}, frames=frames).faults(PULSES)
+    assert fault.kind is kind
+    assert fault.text.endswith(HELD) == bool(note)
+
+
+@pytest.mark.parametrize("is_timed", [True, False])
+def test_only_frames_with_times_are_displaced(is_timed):
+    frames = PlacedFrames(np.arange(5), [], 6, reason="" if is_timed else "no pause")
+    take = Take(ROW, 1, finished=make_end(), captures={"RV": make_capture(**NOT_LOCATED)}, frames={"RV": frames})
+    assert take.find_displaced("RV") is (frames if is_timed else None)
+
+
+@pytest.mark.parametrize(
+    ("frames", "text"),
+    [
+        ({}, ""),
+        ({"RV": PlacedFrames(np.arange(5), [], 6, reason="no pause")}, "; missed pulses cannot be located: no pause"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("state", "note", "kind", "more"),
+    [
+        (RadarState.UNKNOWN, "", FaultKind.FRAMES_MISSING, ""),
+        (RadarState.ARMED, "", FaultKind.RADAR_WAITS, "; the radar still waits for pulses"),
+        (RadarState.UNKNOWN, "held", FaultKind.HELD, HELD),
+    ],
+)
+def test_a_board_that_is_not_located_says_all_that_is_known(frames, text, state, note, kind, more):
+    take = Take(
+        ROW, 1, finished=make_end(reason=note), captures={"RV": make_capture(**NOT_LOCATED)}, frames=frames,
+        radars={"RV": BoardState(state)},
+    )  # fmt: skip
+    assert take.faults(PULSES) == [TakeFault(kind, "a frame is missing" + text + more, "RV")]
+
+
 @pytest.mark.parametrize("change", [-0.5, 0.5])
 def test_a_setting_that_places_rows_differs_if_it_is_smaller_or_larger_on_the_pi(change):
     stage = load_published_rig().stage
@@ -161,3 +192,30 @@ def test_rows_are_processed_below_the_priority_of_the_program():
     assert queue.close(now=False) is None
     # 19 is the system's largest value.
     assert nice_values == [min(19, getpriority(PRIO_PROCESS, threading.get_native_id()) + NICE)]
+
+
+def test_a_scan_that_stops_now_waits_for_the_row_in_hand_and_processes_no_other():
+    has_begun = threading.Event()
+    may_end = threading.Event()
+    processed = []
+    errors = []
+
+    def process(row: int) -> None:
+        has_begun.set()
+        may_end.wait()
+        processed.append(row)
+
+    queue = ProcessingQueue(process, limit=9)
+    for row in range(3):
+        queue.add(row)
+    has_begun.wait()
+    closing = threading.Thread(target=lambda: errors.append(queue.close(now=True)))
+    closing.start()
+    # The others are given up at once.
+    while queue.rows_left > 1:
+        closing.join(0.001)
+    closing.join(0.03)
+    assert closing.is_alive()
+    may_end.set()
+    closing.join()
+    assert (processed, errors) == ([0], [None])

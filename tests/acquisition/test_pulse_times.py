@@ -155,3 +155,22 @@ def test_a_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift, frame):
     assert not result.contradicted
     if load == QUIET:
         assert (result.reason, result.uncertain) == ("", 0)
+
+
+@pytest.mark.parametrize(("astray", "contradicted"), [(0, True), (28, True), (36, False)])
+def test_one_early_frame_contradicts_a_whole_row_only_if_its_times_are_sharp(astray, contradicted):
+    """A spurious edge in the pause before a burst, and a missed pulse: one frame comes at the pulse before its own.
+
+    `astray` frames of later bursts come between two pulses. Times are sharp if that are at most a tenth of all.
+    """
+    pulses = draw_pulse_times(BURSTS)
+    edges = pulses.copy()
+    edges[1, 0] = pulses[1, 0] - 40 * MS
+    edges[1, 1] = pulses[1, 0]
+    late = [(burst, pulse) for burst in range(3, BURSTS) for pulse in range(2, 14, 2)][:astray]
+    for burst, pulse in late:
+        edges[burst, pulse] += 900_000
+    arrivals, answer = receive(edges.reshape(-1), pulses, PAYLOAD, np.random.default_rng(2))
+    placed = place(pulses, answer, arrivals, PAYLOAD)
+    assert placed.contradicted == contradicted
+    assert contradicted or placed.slots[17] == -1

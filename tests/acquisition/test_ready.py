@@ -11,14 +11,15 @@ from tests.support.store.facts import load_facts
 
 from polysight.acquisition import ready
 from polysight.acquisition.control import StopRequest
-from polysight.acquisition.pi_client import PiClient
-from polysight.acquisition.ready import STAGE_NOT_REPORTED, check_disk, make_ready
+from polysight.acquisition.pi_client import MOVING, PiClient
+from polysight.acquisition.ready import STAGE_NOT_REPORTED, check_between_rows, check_disk, make_ready
 from polysight.acquisition.scan import resume_scan, run_scan
 from polysight.doctor.rig_checks import check_time
 from polysight.planning.forecast import forecast
 from polysight.store.scan_folder import ScanFolder
 from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
+from polysight_shared.messages import StatusReply
 from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 
@@ -72,6 +73,32 @@ def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, times_asked):
     )  # fmt: skip
     PiClient.home(pi)
     assert len(sent) == times_asked
+
+
+@pytest.mark.parametrize(
+    ("state", "homed", "is_ready"),
+    [
+        ("ready", True, True),
+        ("ready", False, False),
+        # A stage that moves has lost no position; the next row waits for it.
+        *((moving, False, True) for moving in MOVING),
+        ("idle", True, False),
+        ("homed", True, False),
+        ("fault", True, False),
+    ],
+)
+def test_between_rows_a_stage_that_must_be_homed_needs_a_person(state, homed, is_ready):
+    status = StatusReply(
+        state=state, homed=homed, x_mm=0.0, y_mm=0.0, scan_id="s", row_index=-1, take=0, points=0, pulses=0, last_seq=0,
+        fault=0, reason="",
+    )  # fmt: skip
+    if is_ready:
+        check_between_rows(status, "s", first=False)
+    else:
+        with expect_refusal(ErrorCode.STAGE_NOT_READY):
+            check_between_rows(status, "s", first=False)
+        # Before the first row it is homed, also out of a fault.
+        check_between_rows(status, "s", first=True)
 
 
 def test_pi_and_host_have_the_same_homing_timeout():
@@ -173,7 +200,9 @@ def start_scan(rig, folder, **stage):
     return result, load_facts(folder, "scan_ended")[-1]
 
 
-@pytest.mark.parametrize(("lost_mm", "answer"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((0.0, -1.2), True)])
+@pytest.mark.parametrize(
+    ("lost_mm", "answer"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((-0.05, 0.0), True), ((0.0, -1.2), True)]
+)
 def test_what_was_lost_is_in_the_manifest_and_what_matters_is_a_warning(rig, tmp_path, lost_mm, answer):
     rig.pi.lost_mm = lost_mm
     result, ended = start_scan(rig, tmp_path / "s")

@@ -86,7 +86,11 @@ def test_lost_reply_runs_no_row_twice(rig, tmp_path):
 @pytest.mark.parametrize("dropped", [{0}, {5}, {25}, {0, 1, 25}])
 def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, dropped):
     rig.cards["RV"].drop[1, 1] = dropped
-    result = run_scan(rig.instrument, tmp_path / "s")
+    said = []
+    result = run_scan(
+        rig.instrument, tmp_path / "s", progress=lambda p: p.phase == "row" and p.message and said.append(p.message)
+    )
+    assert said == ["row 0", "row 1", "row 1, take 2", "row 2", "row 3"]
     assert (result.exit_status, result.retakes) == ("success", 1)
     scan = ScanFolder.load(tmp_path / "s")
     assert scan.committed_rows()[1].take == 2

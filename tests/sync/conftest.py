@@ -21,7 +21,8 @@ def sweep_hz(rig: Instrument) -> np.ndarray:
 def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """`paths(board, positions, echo, rng)`: ideal signal [position, rx, sample], and direct path [rx], metres.
 
-    `echo` is the rms amplitude of all echoes over the direct path; they lie within `spread_m` of the mirror point.
+    The signal is the direct path of amplitude 1 and echoes of points on the object plane, at most `spread_m` away from
+    the mirror point along x and y. `echo` is the rms amplitude of all echoes together; each has a random phase.
     """
 
     def make(
@@ -29,24 +30,26 @@ def paths(rig: Instrument) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     ) -> tuple[np.ndarray, np.ndarray]:
         tx = np.array(tx_position_m(rig))
         rx = np.array(rx_positions_m(rig, board))
-        direct = np.linalg.norm(rx - tx, axis=1)
+        direct_m = np.linalg.norm(rx - tx, axis=1)
         f = sweep_hz(rig)
-        out = np.zeros((positions, len(rx), f.size), complex)
-        out += np.exp(2j * np.pi * f * direct[:, None] / SPEED_OF_LIGHT_M_S)
+        signal = np.zeros((positions, len(rx), f.size), complex)
+        signal += np.exp(2j * np.pi * f * direct_m[:, None] / SPEED_OF_LIGHT_M_S)
         for _ in range(echoes):
-            aside = spread_m * rng.uniform(-1, 1, (positions, 2))
-            v = np.array(specular_midpoint_m(rig, board)) + np.column_stack([aside, np.zeros(positions)])
-            d = np.linalg.norm(v - tx, axis=1)[:, None] + np.linalg.norm(v[:, None] - rx, axis=2)
+            aside_m = spread_m * rng.uniform(-1, 1, (positions, 2))
+            points = np.array(specular_midpoint_m(rig, board)) + np.column_stack([aside_m, np.zeros(positions)])
+            from_tx_m = np.linalg.norm(points - tx, axis=1)[:, None]
+            to_rx_m = np.linalg.norm(points[:, None] - rx, axis=2)
+            path_m = from_tx_m + to_rx_m
             amplitude = echo / np.sqrt(echoes) * np.exp(2j * np.pi * rng.uniform(size=(positions, 1, 1)))
-            out += amplitude * np.exp(2j * np.pi * f * d[..., None] / SPEED_OF_LIGHT_M_S)
-        return out, direct
+            signal += amplitude * np.exp(2j * np.pi * f * path_m[..., None] / SPEED_OF_LIGHT_M_S)
+        return signal, direct_m
 
     return make
 
 
 @pytest.fixture(scope="session")
 def noise() -> Callable[..., np.ndarray]:
-    """`noise(shape, power_db, rng)`: complex white noise."""
+    """`noise(shape, power_db, rng)`: complex white noise; 0 dB is the power of a tone of amplitude 1."""
 
     def make(shape: tuple[int, ...], power_db: float, rng: np.random.Generator) -> np.ndarray:
         return 10 ** (power_db / 20) / np.sqrt(2) * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape))

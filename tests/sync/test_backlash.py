@@ -1,4 +1,7 @@
-"""Backlash of the stage is recovered from simulated raw data, or not reported."""
+"""Backlash of the stage is recovered from simulated raw data, or not reported.
+
+With backlash the rows of one direction of travel are shifted in x against those of the other.
+"""
 
 import numpy as np
 import pytest
@@ -8,12 +11,13 @@ from polysight.sync.backlash import estimate_backlash, object_filter
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
+# Three points, x and y in mm
 POINTS = [{"position_mm": p, "amplitude": [0.8, 0.0]} for p in ([0.0, 0.0], [25.0, 10.0], [-30.0, -8.0])]
 
 
 @pytest.fixture(scope="module")
 def echoes(rig):
-    """Echoes of a small scan of board H by row, and its rig."""
+    """`echoes(backlash_mm)`: the object's echo at each position of RH, by row, of a small scan; and its rig."""
 
     def scan(backlash_mm, points=POINTS, rows=20):
         raw = {"name": "t", "points": points, "grid": {"columns": 64, "rows": rows, "step_x_mm": 2.0, "step_y_mm": 2.0}}
@@ -21,18 +25,20 @@ def echoes(rig):
         board = radar.rig.receivers[0]
         setup = BoardSetup.from_rig(radar.rig, board)
         weights = object_filter(radar.rig, board, setup.path.sweep_hz)
-        out = {}
+        echoes_by_row = {}
         for row in plan_raster(radar.rig.grid):
             x, y = row_offsets_mm(radar, row)
-            words = radar.chirps(board.name, x, y, row.index * len(x)).reshape(-1, 256, 2, 4)
-            out[row.index] = synchronise_row(words, np.ones(len(words), bool), setup).through(weights)
-        return out, radar.rig
+            first_position = row.index * len(x)
+            words = radar.chirps(board.name, x, y, first_position).reshape(-1, 256, 2, 4)
+            no_chirp_lost = np.ones(len(words), bool)
+            echoes_by_row[row.index] = synchronise_row(words, no_chirp_lost, setup).through(weights)
+        return echoes_by_row, radar.rig
 
     return scan
 
 
 @pytest.mark.parametrize("backlash_mm", [0.3, -0.3])
-def test_backlash_is_recovered_with_everything_else_disturbed(echoes, backlash_mm):
+def test_backlash_is_recovered_although_all_other_disturbances_are_simulated(echoes, backlash_mm):
     estimate = estimate_backlash(*echoes(backlash_mm))
     assert estimate is not None
     assert estimate.shift == pytest.approx(backlash_mm, abs=0.05)
@@ -41,9 +47,11 @@ def test_backlash_is_recovered_with_everything_else_disturbed(echoes, backlash_m
 
 def test_an_empty_plane_gives_no_backlash(echoes):
     estimate = estimate_backlash(*echoes(0.3, points=[]))
+    # None, or one with an error that is too large to be of use
     assert estimate is None or estimate.std > 0.1
 
 
 def test_too_few_rows_give_no_backlash(echoes):
     rows, rig = echoes(0.3, rows=20)
-    assert estimate_backlash({r: rows[r] for r in range(8)}, rig) is None
+    first_eight = {index: rows[index] for index in range(8)}
+    assert estimate_backlash(first_eight, rig) is None

@@ -14,8 +14,12 @@ from polysight.sync.loops import estimate_tone
 from polysight_shared.errors import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Of a row, and chirps of each position
 POSITIONS = 9
 PULSES = 6
+
+# Amplitude of the direct path in counts of the converter
+COUNTS = 800
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +29,11 @@ def short_bursts_rig(rig):
 
 @pytest.fixture(scope="module")
 def make_row(short_bursts_rig, paths, noise):
-    """Frames of one row in ADC counts, disturbed or not, and the ideal referenced samples [rx, position, block]."""
+    """`make_row(...)`: chirps of one row in ADC counts, which of them are valid, and the ideal result.
+
+    `offsets`: each chirp has a random offset of frequency and phase. `filtered`: the receiver's high-pass filter was
+    applied. The ideal result are samples [rx, position, block] relative to the direct path.
+    """
     board = short_bursts_rig.receivers[1]
 
     def make(offsets=True, filtered=False, snr_db=12.0, seed=0):
@@ -35,9 +43,13 @@ def make_row(short_bursts_rig, paths, noise):
         f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
         ideal = signal * np.exp(-2j * np.pi * f * direct[:, None] / SPEED_OF_LIGHT_M_S)
         n = np.arange(chirp.samples)
+        # The direct path is at 0.35 cycles per sample.
         shape = (POSITIONS, PULSES)
-        df = 0.35 + (rng.uniform(-0.08, 0.08, shape) if offsets else np.zeros(shape))
-        phase = rng.uniform(-np.pi, np.pi, shape) if offsets else np.zeros(shape)
+        df = np.full(shape, 0.35)
+        phase = np.zeros(shape)
+        if offsets:
+            df = df + rng.uniform(-0.08, 0.08, shape)
+            phase = rng.uniform(-np.pi, np.pi, shape)
         frames = signal[:, None] * np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))[:, :, None]
         if filtered:
             # The analogue filter's steady state, tone by tone: no start-up inside the window.
@@ -45,7 +57,8 @@ def make_row(short_bursts_rig, paths, noise):
             bins = np.fft.fftfreq(1280, 1 / chirp.sample_rate_hz) % chirp.sample_rate_hz
             frames = np.fft.ifft(spectrum * high_pass(chirp).response(bins), axis=-1)[..., 1024:]
         frames = frames + noise(frames.shape, -snr_db, rng)
-        counts = np.round(frames * 800).transpose(2, 0, 1, 3).reshape(4, -1, chirp.samples)
+        counts = np.round(frames * COUNTS).transpose(2, 0, 1, 3).reshape(4, -1, chirp.samples)
+        # The middle of each block of four samples, by a cubic through them
         blocks = ideal[..., :192].reshape(*ideal.shape[:2], -1, 4)
         middles = blocks @ (np.array([-1, 9, 9, -1]) / 16)
         return counts.astype(np.complex64), np.ones(POSITIONS * PULSES, bool), middles.swapaxes(0, 1)
@@ -59,8 +72,10 @@ def setup(short_bursts_rig):
 
 
 def _compute_relative_error(row, ideal, inside=slice(None)):
-    scaled = row.samples / 800
-    return np.sqrt((np.abs(scaled - ideal)[..., inside] ** 2).mean() / (np.abs(ideal)[..., inside] ** 2).mean())
+    """Rms error of a row over the rms of its ideal; `inside` selects blocks."""
+    error = np.abs(row.samples / COUNTS - ideal)[..., inside]
+    size = np.abs(ideal)[..., inside]
+    return np.sqrt((error**2).mean() / (size**2).mean())
 
 
 def test_a_disturbed_row_is_restored_to_the_ideal(make_row, setup):
@@ -68,37 +83,47 @@ def test_a_disturbed_row_is_restored_to_the_ideal(make_row, setup):
     synchronised = synchronise_row(frames, valid, setup)
     assert synchronised.valid.all()
     assert (synchronised.chirps == PULSES).all()
+    # Noise of -12 dB, averaged over the pulses, over direct path and echo, which are equally strong (sqrt 2 together)
     noise_floor = 10 ** (-12 / 20) / np.sqrt(PULSES) / np.sqrt(2)
     assert _compute_relative_error(synchronised, ideal) < 1.3 * noise_floor
 
 
 def test_offsets_have_no_effect_beyond_noise(make_row, setup):
-    with_offsets = synchronise_row(*make_row(offsets=True, snr_db=30)[:2], setup)
-    without = synchronise_row(*make_row(offsets=False, snr_db=30)[:2], setup)
-    difference = np.abs(with_offsets.samples - without.samples)
-    assert np.sqrt((difference**2).mean()) < 0.04 * 800
+    frames, valid, _ = make_row(offsets=True, snr_db=30)
+    with_offsets = synchronise_row(frames, valid, setup)
+    frames, valid, _ = make_row(offsets=False, snr_db=30)
+    without_offsets = synchronise_row(frames, valid, setup)
+    difference = np.abs(with_offsets.samples - without_offsets.samples)
+    # Noise of -30 dB is 0.03 of the direct path.
+    assert np.sqrt((difference**2).mean()) < 0.04 * COUNTS
 
 
 def test_the_high_pass_filter_is_compensated(make_row, short_bursts_rig, setup):
     frames, valid, ideal = make_row(filtered=True, snr_db=30)
-    undone = synchronise_row(frames, valid, BoardSetup.from_rig(short_bursts_rig, short_bursts_rig.receivers[1]))
-    remainder = synchronise_row(frames, valid, setup)
-    assert _compute_relative_error(undone, ideal, slice(3, None)) < 0.04
-    assert _compute_relative_error(undone, ideal, slice(3, None)) < 0.4 * _compute_relative_error(
-        remainder, ideal, slice(3, None)
-    )
+    compensating_setup = BoardSetup.from_rig(short_bursts_rig, short_bursts_rig.receivers[1])
+    compensated = synchronise_row(frames, valid, compensating_setup)
+    not_compensated = synchronise_row(frames, valid, setup)
+    # The first blocks still have the filter's start.
+    after_start = slice(3, None)
+    error = _compute_relative_error(compensated, ideal, after_start)
+    assert error < 0.04
+    assert error < 0.4 * _compute_relative_error(not_compensated, ideal, after_start)
 
 
 def test_errors_shrink_from_received_to_averaged(make_row, setup):
-    synchronised = synchronise_row(*make_row()[:2], setup)
+    """Errors of frequency, phase (rad) and amplitude after each stage: received, aligned, averaged, referenced."""
+    frames, valid, _ = make_row()
+    synchronised = synchronise_row(frames, valid, setup)
     assert list(synchronised.stages) == ["received", "aligned", "averaged", "referenced"]
     f, phase, amplitude = zip(*synchronised.stages.values(), strict=True)
+    # Alignment removes the offsets of the chirps; the average over the pulses reduces the noise. The phase of received
+    # chirps is random (more than 1 rad). The factors are chosen.
     assert f[0] > 20 * f[1]
     assert f[1] > 1.5 * f[2]
     assert phase[0] > 1 > 20 * phase[1]
     assert phase[1] > phase[2]
     assert amplitude[1] > 1.5 * amplitude[2]
-    np.testing.assert_allclose(synchronised.direct_amplitude, 800, rtol=0.05)
+    np.testing.assert_allclose(synchronised.direct_amplitude, COUNTS, rtol=0.05)
 
 
 def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
@@ -113,28 +138,31 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     df = 0.35 + rng.uniform(-0.08, 0.08, shape)
     phase = rng.uniform(-np.pi, np.pi, shape)
     frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
-    frames = 800 * (frames + noise(frames.shape, -snr_db, rng))
+    frames = COUNTS * (frames + noise(frames.shape, -snr_db, rng))
     full_setup = replace(setup, examined=positions)
     synchronised = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), full_setup)
 
-    echo = (synchronised.samples / 800 - 1).astype(complex)
-    mean = echo.mean(axis=1, keepdims=True)
-    tone = estimate_tone((echo * mean.conj()).sum(axis=0).astype(np.complex64))
+    # The echo at each position over the mean echo is a tone: its frequency and phase are the error of the reference.
+    echo = (synchronised.samples / COUNTS - 1).astype(complex)
+    mean_echo = echo.mean(axis=1, keepdims=True)
+    tone = estimate_tone((echo * mean_echo.conj()).sum(axis=0).astype(np.complex64))
     f_hz, rad, _ = synchronised.stages["referenced"]
+    # A block is four samples.
     assert f_hz == pytest.approx(tone.frequency.std() * rig.chirp.sample_rate_hz / 4, rel=0.15)
     assert rad == pytest.approx(np.angle(tone.amplitude).std(), rel=0.15)
     averaged_rad, averaged_amplitude = synchronised.stages["averaged"][1:]
-    assert averaged_amplitude == pytest.approx(synchronised.direct_amplitude.std() / 800, rel=0.15)
+    assert averaged_amplitude == pytest.approx(synchronised.direct_amplitude.std() / COUNTS, rel=0.15)
     # Noise changes the phase as much as the relative amplitude.
     assert averaged_rad == pytest.approx(averaged_amplitude, rel=0.15)
 
 
 def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, noise, setup):
-    signal = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))[0]
+    """Residuals are measured at `examined` positions of a row only."""
+    signal, _ = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))
     rng = np.random.default_rng(3)
-    turn = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
-    frames = 800 * (signal.swapaxes(0, 1)[:, :, None] * turn)
-    frames = (frames + 800 * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
+    phases = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
+    frames = COUNTS * (signal.swapaxes(0, 1)[:, :, None] * phases)
+    frames = (frames + COUNTS * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
     few_examined = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=64))
     all_positions = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=300))
     assert {name: values.shape[1] for name, values in few_examined.errors.items() if name != "referenced"} == {
@@ -149,6 +177,7 @@ def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, 
 
 def test_clipped_and_missing_chirps_are_left_out(make_row, setup):
     frames, valid, ideal = make_row()
+    # A clipped sample of one chirp at position 3, two missing chirps at position 5, and the whole position 7 missing
     frames[2, 3 * PULSES + 1, 40] = 32767
     valid[5 * PULSES : 5 * PULSES + 2] = False
     valid[7 * PULSES : 8 * PULSES] = False
@@ -158,7 +187,8 @@ def test_clipped_and_missing_chirps_are_left_out(make_row, setup):
     assert synchronised.valid.tolist() == [True] * 7 + [False, True]
     assert not synchronised.samples[:, 7].any()
     is_valid = synchronised.valid
-    assert np.abs(synchronised.samples[:, is_valid] / 800 - ideal[:, is_valid]).mean() < 0.2
+    # The noise of -12 dB (0.25), averaged over the pulses, is 0.1.
+    assert np.abs(synchronised.samples[:, is_valid] / COUNTS - ideal[:, is_valid]).mean() < 0.2
 
 
 def test_bursts_of_one_chirp(make_row, setup):
@@ -169,7 +199,9 @@ def test_bursts_of_one_chirp(make_row, setup):
     assert synchronised.valid.all()
     assert (synchronised.chirps == 1).all()
     assert "referenced" not in synchronised.stages
-    assert synchronised.stages["received"][2] < 0.2  # amplitude: noise, and no more
+    # The amplitude varies by the noise alone, a tenth.
+    _, _, amplitude_error = synchronised.stages["received"]
+    assert amplitude_error < 0.2
     assert _compute_relative_error(synchronised, ideal) < 1.3 * 10 ** (-20 / 20)
 
 
@@ -191,24 +223,30 @@ def test_a_truncated_recording_is_refused(setup):
 
 
 @pytest.mark.parametrize("conjugate", [False, True])
-def test_a_row_of_a_cube_is_turned_completed_and_masked_where_it_is_empty_or_not_finite(short_bursts_rig, conjugate):
+def test_a_row_of_a_cube_is_converted_and_masked_where_it_is_empty_or_not_finite(short_bursts_rig, conjugate):
+    """Samples of another program's cube are conjugated if necessary, multiplied by `turn`, and a constant is added."""
     rng = np.random.default_rng(3)
     shape = (4, POSITIONS, short_bursts_rig.chirp.samples)
     cube = (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)).astype(np.complex64)
+    # Position 1 is empty; 3 and 4 are not finite.
     cube[:, 1] = 0
     cube[2, 3, 7] = np.nan
     cube[0, 4, 0] = complex(1, -np.inf)
-    # One number is enough
+    # Position 6 is not empty: it has one small number.
     cube[:, 6] = 0
     cube[3, 6, -1] = -1e-30j
     turn = np.exp(2j * np.pi * rng.uniform(size=(4, short_bursts_rig.chirp.samples))).astype(np.complex64)
     constant = np.arange(4).astype(np.complex64)
-    form = CubeForm(conjugate, turn, constant, None, short_bursts_rig.chirp, "")
+    no_direct_path = None
+    form = CubeForm(conjugate, turn, constant, no_direct_path, short_bursts_rig.chirp, "")
+    # A row that was scanned in the other direction
     row = form.convert_row(cube[:, ::-1], 16)
     masked = [POSITIONS - 1 - position for position in (1, 3, 4)]
     assert np.flatnonzero(~row.valid).tolist() == sorted(masked)
     assert not row.samples[:, ~row.valid].any()
     assert row.chirps.tolist() == [16 * valid for valid in row.valid]
-    met = cube[:, ::-1].conj() if conjugate else cube[:, ::-1]
-    expected = met[:, row.valid] * turn[:, None] + constant[:, None, None]
+    in_scan_order = cube[:, ::-1]
+    if conjugate:
+        in_scan_order = in_scan_order.conj()
+    expected = in_scan_order[:, row.valid] * turn[:, None] + constant[:, None, None]
     np.testing.assert_array_equal(row.samples[:, row.valid], expected)

@@ -18,6 +18,7 @@ from polysight.sync.direct_path import prepare
 from polysight.sync.high_pass_filter import Equaliser, HighPass, high_pass
 from polysight.sync.offsets import AlignedRow, align_in_numpy, align_pieces, align_row
 
+# Bits of a vector: SSE, AVX2 and AVX-512
 WIDTHS = (128, 256, 512)
 
 
@@ -44,16 +45,23 @@ def loops(library_file, tmp_path_factory, request):
 
 
 def draw_bursts(positions=5, chirps=6, samples=256, seed=4):
-    """Noisy tones with a frequency and phase per chirp: int16 [position, chirp, sample, 2, rx]."""
+    """Noisy chirps, each with its own frequency and phase: int16 [position, chirp, sample, 2, rx].
+
+    A chirp has two tones, as of direct path and echo, which are 0.12 rad a sample (3.7 bins of 192) apart.
+    """
     rng = np.random.default_rng(seed)
     n = np.arange(samples)[:, None]
-    f = 0.2 + 0.02 * rng.standard_normal((positions, chirps, 1, 1))
-    tones = np.exp(2j * np.pi * (f * n + rng.uniform(size=(positions, chirps, 1, 1)))) * np.exp(1j * np.arange(4))
-    tones = tones * (1 + 0.6 * np.exp(0.12j * n)) + 0.2 * rng.standard_normal((positions, chirps, samples, 4))
-    return np.rint(1000 * np.stack([tones.real, tones.imag], axis=3)).astype(np.int16)
+    shape = (positions, chirps, 1, 1)
+    frequency = 0.2 + 0.02 * rng.standard_normal(shape)
+    phase_of_rx = np.exp(1j * np.arange(4))
+    tone = np.exp(2j * np.pi * (frequency * n + rng.uniform(size=shape))) * phase_of_rx
+    both_tones = tone * (1 + 0.6 * np.exp(0.12j * n))
+    noisy = both_tones + 0.2 * rng.standard_normal((positions, chirps, samples, 4))
+    return np.rint(1000 * np.stack([noisy.real, noisy.imag], axis=3)).astype(np.int16)
 
 
 def align(by, words, valid, linear, equaliser=None):
+    """Align a row in one piece with the loops `by`."""
     return align_pieces([words], valid, linear, equaliser, by=by)
 
 
@@ -61,13 +69,14 @@ def assert_equal_rows(result: AlignedRow, expected: AlignedRow):
     """Equal within float32 rounding; phases may wrap."""
     np.testing.assert_array_equal(result.good, expected.good)
     np.testing.assert_array_equal(result.clipped, expected.clipped)
-    has_signal = expected.good.any(axis=1)  # silent chirps have no band
+    # Silent chirps have no band, so that its middle is arbitrary.
+    has_signal = expected.good.any(axis=1)
     np.testing.assert_allclose(result.centre[has_signal], expected.centre[has_signal], rtol=0, atol=1e-6)
-    usable = (expected.coherence > 0.1) & has_signal[:, None]  # the tone of a chirp without match is arbitrary
+    # So is the tone of a chirp that matches no other one.
+    usable = (expected.coherence > 0.1) & has_signal[:, None]
     assert result.halves.dtype == expected.halves.dtype
-    np.testing.assert_allclose(
-        result.halves, expected.halves, rtol=0, atol=3e-6 * max(1.0, float(np.abs(expected.halves).max()))
-    )
+    largest = max(1.0, float(np.abs(expected.halves).max()))
+    np.testing.assert_allclose(result.halves, expected.halves, rtol=0, atol=3e-6 * largest)
     np.testing.assert_allclose(result.frequency[usable], expected.frequency[usable], rtol=0, atol=1e-8)
     for name in ("amplitude", "gain", "coherence"):
         np.testing.assert_allclose(getattr(result, name)[usable], getattr(expected, name)[usable], rtol=0, atol=1e-5)
@@ -80,16 +89,23 @@ def make_equaliser(rig):
     return Equaliser.from_model(high_pass(rig.chirp), rig.chirp, 4)
 
 
-@pytest.mark.parametrize("other", ["silent", "clipped"])
-def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, other):
+def assert_aligned_equally(loops, words, valid, linear, equaliser=None):
+    """The loops and NumPy align the row equally."""
+    result = align(loops.align, words, valid, linear, equaliser)
+    assert_equal_rows(result, align(align_in_numpy, words, valid, linear, equaliser))
+
+
+@pytest.mark.parametrize("value_of_others", [0, 32767], ids=["silent", "clipped"])
+def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, value_of_others):
     burst = draw_bursts(positions=3, chirps=1)
     for by in (loops.align, align_in_numpy):
         expected = align(by, burst, np.ones((3, 1), bool), (0, 192))
-        for k in range(6):
-            words = np.full((3, 6, *burst.shape[2:]), 32767 if other == "clipped" else 0, np.int16)
-            words[:, k] = burst[:, 0]
+        for usable_chirp in range(6):
+            words = np.full((3, 6, *burst.shape[2:]), value_of_others, np.int16)
+            words[:, usable_chirp] = burst[:, 0]
             result = align(by, words, np.ones((3, 6), bool), (0, 192))
-            np.testing.assert_array_equal(result.good, np.arange(6) == np.full((3, 1), k))
+            is_usable = np.arange(6) == np.full((3, 1), usable_chirp)
+            np.testing.assert_array_equal(result.good, is_usable)
             np.testing.assert_allclose(result.centre, expected.centre, rtol=0, atol=1e-6)
             np.testing.assert_allclose(result.halves, expected.halves, rtol=0, atol=1e-2)
 
@@ -100,20 +116,22 @@ def test_a_row_in_pieces_is_the_same_row(loops):
     valid[2:4, 1] = False
     memory = np.empty_like(words[:3])
 
-    def pieces():
+    def read_pieces():
+        """Pieces of three positions, in memory that is overwritten after each: it must not be used longer."""
         for i in range(0, 7, 3):
             memory[: 7 - i] = words[i : i + 3]
             yield memory[: 7 - i]
-            memory[:] = 0  # a piece is used only until the next
+            memory[:] = 0
 
-    for piece, full_row in zip(
-        align_pieces(pieces(), valid, (0, 192), by=loops.align), align(loops.align, words, valid, (0, 192)), strict=True
-    ):
-        np.testing.assert_array_equal(piece, full_row)
+    in_pieces = align_pieces(read_pieces(), valid, (0, 192), by=loops.align)
+    in_one_piece = align(loops.align, words, valid, (0, 192))
+    for values, expected in zip(in_pieces, in_one_piece, strict=True):
+        np.testing.assert_array_equal(values, expected)
 
 
 @pytest.mark.parametrize("positions", [0, 4, 6])
-def test_pieces_that_are_not_the_row_are_refused(loops, positions):
+def test_pieces_with_fewer_or_more_positions_than_the_row_are_refused(loops, positions):
+    """The row has five."""
     for by in (loops.align, align_in_numpy):
         with pytest.raises(ValueError, match="position"):
             align_pieces([draw_bursts(1)] * positions, np.ones((5, 6), bool), (0, 192), by=by)
@@ -121,48 +139,40 @@ def test_pieces_that_are_not_the_row_are_refused(loops, positions):
 
 @pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
 @pytest.mark.parametrize("filtered", [True, False])
-def test_any_linear_part(loops, rig, linear, filtered):
-    words = draw_bursts()
-    valid = np.ones((5, 6), bool)
+def test_loops_agree_for_any_linear_part(loops, rig, linear, filtered):
+    """Beginnings and lengths that are whole blocks of four samples, and others."""
     equaliser = make_equaliser(rig) if filtered else None
-    assert_equal_rows(
-        align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser)
-    )
+    assert_aligned_equally(loops, draw_bursts(), np.ones((5, 6), bool), linear, equaliser)
 
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
-def test_any_number_of_samples(loops, rig, samples, linear):
-    """The law holds also if samples do not fill whole vectors or blocks."""
+def test_loops_agree_for_any_number_of_samples(loops, rig, samples, linear):
+    """Also if samples do not fill whole vectors or blocks."""
     words = draw_bursts(samples=samples)
-    valid = np.ones((5, 6), bool)
-    equaliser = make_equaliser(rig)
-    assert_equal_rows(
-        align(loops.align, words, valid, linear, equaliser), align(align_in_numpy, words, valid, linear, equaliser)
-    )
+    assert_aligned_equally(loops, words, np.ones((5, 6), bool), linear, make_equaliser(rig))
 
 
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
-def test_any_number_of_chirps(loops, rig, chirps):
+def test_loops_agree_for_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed together; a single one has no reference."""
     words = draw_bursts(positions=3, chirps=chirps)
-    valid = np.ones((3, chirps), bool)
-    equaliser = make_equaliser(rig)
-    assert_equal_rows(
-        align(loops.align, words, valid, (0, 192), equaliser),
-        align(align_in_numpy, words, valid, (0, 192), equaliser),
-    )
+    assert_aligned_equally(loops, words, np.ones((3, chirps), bool), (0, 192), make_equaliser(rig))
 
 
-def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
+def test_loops_agree_for_absent_silent_saturated_and_foreign_chirps(loops, rig):
     words = draw_bursts(positions=7, chirps=8)
     valid = np.ones((7, 8), bool)
+    # Three chirps and a whole position are absent.
     valid[0, :3] = False
     valid[1] = False
+    # A silent chirp, and two with a sample at the end of the range
     words[2, 4] = 0
     words[3, 2, 100, 1, 3] = 32767
     words[3, 5, 7, 0, 0] = -32768
+    # Chirp 0 is usually the reference. This one matches no other chirp, so that another reference is tried.
     rng = np.random.default_rng(3)
-    words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)  # matches no other chirp, so another reference is tried
+    words[4, 0] = rng.integers(-1000, 1000, words[4, 0].shape)
+    # More foreign chirps than others; and a silent position
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
     aligned = align(loops.align, words, valid, (0, 192), make_equaliser(rig))
@@ -176,25 +186,21 @@ def test_absent_silent_saturated_and_foreign_chirps(loops, rig):
 
 
 @pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
-def test_any_filter(loops, mode):
+def test_loops_agree_for_any_filter(loops, mode):
     words = draw_bursts()
     valid = np.ones((5, 6), bool)
-    for corners in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
-        equaliser = Equaliser(HighPass(corners), 10e6, mode == "complex2x", 4, 3 / 192)
-        assert_equal_rows(
-            align(loops.align, words, valid, (0, 192), equaliser),
-            align(align_in_numpy, words, valid, (0, 192), equaliser),
-        )
+    for corners_hz in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
+        equaliser = Equaliser(HighPass(corners_hz), 10e6, mode == "complex2x", 4, 3 / 192)
+        assert_aligned_equally(loops, words, valid, (0, 192), equaliser)
 
 
-def test_words_in_another_order_in_memory(loops):
+def test_loops_agree_for_words_in_another_order_in_memory(loops):
     words = draw_bursts()[:, :, :, ::-1]
-    valid = np.ones((5, 6), bool)
     assert not words.flags.c_contiguous
-    assert_equal_rows(align(loops.align, words, valid, (0, 192)), align(align_in_numpy, words, valid, (0, 192)))
+    assert_aligned_equally(loops, words, np.ones((5, 6), bool), (0, 192))
 
 
-def test_any_number_of_positions_and_none(loops):
+def test_loops_agree_for_any_number_of_positions_and_none(loops):
     for positions in (0, 1, 17):
         words = draw_bursts(positions=positions)
         valid = np.ones((positions, 6), bool)
@@ -204,13 +210,17 @@ def test_any_number_of_positions_and_none(loops):
             assert_equal_rows(result, align(align_in_numpy, words, valid, (0, 192)))
 
 
-def test_the_direct_path(loops, rig, paths, noise, counts):
-    """A row with missing positions, noise only, and positions where the second peak is the direct path."""
+def test_loops_agree_on_the_direct_path(loops, rig, paths, noise, counts):
+    """In a row with echoes stronger than the direct path, so that the second peak is the direct path at some positions.
+
+    Position 7 has only noise, position 11 is missing.
+    """
     board = rig.receivers[0]
     rng = np.random.default_rng(5)
     ideal, _ = paths(board, 37, 1.5, rng)
     ideal[7] = 0
-    frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
+    phase_of_chirps = np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
+    frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * phase_of_chirps
     words = counts(frames.transpose(2, 0, 1, 3))
     valid = np.ones((37, 4), bool)
     valid[11] = False
@@ -230,7 +240,8 @@ def test_the_direct_path(loops, rig, paths, noise, counts):
 
 
 @pytest.mark.parametrize("size", [16, 64, 256])
-def test_peaks_and_medians_of_any_spectrum(loops, size):
+def test_loops_agree_on_peaks_and_medians_of_any_spectrum(loops, size):
+    """Random numbers instead of a signal; one position is silent."""
     rng = np.random.default_rng(size)
     halves = (rng.standard_normal((35, 2, 4, 16)) + 1j * rng.standard_normal((35, 2, 4, 16))).astype(np.complex64)
     halves[3] = 0
@@ -260,12 +271,14 @@ def test_three_receivers_are_aligned_in_numpy():
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     library = sync_loops.Library(library_file)
     monkeypatch.setattr(sync_loops, "load_library", lambda: library)
+    # Calling the form in NumPy would fail.
     monkeypatch.setattr("polysight.sync.offsets.align_in_numpy", None)
     assert align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
 
 
 @pytest.fixture
 def fresh_library():
+    """The library is loaded once per process: it is forgotten before and after the test."""
     sync_loops._load.cache_clear()
     yield
     sync_loops._load.cache_clear()
@@ -283,12 +296,14 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
     elif broken == "truncated":
         file.write_bytes(library_file.read_bytes()[:30000])
     elif broken == "foreign":
+        # A library without our functions
         shutil.copyfile(_ctypes.__file__, file)
     elif broken == "a pipe":
         os.mkfifo(file)
     library_class = sync_loops.Library
     monkeypatch.setattr(sync_loops, "Library", lambda: library_class(file))
     with caplog.at_level(logging.WARNING), ThreadPoolExecutor(3) as pool:
+        # Three threads load it at the same time.
         for row in pool.map(lambda _: align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
             assert row.good.all()
     (record,) = caplog.records
@@ -297,6 +312,7 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
 
 def test_the_build_command_does_not_import_itself_twice():
     """`python -m polysight.sync.build` would warn if importing the package imported this module."""
+    # The exit status is 1 if the module was imported.
     code = "import sys, polysight.sync; sys.exit('polysight.sync.build' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -313,5 +329,6 @@ def test_the_system_s_compiler_comes_first_and_ziglang_last(monkeypatch, tmp_pat
     (tmp_path / "cc").chmod(0o755)
     assert build.find_compiler({"PATH": str(tmp_path)}) == [str(tmp_path / "cc")]
     assert build.find_compiler({"PATH": str(tmp_path), "CC": "ccache gcc"}) == ["ccache", "gcc"]
+    # Without a compiler in the path, and without ziglang
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert build.find_compiler({"PATH": str(tmp_path / "nothing")}) is None

@@ -9,15 +9,17 @@ from polysight.sync.loops import block_edges, block_times, cis, estimate_tone, p
 
 @given(st.floats(-0.49, 0.49), st.floats(-3.1, 3.1), st.integers(24, 256))
 def test_a_clean_tone_is_recovered(frequency, phase, n):
-    z = np.exp(1j * (2 * np.pi * frequency * (np.arange(n) - (n - 1) / 2) + phase)).astype(np.complex64)
-    tone = estimate_tone(z[None])
+    # The phase is that in the middle of the record.
+    from_middle = np.arange(n) - (n - 1) / 2
+    samples = np.exp(1j * (2 * np.pi * frequency * from_middle + phase)).astype(np.complex64)
+    tone = estimate_tone(samples[None])
     assert tone.frequency[0] == pytest.approx(frequency, abs=1e-3 / n)
     assert np.angle(tone.amplitude[0] * np.exp(-1j * phase)) == pytest.approx(0, abs=1e-3)
 
 
 @pytest.mark.parametrize("snr_db", [7, 16, 22, 30])
 def test_error_is_at_the_cramer_rao_bound(noise, snr_db):
-    # Rife and Boorstyn 1974: var(w) = sigma^2 / (2 A^2 sum (n - mean)^2), var(central phase) = sigma^2 / (2 A^2 N).
+    """Rife and Boorstyn 1974: var(w) = sigma^2 / (2 A^2 sum (n - mean)^2), var(central phase) = sigma^2 / (2 A^2 N)."""
     rng = np.random.default_rng(1)
     n = 192
     trials = 20_000
@@ -28,6 +30,7 @@ def test_error_is_at_the_cramer_rao_bound(noise, snr_db):
     power = 10 ** (-snr_db / 10)
     w_bound = np.sqrt(power / 2 / (t**2).sum())
     phase_bound = np.sqrt(power / 2 / n)
+    # A standard deviation of 20,000 trials is known to half a per cent; a few per cent are left to the estimator.
     assert 0.97 < (tone.frequency - f).std() * 2 * np.pi / w_bound < 1.05
     assert 0.97 < np.angle(tone.amplitude).std() / phase_bound < 1.05
 
@@ -46,9 +49,9 @@ def test_cis_is_on_the_unit_circle_at_its_angle(angle):
 
 
 def test_phasor_is_the_exponential():
-    f = np.array([0.3, -0.41])
-    p = np.array([1.0, -2.0])
-    n = np.arange(250)
-    np.testing.assert_allclose(
-        phasor(f, p, 250, 95.5), np.exp(1j * (2 * np.pi * f[:, None] * (n - 95.5) + p[:, None])), atol=1e-6
-    )
+    frequency = np.array([0.3, -0.41])
+    phase = np.array([1.0, -2.0])
+    centre = 95.5
+    from_centre = np.arange(250) - centre
+    expected = np.exp(1j * (2 * np.pi * frequency[:, None] * from_centre + phase[:, None]))
+    np.testing.assert_allclose(phasor(frequency, phase, 250, centre), expected, atol=1e-6)

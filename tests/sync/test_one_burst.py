@@ -83,7 +83,7 @@ def test_sixteen_chirps_in_one_frame_fit_five_times_the_speed():
     [
         # The time from chirp to chirp is missing.
         ({"chirps": 16}, "chirp_us"),
-        # The frame needs 2588 microseconds: 16 chirps of 143, and 300 to prepare the next frame.
+        # A frame of 16 chirps of 143 us needs a period of 16 * 143 + 300 = 2588 us.
         ({"chirps": 16, "chirp_us": 143.0, "period_us": 2000.0}, "2588"),
     ],
 )

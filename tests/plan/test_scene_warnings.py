@@ -38,11 +38,15 @@ def test_the_example_scene_needs_no_change():
 @pytest.mark.parametrize(
     ("plates", "expected"),
     [
+        # Plates of 45 mm: a gap of 15 mm is too narrow, one of 35 mm is not.
         ([make_plate(-30), make_plate(30)], ["gap"]),
         ([make_plate(-40), make_plate(40)], []),
+        # Side by side in x, but one above the other.
         ([make_plate(-25, -40), make_plate(25, 40)], []),
         ([make_plate(-60, background=True, side_mm=400.0), make_plate(0)], []),
+        # Too narrow in x and in y.
         ([make_plate(0, side_mm=15.0)], ["size", "size"]),
+        # Its reflection leaves the scanned area of 360 mm.
         ([make_plate(150)], ["aperture"]),
         ([make_plate(0, thickness_mm=1.2)], ["thickness"]),
         ([make_plate(0, thickness_mm=40.0)], []),

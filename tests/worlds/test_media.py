@@ -19,7 +19,10 @@ def compute_fresnel(permittivity: complex, cosine: float) -> tuple[complex, comp
 
 
 def compute_fresnel_between(above: complex, below: complex, cosine: float) -> tuple[complex, complex]:
-    """Fresnel's formulas at a boundary of two media; `cosine` of the angle in air."""
+    """Fresnel's formulas at a boundary of two media; `cosine` is that of the angle in air.
+
+    By Snell's law the wavenumber along the boundary is the same in all media, so that the sine in air is enough.
+    """
     sine_squared = 1 - cosine**2
     first = np.sqrt(above - sine_squared + 0j)
     second = np.sqrt(below - sine_squared + 0j)
@@ -36,7 +39,9 @@ def test_a_half_space_reflects_by_fresnel(permittivity, cosine):
 
 @given(permittivities, permittivities, st.floats(0.0, 0.006), cosines)
 def test_a_layer_reflects_by_airy(layer, below, thickness_m, cosine):
+    """Airy's formula: the reflection at the top, and all that returns from the bottom, in one fraction."""
     root = np.sqrt(layer - (1 - cosine**2))
+    # The phase of the way down and up in the layer.
     turn = np.exp(-4j * np.pi * FREQUENCY_HZ / LIGHT_M_PER_S * root * thickness_m)
     stack = Stack(((layer, thickness_m),), below)
     pairs = zip(compute_fresnel_between(1, layer, cosine), compute_fresnel_between(layer, below, cosine), strict=True)
@@ -59,13 +64,14 @@ def test_no_stack_returns_more_than_it_was_given(layers, below, cosine):
 
 @given(st.lists(st.tuples(st.floats(1.01, 20), st.floats(0.0, 0.01)), max_size=4), cosines)
 def test_layers_without_loss_on_metal_return_all(layers, cosine):
-    # Of a conductor without loss: copper's own loss grows where the layers resonate.
-    stack = Stack(tuple((eps, thickness) for eps, thickness in layers), -1e7)
+    # A permittivity of -1e7 is a conductor without loss. Copper has some, which grows where the layers resonate.
+    stack = Stack(tuple(layers), below=-1e7)
     assert np.abs(reflect(stack, FREQUENCY_HZ, cosine)) == pytest.approx([1, 1])
 
 
 @given(cosines)
 def test_metal_turns_both_polarisations_alike(cosine):
+    # Copper's own loss at cosines down to 0.05 is below 2 %.
     assert np.array(reflect(METAL, FREQUENCY_HZ, cosine)) == pytest.approx([-1, -1], abs=0.02)
 
 

@@ -8,13 +8,15 @@ import polysight_worlds as worlds
 from polysight_worlds.shape_scenes import disturb_boards
 from polysight_worlds.shapes import find_specular
 
-WHOLE = worlds.published_boards()
-BOARDS = worlds.Boards(WHOLE.tx, WHOLE.h[:1], WHOLE.v[:1])
+ALL_RX = worlds.published_boards()
+# One RX of each board
+BOARDS = worlds.Boards(ALL_RX.tx, ALL_RX.h[:1], ALL_RX.v[:1])
 OFFSETS_M = worlds.scan_offsets(every=50)
 FREQUENCIES_HZ = np.linspace(76.3e9, 79.7e9, 3)
 
 
 def scan(nuisances: worlds.ShapeNuisances, number: int = 0) -> dict[str, np.ndarray]:
+    """Samples of each board of the reference sphere; `number` is that of the scan, which draws its noise."""
     return worlds.scan_shapes(
         [worlds.reference_sphere()], OFFSETS_M, nuisances, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ, number=number
     )
@@ -25,7 +27,8 @@ def test_a_drawn_object_is_seen_and_its_truth_is_where_its_rays_are(kind):
     scene = worlds.draw_shapes(5, kind, with_table=True)
     samples = worlds.scan_shapes(scene.shapes, OFFSETS_M, boards=BOARDS, frequencies_hz=FREQUENCIES_HZ)
     brightest = np.abs(samples["h"]).max()
-    # Brighter than a thousandth of a mirror, darker than a concave one.
+    # A flat mirror has 1 / L = 0.6, over a path L of 1.7 m. A curved dielectric has more than a thousandth of that, and
+    # a concave mirror, which focuses, not four times as much.
     assert 6e-4 < brightest < 2
     middle_m = np.zeros((3, 1))
     shape = scene.shapes[0]
@@ -62,23 +65,26 @@ def test_each_disturbance_changes_the_samples_and_repeats(change):
 
 
 def test_the_back_of_a_body_is_not_a_surface_that_is_seen():
-    """A table that touches it has another normal."""
+    """A point there is far from every surface: a table that touches the body there is not taken for the body."""
     scene = worlds.draw_shapes(5, "barrel")
     middle_m = np.array(scene.shapes[0].place_m)
-    front = -scene.shapes[0].axes[:, 2]
+    towards_antennas = -scene.shapes[0].axes[:, 2]
     radius_m = scene.radius_m
-    points_m = np.stack([middle_m + radius_m * front, middle_m - radius_m * front])
-    distances, normals = scene.nearest_surface(points_m)
-    assert abs(distances[0]) < 1e-6
-    assert normals[0] @ front > 0.99
-    assert abs(distances[1]) > radius_m
+    front_m = middle_m + radius_m * towards_antennas
+    back_m = middle_m - radius_m * towards_antennas
+    (front_distance_m, back_distance_m), normals = scene.nearest_surface(np.stack([front_m, back_m]))
+    assert abs(front_distance_m) < 1e-6
+    assert normals[0] @ towards_antennas > 0.99
+    assert abs(back_distance_m) > radius_m
 
 
 @pytest.mark.parametrize(
     ("change", "std"),
     [
+        # The rms of a displacement is given, which has three components.
         ({"misplaced_mm": 1.0}, 1e-3 / np.sqrt(3)),
         ({"axes_deg": 2.0}, np.radians(2.0)),
+        # That of a complex number, which has two parts.
         ({"leakage": 0.05}, 0.05 / np.sqrt(2)),
     ],
     ids=["places", "axes", "leakage"],
@@ -89,6 +95,7 @@ def test_disturbances_are_normally_distributed_with_the_size_given(change, std):
     for seed in range(400):
         true_boards = disturb_boards(BOARDS, worlds.ShapeNuisances(seed=seed, **change))
         for antenna, true_antenna in ((BOARDS.h[0], true_boards.h[0]), (BOARDS.v[0], true_boards.v[0])):
+            # The component of the true polarisation across the nominal one: the sine of a turn, or the leakage.
             across = complex(np.cross(antenna.boresight, antenna.polarisation) @ true_antenna.polarisation)
             if "misplaced_mm" in change:
                 deviations.extend(true_antenna.position - antenna.position)

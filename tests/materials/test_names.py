@@ -22,6 +22,7 @@ from polysight.materials.names import Odds, add_explanation, may_be_thin, name_p
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
 from polysight_shared.errors import DataError
 
+# t is V / H relative to metal. Scans are under one of these two incidence angles.
 ANGLES = tuple(np.radians([55.0, 65.0]))
 LIBRARY = {"acrylic": 4.0 - 0.4j, "rubber": 5.06 - 1.11j, "wood": 2.61 - 0.01j, "glass": 7.26 - 0.85j}
 KINDS = (*(Kind(name, eps) for name, eps in LIBRARY.items()), *list_literature_kinds(tuple(LIBRARY)))
@@ -29,6 +30,10 @@ AT_ANGLES = tuple(Kinds(KINDS, angle, with_sheets=True) for angle in ANGLES)
 
 
 def name_ratios(*ratios: complex, std: float = 0.004, share: float = 0.5):
+    """Return the name of a patch with these V / H, one for each angle.
+
+    `std` is the error of each part, `share` the probability before the measurement that it is of the library.
+    """
     kinds = AT_ANGLES[: len(ratios)]
     covariance = std**2 * np.eye(2)
     evidence = [RatioEvidence(kind.theta_rad, t, covariance, share) for kind, t in zip(kinds, ratios, strict=True)]
@@ -39,9 +44,12 @@ def name_ratios(*ratios: complex, std: float = 0.004, share: float = 0.5):
 @settings(max_examples=40, deadline=None)
 @given(st.floats(1.05, 12.0), st.floats(0.0, 8.0), st.floats(0.002, 0.05), st.integers(1, 2))
 def test_probabilities_sum_to_one_and_the_name_has_the_largest(real, loss, std, scans):
-    patch_name = name_ratios(*inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans])), std=std).patch_name
-    assert sum(patch_name.probabilities.values()) == pytest.approx(1, abs=1e-9)
-    assert patch_name.confidence == patch_name.probabilities[patch_name.name] == max(patch_name.probabilities.values())
+    ratios = inverse_ratio(complex(real, -loss), np.array(ANGLES[:scans]))
+    patch_name = name_ratios(*ratios, std=std).patch_name
+    probabilities = patch_name.probabilities
+    assert sum(probabilities.values()) == pytest.approx(1, abs=1e-9)
+    assert patch_name.confidence == probabilities[patch_name.name]
+    assert patch_name.confidence == max(probabilities.values())
 
 
 @settings(max_examples=40, deadline=None)
@@ -53,51 +61,55 @@ def test_a_name_of_the_literature_is_never_one_of_the_library(real, loss):
     else:
         assert patch_name.name not in LIBRARY
         assert patch_name.name in (UNKNOWN, LAYER) or patch_name.source == "literature"
-    with pytest.raises(DataError):
-        clean_name(patch_name.name if patch_name.source != "library" else UNKNOWN)
+        # Such a name cannot be given to a box, so no library can contain it.
+        with pytest.raises(DataError):
+            clean_name(patch_name.name)
 
 
 def test_a_patch_that_only_the_literature_explains_is_named_as_like_it():
-    patch_name = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2).patch_name
+    # Sapphire has 9.41 in the catalogue.
+    sapphire = complex(inverse_ratio(9.41 - 0.002j, ANGLES[0]))
+    patch_name = name_ratios(sapphire, std=0.001, share=0.2).patch_name
     assert patch_name.source == "literature"
     assert "sapphire" in patch_name.literature
 
 
-@pytest.mark.parametrize(("share", "named"), [(0.79, "polymer"), (0.81, "its likeliest")])
-def test_a_family_is_named_by_a_material_that_holds_four_fifths_of_it(share, named):
+@pytest.mark.parametrize(("share", "is_material_named"), [(0.79, False), (0.81, True)])
+def test_a_family_is_named_by_a_material_that_has_four_fifths_of_its_probability(share, is_material_named):
+    """The patch is a polymer with 0.6, of which one polymer has `share`, and a laminate with 0.4, all alike."""
     kinds = AT_ANGLES[0].kinds
-    polymers, laminates = (
-        [k for k, kind in enumerate(kinds) if kind.family == family] for family in ("polymer", "laminate")
-    )
+    polymers = [k for k, kind in enumerate(kinds) if kind.family == "polymer"]
+    laminates = [k for k, kind in enumerate(kinds) if kind.family == "laminate"]
     probability = np.zeros(len(kinds))
     probability[polymers] = 0.6 * (1 - share) / (len(polymers) - 1)
     probability[polymers[3]] = 0.6 * share
     probability[laminates] = 0.4 / len(laminates)
     odds = Odds(kinds=probability, sheet=0.0, other=0.0, distance=np.zeros(len(kinds)))
-    likeliest = kinds[polymers[3]].name if named == "its likeliest" else named
-    assert summarise_literature(AT_ANGLES[0], odds)[0] == f"like {likeliest} or laminate (literature)"
+    name = kinds[polymers[3]].name if is_material_named else "polymer"
+    assert summarise_literature(AT_ANGLES[0], odds)[0] == f"like {name} or laminate (literature)"
 
 
 def test_a_second_angle_makes_a_true_name_surer():
-    t = inverse_ratio(LIBRARY["acrylic"], np.array(ANGLES))
-    alone = name_ratios(t[0], std=0.03).patch_name.probabilities["acrylic"]
-    patch_name = name_ratios(*t, std=0.03).patch_name
-    assert patch_name.name == "acrylic"
-    assert patch_name.confidence > alone
+    ratios = inverse_ratio(LIBRARY["acrylic"], np.array(ANGLES))
+    by_one_angle = name_ratios(ratios[0], std=0.03).patch_name
+    by_two_angles = name_ratios(*ratios, std=0.03).patch_name
+    assert by_two_angles.name == "acrylic"
+    assert by_two_angles.confidence > by_one_angle.probabilities["acrylic"]
 
 
 def test_a_thin_plate_that_fits_no_half_space_is_a_possible_layer():
-    t, _ = draw_sheets(ANGLES[0])
-    far_ratio = t[np.argsort(np.abs(t))[int(0.97 * t.size)]]
+    ratios_of_sheets, _ = draw_sheets(ANGLES[0])
+    # Of 97 % of the drawn sheets |V / H| is smaller.
+    far_ratio = ratios_of_sheets[np.argsort(np.abs(ratios_of_sheets))[int(0.97 * ratios_of_sheets.size)]]
     names = [name_ratios(complex(far_ratio)).patch_name.name, name_ratios(-0.25 + 0.2j).patch_name.name]
     assert LAYER in names
     assert not set(names) & set(LIBRARY)
 
 
 def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float, float]:
-    """Median probability of a possible layer, of drawn thin plates and of the half spaces of the same ratios.
+    """Return the median probability of a possible layer: for drawn thin plates, and for half spaces of the same ratios.
 
-    The plates are sheets of 0.5 to 3 mm in air, their ratios and brightnesses are from multilayer's r_s and r_p.
+    The plates are sheets of 0.5 to 3 mm in air. Only their brightness |H| distinguishes them from the half spaces.
     """
     rng = np.random.default_rng(5)
     probabilities = []
@@ -106,15 +118,17 @@ def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float
         r_s, r_p = multilayer([eps, 1.0], [rng.uniform(0.5e-3, 3e-3), np.inf], 78e9, ANGLES[0])
         t = complex(r_p / r_s)
         half_space = permittivity_from_ratio(t, ANGLES[0])
+        # Others are recognised by their ratio already.
         if not (half_space.real > 1.3 and -3 < half_space.imag < 0):
             continue
-        expected = np.log(np.abs(fresnel(half_space, ANGLES[0])[0]))
-        row = []
-        for brightness in (np.log(np.abs(r_s)) - expected, 0.0):
-            measured_off = float(brightness + brightness_std * rng.standard_normal())
-            evidence = RatioEvidence(ANGLES[0], t, 1e-4 * np.eye(2), 0.5, measured_off, brightness_std)
-            row.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
-        probabilities.append(row)
+        # ln |H| of the sheet minus that of the half space
+        off_of_sheet = np.log(np.abs(r_s)) - np.log(np.abs(fresnel(half_space, ANGLES[0])[0]))
+        of_sheet_and_half_space = []
+        for brightness_off in (off_of_sheet, 0.0):
+            measured_off = float(brightness_off + brightness_std * rng.standard_normal())
+            evidence = RatioEvidence(ANGLES[0], t, 0.01**2 * np.eye(2), 0.5, measured_off, brightness_std)
+            of_sheet_and_half_space.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
+        probabilities.append(of_sheet_and_half_space)
     thin, thick = np.median(probabilities, axis=0)
     return float(thin), float(thick)
 
@@ -130,28 +144,35 @@ def test_brightness_of_unevenly_lit_plates_is_weak_evidence():
     assert abs(thin - thick) < 0.2
 
 
-def test_a_patch_that_is_a_layer_with_a_chance_of_one_in_four_is_measured_as_no_half_space():
-    """Its 95 % region would miss a quarter of the truths; the same ratio with a half space's brightness is measured."""
+def test_a_patch_that_may_be_a_layer_gets_no_permittivity_from_a_probability_of_a_fifth_on():
+    """The 95 % region of a half space would not hold the truth that often.
+
+    The brightness decides: a patch with the same ratio and a half space's own brightness gets a permittivity.
+    """
     eps = 3.0 - 0.03j
     r_s, r_p = multilayer([eps, 1.0], [0.9e-3, np.inf], 78e9, ANGLES[0])
-    as_bright = RatioEvidence(ANGLES[0], complex(r_p / r_s), 1e-4 * np.eye(2), 0.5, 0.0, 0.05)
-    offs = np.linspace(0.0, 0.4, 81)
-    evidences = [replace(as_bright, brightness_off=float(off)) for off in offs]
-    odds = np.array([weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet for evidence in evidences])
-    assert odds[0] < 0.1
-    assert np.any((odds > 0.25) & (odds < 0.5))
-    assert [may_be_thin(evidence, AT_ANGLES[0]) for evidence in evidences] == (odds > 0.2).tolist()
+    of_half_space = RatioEvidence(ANGLES[0], complex(r_p / r_s), 0.01**2 * np.eye(2), 0.5, 0.0, 0.05)
+    # ln |H| above that of a half space
+    brightness_offs = np.linspace(0.0, 0.4, 81)
+    evidences = [replace(of_half_space, brightness_off=float(off)) for off in brightness_offs]
+    probability_of_layer = np.array([weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet for evidence in evidences])
+    # The cases lie on both sides of the limit.
+    assert probability_of_layer[0] < 0.1
+    assert np.any((probability_of_layer > 0.25) & (probability_of_layer < 0.5))
+    assert [may_be_thin(evidence, AT_ANGLES[0]) for evidence in evidences] == (probability_of_layer > 0.2).tolist()
 
 
+# About the linear part of the published rig's sweep
 BAND_HZ = (76.3e9, 79.75e9)
 
 
 def make_dispersion(change: np.ndarray, std: float = 0.01) -> PatchDispersion:
+    """Return a change over the sweep, of ln |H| and of both parts of ln(V / H), each with the same error."""
     return PatchDispersion(change, np.full(3, std), BAND_HZ)
 
 
 def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
-    """Changes of plates before half spaces, from multilayer's r_s and r_p at both ends of a band of a tenth."""
+    """Half spaces reflect all frequencies alike; a plate before a half space does not."""
     rng = np.random.default_rng(7)
     centre_hz = np.mean(BAND_HZ)
     width_hz = BAND_HZ[1] - BAND_HZ[0]
@@ -159,22 +180,25 @@ def test_a_change_over_the_sweep_distinguishes_layers_from_half_spaces():
     for _ in range(100):
         eps = rng.uniform(2, 7) * (1 - 1j * rng.uniform(0.001, 0.05))
         stack = [eps, rng.uniform(2, 9) * (1 - 1j * rng.uniform(0, 1.5))], [rng.uniform(1e-3, 5e-3), np.inf]
-        logs = [np.log(np.array(multilayer(*stack, centre_hz + part * width_hz, ANGLES[0]))) for part in (-0.05, 0.05)]
-        of_s, of_p = (logs[1] - logs[0]) / 0.1
-        change = np.array([of_s.real, (of_p - of_s).real, (of_p - of_s).imag])
+        # The change over a tenth of the sweep, times ten: a plate's phase changes by several turns over the whole.
+        low = np.log(np.array(multilayer(*stack, centre_hz - 0.05 * width_hz, ANGLES[0])))
+        high = np.log(np.array(multilayer(*stack, centre_hz + 0.05 * width_hz, ANGLES[0])))
+        change_of_s, change_of_p = (high - low) / 0.1
+        change_of_ratio = change_of_p - change_of_s
+        change = np.array([change_of_s.real, change_of_ratio.real, change_of_ratio.imag])
         layered.append(float(np.mean(compute_layer_odds(make_dispersion(change), ANGLES[0]))))
     assert np.median(layered) > 1e3
-    half_spaces = [
-        float(np.mean(compute_layer_odds(make_dispersion(x), ANGLES[0]))) for x in 0.01 * rng.standard_normal((100, 3))
-    ]
+    # Half spaces show only the error of the measurement.
+    errors = 0.01 * rng.standard_normal((100, 3))
+    half_spaces = [float(np.mean(compute_layer_odds(make_dispersion(error), ANGLES[0]))) for error in errors]
     assert np.median(half_spaces) < 0.1
     assert max(half_spaces) < 1
 
 
 def test_an_uncertain_change_over_the_sweep_is_not_evidence():
     for std in (30.0, 1e60):
-        unknown = compute_layer_odds(make_dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
-        assert np.median(unknown) == pytest.approx(1, abs=0.05)
+        odds = compute_layer_odds(make_dispersion(np.array([0.5, -0.4, 0.6]), std=std), ANGLES[0])
+        assert np.median(odds) == pytest.approx(1, abs=0.05)
 
 
 def test_a_change_of_any_size_has_finite_odds():
@@ -188,20 +212,20 @@ def test_a_ratio_of_a_half_space_that_changes_over_the_sweep_is_named_a_layer():
     wood = Kind("wood", 2.6 - 0.1j)
     kinds = Kinds([wood, *list_literature_kinds()], ANGLES[0], with_sheets=True)
     t = complex(inverse_ratio(2.6 - 0.1j, ANGLES[0]))
-    evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5)
-    named_without_change = name_patch(
-        (kinds,), (replace(evidence, dispersion=make_dispersion(np.zeros(3))),), np.array([[t]])
-    ).patch_name
-    changing = make_dispersion(np.array([0.2, -0.1, 0.3]))
-    named_with_change = name_patch((kinds,), (replace(evidence, dispersion=changing),), np.array([[t]])).patch_name
-    assert named_without_change.name == "wood"
-    assert named_without_change.confidence > 0.9
-    assert named_with_change.name == LAYER
+
+    def name_with_change(change: np.ndarray):
+        evidence = RatioEvidence(ANGLES[0], t, 1e-5 * np.eye(2), 0.5, dispersion=make_dispersion(change))
+        return name_patch((kinds,), (evidence,), np.array([[t]])).patch_name
+
+    constant = name_with_change(np.zeros(3))
+    assert constant.name == "wood"
+    assert constant.confidence > 0.9
+    assert name_with_change(np.array([0.2, -0.1, 0.3])).name == LAYER
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["dishes", "sheets"])
-def test_what_reflects_at_two_faces_gets_no_name_of_the_library_and_no_wrong_value(kind):
+def test_pieces_that_reflect_at_two_faces_get_no_name_of_the_library_and_no_wrong_permittivity(kind):
     pieces = judge_scene(kind, 1)
     assert not [p for p in pieces if p.source == "library" and p.confidence >= 0.8]
     # A sheet whose brightness happens to peak in the middle of the sweep looks like a half space.
@@ -210,15 +234,15 @@ def test_what_reflects_at_two_faces_gets_no_name_of_the_library_and_no_wrong_val
 
 
 def test_each_reason_of_a_name_has_a_subject():
-    """Metal has no permittivity that could be it."""
-    named = name_ratios(complex(inverse_ratio(9.41 - 0.002j, ANGLES[0])), std=0.001, share=0.2)
-    for permittivity, subject in ((None, "it is like "), (9.41 - 0.002j, "permittivity 9.41 - j0.00 is like ")):
-        assert add_explanation(named, permittivity, None, LIBRARY).patch_name.why.startswith(subject)
+    """The subject is the permittivity, and "it" for a patch without one."""
+    sapphire = 9.41 - 0.002j
+    named = name_ratios(complex(inverse_ratio(sapphire, ANGLES[0])), std=0.001, share=0.2)
+    for permittivity, beginning in ((None, "it is like "), (sapphire, "permittivity 9.41 - j0.00 is like ")):
+        assert add_explanation(named, permittivity, None, LIBRARY).patch_name.why.startswith(beginning)
 
 
 @pytest.mark.parametrize(("unknown", "rival"), [(0.5, "a material that the library lacks 50 %"), (0.001, "no other")])
 def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
-    """Half of the probability without a name is another likely material."""
     named = name_ratios(complex(inverse_ratio(LIBRARY["acrylic"], ANGLES[0])))
     patch_name = replace(named.patch_name, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})
     reason = add_explanation(replace(named, patch_name=patch_name), LIBRARY["acrylic"], None, LIBRARY).patch_name.why

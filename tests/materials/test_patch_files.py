@@ -13,22 +13,23 @@ from polysight_shared.errors import ErrorCode
 
 
 def name_from_file(result, scene, classifier, path):
-    """Names of a result's patches, by number, from its file."""
+    """Return the names of a result's patches, by number, after it was written to a file and read again."""
     path.write_bytes(pack_patches(result, scene.x_m, scene.y_m, simulated=True))
     patches = read_patches(path)
     matched = [m for m in match_patches([patches]) if m.label in patches.evidence]
     renamed = classifier.scan([m.features for m in matched], [m.evidence for m in matched])
-    return {m.label: n.patch_name for m, n in zip(matched, renamed, strict=True)}
+    return {match.label: named.patch_name for match, named in zip(matched, renamed, strict=True)}
 
 
-def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placement, tmp_path):
-    scene = synthetic(3)
+def test_a_scan_that_is_named_again_from_its_file_gets_the_same_names(synthetic, library, name_placement, tmp_path):
+    scene = synthetic(seed=3)
     classifier = Classifier(library)
     analysis = name_placement(3)
     renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
     for r in analysis.patches:
         if r.named is not None:
             assert renamed[r.patch.label].name == r.named.patch_name.name
+            # Files have single precision.
             assert renamed[r.patch.label].probabilities == pytest.approx(r.named.patch_name.probabilities, abs=1e-3)
 
 
@@ -36,25 +37,28 @@ def test_a_scan_is_named_again_as_it_was_named(synthetic, library, name_placemen
 def test_brightness_that_all_plates_share_does_not_change_their_names(
     gain, synthetic, library, name_placement, tmp_path
 ):
-    """A low or tilted metal plate makes all others brighter or darker in both channels: V / H stays."""
-    scene = synthetic(3)
+    """A low or tilted metal plate makes all others brighter or darker in both channels, but does not change V / H."""
+    scene = synthetic(seed=3)
     classifier = Classifier(library)
     plain = name_placement(3)
-    metal = plain.segmentation.labels == plain.metal.label
-    factor = np.where(metal, 1.0, gain)
+    is_metal = plain.segmentation.labels == plain.metal.label
+    factor = np.where(is_metal, 1.0, gain)
     pair = Images(scene.h * factor, scene.v * factor, scene.x_m, scene.y_m, np.ones(scene.h.shape, bool))
     analysis = scene.analyse(classifier=classifier, pair=pair)
     renamed = name_from_file(analysis, scene, classifier, tmp_path / "patches.npz")
-    names = {r.patch.label: r.named.patch_name.name for r in plain.patches if r.named is not None}
-    changed_names = {
-        n: (names[n], v.name) for n, v in renamed.items() if n in names and v.name not in (names[n], UNKNOWN)
-    }
-    assert not changed_names
-    assert sum(v.name == names.get(n) for n, v in renamed.items()) >= 0.7 * len(names)
+    names_before = {r.patch.label: r.named.patch_name.name for r in plain.patches if r.named is not None}
+    names_after = {label: patch_name.name for label, patch_name in renamed.items() if label in names_before}
+    # A patch may become unknown, but no other material; chosen: seven of ten keep their names.
+    for label, name in names_after.items():
+        assert name in (names_before[label], UNKNOWN)
+    kept = [label for label, name in names_after.items() if name == names_before[label]]
+    assert len(kept) >= 0.7 * len(names_before)
 
 
-def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, name_placement, tmp_path):
-    scene = synthetic(3)
+def test_a_file_of_an_earlier_release_without_errors_of_its_patches_is_read(
+    synthetic, library, name_placement, tmp_path
+):
+    scene = synthetic(seed=3)
     analysis = name_placement(3)
     path = tmp_path / "patches.npz"
     path.write_bytes(pack_patches(analysis, scene.x_m, scene.y_m, simulated=True))
@@ -69,13 +73,13 @@ def test_a_file_without_an_error_budget_is_read_as_before(synthetic, library, na
     assert not patches.evidence
     assert len(patches.patches) == len(analysis.patches)
     matched = match_patches([patches])
-    names = [n.patch_name.name for n in Classifier(library).scan([m.features for m in matched])]
-    true = [m.truth for m in matched]
-    assert not [n for n, t in zip(names, true, strict=True) if n in library.names and n != t]
+    for named, match in zip(Classifier(library).scan([m.features for m in matched]), matched, strict=True):
+        name = named.patch_name.name
+        assert name == match.truth or name not in library.names
 
 
-def test_a_budget_of_other_patches_is_refused(synthetic, analyse_placement, tmp_path):
-    scene = synthetic(3)
+def test_a_file_whose_errors_are_of_fewer_patches_is_refused(synthetic, analyse_placement, tmp_path):
+    scene = synthetic(seed=3)
     path = tmp_path / "patches.npz"
     path.write_bytes(pack_patches(analyse_placement(1000), scene.x_m, scene.y_m, simulated=True))
     with np.load(path) as z:

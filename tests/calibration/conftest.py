@@ -38,12 +38,15 @@ def set_rig() -> Callable[[Path, Instrument], None]:
 
 @pytest.fixture(scope="session")
 def make_scan(set_rig: Callable[[Path, Instrument], None]) -> Callable[..., Path]:
-    """`make_scan(folder, true, believed, **scene)`: scan with the true rig; the manifest contains the believed one."""
+    """`make_scan(folder, true_rig, rig_of_file, **scene)`: simulate a scan with the true rig.
 
-    def make(folder: Path, true: Instrument, believed: Instrument | None = None, **scene: Any) -> Path:
-        simulate(true, decode_scene({"name": "test", **scene}, "test"), folder)
-        if believed is not None:
-            set_rig(folder, believed)
+    Its manifest contains the rig of the rig file; without one, the true rig.
+    """
+
+    def make(folder: Path, true_rig: Instrument, rig_of_file: Instrument | None = None, **scene: Any) -> Path:
+        simulate(true_rig, decode_scene({"name": "test", **scene}, "test"), folder)
+        if rig_of_file is not None:
+            set_rig(folder, rig_of_file)
         return folder
 
     return make

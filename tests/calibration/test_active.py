@@ -33,6 +33,7 @@ from polysight_shared.tables import to_builtins
 
 @pytest.fixture
 def hpf(tmp_path):
+    """The path of a calibration file of the high-pass filters."""
     return write_calibration(filter_file(), tmp_path / "c")
 
 
@@ -41,31 +42,42 @@ def rig_naming(make_rig):
     """`rig_naming(hpf=path, metal=path)`: a rig whose file names these calibration files."""
 
     def make(**files):
-        return make_rig(calibration={k: str(v) for k, v in files.items()}, grid={"columns": 2, "rows": 2})
+        paths = {kind: str(path) for kind, path in files.items()}
+        return make_rig(calibration=paths, grid={"columns": 2, "rows": 2})
 
     return make
 
 
-def create(folder, rig) -> ScanFolder:
-    copies = copy_into_scan(rig, folder, True)
+def create_scan(folder, rig) -> ScanFolder:
+    """Create a simulated scan with copies of the calibration files that its rig names."""
+    copies = copy_into_scan(rig, folder, simulated=True)
     return ScanFolder.create(folder, rig, plan_raster(rig.grid), calibration=copies)
 
 
 def test_a_filter_measured_with_other_corners_or_not_on_every_receiver_is_refused(make_rig, tmp_path):
-    filter_path = filter_file()
-    partial = msgspec.structs.replace(filter_path, boards={"RH": filter_path.boards["RH"]})
-    for i, (file, khz, value) in enumerate([(filter_path, 350.0, "[175.0, 350.0] kHz"), (partial, 175.0, "RV")]):
+    # Measured with corners of 175 and 350 kHz
+    complete = filter_file()
+    without_rv = msgspec.structs.replace(complete, boards={"RH": complete.boards["RH"]})
+    cases = [
+        # File, first corner of the rig file, and what the message names
+        (complete, 350.0, "[175.0, 350.0] kHz"),
+        (without_rv, 175.0, "RV"),
+    ]
+    for i, (file, first_corner_khz, named) in enumerate(cases):
         path = write_calibration(file, tmp_path / str(i))
-        rig = make_rig(chirp={"hpf1_khz": khz}, calibration={"hpf": str(path)}, grid={"columns": 2, "rows": 2})
-        with expect_refusal(ErrorCode.MISMATCH, path, value):
-            copy_into_scan(rig, tmp_path / "scan", True)
+        rig = make_rig(
+            chirp={"hpf1_khz": first_corner_khz}, calibration={"hpf": str(path)}, grid={"columns": 2, "rows": 2}
+        )
+        with expect_refusal(ErrorCode.MISMATCH, path, named):
+            copy_into_scan(rig, tmp_path / "scan", simulated=True)
 
 
-def test_files_survive_writing_and_never_overwrite(tmp_path):
+def test_a_file_is_read_back_as_it_was_written_and_replaces_no_other(tmp_path):
     file = filter_file()
     paths = [write_calibration(file, tmp_path / "new") for _ in range(3)]
     assert len(set(paths)) == 3
     assert all(read_calibration(path, FilterFile, "hpf") == file for path in paths)
+    # The kind and the date, from the year on
     assert paths[0].name.startswith("hpf-20")
     assert file.simulated
 
@@ -92,7 +104,7 @@ def test_relative_paths_are_relative_to_the_rig_file(tmp_path, make_rig):
     assert load_rig_calibration(rig).high_pass("RH").corners_hz == (180.5e3, 355.25e3)
 
 
-def test_without_files_nothing_changes(make_rig):
+def test_a_rig_without_calibration_files_is_not_changed(make_rig):
     rig = make_rig()
     calibration = load_rig_calibration(rig)
     assert calibration.rig(rig) is rig
@@ -103,9 +115,10 @@ def test_without_files_nothing_changes(make_rig):
 def test_a_scan_keeps_copies_of_its_calibration(tmp_path, make_rig, rig_naming, hpf):
     dispersion = (0.1 - 0.2j, 0.05j)
     metal = write_metal(replace(make_metal_reference(make_rig()), dispersion=dispersion), SOURCES, hpf.parent)
-    scan = create(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
+    scan = create_scan(tmp_path / "scan", rig_naming(hpf=hpf, metal=metal))
     assert sorted(load_facts(scan, "scan_started")[0]["calibration"]) == ["hpf", "metal"]
     assert not [f for f in validate(scan.path) if f.level == "error"]
+    # The originals are deleted.
     copies_before = load_scan_calibration(scan)
     for original in hpf.parent.iterdir():
         original.unlink()
@@ -121,18 +134,18 @@ def test_files_of_one_name_in_two_folders_are_both_kept(tmp_path, make_rig, rig_
     metal = write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "b")
     hpf = hpf.rename(hpf.with_name("latest.toml"))
     metal = metal.rename(metal.with_name("latest.toml"))
-    calibration = load_scan_calibration(create(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
+    calibration = load_scan_calibration(create_scan(tmp_path / "s", rig_naming(hpf=hpf, metal=metal)))
     assert set(calibration.files()) == {"hpf", "metal"}
 
 
 def test_metal_of_other_pixels_is_refused_before_the_scan(tmp_path, make_rig, rig_naming):
     metal = write_metal(make_metal_reference(make_rig(image={"pixel_mm": 2.5})), SOURCES, tmp_path / "c")
     with expect_refusal(ErrorCode.MISMATCH):
-        create(tmp_path / "s", rig_naming(metal=metal))
+        create_scan(tmp_path / "s", rig_naming(metal=metal))
 
 
 def test_a_changed_or_missing_copy_is_refused(tmp_path, rig_naming, hpf):
-    scan = create(tmp_path / "scan", rig_naming(hpf=hpf))
+    scan = create_scan(tmp_path / "scan", rig_naming(hpf=hpf))
     copy = next((scan.path / "calibration").iterdir())
     copy.write_text(copy.read_text().replace("180.5", "190.5"))
     with expect_refusal(ErrorCode.FILE_DAMAGED, copy, hpf):
@@ -143,19 +156,20 @@ def test_a_changed_or_missing_copy_is_refused(tmp_path, rig_naming, hpf):
 
 
 def test_the_calibration_of_an_existing_scan_is_not_overwritten(tmp_path, rig_naming, hpf):
-    scan = create(tmp_path / "scan", rig_naming(hpf=hpf))
-    copy_into_scan(rig_naming(hpf=write_calibration(filter_file(200.0), hpf.parent)), scan.path, True)
+    scan = create_scan(tmp_path / "scan", rig_naming(hpf=hpf))
+    other_file = write_calibration(filter_file(first_khz=200.0), hpf.parent)
+    copy_into_scan(rig_naming(hpf=other_file), scan.path, simulated=True)
     assert load_scan_calibration(scan).high_pass("RH").corners_hz[0] == 180.5e3
 
 
 def test_a_missing_file_is_refused_before_the_scan_is_created(tmp_path, rig_naming):
     with pytest.raises(ConfigError) as caught:
-        copy_into_scan(rig_naming(hpf=tmp_path / "nowhere.toml"), tmp_path / "scan", True)
+        copy_into_scan(rig_naming(hpf=tmp_path / "nowhere.toml"), tmp_path / "scan", simulated=True)
     assert "nowhere.toml" in str(caught.value)
     assert not (tmp_path / "scan").exists()
 
 
-def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
+def test_a_metal_reference_is_read_back_as_it_was_written(tmp_path, make_rig):
     reference = make_metal_reference(make_rig())
     path = write_metal(reference, SOURCES, tmp_path)
     reloaded = load_calibration({"metal": path}).reference()
@@ -168,7 +182,7 @@ def test_a_metal_reference_survives_its_file(tmp_path, make_rig):
 
 def test_images_of_another_metal_reference_are_refused(tmp_path, make_rig):
     path = write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "one")
-    other_reference = write_metal(make_metal_reference(make_rig(), 1), SOURCES, tmp_path / "two")
+    other_reference = write_metal(make_metal_reference(make_rig(), seed=1), SOURCES, tmp_path / "two")
     path.with_suffix(".npz").write_bytes(other_reference.with_suffix(".npz").read_bytes())
     with expect_refusal(ErrorCode.FILE_DAMAGED, path.with_suffix(".npz")):
         load_calibration({"metal": path}).reference()
@@ -176,7 +190,8 @@ def test_images_of_another_metal_reference_are_refused(tmp_path, make_rig):
 
 def test_simulated_calibration_is_refused_for_a_measured_scan(tmp_path, rig_naming, hpf):
     with expect_refusal(ErrorCode.MISMATCH, hpf):
-        copy_into_scan(rig_naming(hpf=hpf), tmp_path / "scan", False)
-    measured = msgspec.structs.replace(filter_file(), sources=[SourceScan("sweep", "scans/sweep", False, 7)])
+        copy_into_scan(rig_naming(hpf=hpf), tmp_path / "scan", simulated=False)
+    measured_sweep = SourceScan("sweep", "scans/sweep", False, 7)
+    measured = msgspec.structs.replace(filter_file(), sources=[measured_sweep])
     rig = rig_naming(hpf=write_calibration(measured, hpf.parent))
-    assert set(copy_into_scan(rig, tmp_path / "scan", False)) == {"hpf"}
+    assert set(copy_into_scan(rig, tmp_path / "scan", simulated=False)) == {"hpf"}

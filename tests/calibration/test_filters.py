@@ -14,7 +14,10 @@ from polysight.pipeline import Pipeline
 from polysight.store.scan_folder import ScanFolder
 from polysight.sync.high_pass_filter import HighPass, high_pass
 
+# Start frequencies of the receivers: they move the direct path over the IF band, so that it samples the filter.
 OFFSETS_HZ = (60e3, 250e3, 500e3, 850e3, 1250e3)
+
+# Corners of the simulated filters; the rig file says 175 and 350 kHz.
 TRUE_KHZ = (235.0, 700.0)
 
 
@@ -31,10 +34,10 @@ def scans(tmp_path_factory, make_rig, make_scan):
                     board["start_offset_hz"] = offset_hz
 
         tables = {"grid": {"columns": 8, "rows": 3}, "burst": {"pulses": 8}, "image": {"columns": 20, "rows": 20}}
-        believed = make_rig(set_offsets, **tables)
+        rig_of_file = make_rig(set_offsets, **tables)
         corners = {"hpf1_khz": TRUE_KHZ[0], "hpf2_khz": TRUE_KHZ[1]}
-        true = make_rig(set_offsets, chirp=corners, **tables)
-        folders.append(make_scan(folder / f"{k}", true, believed, seed=2, disturbances={"if_offset_hz": 0.0}))
+        true_rig = make_rig(set_offsets, chirp=corners, **tables)
+        folders.append(make_scan(folder / f"{k}", true_rig, rig_of_file, seed=2, disturbances={"if_offset_hz": 0.0}))
     return folders
 
 
@@ -46,8 +49,9 @@ def filter_run(scans, tmp_path_factory):
     return next(out.iterdir())
 
 
-def test_the_filters_found_change_only_on_purpose(filter_run):
+def test_the_estimated_filters_change_only_on_purpose(filter_run):
     figures = msgspec.to_builtins(read_calibration(filter_run, FilterFile, "hpf"))
+    # Within one per cent
     assert_kept(Path(__file__).parent / "kept" / "filters.json", figures["boards"], 0.01)
 
 
@@ -56,6 +60,7 @@ def test_unknown_corners_are_recovered(scans, filter_run):
     for board in file.boards.values():
         corners = np.array(board.corners_khz)
         errors = np.array(board.standard_error_khz)
+        # The limits are chosen.
         np.testing.assert_allclose(corners, TRUE_KHZ, rtol=0.15)
         assert np.all(np.abs(corners - TRUE_KHZ) < 6 * errors)
         assert np.all(errors < 0.1 * np.array(TRUE_KHZ))
@@ -69,29 +74,38 @@ def test_processing_uses_the_filter_that_the_rig_file_names(filter_run, tmp_path
         grid={"columns": 4, "rows": 2}, image={"columns": 20, "rows": 20}, calibration={"hpf": str(filter_run)}
     )
     pipeline = Pipeline(ScanFolder.load(make_scan(tmp_path / "scan", rig)))
+    boards = read_calibration(filter_run, FilterFile, "hpf").boards
     for name, setup in pipeline.synchroniser.setups.items():
-        measured = HighPass(
-            tuple(1e3 * c for c in read_calibration(filter_run, FilterFile, "hpf").boards[name].corners_khz)
-        )
+        measured = HighPass(tuple(1e3 * corner_khz for corner_khz in boards[name].corners_khz))
         assert setup.equaliser.model == measured != high_pass(rig.chirp)
+    # The transmitter has no filter.
     assert load_calibration({"hpf": filter_run}).high_pass("LS") is None
 
 
 def test_a_single_start_frequency_is_refused(scans, tmp_path):
+    # Exit status 3: the data do not suffice.
     assert main(["calibrate", "hpf", str(scans[-1]), "--out", str(tmp_path / "c")]) == 3
     assert not (tmp_path / "c").exists()
 
 
-def test_bins_hold_the_mean_signal_of_enough_chirps_each():
+def test_bins_have_the_mean_signal_of_their_chirps_without_the_noise():
+    """Signals whose amplitude is proportional to the IF, plus a known noise power."""
     rng = np.random.default_rng(1)
-    f = rng.uniform(0.2e6, 1.2e6, 3000)
-    noise = np.full(f.size, 4.0)
-    middles, level = average_in_bins(f, (f / 1e4) ** 2 + noise, noise)
-    np.testing.assert_allclose(level, middles / 1e4, rtol=BIN_HZ / 0.2e6)
-    assert np.all(np.diff(middles) > 0)
+    if_hz = rng.uniform(0.2e6, 1.2e6, 3000)
+    noise_power = np.full(if_hz.size, 4.0)
+    mean_if_hz, level = average_in_bins(if_hz, (if_hz / 1e4) ** 2 + noise_power, noise_power)
+    # Over a bin the level changes by the bin over the IF, at most at the lowest one.
+    np.testing.assert_allclose(level, mean_if_hz / 1e4, rtol=BIN_HZ / 0.2e6)
+    assert np.all(np.diff(mean_if_hz) > 0)
+
+
+def test_bins_of_few_chirps_of_a_negative_if_or_of_noise_are_left_out():
     few = np.ones(MIN_CHIRPS - 1)
-    assert average_in_bins(1e5 * few, few, 0 * few)[0].size == 0
+    mean_if_hz, _ = average_in_bins(1e5 * few, few, 0 * few)
+    assert mean_if_hz.size == 0
     enough = np.ones(MIN_CHIRPS)
-    assert average_in_bins(-1e5 * enough, enough, 0 * enough)[0].size == 0
-    # Noise
-    assert average_in_bins(1e5 * enough, enough, enough / 2)[0].size == 0
+    mean_if_hz, _ = average_in_bins(-1e5 * enough, enough, 0 * enough)
+    assert mean_if_hz.size == 0
+    # Half of the power is noise.
+    mean_if_hz, _ = average_in_bins(1e5 * enough, enough, enough / 2)
+    assert mean_if_hz.size == 0

@@ -19,16 +19,18 @@ from polysight.store import ScanFolder
 from polysight_shared.errors import ErrorCode
 
 
-def set_board_values(name, **more):
+def set_board_values(name, **values):
+    """Change keys of one board. Like the next ones, this returns a function that changes the table of a rig file."""
+
     def change(table):
         (board,) = (b for b in table["boards"] if b["name"] == name)
-        board.update(more)
+        board.update(values)
 
     return change
 
 
-def mount(name, first=(), last=()):
-    """Add steps before and after a board's mount."""
+def add_mount_steps(name, first=(), last=()):
+    """Add steps before and after those of a board's mount."""
 
     def change(table):
         (board,) = (b for b in table["boards"] if b["name"] == name)
@@ -38,17 +40,28 @@ def mount(name, first=(), last=()):
 
 
 def move_antennas(table):
+    """Move the receive antennas by 0.05 mm out of the plane of their board."""
     table["antennas"]["rx_mm"] = [[x, y, 0.05] for x, y, _ in table["antennas"]["rx_mm"]]
 
 
-def set_table_values(**more):
-    return lambda table: [table[name].update(values) for name, values in more.items()]
+def set_table_values(**tables):
+    """Change keys of tables of the rig file."""
+
+    def change(table):
+        for name, values in tables.items():
+            table[name].update(values)
+
+    return change
 
 
-MATTERS = {
-    "V moved": (mount("RV", last=[{"shift_mm": [0.0, 0.05, 0.0]}]), ["RV"]),
-    "H turned about the line of its antennas": (mount("RH", first=[{"turn_deg": 1.0, "about": "x"}]), ["RH"]),
-    "transmitter moved": (mount("LS", last=[{"shift_mm": [0.0, 0.0, 0.1]}]), ["LS"]),
+V_MOVED = add_mount_steps("RV", last=[{"shift_mm": [0.0, 0.05, 0.0]}])
+
+# Changes after which a metal reference does not hold, because phases or amplitudes of images change; and what the
+# message must name.
+CHANGES_THAT_MATTER = {
+    "V moved": (V_MOVED, ["RV"]),
+    "H turned about the line of its antennas": (add_mount_steps("RH", first=[{"turn_deg": 1.0, "about": "x"}]), ["RH"]),
+    "transmitter moved": (add_mount_steps("LS", last=[{"shift_mm": [0.0, 0.0, 0.1]}]), ["LS"]),
     "another transmit antenna": (set_board_values("LS", tx_antenna=0), ["LS"]),
     "antennas": (move_antennas, ["RV"]),
     "object plane": (set_table_values(geometry={"object_distance_mm": 499.4}), ["499.40 mm", "499.00"]),
@@ -58,13 +71,15 @@ MATTERS = {
     "window": (set_table_values(image={"apodisation": "none"}), ["none", "kaiser"]),
     "filters": (set_table_values(chirp={"hpf1_khz": 235.0}), ["RH", "235 and 350 kHz", "175 and 350"]),
 }
-CANCELS = {
+
+# Changes that have the same effect on the plate and on the scene, or none.
+CHANGES_THAT_CANCEL = {
     "raster": set_table_values(grid={"columns": 20, "rows": 10, "step_x_mm": 4.0}),
     "burst": set_table_values(burst={"pulses": 2}),
     "leakage and speckle filter": set_table_values(polarimetry={"leakage_h": [0.1, 0.02], "smooth_px": 3.0}),
     "start frequency of one receiver": set_board_values("RV", start_offset_hz=3e5),
     "stage": set_table_values(stage={"speed_mm_s": 10.0}),
-    "the same mount in other steps": mount("RV", last=[{"turn_deg": a, "about": "y"} for a in (30.0, -30.0)]),
+    "the same mount in other steps": add_mount_steps("RV", last=[{"turn_deg": a, "about": "y"} for a in (30.0, -30.0)]),
 }
 
 
@@ -74,15 +89,16 @@ def metal(make_rig, tmp_path):
     return write_metal(make_metal_reference(make_rig()), SOURCES, tmp_path / "c")
 
 
-@pytest.mark.parametrize(("change", "values"), MATTERS.values(), ids=MATTERS)
-def test_a_metal_reference_of_another_rig_is_refused_with_the_difference(metal, make_rig, change, values):
-    with expect_refusal(ErrorCode.MISMATCH, metal, *values):
-        load_checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True)
+@pytest.mark.parametrize(("change", "named"), CHANGES_THAT_MATTER.values(), ids=CHANGES_THAT_MATTER)
+def test_a_metal_reference_of_another_rig_is_refused_with_the_difference(metal, make_rig, change, named):
+    with expect_refusal(ErrorCode.MISMATCH, metal, *named):
+        load_checked_calibration(make_rig(change, calibration={"metal": str(metal)}), simulated=True)
 
 
-@pytest.mark.parametrize("change", CANCELS.values(), ids=CANCELS)
+@pytest.mark.parametrize("change", CHANGES_THAT_CANCEL.values(), ids=CHANGES_THAT_CANCEL)
 def test_settings_that_cancel_may_change(metal, make_rig, change):
-    assert load_checked_calibration(make_rig(change, calibration={"metal": str(metal)}), True).metal is not None
+    rig = make_rig(change, calibration={"metal": str(metal)})
+    assert load_checked_calibration(rig, simulated=True).metal is not None
 
 
 def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_rig):
@@ -90,9 +106,10 @@ def test_filters_measured_after_the_plate_may_differ_only_slightly(metal, make_r
         file = write_calibration(filter_file(corner_khz), metal.parent)
         return make_rig(calibration={"metal": str(metal), "hpf": str(file)})
 
-    assert load_checked_calibration(make_rig_with_filter(179.0), True)
+    # The plate was imaged with 175 kHz, as the rig file says.
+    assert load_checked_calibration(make_rig_with_filter(179.0), simulated=True)
     with expect_refusal(ErrorCode.MISMATCH, "RV", 200):
-        load_checked_calibration(make_rig_with_filter(200.0), True)
+        load_checked_calibration(make_rig_with_filter(200.0), simulated=True)
 
 
 def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
@@ -100,19 +117,23 @@ def test_a_file_of_an_older_release_without_its_rig_is_refused(metal, make_rig):
     assert text_after
     metal.write_text(text_before)
     with expect_refusal(ErrorCode.KEY_MISSING, metal):
-        load_checked_calibration(make_rig(calibration={"metal": str(metal)}), True)
+        load_checked_calibration(make_rig(calibration={"metal": str(metal)}), simulated=True)
 
 
+# Tables of a rig with a small grid and a small image, and a copper plate that is larger than both
 SMALL = {
     "grid": {"columns": 10, "rows": 8, "step_x_mm": 14.0, "step_y_mm": 14.0},
     "image": {"columns": 24, "rows": 24, "pixel_mm": 4.0},
 }
 PLATE = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [500.0, 400.0], "metal": True}
+
+# Sub-bands of the sweep
 BANDS = 2
 
 
 @pytest.fixture(scope="module")
 def plate(make_rig, make_scan, tmp_path_factory):
+    """A scan of the copper plate."""
     return make_scan(tmp_path_factory.mktemp("metal") / "plate", make_rig(**SMALL), plates=[PLATE])
 
 
@@ -136,13 +157,13 @@ def banded_metal(plate, tmp_path_factory):
 
 @pytest.fixture
 def take_scan_with(plate, make_rig, set_rig, tmp_path):
-    """`taken_with(metal, change)`: the plate's scan, recorded with a changed rig and this calibration file."""
+    """`take_scan_with(metal, change)`: the plate's scan, whose manifest has a changed rig and this calibration file."""
 
     def make(metal, change=lambda _table: None):
         folder = shutil.copytree(plate, tmp_path / f"scan-{len(list(tmp_path.iterdir()))}")
-        # Where a scan keeps its files
-        inside = shutil.copytree(metal.parent, folder / "calibration") / metal.name
-        set_rig(folder, make_rig(change, **SMALL, calibration={"metal": str(inside)}))
+        # A scan has its own copies of calibration files, in this folder.
+        metal_of_scan = shutil.copytree(metal.parent, folder / "calibration") / metal.name
+        set_rig(folder, make_rig(change, **SMALL, calibration={"metal": str(metal_of_scan)}))
         return ScanFolder.load(folder)
 
     return make
@@ -157,14 +178,15 @@ def test_a_scan_without_metal_is_refused(tmp_path, make_rig, make_scan):
 
 
 def test_a_plastic_sheet_is_not_a_metal_plate(tmp_path, make_rig, make_scan):
-    sheet = {k: v for k, v in PLATE.items() if k != "metal"} | {"name": "acrylic", "permittivity": [4.0, 0.4]}
+    sheet = PLATE | {"name": "acrylic", "permittivity": [4.0, 0.4]}
+    del sheet["metal"]
     folder = make_scan(tmp_path / "sheet", make_rig(**SMALL), plates=[sheet])
     with expect_refusal(ErrorCode.NO_DATA, "no metal"):
         load_reference(folder)
 
 
 def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
-    """The rig file is the same, but the active positions are not."""
+    """The rig file is the same, but the calibrated distance of the plane, which replaces that of the file, is not."""
     reference = load_reference(plate)
     rig = make_rig(**SMALL)
     reference.check_rig(ImagedWith.from_rig(rig, {}))
@@ -175,7 +197,7 @@ def test_an_object_plane_calibrated_after_the_plate_is_refused(plate, make_rig):
 
 def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows(plate, make_rig, make_scan, tmp_path):
     """The board V moved between the two scans: its axes are the same, but not its phases."""
-    other_scan = make_scan(tmp_path / "other", make_rig(MATTERS["V moved"][0], **SMALL), plates=[PLATE])
+    other_scan = make_scan(tmp_path / "other", make_rig(V_MOVED, **SMALL), plates=[PLATE])
     out = tmp_path / "out"
     assert main(["process", str(other_scan), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 3
     assert not (out / "image.npz").exists()
@@ -183,15 +205,17 @@ def test_processing_refuses_a_reference_scan_of_another_rig_before_it_reads_rows
 
 def test_processing_refuses_the_calibration_of_another_rig(full_metal, take_scan_with):
     assert load_metal_plane(Pipeline(take_scan_with(full_metal))) is not None
-    moved = Pipeline(take_scan_with(full_metal, MATTERS["V moved"][0]))
+    moved = Pipeline(take_scan_with(full_metal, V_MOVED))
     with expect_refusal(ErrorCode.MISMATCH, "RV"):
         load_metal_plane(moved)
-    # Metal in the scene has the scene's rig
+    # With metal in the scene itself no reference of another scan is needed.
     assert load_metal_plane(moved, in_scene=True) is None
 
 
 def load_metal_plane(pipeline, bands=1, in_scene=False):
-    return pipeline.calibration.metal_plane(pipeline.rig, None, in_scene, bands)
+    """The metal reference that the pipeline uses; None if it uses metal in the scene."""
+    no_reference_scan = None
+    return pipeline.calibration.metal_plane(pipeline.rig, no_reference_scan, in_scene, bands)
 
 
 def test_the_calibration_file_holds_the_reference_of_the_plate_in_every_sub_band(plate, banded_metal, take_scan_with):

@@ -17,23 +17,30 @@ from polysight.jobs.calibrate import take_antenna_places
 from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
+# How the true rig differs from its rig file: shifts of the boards (mm), and the object plane farther away
 SHIFTS = {"RH": (1.5, -1.0, 0.8), "RV": (-1.2, 0.7, -1.4)}
 DEEPER_MM = 1.7
+
+# The target: five points, measured on it. It lies on the object plane with this offset and rotation, which are unknown.
 POINTS = [(-60.0, -50.0), (60.0, -45.0), (0.0, 0.0), (-55.0, 55.0), (50.0, 60.0)]
-LAID_MM = (4.0, -3.0)
-TURN_DEG = 0.5
+TARGET_OFFSET_MM = (4.0, -3.0)
+TARGET_TURN_DEG = 0.5
 
 
-def measure_positions(points):
-    """Measured positions of a target's points."""
-    c = np.cos(np.radians(TURN_DEG))
-    s = np.sin(np.radians(TURN_DEG))
-    return [(c * x - s * y + LAID_MM[0], s * x + c * y + LAID_MM[1]) for x, y in points]
+def place_target(points):
+    """x and y of the target's points on the object plane."""
+    cos = np.cos(np.radians(TARGET_TURN_DEG))
+    sin = np.sin(np.radians(TARGET_TURN_DEG))
+    offset_x, offset_y = TARGET_OFFSET_MM
+    return [(cos * x - sin * y + offset_x, sin * x + cos * y + offset_y) for x, y in points]
 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory, make_rig, make_scan):
-    """A scan of a displaced rig whose manifest contains the same rig file."""
+    """A scan of a displaced rig: its folder, the file of the target, the rig of the rig file, and the true rig.
+
+    The scan's manifest contains the rig of the rig file.
+    """
 
     def shift_boards(table):
         for board in table["boards"]:
@@ -45,13 +52,13 @@ def case(tmp_path_factory, make_rig, make_scan):
         "grid": {"columns": 18, "rows": 12, "step_x_mm": 13.0, "step_y_mm": 13.0},
         "image": {"columns": 64, "rows": 64, "pixel_mm": 2.5},
     }
-    believed = make_rig(**tables)
-    true = make_rig(shift_boards, **tables)
-    points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in measure_positions(POINTS)]
-    folder = make_scan(tmp_path_factory.mktemp("places") / "scan", true, believed, points=points, seed=5)
+    rig_of_file = make_rig(**tables)
+    true_rig = make_rig(shift_boards, **tables)
+    points = [{"position_mm": [float(x), float(y)], "amplitude": [0.5, 0.0]} for x, y in place_target(POINTS)]
+    folder = make_scan(tmp_path_factory.mktemp("places") / "scan", true_rig, rig_of_file, points=points, seed=5)
     target = folder.parent / "target.toml"
     target.write_text(tomli_w.dumps({"name": "five balls", "points": [{"position_mm": list(p)} for p in POINTS]}))
-    return folder, target, believed, true
+    return folder, target, rig_of_file, true_rig
 
 
 @pytest.fixture(scope="module")
@@ -69,51 +76,66 @@ def places_run(case, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def file(places_run):
+    """The calibration file of that scan."""
     return read_calibration(places_run[1], PlacesFile, "direct_path")
 
 
-def test_the_places_found_change_only_on_purpose(file):
+def test_the_estimated_places_change_only_on_purpose(file):
     figures = msgspec.to_builtins(file)
     of_the_run = ("made_utc", "sources", "versions")
     kept_figures = {name: value for name, value in figures.items() if name not in of_the_run}
+    # Within one per cent
     assert_kept(Path(__file__).parent / "kept" / "places.json", kept_figures, 0.01)
 
 
 def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
-    _, _, believed, true = case
-    middle = [np.array(specular_midpoint_m(rig, rig.receivers[0])) * 1e3 for rig in (true, believed)]
-    target = (middle[0] - middle[1])[:2] + LAID_MM
-    deeper = file.object_distance_mm - file.object_distance_was_mm
-    rest = (file.target_turn_standard_error_deg, file.object_distance_standard_error_mm)
-    values = [*(v for n in SHIFTS for v in file.boards[n].shift_mm), deeper, *file.target_mm, file.target_turn_deg]
-    errors = [*(v for n in SHIFTS for v in file.boards[n].standard_error_mm), rest[1]]
-    errors += [*file.target_standard_error_mm, rest[0]]
-    truth = np.array([*SHIFTS["RH"], *SHIFTS["RV"], DEEPER_MM, *target, TURN_DEG])
-    assert np.all(np.array(errors) < [0.3] * 9 + [0.05])
-    np.testing.assert_array_less(np.abs(values - truth), 5 * np.array(errors))
+    _, _, rig_of_file, true_rig = case
+    # The target's place is relative to the mirror point of the rig file's rig, which the shifts move.
+    true_middle_mm = np.array(specular_midpoint_m(true_rig, true_rig.receivers[0])) * 1e3
+    middle_mm = np.array(specular_midpoint_m(rig_of_file, rig_of_file.receivers[0])) * 1e3
+    target_mm = (true_middle_mm - middle_mm)[:2] + TARGET_OFFSET_MM
+    h = file.boards["RH"]
+    v = file.boards["RV"]
+    deeper_mm = file.object_distance_mm - file.object_distance_was_mm
+    values = np.array([*h.shift_mm, *v.shift_mm, deeper_mm, *file.target_mm, file.target_turn_deg])
+    errors = np.array(
+        [
+            *h.standard_error_mm,
+            *v.standard_error_mm,
+            file.object_distance_standard_error_mm,
+            *file.target_standard_error_mm,
+            file.target_turn_standard_error_deg,
+        ]
+    )
+    truth = np.array([*SHIFTS["RH"], *SHIFTS["RV"], DEEPER_MM, *target_mm, TARGET_TURN_DEG])
+    # Nine values in mm and one in degrees; the limits are chosen.
+    assert np.all(errors < [0.3] * 9 + [0.05])
+    np.testing.assert_array_less(np.abs(values - truth), 5 * errors)
     assert file.explained > 0.9
     for name, board in file.boards.items():
-        antennas = Antennas.from_rig(true, true.by_name(name))
+        antennas = Antennas.from_rig(true_rig, true_rig.by_name(name))
         direct_mm = np.linalg.norm(antennas.rx_m[0] - antennas.tx_m) * 1e3
-        # The error that was removed
+        # The rig file's direct path was wrong by more than half a millimetre.
         assert abs(board.direct_path_was_mm - direct_mm) > 0.5
         assert board.direct_path_mm == pytest.approx(direct_mm, abs=5 * board.direct_path_standard_error_mm)
 
 
 def test_an_active_calibration_corrects_every_antenna(case, file):
-    _, _, believed, true = case
-    corrected = Calibration(places=file).rig(believed)
-    assert corrected.geometry.object_distance_mm == pytest.approx(true.geometry.object_distance_mm, abs=0.5)
+    _, _, rig_of_file, true_rig = case
+    corrected = Calibration(places=file).rig(rig_of_file)
+    # About two of the largest standard errors that the test above allows
+    assert corrected.geometry.object_distance_mm == pytest.approx(true_rig.geometry.object_distance_mm, abs=0.5)
     for name in SHIFTS:
-        expected_m = Antennas.from_rig(true, true.by_name(name)).rx_m
-        thought = Antennas.from_rig(corrected, corrected.by_name(name)).rx_m
-        np.testing.assert_allclose(thought, expected_m, atol=0.6e-3)
-    assert corrected.transmitter == believed.transmitter
+        true_m = Antennas.from_rig(true_rig, true_rig.by_name(name)).rx_m
+        corrected_m = Antennas.from_rig(corrected, corrected.by_name(name)).rx_m
+        np.testing.assert_allclose(corrected_m, true_m, atol=0.6e-3)
+    assert corrected.transmitter == rig_of_file.transmitter
 
 
-def test_it_is_refused_after_a_change_of_mounts_in_the_rig_file(case, file):
+def test_a_calibration_is_refused_after_a_change_of_mounts_in_the_rig_file(case, file):
+    _, _, _, rig_with_other_mounts = case
     with expect_refusal(ErrorCode.MISMATCH):
-        Calibration(places=file).rig(case[3])
+        Calibration(places=file).rig(rig_with_other_mounts)
 
 
 def test_the_command_shows_the_changes_and_the_line_for_the_rig_file(places_run, file):
@@ -126,25 +148,31 @@ def test_the_command_shows_the_changes_and_the_line_for_the_rig_file(places_run,
 
 @pytest.fixture(scope="module")
 def few_echoes(case):
-    """Samples at few positions."""
-    folder, _, believed, _ = case
+    """Samples at 60 positions only, for speed."""
+    folder, _, rig_of_file, _ = case
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("polysight.calibration.places.POSITIONS", 60)
-        return load_echoes(open_raw(folder), believed)
+        return load_echoes(open_raw(folder), rig_of_file)
 
 
 def test_an_undetermined_unknown_stays_near_the_rig_file(case, few_echoes):
     """A prior that is much tighter than the data determines the result: standard errors do not exceed it."""
-    prior = Prior(0.001, 0.001)
-    fit = fit_places(few_echoes, case[2], [TargetPoint(p) for p in POINTS], prior)
-    assert np.all(np.abs(fit.values[:7]) < 0.1)
-    assert np.all(fit.errors <= prior.scale(2) * (1 + 1e-6))
+    _, _, rig_of_file, _ = case
+    prior = Prior(board_mm=0.001, plane_mm=0.001)
+    fit = fit_places(few_echoes, rig_of_file, [TargetPoint(p) for p in POINTS], prior)
+    # Three shifts of each of two boards, and the plane
+    boards_and_plane_mm = fit.values[:7]
+    assert np.all(np.abs(boards_and_plane_mm) < 0.1)
+    assert np.all(fit.errors <= prior.scale(boards=2) * (1 + 1e-6))
 
 
 def test_another_target_is_refused(case, few_echoes):
-    other_targets = [TargetPoint((20.0 * k, 31.0 * (k % 2))) for k in range(-1, 2)]
+    """Three points where the target has none."""
+    _, _, rig_of_file, _ = case
+    other_target = [TargetPoint((-20.0, 31.0)), TargetPoint((0.0, 0.0)), TargetPoint((20.0, 31.0))]
+    fit = fit_places(few_echoes, rig_of_file, other_target)
     with expect_refusal(ErrorCode.MISMATCH):
-        places_file(case[2], fit_places(few_echoes, case[2], other_targets), 3, [])
+        places_file(rig_of_file, fit, 3, [])
 
 
 def test_a_target_needs_three_points(tmp_path):
@@ -154,7 +182,7 @@ def test_a_target_needs_three_points(tmp_path):
         read_target(path)
 
 
-def test_another_rig_files_places_are_taken_and_nothing_else(make_rig):
+def test_of_another_rig_file_only_the_places_of_antennas_and_plane_are_used(make_rig):
     scanned = make_rig(grid={"columns": 5})
     other_rig = make_rig(geometry={"object_distance_mm": 600.0})
     rig_of_scan = take_antenna_places(scanned, other_rig)

@@ -1,4 +1,8 @@
-"""The estimated start frequencies move the direct path to the middle of the IF band, from anywhere."""
+"""The estimated start frequencies move the direct path to the middle of the IF band, from anywhere.
+
+The IF band is 0 to 0.9 sample rates of complex1x, and -0.45 to 0.45 of complex2x. An IF outside of a whole sample rate
+is seen at its *alias*, a multiple of the sample rate away.
+"""
 
 from types import SimpleNamespace
 
@@ -19,6 +23,8 @@ TABLES = {"grid": {"columns": 6, "rows": 2}, "burst": {"pulses": 16}, "image": {
 
 
 def set_offset(value_hz):
+    """A change of the rig file: the start offset of both receivers."""
+
     def change(table):
         for board in table["boards"]:
             if board["role"] != "transmit":
@@ -27,52 +33,68 @@ def set_offset(value_hz):
     return change
 
 
+def find_alias_hz(true_hz, rig):
+    """Where an IF is seen: within 0 to 1 sample rate of complex1x, -1/2 to 1/2 of complex2x."""
+    rate = rig.chirp.sample_rate_hz
+    if rig.chirp.if_mode == "complex1x":
+        return true_hz % rate
+    return (true_hz + rate / 2) % rate - rate / 2
+
+
 @pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
-def test_whatever_the_true_if_its_alias_in_the_band_gives_the_offset_to_the_middle(make_rig, if_mode):
-    """Law: true IF + change of offset = middle, if the rig file's expectation is within half a sample rate of it."""
+def test_the_alias_of_any_true_if_gives_the_offset_that_moves_it_to_the_middle(make_rig, if_mode):
+    """True IF + change of the offset = middle, if the rig file's IF is within half a sample rate of the true one."""
     rig = make_rig(set_offset(123e3), chirp={"if_mode": if_mode})
     board = rig.receivers[0]
     rate = rig.chirp.sample_rate_hz
-    middle = 0.45 * rate if if_mode == "complex1x" else 0.0
+    middle_hz = 0.45 * rate if if_mode == "complex1x" else 0.0
     rng = np.random.default_rng(3)
     for true_hz in rng.uniform(-4e6, 6e6, 50):
-        alias_hz = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
-        start_offset = choose_start_offset(rig, board, true_hz + rng.uniform(-0.4, 0.4) * rate, alias_hz, 1.0, 10)
-        assert true_hz + start_offset.start_offset_hz - board.start_offset_hz == pytest.approx(middle, abs=1.0)
+        expected_hz = true_hz + rng.uniform(-0.4, 0.4) * rate
+        advice = choose_start_offset(
+            rig, board, expected_hz=expected_hz, seen_hz=find_alias_hz(true_hz, rig), error_hz=1.0, chirps=10
+        )
+        # Offsets are whole hertz.
+        change_hz = advice.start_offset_hz - board.start_offset_hz
+        assert true_hz + change_hz == pytest.approx(middle_hz, abs=1.0)
 
 
 @pytest.mark.parametrize("if_mode", ["complex1x", "complex2x"])
-def test_jitter_across_the_bands_edge_does_not_tear_the_mean_apart(make_rig, if_mode):
-    """Law: IFs that are wrapped into the band and unwrapped again differ at most by a multiple of the sample rate."""
+def test_ifs_that_scatter_across_the_edge_of_the_band_are_unwrapped_to_one_side(make_rig, if_mode):
+    """Their aliases lie at both ends of the band, so that a plain mean would be wrong.
+
+    Unwrapped, all of them differ from the true IFs by the same multiple of the sample rate.
+    """
     rig = make_rig(chirp={"if_mode": if_mode})
     rate = rig.chirp.sample_rate_hz
     rng = np.random.default_rng(5)
-    for centre in np.linspace(-1, 1, 9) * rate:
-        true_hz = centre + 0.03 * rate * rng.standard_normal(64)
-        alias_hz = true_hz % rate if if_mode == "complex1x" else (true_hz + rate / 2) % rate - rate / 2
-        difference = (unwrap_if(alias_hz, rig) - true_hz) / rate
-        np.testing.assert_allclose(difference, np.round(difference[0]), atol=1e-9)
+    for centre_hz in np.linspace(-1, 1, 9) * rate:
+        true_hz = centre_hz + 0.03 * rate * rng.standard_normal(64)
+        turns = (unwrap_if(find_alias_hz(true_hz, rig), rig) - true_hz) / rate
+        np.testing.assert_allclose(turns, np.round(turns[0]), atol=1e-9)
 
 
-def test_by_geometry_alone_the_expectation_is_in_the_middle(make_rig):
+def test_the_offset_predicted_by_geometry_puts_the_expected_if_in_the_middle(make_rig):
     rig = make_rig(set_offset(50e3))
     board = rig.receivers[1]
     board_of_advice = msgspec.structs.replace(board, start_offset_hz=predict_by_geometry(rig, board))
-    # Steps of 54 Hz
+    # The radar's start frequency has steps of 54 Hz; each board may be off by some of them.
     assert direct_if_hz(rig, board_of_advice) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
 
 
 def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_rig, make_scan, tmp_path, capsys):
-    """The boards were programmed 260 kHz away from what the rig file says, and their crystals differ."""
+    """The true IF is 260 kHz away from what the rig file says, and the crystals of the boards differ."""
     disturbances = {"if_offset_hz": 260e3, "crystal_ppm": {"receive_h": 0.8, "receive_v": -1.1}}
 
     def make_advice(rig, name):
+        """Scan, calibrate, and return the facts of both receivers by name."""
         folder = make_scan(tmp_path / name, rig, seed=4, disturbances=disturbances)
-        assert main(["calibrate", "start-frequency", str(folder), "--out", str(tmp_path / name / "c")]) == 0
-        boards = read_calibration(next((tmp_path / name / "c").iterdir()), StartFile, "start_frequency").boards
+        out = tmp_path / name / "c"
+        assert main(["calibrate", "start-frequency", str(folder), "--out", str(out)]) == 0
+        boards = read_calibration(next(out.iterdir()), StartFile, "start_frequency").boards
         output = capsys.readouterr().out
-        assert all(f"start_offset_hz = {b.start_offset_hz:.0f}" in output for b in boards.values())
-        return {n: to_builtins(b) for n, b in boards.items()}
+        assert all(f"start_offset_hz = {board.start_offset_hz:.0f}" in output for board in boards.values())
+        return {board_name: to_builtins(board) for board_name, board in boards.items()}
 
     first_advice = make_advice(make_rig(set_offset(300e3), **TABLES), "first")
 
@@ -82,23 +104,27 @@ def test_scanning_again_with_the_advised_offsets_finds_nothing_to_change(make_ri
                 board["start_offset_hz"] = first_advice[board["name"]]["start_offset_hz"]
 
     second_advice = make_advice(make_rig(set_advice, **TABLES), "second")
-    for name, board in second_advice.items():
-        assert abs(first_advice[name]["start_offset_hz"] - 300e3) > 100e3
-        error = np.hypot(board["direct_if_standard_error_hz"], first_advice[name]["direct_if_standard_error_hz"])
-        assert abs(board["start_offset_hz"] - board["start_offset_was_hz"]) < 5 * error
-        assert board["direct_if_hz"] == pytest.approx(board["middle_hz"], abs=5 * error)
+    for name, second in second_advice.items():
+        first = first_advice[name]
+        assert abs(first["start_offset_hz"] - 300e3) > 100e3
+        error_hz = np.hypot(second["direct_if_standard_error_hz"], first["direct_if_standard_error_hz"])
+        assert abs(second["start_offset_hz"] - second["start_offset_was_hz"]) < 5 * error_hz
+        assert second["direct_if_hz"] == pytest.approx(second["middle_hz"], abs=5 * error_hz)
 
 
 def test_without_a_direct_path_the_offset_from_geometry_is_given(make_rig, make_scan, tmp_path):
     rig = make_rig(set_offset(790e3), **TABLES)
     folder = make_scan(tmp_path / "scan", rig, disturbances={"if_offset_hz": 0.0, "direct_loss_db": 80.0})
-    with expect_refusal(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predict_by_geometry(rig, rig.receivers[0]):.0f}"):
+    predicted_hz = predict_by_geometry(rig, rig.receivers[0])
+    with expect_refusal(ErrorCode.NO_DATA, "RH", f"start_offset_hz = {predicted_hz:.0f}"):
         fit_start(open_raw(folder), "RH")
 
 
-def test_of_many_rows_as_many_as_asked_for_are_read_evenly_spaced(make_rig, monkeypatch):
+def test_of_many_rows_only_the_requested_number_is_read_evenly_spaced(make_rig, monkeypatch):
+    """Of a scan whose rows 2, 6 and 7 are missing."""
     monkeypatch.setattr(files, "view_row_words", lambda *_: (None, None))
-    recorded = SimpleNamespace(payload=None, missing=(), frames_expected=0)
-    source = SimpleNamespace(instrument=make_rig(), rows=lambda: iter((0, 1, 3, 4, 5, 8)), read_row=lambda *_: recorded)
-    for limit, rows in ((None, [0, 1, 3, 4, 5, 8]), (6, [0, 1, 3, 4, 5, 8]), (3, [0, 3, 8]), (1, [0])):
-        assert [row for row, _, _ in files.read_board_rows(source, "RH", limit)] == rows
+    empty_row = SimpleNamespace(payload=None, missing=(), frames_expected=0)
+    rows = (0, 1, 3, 4, 5, 8)
+    source = SimpleNamespace(instrument=make_rig(), rows=lambda: iter(rows), read_row=lambda *_: empty_row)
+    for limit, expected in ((None, [0, 1, 3, 4, 5, 8]), (6, [0, 1, 3, 4, 5, 8]), (3, [0, 3, 8]), (1, [0])):
+        assert [row for row, _, _ in files.read_board_rows(source, "RH", limit)] == expected

@@ -47,10 +47,13 @@ def test_the_plane_of_fig13_is_seen_under_50_degrees():
 
 @pytest.mark.parametrize("if_hz", [210e3, 870e3, 1.81e6])
 def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
+    """The amplitude is that of all four RX: the root of the sum of squares."""
     chirp = load_published_rig().chirp
     t = np.arange(chirp.samples) / chirp.sample_rate_hz
     gains = np.array([1.0, 1j, -0.5, 0.25])[:, None, None]
-    frequency, amplitude = tones((gains * 40 * np.exp(2j * np.pi * if_hz * t)).astype(np.complex64), chirp)
+    samples = gains * 40 * np.exp(2j * np.pi * if_hz * t)
+    frequency, amplitude = tones(samples.astype(np.complex64), chirp)
+    # A thirtieth of a bin of the Fourier transform, 2.15 MHz / 256
     assert frequency[0] == pytest.approx(if_hz, abs=300)
     assert amplitude[0] == pytest.approx(40 * np.sqrt((np.abs(gains) ** 2).sum()), rel=2e-3)
 
@@ -114,10 +117,13 @@ def test_names_stand_in_the_middle_of_the_plates():
 
 def test_the_smear_around_a_tone_rises_with_the_power_of_its_noise():
     chirp = load_published_rig().chirp
+    # Complex noise of 20 chirps, and a tone at a fifth of the sample rate
     noise = np.random.default_rng(1).standard_normal((1, 20, chirp.samples, 2)) @ [1, 1j]
     tone = np.exp(2j * np.pi * 0.2 * np.arange(chirp.samples))
     axes = Figure().add_subplot()
-    quiet, loud = (_draw_skirts(axes, (tone + size * noise).astype(np.complex64), chirp) for size in (0.01, 0.1))
-    for part, level_db in quiet.items():
+    quiet_db = _draw_skirts(axes, (tone + 0.01 * noise).astype(np.complex64), chirp)
+    loud_db = _draw_skirts(axes, (tone + 0.1 * noise).astype(np.complex64), chirp)
+    for part, level_db in quiet_db.items():
         assert level_db < -30
-        assert loud[part] - level_db == pytest.approx(20, abs=1)
+        # Ten times the amplitude
+        assert loud_db[part] - level_db == pytest.approx(20, abs=1)

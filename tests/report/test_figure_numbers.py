@@ -34,7 +34,7 @@ def make_scan(phases_deg: dict[float, Any], segments: list[PatchFigures] | None 
     ("phases_deg", "limits"),
     [
         ({0.0: 40.0}, (30.0, 50.0)),
-        # 40 degrees between two plates, and 15 % of room, up to a whole 5
+        # From 20 to 60 degrees, and 15 % of these 40 on either side, up to a multiple of 5
         ({-30.0: 20.0, 30.0: 60.0}, (10.0, 70.0)),
         # Either side of 180 degrees lies together.
         ({-30.0: 170.0, 30.0: -170.0}, (165.0, 195.0)),
@@ -48,13 +48,11 @@ def test_colours_of_phases_span_the_insides_of_patches(phases_deg, limits):
 def test_phases_around_the_circle_have_no_range():
     circle = np.linspace(-180, 180, 49).reshape(7, 7)
     assert figures.find_phase_limits_deg(make_scan({0.0: circle})) is None
-    half = np.linspace(-100, 100, 49).reshape(7, 7)
-    low, high = figures.find_phase_limits_deg(make_scan({0.0: half})) or (0.0, 0.0)
-    # 90 % of them, and 15 % of that on either side
-    assert (low, high) == (-120.0, 120.0)
-    assert (
-        figures.find_phase_limits_deg(make_scan({0.0: 40.0}, [make_patch(0.0, box_mm=(90.0, 0.0, 95.0, 1.0))])) is None
-    )
+    more_than_half = np.linspace(-100, 100, 49).reshape(7, 7)
+    # The middle 90 % of them, -90 to 90, and 15 % of these 180 on either side, up to a multiple of 5
+    assert figures.find_phase_limits_deg(make_scan({0.0: more_than_half})) == (-120.0, 120.0)
+    beside_the_image = make_patch(0.0, box_mm=(90.0, 0.0, 95.0, 1.0))
+    assert figures.find_phase_limits_deg(make_scan({0.0: 40.0}, [beside_the_image])) is None
 
 
 def test_metal_and_patches_that_were_not_judged_do_not_widen_the_range():
@@ -132,8 +130,13 @@ def test_colours_of_a_surface_span_its_permittivities(values, limits):
 
 
 def test_a_relative_error_is_that_of_both_parts(monkeypatch):
-    """0.3 and 0.4 of |3 - 4j| are 10 %; the colours of values have room of a tenth, or of 0.25."""
+    """Errors of 0.3 and 0.4 are together 0.5, which is 10 % of |3 - 4j| = 5.
+
+    Colours of the real parts reach beyond the smallest and the largest by a tenth of their difference, at least by
+    0.25.
+    """
     drawn = []
+    # Called for each of the two maps, with values, texts and colours as the last arguments.
     monkeypatch.setattr(figures, "_fill_patches", lambda *given: drawn.append(given[3:]))
     monkeypatch.setattr(figures.style, "encode_png", lambda _: b"")
     value = PermittivityFigures(real=3.0, imag=-4.0, covariance=[[0.09, 0.0], [0.0, 0.16]])
@@ -148,15 +151,19 @@ def test_a_relative_error_is_that_of_both_parts(monkeypatch):
     scan.segments += [make_patch(0.0, label=2, permittivity=other), make_patch(0.0, label=3)]
     drawn.clear()
     figures.draw_permittivity_map(scan)
-    assert drawn[0][2][1:3] == pytest.approx((2.5, 8.5))
-    assert set(drawn[0][0]) == {1, 2}
+    values, _, (_, low, high, _) = drawn[0]
+    assert (low, high) == pytest.approx((3.0 - 0.5, 8.0 + 0.5))
+    assert set(values) == {1, 2}, "the patch without a permittivity is not filled"
     scan.segments = [make_patch(0.0)]
     assert figures.draw_permittivity_map(scan) is None
 
 
 @pytest.mark.parametrize("count", [1, 59, 60, 119, 120, 500])
 def test_a_surface_has_up_to_120_needles_along_its_normals(monkeypatch, count):
-    """Points are drawn from the far ones to the near ones, as seen from the rig, from the side and from above."""
+    """Points are drawn from the far ones to the near ones, as seen from the rig, from the side and from above.
+
+    Needles are 12 mm long. So that they can be told apart, only each n-th point has one.
+    """
     seen: list[Figure] = []
     monkeypatch.setattr(figures.style, "encode_png", seen.append)
     rng = np.random.default_rng(count)
@@ -168,14 +175,16 @@ def test_a_surface_has_up_to_120_needles_along_its_normals(monkeypatch, count):
     with matplotlib.rc_context({"figure.max_open_warning": 0}):
         figures.surface_figure(surface)
     points_mm = 1e3 * surface.points_m
-    for ax, (across, up), depth in zip(
-        seen[0].axes, ((0, 1), (2, 1), (0, 2)), (points_mm[:, 2], -points_mm[:, 0], -points_mm[:, 1]), strict=True
-    ):
+    x, y, z = points_mm.T
+    # Coordinates to the right and upwards, and the distance from the eye
+    views = (((0, 1), z), ((2, 1), -x), ((0, 2), -y))
+    for ax, ((across, up), depth) in zip(seen[0].axes, views, strict=True):
         (dots,) = ax.collections
         order = np.argsort(-depth)
         assert np.allclose(dots.get_offsets(), points_mm[order][:, [across, up]])
         needles = ax.lines
         assert min(count, 60) <= len(needles) <= 120
+        # Rounded up
         stride = -(-count // len(needles))
         for needle, start, normal in zip(needles, points_mm[::stride], surface.normals[::stride], strict=True):
             ends = np.array([start, start + 12 * normal])

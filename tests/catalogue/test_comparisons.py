@@ -13,6 +13,11 @@ from polysight.results import PatchFigures, PermittivityFigures
 from polysight_shared.errors import ErrorCode
 
 NAMES = ("first", "second")
+# Of pixels that have not changed the differences are complex and normally distributed, with a magnitude whose median is
+# so many standard deviations of either part: sqrt(2 ln 2) = 1.18 (Rayleigh distribution).
+UNCHANGED_MEDIAN = (2 * np.log(2)) ** 0.5
+# The standard deviation of a difference of two pixels with errors of 0.3.
+DIFFERENCE_STD = 0.3 * 2**0.5
 
 
 def make_pixels(p: complex = 1.0, x0_mm: float = 0.0, **changes: Any) -> Any:
@@ -50,12 +55,11 @@ def test_a_difference_is_the_first_scan_minus_the_second():
     assert comparison.figures.notes == []
 
 
-@pytest.mark.parametrize(("difference", "share"), [(2.99 * 0.3 * 2**0.5, 0.0), (3.01 * 0.3 * 2**0.5, 0.25)])
-def test_a_difference_of_more_than_three_standard_deviations_is_significant(difference, share):
-    p = np.ones((3, 4), complex)
-    # Unchanged pixels scatter as their errors say: their median is sqrt(2 ln 2).
-    p += 1.18 * 0.3 * 2**0.5
-    p[:, 0] = 1 + difference
+@pytest.mark.parametrize(("sigmas", "share"), [(2.99, 0.0), (3.01, 0.25)])
+def test_a_difference_of_more_than_three_standard_deviations_is_significant(sigmas, share):
+    """One column of four differs by so many standard deviations; the others scatter as their errors say."""
+    p = np.full((3, 4), 1 + UNCHANGED_MEDIAN * DIFFERENCE_STD)
+    p[:, 0] = 1 + sigmas * DIFFERENCE_STD
     pixels = make_pixels()
     pixels.p = p
     assert compare(pixels, make_pixels(1.0)).figures.significant_share == share
@@ -72,14 +76,18 @@ def test_pixels_within_half_a_pixel_are_at_one_place(shift_mm, columns):
     assert comparison.figures.compared == 3 * len(columns)
 
 
-def test_scans_of_different_places_have_nothing_to_compare():
+def test_scans_without_a_common_place_have_nothing_to_compare():
     with expect_refusal(ErrorCode.MISMATCH, "no place in common"):
         compare(make_pixels(), make_pixels(x0_mm=8.1))
+    nowhere = np.zeros((3, 4), bool)
     with expect_refusal(ErrorCode.MISMATCH):
-        compare(make_pixels(), make_pixels(clear=np.zeros((3, 4), bool)))
-    for a, b, name in ((False, True, "first"), (True, False, "second")):
+        compare(make_pixels(), make_pixels(clear=nowhere))
+
+
+def test_a_scan_without_a_metal_reference_has_nothing_to_compare_and_is_named():
+    for is_first_referenced, is_second_referenced, name in ((False, True, "first"), (True, False, "second")):
         with expect_refusal(ErrorCode.NO_DATA, name):
-            compare(make_pixels(referenced=a), make_pixels(referenced=b))
+            compare(make_pixels(referenced=is_first_referenced), make_pixels(referenced=is_second_referenced))
 
 
 def test_only_pixels_that_are_lit_and_known_in_both_scans_are_compared():
@@ -114,11 +122,12 @@ def test_what_limits_a_comparison_is_a_note(changes, note):
 
 def test_scans_that_share_their_errors_are_compared_in_units_of_what_is_left():
     comparison = compare(make_pixels(1.1), make_pixels(1.0))
-    # 0.1 in 0.42 of error, over sqrt(2 ln 2) of an unchanged pixel
-    scatter = 0.1 / (0.3 * 2**0.5) / (2 * np.log(2)) ** 0.5
+    # All pixels differ by 0.1, less than unchanged pixels with independent errors would.
+    scatter = 0.1 / DIFFERENCE_STD / UNCHANGED_MEDIAN
     assert comparison.figures.scatter == round(scatter, 3)
     assert f"{scatter:.2f} of their stated errors" in comparison.figures.notes[0]
-    assert comparison.sigmas == pytest.approx((2 * np.log(2)) ** 0.5)
+    # In units of errors that are smaller by this factor they scatter as unchanged pixels do.
+    assert comparison.sigmas == pytest.approx(UNCHANGED_MEDIAN)
 
 
 def test_errors_that_are_not_known_leave_a_comparison_without_significance():
@@ -133,43 +142,45 @@ def make_patch(x_mm: float, y_mm: float, real: float = 3.0, imag: float = -0.5, 
     return PatchFigures(**(fields | changes))
 
 
-def pair(first: list[PatchFigures], second: list[PatchFigures]) -> list[Any]:
+def pair_patches(first: list[PatchFigures], second: list[PatchFigures]) -> list[Any]:
+    """The patches of two scans that are compared with each other."""
     return compare(make_pixels(2.0, segments=first), make_pixels(1.0, segments=second)).figures.patches
 
 
 @pytest.mark.parametrize(("x_mm", "y_mm", "pairs"), [(9.0, 12.0, 1), (9.1, 12.0, 0), (-9.0, -12.0, 1), (0.0, 15.1, 0)])
 def test_patches_whose_centres_are_within_15_mm_are_one_plate(x_mm, y_mm, pairs):
-    assert len(pair([make_patch(0.0, 0.0)], [make_patch(x_mm, y_mm)])) == pairs
+    assert len(pair_patches([make_patch(0.0, 0.0)], [make_patch(x_mm, y_mm)])) == pairs
 
 
 def test_a_patch_is_compared_with_the_nearest_one_and_never_with_the_metal():
     near = make_patch(3.0, 0.0, label=7)
     far = make_patch(0.0, 5.0, label=8)
     metal = make_patch(0.0, 0.0, label=9, metal_reference=True)
-    (found,) = pair([make_patch(0.04, 0.06, label=2), metal], [far, metal, near])
-    assert found.labels == (2, 7)
-    assert found.names == ("PET", "PET")
-    assert found.place_mm == (0.0, 0.1)
-    assert pair([make_patch(0.0, 0.0)], [metal]) == []
+    (compared,) = pair_patches([make_patch(0.04, 0.06, label=2), metal], [far, metal, near])
+    assert compared.labels == (2, 7)
+    assert compared.names == ("PET", "PET")
+    assert compared.place_mm == (0.0, 0.1)
+    assert pair_patches([make_patch(0.0, 0.0)], [metal]) == []
 
 
 def test_a_difference_of_two_patches_has_the_errors_of_both():
-    (found,) = pair([make_patch(0.0, 0.0)], [make_patch(0.0, 0.0, real=2.4, imag=-0.1)])
-    assert (found.difference.real, found.difference.imag) == (0.6, -0.4)
-    assert found.difference.real_std == round((2 * 0.09) ** 0.5, 4)
-    assert found.difference.imag_std == round((2 * 0.16) ** 0.5, 4)
-    assert found.sigmas == round((0.6**2 / 0.18 + 0.4**2 / 0.32) ** 0.5, 2)
+    """Variances of 0.09 and 0.16 of real and imaginary part are twice as large for a difference."""
+    (compared,) = pair_patches([make_patch(0.0, 0.0)], [make_patch(0.0, 0.0, real=2.4, imag=-0.1)])
+    assert (compared.difference.real, compared.difference.imag) == (0.6, -0.4)
+    assert compared.difference.real_std == round((2 * 0.09) ** 0.5, 4)
+    assert compared.difference.imag_std == round((2 * 0.16) ** 0.5, 4)
+    assert compared.sigmas == round((0.6**2 / 0.18 + 0.4**2 / 0.32) ** 0.5, 2)
 
 
 @pytest.mark.parametrize("covariance", [None, [[0.0, 0.0], [0.0, 0.0]], [[float("nan"), 0.0], [0.0, 1.0]]])
 def test_without_an_error_a_difference_of_two_patches_has_no_significance(covariance):
     value = PermittivityFigures(real=2.4, imag=-0.1, covariance=covariance)
     exact = PermittivityFigures(real=3.0, imag=-0.5, covariance=[[0.0, 0.0], [0.0, 0.0]])
-    (found,) = pair([make_patch(0.0, 0.0, permittivity=exact)], [make_patch(0.0, 0.0, permittivity=value)])
-    assert (found.difference.real, found.difference.imag) == (0.6, -0.4)
-    assert (found.difference.real_std, found.sigmas) == (None, None)
-    (found,) = pair([make_patch(0.0, 0.0, permittivity=None)], [make_patch(0.0, 0.0)])
-    assert (found.difference, found.sigmas) == (None, None)
+    (compared,) = pair_patches([make_patch(0.0, 0.0, permittivity=exact)], [make_patch(0.0, 0.0, permittivity=value)])
+    assert (compared.difference.real, compared.difference.imag) == (0.6, -0.4)
+    assert (compared.difference.real_std, compared.sigmas) == (None, None)
+    (compared,) = pair_patches([make_patch(0.0, 0.0, permittivity=None)], [make_patch(0.0, 0.0)])
+    assert (compared.difference, compared.sigmas) == (None, None)
 
 
 def test_colours_of_a_map_of_differences_reach_the_largest_ones():

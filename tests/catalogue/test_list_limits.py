@@ -73,16 +73,17 @@ def test_a_scan_to_be_made_need_not_be_there(tmp_path):
     # Nothing is made inside of a scan.
     with expect_refusal(ErrorCode.FILE_MISSING, "inside the scan a"):
         Scans(tmp_path).folder("a/new", new=True)
-    only = Scans(tmp_path, only="later")
-    assert only.folder("later") == tmp_path / "later"
+    one_scan = Scans(tmp_path, only="later")
+    assert one_scan.folder("later") == tmp_path / "later"
     with expect_refusal(ErrorCode.PATH_OUTSIDE):
-        only.folder("a")
+        one_scan.folder("a")
 
 
 @pytest.mark.parametrize(
     ("ages_s", "is_kept"), [((10.0, 10.0), True), ((2.5, 10.0), True), ((10.0, 1.5), False), ((-100.0, 10.0), False)]
 )
 def test_an_index_keeps_what_was_written_more_than_two_seconds_ago(tmp_path, monkeypatch, ages_s, is_kept):
+    """A scan has two files here. One that is younger, or of the future, may still change without another time."""
     now_ns = 1_800_000_000_000_000_000
     monkeypatch.setattr(scans_module, "time", SimpleNamespace(time=lambda: now_ns / 1e9))
     stamp = tuple((now_ns - int(age_s * 1e9), 1) for age_s in ages_s)
@@ -171,6 +172,7 @@ def test_a_scan_that_has_ended_needs_no_sign_of_life(tmp_path, state):
 def test_a_scan_that_began_and_whose_program_failed_says_why(tmp_path):
     folder = make_scan(tmp_path, "a")
     assert add_signs_of_life(folder, Summary("a", "begun")).state == "begun"
+    # No process has a number above the largest one of Linux.
     record = {"pid": 1 << 22, "ticks": 1, "words": ["x", "-m", "polysight", "scan"], "started_utc": "2026-01-01"}
     (folder / "program" / "scan.json").write_bytes(msgspec.json.encode(record))
     (folder / "program" / "scan.status").write_text("1\n")

@@ -42,7 +42,7 @@ def board(rig: Instrument) -> Board:
 
 @pytest.fixture
 def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
-    """Starts cards of boards by name, or of the boards in `more`."""
+    """Function that starts cards of boards by name, and of the boards in `more`."""
     with ExitStack() as stack:
 
         def start(*names: str, streamed_bytes: int = 0, more: tuple[Board, ...] = (), **faults: Faults) -> Cards:
@@ -58,7 +58,7 @@ def cards(rig: Instrument) -> Iterator[Callable[..., Cards]]:
 
 @pytest.fixture
 def scripted_card(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, ScriptedCard]]]:
-    """Makes a client and a card with scripted answers, of board RV.
+    """Function that makes a client of board RV and a card with scripted answers.
 
     An attempt times out only if it is in `unanswered` (code and count, as for the answers). Others never time out.
     """
@@ -71,11 +71,20 @@ def scripted_card(rig: Instrument) -> Iterator[Callable[..., tuple[CardClient, S
             sent: Counter[Code] = Counter()
 
             class Client(CardClient):
+                """A client that does not wait for answers that do not come."""
+
                 def _try(self, code: Code, data: bytes, limit_s: float) -> Reply | None:
                     sent[code] += 1
-                    return super()._try(code, data, 0.0 if (code, sent[code]) in unanswered else limit_s)
+                    if (code, sent[code]) in unanswered:
+                        limit_s = 0.0
+                    return super()._try(code, data, limit_s)
 
-            card = ScriptedCard(board, lambda code, n: [] if (code, n) in unanswered else answers(code, n), source_port)
+            def answer_unless_lost(code: Code, n: int):
+                if (code, n) in unanswered:
+                    return []
+                return answers(code, n)
+
+            card = ScriptedCard(board, answer_unless_lost, source_port)
             stack.callback(card.close)
             return stack.enter_context(Client(board, 3 * HANG_S)), card
 

@@ -16,26 +16,31 @@ from polysight.capture.dca1000 import Counters
 from polysight.capture.placement import EarlierRecords, PlacedRecord, place_record
 from polysight_simulators.cards import NETWORK_TROUBLES, Adversary, SentRecord
 
+# Records of one run of the state machine.
 STEPS = 20
-# Bytes of a frame, frames of a row
+# Bytes of a frame, and frames of a row. A packet has 1456 bytes.
 GRIDS = [
-    (64, 91),  # ends in a full packet
+    # Rows that end in a full packet.
+    (64, 91),
     (64, 910),
     (4096, 91),
+    # Rows that end in a shorter one.
     (4096, 48),
     (4096, 160),
-    (128, 5),  # one packet
+    # One packet, and two.
+    (128, 5),
     (128, 12),
-    (1456, 1),  # one full packet
+    # Full packets only: one, and seven.
+    (1456, 1),
     (1456, 7),
     (512, 30),
 ]
-# Perfect records in a row, after anything that may have happened
+# So many perfect records in sequence may be refused, after anything that may have happened.
 MAX_REFUSED = 1
 
 
 def count_wrong_bytes(sent: SentRecord, placed: PlacedRecord, out: np.ndarray) -> int:
-    """Bytes that are not masked and are not those of the row."""
+    """Return the number of bytes that are not masked and are not those of the row."""
     mask = make_mask(out.size, placed.missing)
     assert not placed.located or not out[mask].any()
     return int((out[~mask] != np.frombuffer(sent.data, dtype=np.uint8)[~mask]).sum())
@@ -47,29 +52,28 @@ class Rows(RuleBasedStateMachine):
     @initialize(
         grid=st.sampled_from(GRIDS),
         seed=st.integers(0, 2**32 - 1),
-        fresh=st.booleans(),
-        near_wrap=st.booleans(),
+        is_fresh=st.booleans(),
+        is_near_wrap=st.booleans(),
     )
-    def begin(self, grid, seed, fresh, near_wrap):
+    def begin(self, grid, seed, is_fresh, is_near_wrap):
+        """Draw the card's counters: those after a reset, some that soon begin again at 0, or any."""
         self.frame, self.frames = grid
         self.size = self.frame * self.frames
         rng = random.Random(seed)
-        if fresh:
+        if is_fresh:
             count = 0
-        elif near_wrap:
-            count = 2**48 - rng.randint(1, 40_000)
-        else:
-            count = rng.randrange(2**48)
-        if fresh:
             sequence = 1
-        elif near_wrap:
+        elif is_near_wrap:
+            count = 2**48 - rng.randint(1, 40_000)
             sequence = 2**32 - rng.randint(1, 60)
         else:
+            count = rng.randrange(2**48)
             sequence = rng.randrange(2**32)
         self.card = Adversary(rng, self.frame, count, sequence)
         self.past = EarlierRecords(Counters(count, sequence))
-        # The next record's start is known
-        self.sure = True
+        # True if the start of the next record is known.
+        self.start_is_known = True
+        # Perfect records that were refused in sequence.
         self.refused = 0
 
     def take(self, troubles: tuple[str, ...], batch: int, pulses_known: bool) -> tuple[SentRecord, PlacedRecord]:
@@ -77,25 +81,28 @@ class Rows(RuleBasedStateMachine):
         log = log_packets(sent, self.size, batch)
         placed, out = place_record(log, self.frame, self.past, sent.not_before_ns if pulses_known else 0)
         assert count_wrong_bytes(sent, placed, out) == 0, (troubles, placed.reason)
+        # Each packet is counted once, under one name.
         c = placed.counts
-        named = c.placed + c.duplicates + c.conflicting + c.leftover + c.restarted + c.outside + c.disagreeing
-        assert named + c.malformed == len(sent.arrivals)
+        well_formed = c.placed + c.duplicates + c.conflicting + c.leftover + c.restarted + c.outside + c.disagreeing
+        assert well_formed + c.malformed == len(sent.arrivals)
         self.check_mask(sent, placed)
         self.past = placed.past
-        self.sure = placed.located
-        if placed.past.lost:  # as the host does before the next row
+        self.start_is_known = placed.located
+        # As the host does before the next row.
+        if placed.past.lost:
             self.card.reset_by_host()
             self.past = EarlierRecords.after_reset()
         return sent, placed
 
     def check_mask(self, sent: SentRecord, placed: PlacedRecord) -> None:
         """If the start is known and the card sent one complete record, exactly the lost bytes are masked."""
-        if placed.complete:  # and right, as was seen before
+        # A complete row is right: its bytes were compared before.
+        if placed.complete:
             return
-        spoils = {"truncate", "turn_header_bit", "two_paths", "reset_between"}
-        if not (self.sure and self.past.start and sent.is_complete and self.card.resets == 0) or spoils & {
-            *sent.troubles
-        }:
+        # With these faults also received bytes may be masked.
+        spoiling_troubles = {"truncate", "turn_header_bit", "two_paths", "reset_between"}
+        start_is_sure = self.start_is_known and self.past.start and self.card.resets == 0
+        if not start_is_sure or not sent.is_complete or spoiling_troubles & {*sent.troubles}:
             return
         received_heads = {a.packet[:10] for a in sent.arrivals if a.record == sent.number}
         start = self.past.start.byte_count
@@ -117,12 +124,15 @@ class Rows(RuleBasedStateMachine):
     @rule(batch=st.sampled_from([1, 7, 64]))
     def perfect(self, batch):
         """A record without faults of its own; leftovers of others may come among its packets."""
-        sure = self.sure and self.past.start is not None and self.card.resets == 0
+        start_is_sure = self.start_is_known and self.past.start is not None and self.card.resets == 0
         sent, placed = self.take((), batch, pulses_known=True)
-        alone = all(a.record == sent.number or a.t_ns < sent.not_before_ns for a in sent.arrivals)
-        if sure:
+        has_no_leftovers = all(a.record == sent.number or a.t_ns < sent.not_before_ns for a in sent.arrivals)
+        if start_is_sure:
             assert placed.complete, placed.reason
-        self.refused = 0 if placed.complete or not alone else self.refused + 1
+        if placed.complete or not has_no_leftovers:
+            self.refused = 0
+        else:
+            self.refused += 1
         assert self.refused <= MAX_REFUSED, placed.reason
 
     @rule()
@@ -130,12 +140,13 @@ class Rows(RuleBasedStateMachine):
         """The host's program is started again: it has no state, and resets the card."""
         self.card.reset_by_host()
         self.past = EarlierRecords.after_reset()
-        self.sure = True
+        self.start_is_known = True
         self.refused = 0
 
 
 def test_no_byte_is_wrong_and_none_is_masked_without_reason(request: pytest.FixtureRequest):
-    records = 20_000 if request.config.getoption("--long") else 2_000
+    is_long = request.config.getoption("--long")
+    records = 20_000 if is_long else 2_000
     run_state_machine_as_test(
         Rows,
         settings=settings(
@@ -143,6 +154,6 @@ def test_no_byte_is_wrong_and_none_is_masked_without_reason(request: pytest.Fixt
             stateful_step_count=STEPS,
             deadline=None,
             suppress_health_check=list(HealthCheck),
-            phases=[Phase.generate, Phase.shrink] if not request.config.getoption("--long") else list(Phase),
+            phases=list(Phase) if is_long else [Phase.generate, Phase.shrink],
         ),
     )

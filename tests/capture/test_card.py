@@ -21,7 +21,7 @@ from polysight_simulators.cards import Network
 from polysight_simulators.faults import Faults
 
 
-def test_configures_as_seen_on_a_real_card(scripted_card):
+def test_a_card_is_configured_with_the_bytes_that_a_real_card_accepted(scripted_card):
     client, card = scripted_card(lambda code, _: [reply(code, 0x0402 if code == Code.VERSION else 0)])
     client.check_alive()
     client.configure(Card())
@@ -44,7 +44,7 @@ def test_configures_as_seen_on_a_real_card(scripted_card):
 
 @pytest.mark.parametrize("source_port", [1024, 4098, 0])
 def test_replies_and_status_count_from_any_source_port(scripted_card, source_port):
-    """Only the address identifies a card: the sockets have no peer."""
+    """Only the address identifies a card, so the socket is not connected to one port."""
     client, _ = scripted_card(
         lambda code, _: [reply(Code.STATUS, Status.NO_LVDS_DATA), reply(code, 0x0402)], source_port=source_port
     )
@@ -68,7 +68,7 @@ def test_status_messages_are_not_replies(scripted_card):
     assert client.strangers == 2
 
 
-def test_lost_reply_is_retried(scripted_card):
+def test_a_command_whose_reply_was_lost_is_sent_again(scripted_card):
     client, card = scripted_card(lambda code, _: [reply(code)], unanswered=[(Code.ALIVE, 1)])
     client.check_alive()
     assert [c for c, _ in card.seen] == [Code.ALIVE, Code.ALIVE]
@@ -85,8 +85,9 @@ def test_a_reply_that_waits_while_the_program_is_stopped_is_not_lost(scripted_ca
         return dca1000.encode_request(code, data)
 
     def monotonic() -> float:
+        # After the request time passes only when the reply waits in the socket; then the timeout is over.
         if requests:
-            assert select.select([client], [], [], HANG_S)[0], "a reply is there"
+            assert select.select([client], [], [], HANG_S)[0]
         return next(clock_s)
 
     monkeypatch.setattr(card, "dca1000", SimpleNamespace(**vars(dca1000) | {"encode_request": encode}))
@@ -116,21 +117,22 @@ def test_record_start_is_never_sent_twice_without_a_stop(scripted_card):
     assert [c for c, _ in card.seen] == [Code.RECORD_START, Code.RECORD_STOP, Code.RECORD_START]
 
 
-def test_refusal_is_an_error_but_not_for_stop(scripted_card):
+def test_a_refusal_is_an_error_except_that_of_a_stop(scripted_card):
+    """A card that does not record refuses to stop."""
     client, _ = scripted_card(lambda code, _: [reply(code, 1)])
     client.record_stop()
     with expect_refusal(ErrorCode.REFUSED_BY_PEER, "CONFIGURE_FPGA"):
         client.configure(Card())
 
 
-def test_silent_card_is_named(scripted_card):
+def test_the_error_of_a_silent_card_names_it_after_three_requests(scripted_card):
     client, card = scripted_card(lambda *_: [], unanswered=[(Code.ALIVE, n) for n in (1, 2, 3)])
     with expect_refusal(ErrorCode.NO_ANSWER, "RV", ":4202", "ALIVE", "EEPROM"):
         client.check_alive()
     wait_for(lambda: len(card.seen) == 3, "three requests")
 
 
-def test_command_port_in_use(scripted_card):
+def test_a_command_port_in_use_is_an_error_with_the_command_that_finds_its_user(scripted_card):
     client, _ = scripted_card(lambda *_: [])
     with expect_refusal(ErrorCode.BUSY, 4202, "ss -ulnp"):
         CardClient(client.board, 1.0)
@@ -169,7 +171,8 @@ def test_wait_for_a_completed_record_has_a_timeout(scripted_card):
     assert client.take_status() == Status(0)
 
 
-def test_the_bytes_are_reversed():
+def test_addresses_in_the_eeprom_have_their_last_byte_first():
+    """Host, card, MAC address, and the ports 4200 and 4201."""
     body = EepromSettings("192.168.33.30", "192.168.33.181", "12:34:56:78:90:13", 4200, 4201).encode()
     assert body.hex(" ") == "1e 21 a8 c0 b5 21 a8 c0 13 90 78 56 34 12 68 10 69 10"
 
@@ -231,7 +234,7 @@ def make_answers(status: int = 0, answer: int = 0):
     return answers
 
 
-def test_written_once_confirmed(scripted_card):
+def test_the_eeprom_is_written_once_after_a_confirmation(scripted_card):
     client, card = scripted_card(make_answers())
     settings = read_settings(client)
     program_eeprom(client, settings, settings.confirmation)
@@ -239,7 +242,7 @@ def test_written_once_confirmed(scripted_card):
 
 
 @pytest.mark.parametrize("confirmed", ["", "yes", "192.168.33.180"])
-def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
+def test_without_the_right_confirmation_nothing_is_sent(scripted_card, confirmed):
     client, card = scripted_card(make_answers())
     with expect_refusal(ErrorCode.VALUE_INVALID, client.board.card_address):
         program_eeprom(client, read_settings(client), confirmed)
@@ -254,7 +257,7 @@ def test_nothing_is_sent_unconfirmed(scripted_card, confirmed):
         (0, 0, [(Code.CONFIGURE_EEPROM, 1)], ErrorCode.NO_ANSWER),
     ],
 )
-def test_a_card_that_could_not_write_it(scripted_card, status, answer, unanswered, code):
+def test_a_card_that_could_not_write_its_eeprom_is_not_asked_again(scripted_card, status, answer, unanswered, code):
     client, card = scripted_card(make_answers(status, answer), unanswered=unanswered)
     settings = read_settings(client)
     with expect_refusal(code):
@@ -263,16 +266,17 @@ def test_a_card_that_could_not_write_it(scripted_card, status, answer, unanswere
     assert [code for code, _ in card.seen] == [Code.ALIVE, Code.CONFIGURE_EEPROM]
 
 
-@pytest.mark.parametrize(
-    ("asked_again", "answers", "alone"), [(0, 1, True), (0, 2, False), (1, 2, True), (1, 3, False)]
-)
-def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, asked_again, answers, alone):
-    """The answer to the first request comes with that to the second one: one card has answered both."""
+@pytest.mark.parametrize(("repeats", "answers", "is_alone"), [(0, 1, True), (0, 2, False), (1, 2, True), (1, 3, False)])
+def test_a_late_answer_is_not_that_of_a_second_card(scripted_card, monkeypatch, repeats, answers, is_alone):
+    """The answer to the first request comes with that to the second one: one card has answered both.
+
+    More answers than requests show a second card with the same address.
+    """
     client, _ = scripted_card(
         lambda code, _: [reply(code, 0x0402)] * answers,
-        unanswered=[(Code.VERSION, n) for n in range(1, 1 + asked_again)],
+        unanswered=[(Code.VERSION, n) for n in range(1, 1 + repeats)],
     )
-    if alone:
+    if is_alone:
         client.require_alone()
     else:
         monkeypatch.setattr(card, "_TWIN_S", HANG_S)
@@ -295,7 +299,7 @@ def test_a_second_card_with_the_same_address_is_refused(rig, cards, monkeypatch)
 
 
 def test_a_card_with_another_mac_address_is_refused_at_the_next_record(scripted_card, monkeypatch):
-    """Cards were exchanged, or a second one answers now. A missing address in the kernel is not an error."""
+    """Cards were exchanged, or a second one answers now. That the kernel has forgotten the address is not an error."""
     client, _ = scripted_card(lambda code, _: [reply(code, 0)])
     neighbours = {"mac": "12:34:56:78:90:12"}
     monkeypatch.setattr(card, "neighbour_mac", lambda _: neighbours["mac"])
@@ -319,6 +323,7 @@ def test_a_second_card_of_any_board_is_reported(rig, cards, monkeypatch):
 def test_mac_addresses_of_cards_are_read_from_the_kernel(tmp_path):
     table = tmp_path / "proc/net/arp"
     table.parent.mkdir(parents=True)
+    # Flag 0x2: the address is complete; 0x0: the kernel has asked and got no answer.
     line = "192.168.33.180   0x1         {}         12:34:56:78:90:12     *        eth0"
     table.write_text("IP address HW type Flags HW address Mask Device\n" + line.format("0x2"))
     assert neighbour_mac("192.168.33.180", tmp_path) == "12:34:56:78:90:12"

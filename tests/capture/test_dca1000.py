@@ -10,7 +10,7 @@ from polysight.capture.dca1000 import decode_row, decode_two_lane
 from polysight_shared.errors import ErrorCode, ProtocolError
 
 
-def test_vectors_seen():
+def test_requests_replies_and_headers_are_those_of_a_real_card():
     assert d.encode_packet_configuration(1470, 25.0) == bytes.fromhex("be05350c0000")
     assert d.encode_fpga_configuration(4) == bytes.fromhex("01010102031e")
     assert d.encode_fpga_configuration(2) == bytes.fromhex("01020102031e")
@@ -31,11 +31,13 @@ def test_vectors_seen():
     ],
 )  # fmt: skip
 def test_malformed_replies_are_refused(raw):
+    """Nothing, too short, a wrong last or first byte, cut, and one byte too long."""
     with pytest.raises(ProtocolError):
         d.decode_reply(raw)
 
 
-def test_out_of_range_is_refused():
+def test_values_that_a_card_cannot_take_are_refused():
+    """More than 504 bytes of data, a delay of more than 524 us or below zero, 3 lanes, and a header without payload."""
     with pytest.raises(ProtocolError):
         d.encode_request(3, bytes(505))
     with pytest.raises(ProtocolError):
@@ -50,7 +52,7 @@ def test_out_of_range_is_refused():
 
 def test_the_largest_and_smallest_values_are_taken():
     assert d.encode_request(3, bytes(504))[4:6] == (504).to_bytes(2, "little")
-    # 65535 ticks of 8 ns
+    # The delay between packets has 16 bits of 8 ns: 65535 ticks.
     assert d.encode_packet_configuration(1470, 524.28)[2:4] == b"\xff\xff"
     assert d.encode_packet_configuration(1470, 0.0)[2:4] == b"\0\0"
     assert d.decode_packet_header(bytes(11)) == (0, 0)
@@ -78,7 +80,7 @@ def draw_cube(frames: int, samples: int, rx: int, seed: int = 0) -> np.ndarray:
 
 
 def encode_four_lane(x: np.ndarray) -> bytes:
-    """I0 I1 I2 I3 Q0 Q1 Q2 Q3 a sample, written out sample by sample."""
+    """Encode as a card with four lanes: of each sample the I of all antennas, then their Q (I0 I1 I2 I3 Q0 ... Q3)."""
     rx, frames, samples = x.shape
     words = []
     for f in range(frames):
@@ -88,7 +90,7 @@ def encode_four_lane(x: np.ndarray) -> bytes:
 
 
 def encode_two_lane(x: np.ndarray) -> bytes:
-    """A whole chirp of RX1, then RX2: I0 I1 Q0 Q1 I2 I3 Q2 Q3."""
+    """Encode as a card with two lanes: a chirp of RX1, then of RX2, each as I0 I1 Q0 Q1 I2 I3 Q2 Q3 of its samples."""
     rx, frames, samples = x.shape
     words = []
     for f in range(frames):
@@ -101,7 +103,7 @@ def encode_two_lane(x: np.ndarray) -> bytes:
 
 
 @given(st.integers(1, 4), st.integers(1, 9), st.sampled_from([1, 2, 4]))
-def test_four_lane_round_trip(frames, samples, rx):
+def test_samples_of_four_lanes_are_decoded(frames, samples, rx):
     x = draw_cube(frames, samples, rx)
     decoded, valid = decode_row(encode_four_lane(x), (), frames, samples, rx)
     assert decoded.dtype == np.complex64
@@ -110,7 +112,7 @@ def test_four_lane_round_trip(frames, samples, rx):
 
 
 @given(st.integers(1, 4), st.integers(1, 5), st.sampled_from([1, 2, 4]))
-def test_two_lane_round_trip(chirps, pairs, rx):
+def test_samples_of_two_lanes_are_decoded(chirps, pairs, rx):
     x = draw_cube(chirps, 2 * pairs, rx)
     assert np.array_equal(decode_two_lane(encode_two_lane(x), chirps, 2 * pairs, rx), x)
 
@@ -124,6 +126,7 @@ def test_swapped_order_exchanges_i_and_q():
 
 @given(st.lists(st.tuples(st.integers(0, 639), st.integers(1, 100)), max_size=4))
 def test_frames_with_a_missing_byte_are_invalid_and_zero(cuts):
+    # 5 frames of 8 samples of 4 antennas, each 16 bits of I and of Q.
     x = draw_cube(5, 8, 4)
     size = 5 * 8 * 16
     mask = np.zeros(size, dtype=bool)
@@ -156,7 +159,7 @@ def test_bytes_beyond_the_last_frame_are_ignored():
     assert np.array_equal(decode_row(encode_four_lane(x) + b"rest", (), 2, 4)[0], x)
 
 
-def test_short_data_is_refused():
+def test_data_shorter_than_its_frames_is_refused():
     with expect_refusal(ErrorCode.NOT_ENOUGH_DATA, "127 bytes", "128 bytes"):
         decode_row(bytes(2 * 4 * 16 - 1), (), 2, 4)
     with expect_refusal(ErrorCode.VALUE_INVALID):

@@ -13,6 +13,7 @@ from polysight.capture.inspect import inspect_pcap, is_pcap, read_pcap
 from polysight_shared.errors import ErrorCode
 
 ADDRESS = "192.168.33.180"
+# Replies of a card: its version 2.8, two status messages, and one of an unknown command.
 VERSION = bytes.fromhex("5aa50e000204aaee")
 STATUS = bytes.fromhex("5aa50a000001aaee")
 OTHER_STATUS = bytes.fromhex("5aa50a000100aaee")
@@ -20,7 +21,7 @@ UNKNOWN = bytes.fromhex("5aa555000700aaee")
 
 
 def write_frames(path: Path, *frames: bytes, link: int = 1) -> Path:
-    """A capture of these frames, one a second from second 100 on."""
+    """Write a packet capture of these frames, one a second from 100.5 s on; `link` 1 is Ethernet."""
     raw = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, link)
     for second, frame in enumerate(frames, 100):
         raw += struct.pack("<IIII", second, 500_000, len(frame), len(frame)) + frame
@@ -29,7 +30,7 @@ def write_frames(path: Path, *frames: bytes, link: int = 1) -> Path:
 
 
 def change_bytes(frame: bytes, changes: dict[int, bytes]) -> bytes:
-    """The frame with other bytes at some places; the header of IP begins at 14, that of UDP at 34."""
+    """Return the frame with other bytes at these places. The header of IP begins at byte 14, that of UDP at 34."""
     for start, new in changes.items():
         frame = frame[:start] + new + frame[start + len(new) :]
     return frame
@@ -52,7 +53,7 @@ def test_bytes_after_a_datagram_are_not_part_of_it(tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
-        # ARP, TCP, more fragments to come, and the second fragment
+        # ARP, TCP, a first fragment, and a second one.
         {12: b"\x08\x06"}, {23: b"\x06"}, {20: b"\x20\x00"}, {20: b"\x00\x01"},
     ],
 )  # fmt: skip
@@ -62,6 +63,7 @@ def test_other_packets_and_fragments_are_skipped(tmp_path, changes):
     assert [datagram.payload for datagram in read_pcap(path)] == [b"kept"]
 
 
+# Cut in the header of IP, of UDP, and in the payload.
 @pytest.mark.parametrize("kept_bytes", [20, 41, 45])
 def test_a_frame_that_was_cut_is_named_by_its_number(tmp_path, kept_bytes):
     frame = encode_udp_frame(1024, b"whole")
@@ -96,7 +98,7 @@ def test_datagrams_of_other_ports_are_not_a_cards(tmp_path, port):
 
 
 @pytest.mark.parametrize("cards", [(CARD, OTHER), (OTHER, CARD)])
-def test_of_two_cards_one_is_chosen(tmp_path, cards):
+def test_a_capture_of_two_cards_is_read_only_for_the_chosen_one(tmp_path, cards):
     path = write_frames(tmp_path / "a.pcap", *(encode_udp_frame(1024, VERSION, card) for card in cards))
     with expect_refusal(ErrorCode.VALUES_CONFLICT, "192.168.33.180", "192.168.33.181"):
         inspect_pcap(path)
@@ -118,7 +120,7 @@ def test_a_shorter_last_packet_is_the_tail_of_a_record(tmp_path, last_bytes, tai
     assert report.card is not None
     assert (report.card.tail_bytes, report.card.tail_after_s) == (tail[0], pytest.approx(tail[1]))
     assert report.bytes == 10 * 1456 + last_bytes
-    # A header without payload is no data, and what is missing is said.
+    # Two packets are missing, which is reported; a header without payload does not count as data.
     gap = [*packets[:4], *packets[6:], packets[0][:10]]
     report = inspect_pcap(write_frames(tmp_path / "b.pcap", *(encode_udp_frame(1024, packet) for packet in gap)))
     assert f"{2 * 1456} bytes are missing" in report.remarks

@@ -6,16 +6,16 @@ from tests.support.capture.records import FULL, Card, encode_packet, is_original
 from polysight.capture.dca1000 import Counters, decode_packet_header
 from polysight.capture.placement import EarlierRecords, PacketCounts
 
-# Bytes of a frame, frames of a row
+# Bytes of a frame, and frames of a row. A packet has 1456 bytes.
 GRIDS = [(4096, 62), (4096, 91), (64, 910), (512, 30), (1456, 7)]
-# Counters of the first record
+# Byte count and sequence number of the first record; the last sequence number begins again at 0 within the row.
 STARTS = [(145_600_000, 100_001), (50_000_000, 5), (2**47, 2**32 - 7)]
-OWN_NAMES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "disagreeing", "malformed")
+ANOMALIES = ("duplicates", "conflicting", "leftover", "restarted", "outside", "disagreeing", "malformed")
 
 
 def list_other_anomalies(counts: PacketCounts, *names: str) -> dict[str, int]:
-    """Anomalies that were counted and are not among these."""
-    return {name: n for name in OWN_NAMES if name not in names and (n := getattr(counts, name))}
+    """Return the anomalies that were counted, without these."""
+    return {name: n for name in ANOMALIES if name not in names and (n := getattr(counts, name))}
 
 
 @given(
@@ -28,9 +28,10 @@ def list_other_anomalies(counts: PacketCounts, *names: str) -> dict[str, int]:
 def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start, rows, cut, batch):
     frame, frames = grid
     size = frame * frames
-    many = -(-size // FULL)
-    assume(many > 2)
-    restart_packet = 1 + int(cut * (many - 2))
+    packets = -(-size // FULL)
+    assume(packets > 2)
+    # Neither the first nor the last packet.
+    restart_packet = 1 + int(cut * (packets - 2))
     card = Card(size, *start)
     past = EarlierRecords(Counters(*start))
     for _ in range(rows):
@@ -40,7 +41,7 @@ def test_packets_after_a_reset_within_a_row_are_counted_as_restarted(grid, start
     record = card.record(resets=(restart_packet,))
     placed, out = place(size, record.packets, past, frame, batch)
     assert is_original_or_masked(record, placed, out)
-    assert (placed.counts.placed, placed.counts.restarted) == (restart_packet, many - restart_packet), placed.reason
+    assert (placed.counts.placed, placed.counts.restarted) == (restart_packet, packets - restart_packet), placed.reason
     assert not list_other_anomalies(placed.counts, "restarted")
     assert not placed.located
 
@@ -60,17 +61,21 @@ def test_frames_of_a_row_with_conflicts_are_not_moved():
     size = 62 * 4096
     frame = 4096
     start = Counters(70_000, 9)
-    first, _ = place(size, Card(size - frame, 70_000, 9).record().packets, start, frame)
-    assert first.slipped
-    assert not first.holes
-    fresh = Card(size - frame, 70_000, 9).record().packets
-    twice, _ = place(size, [*fresh, fresh[9][:10] + fresh[8][10:]], start, frame)
-    assert not twice.slipped
-    assert twice.holes == [(9 * FULL, 10 * FULL)]
+
+    # The card has recorded a frame fewer than the row has: `slipped` says that frames may be moved.
+    short_row, _ = place(size, Card(size - frame, 70_000, 9).record().packets, start, frame)
+    assert short_row.slipped
+    assert not short_row.holes
+
+    # Packet 9 comes once more, with the bytes of packet 8.
+    packets = Card(size - frame, 70_000, 9).record().packets
+    row_with_conflict, _ = place(size, [*packets, packets[9][:10] + packets[8][10:]], start, frame)
+    assert not row_with_conflict.slipped
+    assert row_with_conflict.holes == [(9 * FULL, 10 * FULL)]
 
 
 def spoil_packet(packets: list[bytes], kind: str, k: int) -> list[bytes]:
-    """A perfect row's packets with one anomaly at packet k."""
+    """Return the packets of a row with one anomaly after packet k."""
     head = packets[k][:10]
     payload = packets[k][10:]
     extra = {
@@ -84,6 +89,7 @@ def spoil_packet(packets: list[bytes], kind: str, k: int) -> list[bytes]:
 
 
 def end_state(packet: bytes) -> tuple[int, int]:
+    """Return the sequence number and byte count that follow a packet."""
     sequence, count = decode_packet_header(packet)
     return sequence + 1, count + len(packet) - 10
 
@@ -94,7 +100,7 @@ def end_state(packet: bytes) -> tuple[int, int]:
     where=st.floats(0, 1),
     batch=st.sampled_from([1, 7, 64]),
 )
-def test_one_anomaly_is_counted_once_and_by_its_name(grid, kind, where, batch):
+def test_an_anomaly_is_counted_once_and_under_its_name(grid, kind, where, batch):
     frame, frames = grid
     size = frame * frames
     start = Counters(145_600_123, 100_001)

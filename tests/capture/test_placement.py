@@ -24,8 +24,9 @@ from polysight.capture.dca1000 import Counters, PacketLog
 from polysight.capture.placement import EarlierRecords, Evidence, Losses, place_record
 from polysight.capture.row_files import read_packets, write_packets
 
-# A busy machine is not a fault
+# A busy machine is not a fault.
 SLOW = [HealthCheck.too_slow]
+# Byte counts have 48 bits and sequence numbers 32, and begin again at 0 after them. Those drawn are often just before.
 COUNT = 1 << 48
 SEQUENCE = 1 << 32
 near_wrap = st.one_of(st.just(0), st.integers(0, COUNT - 1), st.integers(COUNT - 40_000, COUNT - 1))
@@ -42,13 +43,22 @@ near_sequence_wrap = st.one_of(st.integers(0, SEQUENCE - 1), st.integers(SEQUENC
     rng=st.randoms(use_true_random=True),
     rate=st.sampled_from([0.0, 0.02, 0.05, 0.3]),
 )
-def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, rng: random.Random, rate):
+def test_of_disordered_packets_exactly_the_lost_are_masked(
+    frame, frames, count, sequence, batch, rng: random.Random, rate
+):
     """Start known. Unmasked bytes are original; where the record's place is certain, the mask is exactly the loss."""
     record = Record.make(frame * frames, count, sequence)
-    sent = [(k, p) for k, p in enumerate(record.packets) if rng.random() >= rate]
+    sent = [(k, packet) for k, packet in enumerate(record.packets) if rng.random() >= rate]
     sent += [numbered for numbered in sent if rng.random() < rate]
-    order = sorted(sent, key=lambda numbered: numbered[0] + (rng.randint(-3, 3) if rng.random() < rate else 0))
-    placed, out = place(len(record.data), [p for _, p in order], Counters(count, sequence), frame, batch)
+
+    def draw_place(numbered: tuple[int, bytes]) -> int:
+        """Draw when a packet comes: at its place, or up to three places before or after it."""
+        if rng.random() < rate:
+            return numbered[0] + rng.randint(-3, 3)
+        return numbered[0]
+
+    order = sorted(sent, key=draw_place)
+    placed, out = place(len(record.data), [packet for _, packet in order], Counters(count, sequence), frame, batch)
     assert is_original_or_masked(record, placed, out)
     received = {k for k, _ in sent}
     lost_bytes = make_mask(out.size, [record.byte_range(k) for k in range(len(record.packets)) if k not in received])
@@ -58,6 +68,7 @@ def test_loss_duplicates_and_reordering(frame, frames, count, sequence, batch, r
     assert placed.counts.outside == placed.counts.disagreeing == placed.counts.malformed == 0
     mask = make_mask(out.size, placed.missing)
     assert (mask | ~lost_bytes).all()
+    # With its last packet the length of the record is known.
     if len(record.packets) - 1 in received:
         assert placed.located
     if placed.located:
@@ -77,19 +88,22 @@ class Oracle:
     size: int
     placed: int = 0
     duplicates: int = 0
+    # Packets that came after one from further back in the record.
     late: int = 0
+    # End of the packet that is furthest back in the record.
     extent: int = 0
 
     def __post_init__(self) -> None:
-        self.there = np.zeros(self.size, dtype=bool)
+        self.received = np.zeros(self.size, dtype=bool)
 
     def take(self, start: int, stop: int) -> None:
-        if self.there[start:stop].all():
+        """Count a packet with these bytes of the record."""
+        if self.received[start:stop].all():
             self.duplicates += 1
             return
         self.placed += 1
         self.late += start < self.extent
-        self.there[start:stop] = True
+        self.received[start:stop] = True
         self.extent = max(self.extent, stop)
 
 
@@ -108,23 +122,30 @@ class Oracle:
     cut=st.floats(0, 0.05),
     strange=st.floats(0, 0.05),
 )
-def test_every_disorder_together(
+def test_unmasked_bytes_are_right_with_every_disorder_together(
     frame, packets, count, sequence, batch, rng: random.Random, loss, double, shuffle, lateness, cut, strange
 ):
     """Loss, duplicates, reordering, late and truncated packets, leftovers and nonsense, each up to 5 %."""
     size = max(1, packets * FULL // frame) * frame
     record = Record.make(size, count, sequence)
-    sent: list[tuple[float, int, bytes]] = []  # time, position, packet
+
+    # Time of arrival, number, and bytes of each packet.
+    sent: list[tuple[float, int, bytes]] = []
     for k, packet in enumerate(record.packets):
         if rng.random() < loss:
             continue
-        for copy in range(1 + (rng.random() < double)):
-            short = rng.random() < cut and len(packet) > 20
-            moved = rng.uniform(0, lateness) if rng.random() < shuffle else 0
-            sent.append((k + moved + copy / 2, k, packet[: rng.randint(11, len(packet))] if short else packet))
+        copies = 2 if rng.random() < double else 1
+        for copy in range(copies):
+            is_cut = rng.random() < cut and len(packet) > 20
+            delay = rng.uniform(0, lateness) if rng.random() < shuffle else 0
+            sent_packet = packet[: rng.randint(11, len(packet))] if is_cut else packet
+            sent.append((k + delay + copy / 2, k, sent_packet))
     sent.sort(key=lambda s: s[0])
     arriving = [(k, packet) for _, k, packet in sent]
-    leftovers = malformed = 0
+
+    # Packets of the record before (number -1), and malformed ones (number -2), anywhere but at the begin.
+    leftovers = 0
+    malformed = 0
     for position in range(len(arriving), 1, -1):
         if rng.random() < strange:
             distance = rng.randint(1, 5)
@@ -153,16 +174,19 @@ def test_every_disorder_together(
         == len(arriving)
     )
     assert counts.malformed == malformed
-    if arriving and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL) and not counts.disagreeing:
+    # The expectation holds if the first packet is the record's first or a full one: a shorter one may be the last of
+    # the record before.
+    first_is_of_the_record = bool(arriving) and (arriving[0][0] == 0 or len(arriving[0][1]) == 10 + FULL)
+    if first_is_of_the_record and not counts.disagreeing:
         assert (counts.placed, counts.duplicates, counts.late) == (oracle.placed, oracle.duplicates, oracle.late)
         assert (counts.leftover, counts.outside) == (leftovers, 0)
-        assert placed.received == oracle.there.sum()
+        assert placed.received == oracle.received.sum()
         losses = placed.losses
         assert losses.head_bytes + losses.gap_bytes + losses.tail_bytes == size - placed.received
         assert losses.tail_bytes == size - oracle.extent
         if placed.located:
-            assert (make_mask(size, placed.missing) == ~oracle.there).all()
-            assert not out[~oracle.there].any()
+            assert (make_mask(size, placed.missing) == ~oracle.received).all()
+            assert not out[~oracle.received].any()
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
@@ -175,8 +199,10 @@ def test_every_disorder_together(
     skip=st.integers(0, 3),
     rng=st.randoms(use_true_random=True),
 )
-def test_counters_continue_and_are_not_proportional(frames, frame, records, count, sequence, skip, rng: random.Random):
-    """Each record ends with a short packet: sequence and byte count drift apart, but every record is found."""
+def test_records_are_found_although_sequence_and_byte_count_drift_apart(
+    frames, frame, records, count, sequence, skip, rng: random.Random
+):
+    """Each record ends with a short packet, so that the byte count is not a multiple of the sequence number."""
     start = EarlierRecords(Counters(count, sequence))
     for n in range(records):
         record = Record.make(frames * frame, count, sequence, seed=n)
@@ -191,7 +217,7 @@ def test_counters_continue_and_are_not_proportional(frames, frame, records, coun
         start = placed.past
 
 
-def test_losses_are_counted_by_kind():
+def test_losses_are_counted_by_their_place_at_the_head_between_and_at_the_tail():
     record = Record.make(30 * FULL, 0, 1)
     received = [p for k, p in enumerate(record.packets) if k not in (0, 1, 7, 12, 13, 29)]
     placed, _ = place(30 * FULL, [received[1], received[0], *received[2:]], Counters(0, 1), 65536)
@@ -207,16 +233,17 @@ def test_logging_allocates_nothing_that_stays():
     block = np.frombuffer(b"".join(record.packets), dtype=np.uint8).reshape(batch, 10 + FULL).copy()
     lengths = np.full(batch, 10 + FULL, dtype=np.uint32)
     log = PacketLog(size * 1000)
-    kept_arrays = []
+    blocks_of_memory = []
     for n in range(1000):
         k = np.arange(n * batch, (n + 1) * batch)
         block[:, 0:4] = (k + 1).astype("<u4")[:, None].view(np.uint8)
         block[:, 4:10] = (k * FULL).astype("<u8")[:, None].view(np.uint8)[:, :6]
         log.add(block, lengths, n)
         if n in (9, 999):
-            kept_arrays.append(sys.getallocatedblocks())
+            blocks_of_memory.append(sys.getallocatedblocks())
     assert log.count == 256_000
-    assert kept_arrays[1] - kept_arrays[0] < 200
+    # Less than one object for each of the 990 batches; the limit is chosen.
+    assert blocks_of_memory[1] - blocks_of_memory[0] < 200
 
 
 @settings(max_examples=100, deadline=None, suppress_health_check=SLOW)
@@ -226,7 +253,7 @@ def test_logging_allocates_nothing_that_stays():
     count=near_wrap,
     sequence=near_sequence_wrap,
 )
-def test_lost_head_is_found_from_a_known_start(head, tail, count, sequence):
+def test_a_lost_beginning_is_masked_if_the_start_of_the_record_is_known(head, tail, count, sequence):
     record = Record.make(20 * FULL + tail, count, sequence)
     placed, out = place(len(record.data), record.packets[head:], Counters(count, sequence), 4096)
     assert placed.located
@@ -240,8 +267,8 @@ def test_lost_head_is_found_from_a_known_start(head, tail, count, sequence):
     which=st.integers(0, 20),
     count=near_wrap,
 )
-def test_truncated_packet(cut, which, count):
-    """A truncated packet: its lost bytes are masked, or the whole row if the end is no longer certain."""
+def test_the_lost_bytes_of_a_truncated_packet_are_masked(cut, which, count):
+    """Or the whole row, if its end is no longer certain."""
     record = Record.make(20 * FULL + 700, count, 77)
     packets = list(record.packets)
     packets[which] = packets[which][: max(0, len(packets[which]) - cut)]
@@ -264,9 +291,9 @@ def test_missed_frames_are_never_placed_as_if_nothing_was_missing(missed, count,
 
 @settings(max_examples=60, deadline=None, suppress_health_check=SLOW)
 @given(flip=st.integers(0, 79), which=st.integers(1, 20), count=near_wrap)
-# A position beyond the end of the row
+# A position beyond the end of the row.
 @example(flip=46, which=10, count=0)
-def test_corrupted_header_damages_nothing(flip, which, count):
+def test_a_packet_with_a_wrong_header_is_masked_and_damages_no_other_byte(flip, which, count):
     """One flipped bit anywhere in one packet's counters: only its bytes are masked."""
     record = Record.make(21 * FULL + 100, count, 500)
     packets = list(record.packets)
@@ -279,7 +306,7 @@ def test_corrupted_header_damages_nothing(flip, which, count):
     assert is_original_or_masked(record, placed, out)
 
 
-def test_more_than_expected_is_not_a_row():
+def test_a_record_longer_than_a_row_is_not_placed():
     record = Record.make(6 * 4096, 0, 1)
     placed, _ = place(5 * 4096, record.packets, Counters(0, 1), 4096)
     assert not placed.located
@@ -287,7 +314,7 @@ def test_more_than_expected_is_not_a_row():
     assert placed.counts.outside > 0
 
 
-def test_nothing_and_nonsense():
+def test_without_a_valid_packet_the_whole_row_is_missing():
     placed, out = place(5000, [], Counters(0, 1))
     assert placed.missing == [(0, 5000)]
     assert find_next_start(placed) is None
@@ -325,13 +352,14 @@ def test_truncated_first_packet_is_not_the_last_of_the_record_before():
 
 
 FRAME = 4096
+# Bytes of rows whose last packet is full, and shorter: 91 x 4096 = 256 x 1456, and 62 x 4096 = 174 x 1456 + 608.
 FULL_ENDS = 91 * FRAME
 SHORT_END = 62 * FRAME
 
 
 @pytest.mark.parametrize("lost", [1, 3])
 @pytest.mark.parametrize("dropped", [0, 16, 1440])
-def test_without_its_end_no_record_is_certain(lost, dropped):
+def test_a_record_without_its_end_is_not_placed(lost, dropped):
     """Bytes that the card drops internally show only in the record's length."""
     row = Record.make(SHORT_END, 70_000, 9)
     sent = encode_packets(row.data[:5000] + row.data[5000 + dropped :], 9, 70_000)
@@ -359,6 +387,7 @@ def test_a_lost_start_is_known_again_after_a_reset(size):
 def test_every_second_take_of_a_card_that_restarts_its_counters_in_each_record_is_kept(size):
     card = Card(size)
     past = EarlierRecords.after_reset()
+    """After such a record the start of the next one is not known, and the host resets the card."""
     accepted = []
     for _ in range(6):
         card.reset()
@@ -389,13 +418,15 @@ def test_a_late_packet_of_the_first_record_is_not_a_restart(size):
     late = Record.make(size, 0, 1, seed=1).packets[7]
     start = Counters(5 * size, 5 * -(-size // FULL) + 1)
     placed, out = place(size, [*record.packets[:9], late, *record.packets[9:]], start, FRAME)
-    assert (placed.complete, placed.counts.restarted, placed.past.lost) == (True, 1, False)
+    assert placed.complete
+    assert placed.counts.restarted == 1
+    assert not placed.past.lost
     assert out.tobytes() == record.data
     assert not place(size, [*record.packets[:9], late, *record.packets[9:-1]], start, FRAME)[0].located
 
 
-def test_overlapping_payload_is_compared():
-    """A second network path brings one packet with other bytes: both are masked, and counted under their own name."""
+def test_a_packet_that_comes_twice_with_different_bytes_is_masked():
+    """A second network path may bring it with other bytes. One that comes twice with the same bytes is a duplicate."""
     record = Record.make(20 * FULL + 100, 5000, 7)
     conflicting_packet = bytearray(record.packets[7])
     conflicting_packet[500] ^= 1
@@ -410,25 +441,34 @@ def test_a_second_card_with_equal_counters_fills_no_gap():
     """Two cards with one address that were reset together: if a packet is lost, only the other card's comes."""
     record = Record.make(40 * FULL + 100, 70_000, 9)
     twin = Record.make(40 * FULL + 100, 70_000, 9, seed=1)
-    pairs = enumerate(zip(record.packets, twin.packets, strict=True))
-    packets = [
-        p for k, (packet, twin_packet) in pairs for p in ([twin_packet] if k % 20 == 7 else [packet, twin_packet])
-    ]
+    packets = []
+    for k, (packet, twin_packet) in enumerate(zip(record.packets, twin.packets, strict=True)):
+        is_lost = k % 20 == 7
+        if not is_lost:
+            packets.append(packet)
+        packets.append(twin_packet)
     placed, out = place(len(record.data), packets, Counters(70_000, 9), FRAME)
     assert is_original_or_masked(record, placed, out)
-    assert (placed.located, placed.slipped, placed.past.lost) == (False, False, True)
+    assert not placed.located
+    assert not placed.slipped
+    assert placed.past.lost
     assert "second card" in placed.reason
 
 
 @pytest.mark.parametrize("trouble", ["conflict", "short", "conflict and short"])
-def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
+def test_placing_does_not_change_the_logged_payload(trouble, tmp_path):
     """The row's packet file is written from it afterwards, and gives the same result again."""
     record = Record.make(20 * FULL + 100, 0, 1)
-    late_packet = encode_packet(8, 7 * FULL, bytes(255 - b for b in record.packets[7][10:]))
-    end = FULL if "short" in trouble else 0
-    size = len(record.data) + end
-    elsewhere = encode_packet(99, 5 * size, bytes([9] * 99))
-    packets = [*record.packets, *([late_packet] if "conflict" in trouble else []), elsewhere]
+    packets = list(record.packets)
+    if "conflict" in trouble:
+        # Packet 7 once more, with other bytes.
+        packets.append(encode_packet(8, 7 * FULL, bytes(255 - b for b in record.packets[7][10:])))
+    # The record may be a packet shorter than the row.
+    size = len(record.data)
+    if "short" in trouble:
+        size += FULL
+    # A packet far outside of the row.
+    packets.append(encode_packet(99, 5 * size, bytes([9] * 99)))
     log = make_log(size, packets)
     past = EarlierRecords.after_reset()
     payload_before = log.payload[: log.payload_bytes].copy()
@@ -442,6 +482,7 @@ def test_placing_leaves_the_logged_payload_as_it_came(trouble, tmp_path):
 
 def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
     """Such packets are left over from an earlier record; with counters of this row they are frames without a pulse."""
+    # Two packets come at time 1, before the first pulse at 50; the others after it.
     record = Record.make(SHORT_END, 70_000, 9)
     for early, located in ((Record.make(2 * FULL, 70_000 - 2 * FULL, 7), True), (record, False)):
         log = make_log(SHORT_END, early.packets[:2], t_ns=1)
@@ -453,7 +494,7 @@ def test_packets_before_the_first_pulse_are_left_over_or_spurious_frames():
         assert is_original_or_masked(record, placed, out)
 
 
-def test_a_whole_record_elsewhere_is_not_the_rows():
+def test_a_complete_record_with_the_counters_of_another_card_is_not_the_row():
     """A second card with the same address sends one whole row, and the packets of the right card are lost."""
     twin = Card(SHORT_END, 5_000_000, 40_000)
     placed, _ = place(SHORT_END, twin.record().packets, EarlierRecords(Counters(70_000, 9)), FRAME)

@@ -40,7 +40,7 @@ def draw_noise(size: int, seed: int) -> bytes:
 
 
 def send(card: socket.socket, board: Board, packets: list[bytes]) -> None:
-    """The packets fit in the receive buffer even if the receiver does not run meanwhile."""
+    """Send packets that fit in the receive buffer even if the receiver does not run meanwhile."""
     assert len(packets) <= usable_packets(1 << 20)
     for packet in packets:
         card.sendto(packet, (board.host_address, board.data_port))
@@ -53,6 +53,7 @@ def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
     third = draw_noise(size, 3)
     count = 0
     sequence = 1
+    # Packets of a row.
     n = -(-size // FULL)
     with ReceiverProcess(board, 4 << 20) as receiver:
         assert receiver.granted_bytes >= 1 << 20
@@ -61,7 +62,7 @@ def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
             assert receiver.begin_row(k, 1, size, 4096, path, after_reset=k == 0) == 0
             packets = encode_packets(data, sequence + k * n, count + k * size)
             if k == 1:
-                # Head lost, reordered, duplicate
+                # The first two packets are lost, two are exchanged, and one of them comes twice.
                 packets = [*packets[2:50], packets[51], packets[50], packets[51], *packets[52:]]
                 send(card, board, [*packets, b"tiny"])
                 wait_for(lambda: receiver.report().received == size - 2 * FULL, "packets")
@@ -88,7 +89,7 @@ def test_rows_are_bit_exact_and_counters_continue(board, card, tmp_path):
 
 
 @pytest.mark.parametrize("source_port", [1024, 4098, 0])
-def test_data_counts_from_any_source_port(board, tmp_path, source_port):
+def test_packets_of_the_card_are_data_from_any_source_port(board, tmp_path, source_port):
     data = draw_noise(20_000, 4)
     with (
         ReceiverProcess(board, 1 << 20) as receiver,
@@ -102,7 +103,7 @@ def test_data_counts_from_any_source_port(board, tmp_path, source_port):
     assert (tmp_path / "a.part").read_bytes() == data
 
 
-def test_strangers_and_stale_packets_are_not_data(board, card, tmp_path):
+def test_packets_of_other_machines_and_from_before_the_row_are_not_data(board, card, tmp_path):
     data = draw_noise(20_000, 4)
     stranger_address = (board.host_address, 0)
     with ReceiverProcess(board, 1 << 20) as receiver, closing(bind_udp(*stranger_address, "stranger")) as stranger:
@@ -144,8 +145,7 @@ def test_a_row_is_reported_as_complete_without_a_request(board, card, tmp_path, 
 
 @pytest.mark.parametrize("clock_set_s", [0, 3600])
 def test_a_row_ends_with_all_that_came_before(board, card, tmp_path, monkeypatch, clock_set_s):
-    """For any number of batches in the kernel, any senders of the first ones, and also if the wall clock was set
-    meanwhile.
+    """The first 270 packets are of another machine; the receiver reads one batch at a time; the clock may be set.
 
     The packets fit into the buffer that a kernel grants without rights (208 KiB requested, twice that granted).
     """
@@ -192,7 +192,7 @@ def test_a_new_row_discards_the_one_before_and_may_be_empty(board, tmp_path):
     assert (row.counts.placed, row.missing, row.first_arrival_ns) == (0, [(0, 4096)], 0)
 
 
-def test_errors_come_back_to_the_host(board, tmp_path):
+def test_errors_of_the_receiver_process_are_raised_in_the_host(board, tmp_path):
     with ReceiverProcess(board, 1 << 20) as receiver:
         with expect_refusal(ErrorCode.BUSY, f"{board.host_address}:{board.data_port}"):
             ReceiverProcess(board, 1 << 20)
@@ -208,7 +208,7 @@ def test_errors_come_back_to_the_host(board, tmp_path):
             receiver.report()
 
 
-def test_survives_ctrl_c_and_ends_with_its_host(board):
+def test_a_receiver_ignores_ctrl_c_and_ends_with_its_host(board):
     receiver = ReceiverProcess(board, 1 << 20)
     os.kill(receiver._process.pid, signal.SIGINT)
     assert receiver.report().received == 0
@@ -218,7 +218,8 @@ def test_survives_ctrl_c_and_ends_with_its_host(board):
         os.kill(pid, 0)
 
 
-def test_ends_when_its_host_is_killed(board, tmp_path):
+def test_a_receiver_ends_when_its_host_is_killed(board, tmp_path):
+    # A host with a receiver; it prints the receiver's process id.
     code = (
         "import time\nfrom polysight_shared.config import Board\n"
         "from polysight.capture.receiver import ReceiverProcess\n"
@@ -236,7 +237,7 @@ def test_ends_when_its_host_is_killed(board, tmp_path):
         pass
 
 
-def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
+def test_packets_dropped_by_the_kernel_count_only_for_their_board(board, card, tmp_path):
     """Two receivers, one of which is stopped while packets come: only its row counts drops."""
     other_board = Board(
         name="RV",
@@ -247,24 +248,24 @@ def test_drops_are_those_of_the_board_they_hit(board, card, tmp_path):
         data_port=4203,
         mount=(),
     )
-    with ReceiverProcess(board, 1 << 16) as swamped, ReceiverProcess(other_board, 1 << 16) as quiet:
-        for receiver in (swamped, quiet):
+    with ReceiverProcess(board, 1 << 16) as stopped_receiver, ReceiverProcess(other_board, 1 << 16) as other_receiver:
+        for receiver in (stopped_receiver, other_receiver):
             receiver.begin_row(0, 1, 2000 * FULL, FULL, tmp_path / f"{receiver.board.name}.part", after_reset=True)
-        os.kill(swamped.pid, signal.SIGSTOP)
+        os.kill(stopped_receiver.pid, signal.SIGSTOP)
         packets = encode_packets(draw_noise(2000 * FULL, 3), 1, 0)
         for packet in packets:
             card.sendto(packet, (board.host_address, board.data_port))
         for packet in packets[:20]:
             card.sendto(packet, (other_board.host_address, other_board.data_port))
-        os.kill(swamped.pid, signal.SIGCONT)
-        wait_for(lambda: quiet.report().received == 20 * FULL, "packets")
-        hit = swamped.end_row()
-        spared = quiet.end_row()
-        assert hit.kernel_drops == 2000 - hit.counts.placed > 0
-        assert spared.kernel_drops == 0
-        assert hit.losses.tail_bytes == 2000 * FULL - hit.bytes
-        swamped.begin_row(1, 1, 4096, 4096, tmp_path / "next.part")
-        assert swamped.end_row().kernel_drops == 0
+        os.kill(stopped_receiver.pid, signal.SIGCONT)
+        wait_for(lambda: other_receiver.report().received == 20 * FULL, "packets")
+        row_with_drops = stopped_receiver.end_row()
+        assert row_with_drops.kernel_drops == 2000 - row_with_drops.counts.placed > 0
+        assert row_with_drops.losses.tail_bytes == 2000 * FULL - row_with_drops.bytes
+        assert other_receiver.end_row().kernel_drops == 0
+        # The next row begins to count at zero.
+        stopped_receiver.begin_row(1, 1, 4096, 4096, tmp_path / "next.part")
+        assert stopped_receiver.end_row().kernel_drops == 0
 
 
 def test_data_dropped_by_the_card_masks_the_row(board, card, tmp_path):
@@ -296,6 +297,8 @@ def test_the_short_last_packet_is_reported_immediately(board, card, tmp_path):
 @pytest.mark.parametrize(
     ("progress", "status", "now_s", "ended"),
     [
+        # The row ended at 1 s. Its record has ended when it is complete; after a silence of 0.2 s (`GRACE_NS`) if the
+        # card has reported the end, by its status or a short last packet; or after 3 s of silence.
         (Progress(0, 1, 9, True, 1), Status(0), 1.0, True),
         (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.1, False),
         (Progress(0, 1, 9, False, 1), Status.RECORD_COMPLETED, 1.3, True),
@@ -307,12 +310,12 @@ def test_the_short_last_packet_is_reported_immediately(board, card, tmp_path):
         (Progress(0, 1, 0, False, 0), Status(0), 4.1, True),
     ],
 )
-def test_a_record_ends_with_whichever_is_first(progress, status, now_s, ended):
+def test_a_record_ends_with_the_first_of_its_signs_or_its_time_limit(progress, status, now_s, ended):
     assert has_record_ended(progress, status, 10**9, int(now_s * 1e9), 3 * 10**9) == ended
 
 
 class SuspendedClocks:
-    """Two clocks of a process that the kernel suspends before some readings; see `time`."""
+    """Two clocks in place of the module `time`; the kernel suspends the process before some of their readings."""
 
     def __init__(self, difference_ns: int, pauses_ns: list[int]) -> None:
         self._now_ns = 0
@@ -328,7 +331,7 @@ class SuspendedClocks:
 
 
 @pytest.mark.parametrize("suspended_reading", range(3))
-def test_a_pause_between_two_clocks_is_not_their_difference(monkeypatch, suspended_reading):
+def test_a_pause_between_readings_of_two_clocks_does_not_change_their_difference(monkeypatch, suspended_reading):
     pauses_ns = [0, 0, 0]
     pauses_ns[suspended_reading] = 800_000
     monkeypatch.setattr(network, "time", SuspendedClocks(5_000_000_000, pauses_ns))
@@ -336,6 +339,8 @@ def test_a_pause_between_two_clocks_is_not_their_difference(monkeypatch, suspend
 
 
 def test_of_readings_that_were_all_interrupted_the_closest_counts(monkeypatch):
+    # Five attempts of three readings each, with pauses in the middle one: the second attempt has the shortest, 30 us.
+    # The other clock was read somewhere within it, so that half of it is the error.
     pauses_ns = [0, 800_000, 0, 0, 30_000, 0, 0, 500_000, 0, 0, 600_000, 0, 0, 700_000, 0]
     monkeypatch.setattr(network, "time", SuspendedClocks(5_000_000_000, pauses_ns))
     assert network.measure_clock_difference() == 5_000_000_000 + 30_000 // 2
@@ -356,12 +361,13 @@ def test_a_packet_has_the_time_of_its_arrival_and_not_that_of_the_read(board, ca
         assert receiver.packets[0, :13].tobytes() == b"0123456789abc"
         assert receiver.lengths[:2].tolist() == [13, 10]
         first, second = receiver.times_ns[:2].tolist()
-        # The wall clock may run at a slightly different rate.
+        # The kernel stamps with the wall clock, which may run at a slightly different rate: 1 ms is allowed (chosen).
         assert before_ns - 1_000_000 < first < second <= time.monotonic_ns()
         assert receiver.receive() == 0
 
 
 def test_a_receiver_is_drained_when_a_batch_is_not_full(board, card):
+    """Packets sent before each read of at most two, packets that it returns, and whether none can wait any more."""
     with closing(bind_udp(board.host_address, board.data_port, "x")) as sock:
         receiver = BatchReceiver(sock, board.card_address, batch=2)
         for sent, received, is_drained in ((1, 1, True), (2, 2, False), (0, 0, True), (3, 2, False), (0, 1, True)):
@@ -370,7 +376,7 @@ def test_a_receiver_is_drained_when_a_batch_is_not_full(board, card):
             assert (receiver.receive(), receiver.is_drained) == (received, is_drained)
 
 
-def test_drops_of_the_kernel_are_those_of_the_socket(board, card):
+def test_the_kernel_counts_the_packets_that_a_full_socket_drops(board, card):
     with closing(bind_udp(board.host_address, board.data_port, "x")) as sock:
         enlarge_receive_buffer(sock, 1 << 14)
         receiver = BatchReceiver(sock, board.card_address)
@@ -396,7 +402,7 @@ def test_packets_that_came_before_the_wall_clock_was_set_have_the_time_of_the_re
             assert (receiver.times_ns[0] >= read_ns) == is_time_of_read
 
 
-def test_address_of_another_machine():
+def test_a_socket_with_the_address_of_another_machine_is_refused():
     with expect_refusal(ErrorCode.VALUE_INVALID):
         bind_udp("192.0.2.1", 4098, "RH data")
 

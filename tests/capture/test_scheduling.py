@@ -16,7 +16,8 @@ FULL = 1456
 RIGHTS = REPO / "host/rights.sh"
 
 
-def test_cores_leave_the_first_to_the_host():
+def test_receivers_get_cores_of_their_own_and_leave_the_first_to_the_host():
+    """With too few cores they share one, marked by False; on a single core they are not pinned."""
     assert receiver_cores(2, [0]) == [None, None]
     assert receiver_cores(2, []) == [None, None]
     assert receiver_cores(2, [0, 1]) == [(1, False), (1, False)]
@@ -39,11 +40,17 @@ def test_core_and_priority_are_reported(board):
 def test_a_shared_core_is_taken_with_priority_only(monkeypatch, exclusive, has_priority):
     cores_taken: list[set[int]] = []
     monkeypatch.setattr(os, "sched_setaffinity", lambda _pid, cores: cores_taken.append(cores))
-    assert take_core(1, exclusive, has_priority) == ((1, "") if exclusive or has_priority else (None, ""))
-    assert cores_taken == ([{1}] if exclusive or has_priority else [])
+    core, warning = take_core(1, exclusive, has_priority)
+    assert warning == ""
+    if exclusive or has_priority:
+        assert core == 1
+        assert cores_taken == [{1}]
+    else:
+        assert core is None
+        assert cores_taken == []
 
 
-def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
+def test_the_rights_are_written_to_the_files_that_logins_and_desktops_read(tmp_path):
     process = subprocess.run(
         ["sh", RIGHTS, "ada"], env={**os.environ, "ROOT": str(tmp_path)}, capture_output=True, text=True, check=False
     )
@@ -59,7 +66,7 @@ def test_the_rights_are_written_where_a_login_and_a_desktop_read_them(tmp_path):
         assert process.returncode == 2
 
 
-def test_missing_permissions_are_warnings(monkeypatch):
+def test_without_permission_core_and_priority_are_warnings(monkeypatch):
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
@@ -77,6 +84,7 @@ def test_missing_permissions_are_warnings(monkeypatch):
 def test_buffer_below_two_bursts_is_refused_with_the_command(tmp_path):
     limit = tmp_path / "rmem_max"
     limit.write_text("212992\n")
+    # 16 frames of 4096 bytes, 64 KiB. Arguments: what the system granted, what the rig file asks for.
     burst = 16 * 4096
     assert check_receive_buffer("RH", 8 << 20, 8 << 20, burst, limit) == ""
     warning = check_receive_buffer("RH", 212_992, 8 << 20, burst, limit)
@@ -96,20 +104,20 @@ def test_a_buffer_of_exactly_two_bursts_is_enough(tmp_path):
     assert usable_packets(2304) == 2
     assert usable_packets(2303) == 1
     assert usable_packets(1152) == 1
-    # 100 packets
+    # Room for 100 packets; a burst has 50.
     granted = 100 * 2304 // 2
     assert check_receive_buffer("RH", granted, granted, 50 * 1456, tmp_path / "absent") == ""
     assert check_receive_buffer("RH", granted + 1, granted, 50 * 1456, tmp_path / "absent") == ""
     with expect_refusal(ErrorCode.VALUE_INVALID, f"{granted} bytes, less than two bursts of {50 * 1456 + 1}"):
         check_receive_buffer("RH", granted, granted, 50 * 1456 + 1, tmp_path / "absent")
     assert "granted" in check_receive_buffer("RH", granted, granted + 1, 50 * 1456, tmp_path / "absent")
-    # Two bursts and two packets, rounded down to whole bytes of the request
+    # The advised size has room for two bursts and two packets more; the request is half of what Linux then grants.
     with expect_refusal(ErrorCode.VALUE_INVALID, f"rmem_max={(100 + 2) * 2304 // 2}`"):
         check_receive_buffer("RH", 1000, 1000, 50 * 1456, tmp_path / "absent")
 
 
 @pytest.mark.parametrize(("granted", "needed"), [(8192, 8192), (16384, 8192), (8192, 8193), (8192, 1 << 23)])
-def test_what_limits_the_buffer_is_the_kernel_or_the_rig_file_that_asks_for_no_more(tmp_path, granted, needed):
+def test_a_buffer_too_small_is_blamed_on_the_kernel_or_on_the_rig_file(tmp_path, granted, needed):
     burst = 16 * 4096
     limit = tmp_path / "rmem_max"
     limit.write_text("8192\n")

@@ -11,14 +11,14 @@ from polysight.capture.row_files import Segment, read_index
 from polysight_shared.errors import DataError, DeviceError, ErrorCode
 
 
-def test_memory_is_taken_again_and_clean():
+def test_the_memory_of_an_earlier_row_is_used_again_and_cleared():
     first = PacketLog(9000)
     first.payload[:] = 7
     for expected in (8000, 9000):
         second = PacketLog(expected, first.payload)
         assert np.shares_memory(second.payload, first.payload)
         assert not second.payload[:expected].any()
-    # Not enough for a longer row
+    # It is not enough for a longer row.
     assert not np.shares_memory(PacketLog(9001, first.payload).payload, first.payload)
 
 
@@ -41,7 +41,7 @@ def test_payload_stays_in_its_memory_until_that_is_full():
 
 
 def log_packets(*sizes: int, expected: int = 9000) -> PacketLog:
-    """A log of packets of these sizes, the payload of each filled with its number."""
+    """Return a log of packets with so many bytes of payload, that of each filled with its number."""
     log = PacketLog(expected)
     for number, size in enumerate(sizes):
         packet = np.full((1, 10 + size), number % 256, np.uint8)
@@ -81,17 +81,17 @@ def test_more_packets_than_a_row_has_are_still_counted():
 def test_payload_of_far_more_than_a_row_is_counted_and_not_kept():
     """At most four rows, each with a spare of 1 MiB, are kept."""
     log = PacketLog(0)
-    most = PacketLog.max_kept_bytes(0)
-    assert most == 4 << 20
+    largest_bytes = PacketLog.max_kept_bytes(0)
+    assert largest_bytes == 4 << 20
     packets = np.zeros((1024, 10 + 1024), np.uint8)
     lengths = np.full(1024, 10 + 1024)
     for _ in range(4):
         log.add(packets, lengths, 0)
     assert log.kept == log.count == 4096
-    assert log.payload.size <= most
+    assert log.payload.size <= largest_bytes
     log.add(packets[:1], lengths[:1], 0)
-    assert (log.kept, log.count, log.payload_bytes) == (4096, 4097, most + 1024)
-    # None after a gap is kept.
+    assert (log.kept, log.count, log.payload_bytes) == (4096, 4097, largest_bytes + 1024)
+    # A packet after one that was not kept is not kept either, however small.
     log.add(packets[:1, :11], np.array([11]), 0)
     assert (log.kept, log.count) == (4096, 4098)
 
@@ -117,7 +117,7 @@ def test_a_segment_holds_the_bytes_given(tmp_path):
     assert (tmp_path / "b").read_bytes() == data.tobytes()
 
 
-def test_no_room_on_the_disk(tmp_path):
+def test_a_row_for_which_the_disk_has_no_space_is_refused(tmp_path):
     with expect_refusal(ErrorCode.DISK_FULL):
         Segment(tmp_path / "huge.part", 1 << 60)
 
@@ -129,7 +129,7 @@ def test_damaged_index_is_refused(tmp_path):
             read_index(tmp_path / "a.idx")
 
 
-def test_messages_name_the_scan_folder(tmp_path):
+def test_the_commands_advised_for_a_damaged_or_unwritten_row_have_the_scan_folder(tmp_path):
     index = tmp_path / "scan/raw/RH/0003.idx"
     index.parent.mkdir(parents=True)
     index.write_bytes(b"[]\n")

@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 @pytest.fixture
 def sample(request: pytest.FixtureRequest) -> Callable[[Sequence[T], int], list[T]]:
-    """`sample(cases, n)`: the first, the last and some n others, the same in every run; with --long up to 2000."""
+    """Function that draws `n` cases with the first and the last, the same in every run; with --long up to 2000."""
 
     def draw_sample(cases: Sequence[T], n: int) -> list[T]:
         n = 2000 if request.config.getoption("--long") else n
@@ -32,7 +32,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> Samples:
 
 
 class Undisturbed(SmallScan):
-    """A finished scan; :meth:`copy` gives another one to damage."""
+    """A finished scan; :meth:`copy` returns another one that a test may damage."""
 
     def __init__(self, samples: Samples, folder: Path) -> None:
         super().__init__(samples, folder)

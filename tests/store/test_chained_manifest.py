@@ -13,11 +13,12 @@ from polysight.store.manifest import ManifestWriter, encode_line, parse
 from polysight.store.scan_folder import MANIFEST, ScanFolder
 from polysight.store.validation import to_text, validate
 
-SOME = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
+# Lines of a manifest.
+FACTS = [{"fact": "scan_started"}, *({"fact": "row_committed", "row": k} for k in range(5)), {"fact": "scan_ended"}]
 
 
-def make_chain_lines(path: Path, facts=SOME) -> list[bytes]:
-    """The lines that a writer makes of facts."""
+def make_chain_lines(path: Path, facts=FACTS) -> list[bytes]:
+    """Write facts to a manifest; return its lines."""
     with ManifestWriter(path / MANIFEST, create=True) as writer:
         for fact in facts:
             writer.append(fact)
@@ -29,15 +30,17 @@ def lines(tmp_path_factory) -> list[bytes]:
     return make_chain_lines(tmp_path_factory.mktemp("chain"))
 
 
-@given(st.integers(0, len(SOME) - 2), st.integers(1, 3))
-def test_lines_taken_out_are_missed_and_the_others_stand(lines, at, many):
-    remaining = [*lines[:at], *lines[min(at + many, len(SOME) - 1) :]]
+@given(st.integers(0, len(FACTS) - 2), st.integers(1, 3))
+def test_missing_lines_are_reported_and_the_others_are_valid(lines, first, count):
+    # The last line stays, since only a later line can show that one is missing.
+    remaining = [*lines[:first], *lines[min(first + count, len(FACTS) - 1) :]]
     content = parse(b"".join(remaining))
     assert len(content.facts) == len(remaining)
-    assert [(f.facts["line"], f.facts["lost"]) for f in content.faults] == [(at + 1, len(lines) - len(remaining))]
+    assert [(f.facts["line"], f.facts["lost"]) for f in content.faults] == [(first + 1, len(lines) - len(remaining))]
 
 
-def test_a_line_that_was_replaced_is_missed(lines):
+def test_a_line_that_was_replaced_is_reported_at_the_next_line(lines):
+    """The other line is valid in itself; the next one has the digest of the line that was there."""
     changed_fact = json.loads(lines[3])
     changed_fact["row"] = 77
     del changed_fact["crc"]
@@ -46,7 +49,7 @@ def test_a_line_that_was_replaced_is_missed(lines):
     assert "line before" in content.faults[0].what
 
 
-def test_repeated_lines_are_noticed(lines):
+def test_repeated_lines_are_reported(lines):
     assert [f.facts["line"] for f in parse(b"".join([*lines[:4], *lines[2:]])).faults] == [5]
 
 
@@ -62,16 +65,17 @@ def test_a_damaged_line_is_one_fault_and_the_chain_continues_after_it(tmp_path, 
     assert [f.facts["line"] for f in content.faults] == [4]
 
 
-def test_a_manifest_without_chain_reads_as_before_and_continues_with_one(tmp_path):
+def test_a_manifest_of_an_older_release_without_a_chain_is_read_and_continued_with_one(tmp_path):
     path = tmp_path / MANIFEST
-    path.write_bytes(b"".join(map(encode_line, SOME)))
-    assert (load_facts(path), manifest.read(path).faults) == (SOME, [])
+    path.write_bytes(b"".join(map(encode_line, FACTS)))
+    assert load_facts(path) == FACTS
+    assert manifest.read(path).faults == []
     with ManifestWriter(path, create=False) as writer:
         writer.append({"fact": "scan_resumed"})
         writer.append({"fact": "scan_ended"})
     lines = path.read_bytes().splitlines(keepends=True)
     assert manifest.read(path).faults == []
-    assert json.loads(lines[-1])["count"] == len(SOME) + 1
+    assert json.loads(lines[-1])["count"] == len(FACTS) + 1
     assert parse(b"".join([*lines[:2], *lines[3:]])).faults != []
 
 
@@ -95,22 +99,23 @@ def test_a_missing_line_of_a_row_is_an_error_that_names_line_and_row(scan):
     error_text = "\n".join(list_errors(scan))
     assert "manifest.jsonl line 4" in error_text
     assert "row 2 " in error_text
-    error_text = ScanFolder.load(scan)
-    assert list(error_text.rows()) == [0, 1, 3]
-    assert {f.facts["line"] for f in error_text.manifest_faults} == {4}
+    folder = ScanFolder.load(scan)
+    assert list(folder.rows()) == [0, 1, 3]
+    assert {f.facts["line"] for f in folder.manifest_faults} == {4}
 
 
-def test_a_missing_line_of_the_last_row_is_detected_by_the_end(scan):
+def test_a_missing_line_of_the_last_row_is_detected_by_the_count_in_the_last_line(scan):
     lines = (scan / MANIFEST).read_bytes().splitlines()
     facts = [json.loads(line) for line in lines]
-    plain = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
-    (scan / MANIFEST).write_bytes(b"".join(encode_line(f) for f in plain if f.get("row") != 3))
+    # Without the chain, as an older release wrote it.
+    unchained_facts = [{k: v for k, v in f.items() if k not in ("crc", "count", "previous")} for f in facts]
+    (scan / MANIFEST).write_bytes(b"".join(encode_line(f) for f in unchained_facts if f.get("row") != 3))
     error_text = "\n".join(list_errors(scan))
     assert "scan_ended counts 4 rows" in error_text
     assert "row 3 " in error_text
 
 
-def test_a_row_taken_again_makes_the_gap_a_note(scan):
+def test_a_missing_line_whose_row_was_retaken_is_only_a_note(scan):
     lost_row = load_facts(scan, "row_committed")[2]
     remove_line(scan, 4)
     with ScanFolder.load(scan).writer() as writer:

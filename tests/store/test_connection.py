@@ -32,6 +32,7 @@ def begun() -> Instrument:
 
 
 def list_leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """Yield each value of a table with the keys that lead to it."""
     if isinstance(node, dict):
         items = node.items()
     elif isinstance(node, list):
@@ -47,16 +48,22 @@ def list_leaves(node: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[t
 def make_other_value(value: Any) -> Any:
     if isinstance(value, bool):
         return not value
-    return value + (1 if isinstance(value, int | float) else "1")
+    if isinstance(value, int | float):
+        return value + 1
+    return value + "1"
 
 
 def may_change(path: tuple[str | int, ...]) -> bool:
+    """True for settings of the connection, which a resumed scan takes from the given rig file."""
     board = path[0] == "boards" and path[2] in CHANGEABLE_BOARD_KEYS
     return board or path[0] in ("pi", "limits") or path[:2] == ("radar", "servers")
 
 
 def is_without_effect(path: tuple[str | int, ...]) -> bool:
-    """The scan continues with its own settings that the host does not use (the stage's port), or with a copy."""
+    """True for settings that may differ and are not taken over.
+
+    The host does not use the port of the stage, and the scan has a copy of its calibration.
+    """
     return path[0] == "calibration" or path in (("stage", "port"), ("stage", "baud"))
 
 
@@ -73,7 +80,8 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
         try:
             given_rig = decode(table, Instrument, "given")
         except ConfigError:
-            continue  # a value that no rig file has
+            # A value that no rig file may have.
+            continue
         assert given_rig != begun
         if may_change(path):
             check_same_scan(begun, given_rig, "mine.toml")
@@ -88,11 +96,13 @@ def test_every_key_is_taken_up_or_refused_by_name(begun):
                 check_same_scan(begun, given_rig, "mine.toml")
             assert f"{name} is {value!r} in the scan and {make_other_value(value)!r} there" in e.value.what
             refused += 1
+    # Both kinds were there: a rig file has about a hundred values.
     assert accepted > 20
     assert refused > 40
 
 
 def move_rig(rig: Instrument) -> Instrument:
+    """Return the rig with other addresses and another limit."""
     table = to_builtins(rig)
     table["pi"] |= {"command_address": "tcp://10.1.2.3:4", "event_address": "tcp://10.1.2.3:5"}
     table["boards"][1] |= {"card_address": "10.1.2.9"}
@@ -100,25 +110,26 @@ def move_rig(rig: Instrument) -> Instrument:
     return decode(table, Instrument, "moved")
 
 
-def test_new_connection_settings_hold_from_then_on(undisturbed_scan, tmp_path):
-    """They hold for readers and for later resumes without options; the first settings are still in the manifest."""
+def test_new_connection_settings_are_used_from_then_on(undisturbed_scan, tmp_path):
+    """By readers, and by later resumes without options. The first settings are still in the manifest."""
     small = undisturbed_scan.copy(tmp_path / "moved")
     scan = ScanFolder.load(small.path)
     begun = scan.instrument
-    now = move_rig(scan.instrument)
+    moved_rig = move_rig(scan.instrument)
     with small._connect_pi():
-        assert resume_scan(small.path, rig_now=now).folder.instrument == now
-        assert resume_scan(small.path).folder.instrument == now
+        assert resume_scan(small.path, rig_now=moved_rig).folder.instrument == moved_rig
+        assert resume_scan(small.path).folder.instrument == moved_rig
     scan = ScanFolder.load(small.path)
-    assert scan.instrument == now
+    assert scan.instrument == moved_rig
     started = load_facts(scan, "scan_started")[0]
     first, second = load_facts(scan, "scan_resumed")
     assert decode(started["instrument"], Instrument, "begun") == begun
-    assert (first["rig"], "rig" in second) == (extract_connection(now), False)
-    story = begin_history(started)
+    assert first["rig"] == extract_connection(moved_rig)
+    assert "rig" not in second
+    history = begin_history(started)
     for fact in (first, second):
-        add_fact(story, fact)
-    assert story.instrument == now
+        add_fact(history, fact)
+    assert history.instrument == moved_rig
     assert small.rows() == undisturbed_scan.digests
     assert small.image() == undisturbed_scan.final_image
 

@@ -21,6 +21,7 @@ from polysight_shared.messages import RowStarted
 
 # With --long each byte and bit is tried.
 pytestmark = pytest.mark.timeout(3600)
+# A page of the disk that was never written.
 PAGE = bytes(4096)
 # Bytes of a full packet's payload.
 PACKET = 1456
@@ -93,12 +94,14 @@ def test_bit_of_the_manifest(undisturbed_scan, tmp_path, sample, record):
 
 
 def turn(path: Path, bit: int) -> None:
+    """Flip one bit of a file."""
     raw = bytearray(path.read_bytes())
     raw[bit // 8] ^= 1 << bit % 8
     path.write_bytes(raw)
 
 
 def list_event_ends(raw: bytes) -> list[int]:
+    """Return the places of the log where an event ends, with 0."""
     unpacker = msgpack.Unpacker()
     unpacker.feed(raw)
     return [0, *(unpacker.tell() for _ in unpacker)]
@@ -106,7 +109,7 @@ def list_event_ends(raw: bytes) -> list[int]:
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
-def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
+def test_an_event_log_that_was_cut_is_completed_from_the_journal(undisturbed_scan, tmp_path, sample, record, tail):
     """Events that the host has lost come from the Pi's journal; no row is retaken."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     start = list_event_ends(raw)[-1 - record]
@@ -123,8 +126,8 @@ def test_event_log(undisturbed_scan, tmp_path, sample, record, tail):
         assert (scan.path / "events.msgpack").read_bytes()[: len(raw)] == raw
 
 
-def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
-    """Faults that validate cannot see in the format, it sees by the digest; unreadable events come from the journal."""
+def test_a_flipped_bit_of_the_event_log_is_reported(undisturbed_scan, tmp_path, sample):
+    """By the digest if the log can still be read; else the events come from the journal again."""
     raw = (undisturbed_scan.path / "events.msgpack").read_bytes()
     committed = load_facts(undisturbed_scan.path, "row_committed")[-1]["events"]["bytes"]
     for bit in sample(range(8 * committed), 16):
@@ -143,8 +146,9 @@ def test_bit_of_the_event_log(undisturbed_scan, tmp_path, sample):
 
 @pytest.mark.parametrize("tail", [b"", PAGE], ids=["cut", "cut and zeros behind"])
 @pytest.mark.parametrize("record", [1, 9], ids=["last", "a row's"])
-def test_journal_of_the_pi(undisturbed_scan, tmp_path, sample, record, tail):
-    """The journal is shorter than the host's event log: the sequence continues after the host's last event."""
+def test_after_a_cut_of_the_journal_the_sequence_continues_after_the_host_s_last_event(
+    undisturbed_scan, tmp_path, sample, record, tail
+):
     path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
@@ -157,7 +161,7 @@ def test_journal_of_the_pi(undisturbed_scan, tmp_path, sample, record, tail):
         check_resumed_journal(scan, undisturbed_scan, lost=record)
 
 
-def test_bit_of_the_journal(undisturbed_scan, tmp_path, sample):
+def test_after_a_flipped_bit_of_the_journal_the_events_before_it_are_kept(undisturbed_scan, tmp_path, sample):
     path = find_journal(undisturbed_scan)
     with path.open("rb") as file:
         starts = [offset for offset, _, _ in records(file)]
@@ -170,14 +174,14 @@ def test_bit_of_the_journal(undisturbed_scan, tmp_path, sample):
 @pytest.mark.parametrize(
     "remaining_content", [b"", b"PSJR", PAGE, None], ids=["empty", "torn magic", "zeros", "removed"]
 )
-def test_journal_that_is_lost_as_a_whole(undisturbed_scan, tmp_path, remaining_content):
+def test_a_scan_resumes_after_its_whole_journal_was_lost(undisturbed_scan, tmp_path, remaining_content):
     scan = undisturbed_scan.copy(tmp_path / "s")
     if remaining_content is None:
         find_journal(scan).unlink()
     else:
         find_journal(scan).write_bytes(remaining_content)
     manifest_path = scan.path / "manifest.jsonl"
-    # Row 2 is not recorded yet
+    # The scan was interrupted before row 2 was committed.
     manifest_path.write_bytes(b"".join(read_lines(manifest_path)[:-2]))
     events = len(read_events(scan.path / "events.msgpack").events)
     check_resumed_journal(scan, undisturbed_scan, lost=events, rows={2})
@@ -197,8 +201,8 @@ def check_resumed_journal(scan: SmallScan, undisturbed_scan, lost: int, rows: se
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
-    """Damaged rows are never imaged: validate names the file, reading it is refused, resume retakes that row."""
+def test_a_committed_row_that_was_cut_is_refused_and_retaken(undisturbed_scan, tmp_path, sample, suffix):
+    """`validate` names its file, so that damaged rows are never imaged."""
     name = f"raw/RV/0001{suffix}"
     raw = (undisturbed_scan.path / name).read_bytes()
     for cut in sample([*range(0, len(raw) - PACKET, 97), *range(max(0, len(raw) - PACKET), len(raw))], 6):
@@ -208,7 +212,7 @@ def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
         if suffix == ".bin":
             with expect_refusal(ErrorCode.FILE_DAMAGED):
                 _ = ScanFolder.load(scan.path).read_row("RV", 1).payload
-        # Row 1 is recorded last now
+        # Row 1 was retaken, and no other row.
         assert resume(scan, undisturbed_scan, image=not cut) == {1}
         withdrawn = load_facts(scan.path, "row_withdrawn")
         assert [(f["row"], f["take"]) for f in withdrawn] == [(1, 1)]
@@ -216,7 +220,7 @@ def test_committed_row_cut_short(undisturbed_scan, tmp_path, sample, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
-def test_bit_of_a_committed_row(undisturbed_scan, tmp_path, sample, suffix):
+def test_a_committed_row_with_a_flipped_bit_is_retaken(undisturbed_scan, tmp_path, sample, suffix):
     name = f"raw/RH/0002{suffix}"
     for bit in sample(range(8 * (undisturbed_scan.path / name).stat().st_size), 4):
         scan = undisturbed_scan.copy(tmp_path / "s")
@@ -226,7 +230,9 @@ def test_bit_of_a_committed_row(undisturbed_scan, tmp_path, sample, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".part", ".bin", ".idx"])
-def test_row_that_is_not_committed_may_be_anything(undisturbed_scan, tmp_path, sample, suffix):
+def test_files_of_a_row_that_is_not_committed_are_replaced_whatever_they_have(
+    undisturbed_scan, tmp_path, sample, suffix
+):
     whole_lines = read_lines(undisturbed_scan.path / "manifest.jsonl")
     raw = (undisturbed_scan.path / f"raw/RV/0002{suffix.replace('part', 'bin')}").read_bytes()
     for cut in sample(range(len(raw)), 4):

@@ -15,16 +15,18 @@ from tests.support.store.small_scan import Samples, SmallScan
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
 
-# Number of random remains for each place
+# After a power cut a random part of the unsynced data is on the disk: so many draws for each operation (chosen).
 POWER_CUTS = 12
 pytestmark = [
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # a killed program closes no file
-    pytest.mark.timeout(3600),  # with --long
+    # A killed program closes no file.
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+    # Needed with --long.
+    pytest.mark.timeout(3600),
 ]
 
 
 def list_retaken_rows(path: Path) -> set[int]:
-    """Rows that were retaken since the last resume, by the manifest."""
+    """Return the rows that were retaken since the last resume, by the manifest."""
     facts = load_facts(path)
     since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
     return {f["row"] for f in facts[since:] if f["fact"] == "row_committed" and f["take"] > 1}
@@ -63,7 +65,7 @@ def list_disk_operations(samples: Samples, folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("fault", ["killed", "killed within", "power cut"])
-def test_scan_is_killed_at_every_operation(samples, undisturbed_scan, tmp_path, fault, sample):
+def test_a_scan_that_was_killed_at_any_operation_resumes(samples, undisturbed_scan, tmp_path, fault, sample):
     operations = list_disk_operations(samples, tmp_path / "count")
     assert len(operations) > 100
     draws = POWER_CUTS if fault == "power cut" else 1
@@ -76,7 +78,7 @@ def test_scan_is_killed_at_every_operation(samples, undisturbed_scan, tmp_path, 
         shutil.rmtree(folder)
 
 
-def test_nothing_unsynced_is_relied_on(samples, undisturbed_scan, tmp_path):
+def test_a_scan_that_lost_all_unsynced_data_resumes(samples, undisturbed_scan, tmp_path):
     """Power is cut at and after every sync of a folder and operation on the manifest; all unsynced data is lost."""
     folder = tmp_path / "count"
     operations = list_disk_operations(samples, folder)
@@ -97,9 +99,12 @@ def test_nothing_unsynced_is_relied_on(samples, undisturbed_scan, tmp_path):
 
 
 @pytest.mark.parametrize("fault", ["killed within", "power cut"])
-def test_resume_is_killed_at_every_operation_too(samples, undisturbed_scan, tmp_path, fault, sample):
+def test_a_resumed_scan_that_is_killed_at_any_operation_resumes_again(
+    samples, undisturbed_scan, tmp_path, fault, sample
+):
     operations = list_disk_operations(samples, tmp_path / "count")
-    first = next(i for i, description in enumerate(operations, 1) if description == "write 0001.idx")  # within row 1
+    # The first kill is within row 1.
+    first = next(i for i, description in enumerate(operations, 1) if description == "write 0001.idx")
     killed = 0
     for position in sample(range(1, len(operations)), 12):
         folder = tmp_path / str(position)
@@ -109,4 +114,5 @@ def test_resume_is_killed_at_every_operation_too(samples, undisturbed_scan, tmp_
         killed += run_until_fault(scan, FaultyDisk(folder, fault, position, seed=position))
         assert_that_it_resumes(scan, undisturbed_scan, f"{fault} at {position} of the resume")
         shutil.rmtree(folder)
+    # The resumed scan has fewer operations than a whole one, so that some positions are beyond its end.
     assert killed > 4

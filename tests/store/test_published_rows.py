@@ -18,6 +18,7 @@ from polysight_shared.geometry import direct_path_m, incidence_deg, rx_positions
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import AuthorsLayout
 
+# A small grid; with 3 frames of 4096 bytes at each position no burst ends with a packet of 1456 bytes.
 COLUMNS = 9
 ROWS = 4
 PULSES = 3
@@ -33,6 +34,7 @@ PACKET = 1456
 
 
 def make_plan(by_columns):
+    """Return the plan of the grid, or of the same grid scanned column by column."""
     grid = RIG.grid
     if by_columns:
         grid = Grid(columns=ROWS, rows=COLUMNS, step_x_mm=2.0, step_y_mm=2.0)
@@ -40,7 +42,11 @@ def make_plan(by_columns):
 
 
 def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False):
-    """Write random rows; return the folder and the sent data, {(board, row): bytes of the whole row}."""
+    """Write random rows in the published layout.
+
+    `skipped`: positions whose pulse was missed, by board and row; `lost`: byte ranges that were lost. Returns the
+    folder and the sent data, {(board, row): bytes of the whole row}.
+    """
     layout = AuthorsLayout(
         path=folder,
         rig=RIG,
@@ -64,6 +70,7 @@ def record(folder, skipped=None, lost=None, zero_filling=True, by_columns=False)
 
 
 def list_byte_ranges(*numbers):
+    """Return the bytes of packets of a row, by their numbers."""
     return [(k * PACKET, (k + 1) * PACKET) for k in numbers]
 
 
@@ -78,7 +85,9 @@ def check(data, sent):
 @pytest.mark.parametrize("by_columns", [False, True])
 @pytest.mark.parametrize("zero_filling", [True, False])
 @pytest.mark.parametrize("seed", range(6))
-def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path, seed, zero_filling, by_columns):
+def test_of_missed_positions_and_lost_packets_exactly_the_missing_bytes_are_masked(
+    tmp_path, seed, zero_filling, by_columns
+):
     rng = np.random.default_rng(seed)
     plan = make_plan(by_columns)
     skipped = {}
@@ -99,7 +108,8 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
             missing_positions = skipped[board, row.index]
             missing = len(missing_positions) * BURST + sum(b - a for a, b in losses[board, row.index])
             assert mask.reshape(plan.columns, -1)[sorted(missing_positions)].all()
-            # The transmitter's board was never missing: it gives all places
+            # The transmitter's board missed no position, so that it shows the places of all. A row with fewer than
+            # three positions may be masked as a whole.
             assert mask.sum() in (missing, mask.size)
             assert mask.sum() == missing or len(missing_positions) > plan.columns - 3
     answer = scan.recording_facts()["recording"].boards
@@ -115,6 +125,7 @@ def test_whatever_is_lost_nothing_is_invented_and_all_that_came_is_kept(tmp_path
 @pytest.mark.parametrize("first_sequence", [0, 1, 5000])
 @pytest.mark.parametrize("lost", [{3}, {0}, {4, 5}, {75}], ids=str)
 def test_lost_packets_are_masked_whatever_the_first_number(tmp_path, zero_filling, first_sequence, lost):
+    # Packets 0 to 75; the last one, 75, is not full.
     assert -(-COLUMNS * BURST // PACKET) == 76
     folder, sent = record(tmp_path, lost={("RV", 2): list_byte_ranges(*lost)}, zero_filling=zero_filling)
     log = folder / "RV" / "0_2_log.csv"
@@ -177,7 +188,7 @@ def test_rows_beyond_the_settings_are_left_out_with_a_notice(tmp_path, rows):
     assert all(f"{ROWS - rows} files of rows beyond the {rows}" in notice for notice in notices)
 
 
-def test_published_data_without_rows_is_not_to_be_resumed(tmp_path):
+def test_for_published_data_without_rows_the_remedy_is_not_to_resume(tmp_path):
     folder, _ = record(tmp_path)
     for file in (folder / "RV").iterdir():
         file.unlink()
@@ -205,12 +216,13 @@ def test_an_end_that_all_boards_miss_masks_the_row(tmp_path):
 
 @pytest.mark.parametrize("first_sequence", [0, 1, 5000])
 @pytest.mark.parametrize("zero_filling", [True, False])
-def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling, first_sequence):
+def test_a_missed_pulse_within_a_position_masks_only_that_position(tmp_path, zero_filling, first_sequence):
     folder, sent = record(tmp_path, zero_filling=zero_filling)
     short = 4
     file = folder / "RH" / "0_0.bin"
     log = folder / "RH" / "0_0_log.csv"
-    cut = slice(short * BURST + FRAME, short * BURST + 2 * FRAME)  # one of its frames was never made
+    # The second of three frames of position 4 was never made.
+    cut = slice(short * BURST + FRAME, short * BURST + 2 * FRAME)
     raw = np.delete(np.fromfile(file, np.uint8), cut)
     file.write_bytes(raw.tobytes())
     times = np.loadtxt(log, delimiter=",")
@@ -221,8 +233,9 @@ def test_a_missed_pulse_masks_its_position_alone(tmp_path, zero_filling, first_s
         end = min(start + PACKET, raw.size) - 1
         true_end = end if end < cut.start else end + FRAME
         pulse_time = times[true_end // PACKET, 2] if true_end // PACKET < len(times) else times[-1, 2]
-        # The card keeps the remaining bytes, which do not fill a packet
-        pulse_time += late_s if end + 1 == raw.size else 0.0
+        # The card keeps the last bytes, which do not fill a packet, for a while.
+        if end + 1 == raw.size:
+            pulse_time += late_s
         lines.append(f"{k + first_sequence},{end + 1 - start},{pulse_time:.6f}")
     log.write_text("\n".join(lines))
     scan = open_source(folder, BASE)
@@ -254,11 +267,12 @@ def test_columns_are_rows_of_the_mirrored_rig(tmp_path):
     scan = open_source(folder, BASE)
     assert (scan.plan.columns, scan.plan.rows) == (ROWS, COLUMNS)
     assert scan.recording_facts()["recording"].direction == "col"
-    back = mirror_rig(scan.instrument)
-    assert (back.grid.columns, back.grid.rows) == (COLUMNS, ROWS)
+    original_rig = mirror_rig(scan.instrument)
+    assert (original_rig.grid.columns, original_rig.grid.rows) == (COLUMNS, ROWS)
 
 
-def test_a_mirror_changes_no_path_and_twice_is_nothing():
+def test_a_mirrored_rig_has_x_and_y_exchanged_and_the_same_paths():
+    """Mirrored twice it is the same rig again."""
     mirrored = mirror_rig(BASE)
     assert mirror_rig(mirrored) == BASE
     assert incidence_deg(mirrored, mirrored.receivers[0]) == pytest.approx(incidence_deg(BASE, BASE.receivers[0]))

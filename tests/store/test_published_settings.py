@@ -56,7 +56,7 @@ def _make_settings(**changes):
 
 @pytest.fixture
 def write(tmp_path):
-    """Writes the settings of a scan without rows; returns its folder."""
+    """Function that writes the settings of a scan without rows; it returns the folder."""
 
     def make(**changes):
         folder = tmp_path / "unsynced" / "scan1"
@@ -68,7 +68,7 @@ def write(tmp_path):
 
 
 @pytest.mark.parametrize("columns", [400, 450])
-def test_a_grid_wider_than_the_base_rigs_travel_had_room_there(write, base, columns):
+def test_for_a_grid_wider_than_the_stage_of_the_given_rig_the_travel_is_longer(write, base, columns):
     folder = write(total_x=columns)
     rig = open_source(folder, base).instrument
     assert rig.grid.columns == columns
@@ -152,7 +152,8 @@ def test_a_board_never_looks_away_from_the_object(write, base):
     assert "away from the object" in scan.recording_facts()["recording"].notices[0]
 
 
-def test_units_of_tis_tools_are_understood_too(write, base):
+def test_settings_in_the_units_of_ti_s_tools_are_understood_too(write, base):
+    """GHz, MHz/us, us and thousands of samples a second, instead of SI units."""
     chirp = {"f0": 76.01, "slope": 38.816929, "ramp_time": 128.5, "adc_start_time": 7, "num_adc": SAMPLES, "Fs": 2150}
     folder = write(chirp_configs=[chirp])
     read_chirp = open_source(folder, base).instrument.chirp
@@ -160,7 +161,7 @@ def test_units_of_tis_tools_are_understood_too(write, base):
         assert getattr(read_chirp, key) == pytest.approx(getattr(base.chirp, key))
 
 
-def test_other_orders_and_other_folders_are_refused(write, base, tmp_path):
+def test_an_unknown_order_of_rows_and_a_folder_without_settings_are_refused(write, base, tmp_path):
     with expect_refusal(ErrorCode.FILE_FOREIGN, tmp_path):
         open_source(tmp_path, base)
     folder = write(moving_direction="spiral")
@@ -203,7 +204,7 @@ def test_a_whole_number_with_a_decimal_point_is_reported_as_such(write, base):
         open_source(folder, base)
 
 
-def test_the_packaged_rig_file_is_that_of_published_data_alone(write, tmp_path, monkeypatch):
+def test_the_packaged_rig_file_is_the_default_for_published_data_only(write, tmp_path, monkeypatch):
     folder = write()
     monkeypatch.chdir(tmp_path)
     assert open_source(folder, rig_file(None, folder)).instrument.grid.columns == COLUMNS

@@ -65,6 +65,7 @@ def list_payloads(scan: Path) -> set[Path]:
 
 
 def read_contents(folder: Path) -> dict[str, bytes]:
+    """Return the contents of the files of a folder, by name."""
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.is_file()}
 
 
@@ -79,20 +80,24 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     for board in ("RH", "RV"):
         assert f"to be removed: raw/{board}: rows 0-{ROWS - 1} ({ROWS} files)\n" in process.stdout
     assert not list_payloads(scan)
-    said = json.loads(products.pop("quality.json"))
-    products_before = read_contents(scan / "products")
-    dropped = json.loads(products_before.pop("quality.json"))
+
+    # Of the products only one file has changed, by a mark.
+    quality_before = json.loads(products.pop("quality.json"))
+    products_after = read_contents(scan / "products")
+    dropped = json.loads(products_after.pop("quality.json"))
     assert dropped.pop("raw_dropped")["scan_id"] == ScanFolder.load(scan).scan_id
-    assert (products_before, dropped) == (products, said)
+    assert products_after == products
+    assert dropped == quality_before
     products = read_contents(scan / "products")
-    # Arrivals and gaps stay, where there were any
+    # Indices, with arrivals and gaps, are kept if there were any.
     assert len(list(scan.glob("raw/*/*.idx"))) in (0, ROWS * BOARDS)
     facts = load_facts(scan, "raw_dropped")
     assert [f["row"] for f in facts] == list(range(ROWS))
-    said = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
-    assert said == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
+    dropped_digests = {(name, f["row"]): board["crc32"] for f in facts for name, board in f["boards"].items()}
+    assert dropped_digests == {(name, row): crc for name, rows in digests.items() for row, crc in rows.items()}
     process = run_polysight("validate", scan)
-    assert (process.returncode, process.stdout.count("note: raw: ")) == (0, 1)
+    assert process.returncode == 0
+    assert process.stdout.count("note: raw: ") == 1
     assert f"the raw data of {ROWS} rows was dropped after processing into products" in process.stdout
     with expect_refusal(ErrorCode.NO_DATA, ROWS):
         resume(scan, DEFAULT, keep_incomplete=False, process=True)
@@ -105,7 +110,8 @@ def test_dropped_rows_are_deleted_and_reported_by_every_command(scan, capsys):
     assert quality_again["boards"] == dropped["boards"]
 
 
-def test_products_replaced_after_a_drop_in_between_keep_its_mark(scan):
+def test_products_that_are_replaced_after_a_drop_keep_its_mark(scan):
+    """Also if they were being processed while the raw data was dropped."""
     pipeline = process_rows(ScanFolder.load(scan), scan)
     assert drop_raw(scan, None, yes=True) == 0
     make_products(pipeline, scan / "products", ())
@@ -119,7 +125,8 @@ def test_nothing_is_dropped_unless_whole_products_and_samples_remain(scan, what)
     with ExitStack() as other_items:
         code = ErrorCode.BUSY
         named = "products"
-        if what == "image only":  # as after a kill of `process`
+        if what == "image only":
+            # As after a kill of `process`.
             (scan / "products" / REPORT).unlink()
             code = ErrorCode.FILE_MISSING
             named = REPORT
@@ -154,12 +161,14 @@ def flip(path: Path, row: int) -> None:
     records.flush()
 
 
-def test_a_damaged_sample_of_a_dropped_row_is_named_and_costs_this_row(scan, tmp_path, caplog):
+def test_a_damaged_sample_of_a_dropped_row_is_named_and_only_that_row_is_lost(scan, tmp_path, caplog):
     whole_scan = tmp_path / "whole"
     assert drop_raw(scan, None, yes=True) == 0
     assert main(["image", str(scan), "--out", str(whole_scan)]) == 0
     flip(scan / "samples" / "RH.npy", row=2)
-    assert list_errors(scan) == [e for e in list_errors(scan) if "samples/RH.npy" in e and "row 2" in e] != []
+    errors = list_errors(scan)
+    assert errors
+    assert all("samples/RH.npy" in error and "row 2" in error for error in errors)
     assert main(["image", str(scan), "--out", str(tmp_path / "less")]) == 0
     assert "rows 2 are left out" in caplog.text
     coverage = json.loads((tmp_path / "less" / "quality.json").read_text())["coverage"]
@@ -182,10 +191,11 @@ def test_nothing_is_dropped_unconfirmed_or_unprocessed(scan, tmp_path, monkeypat
     with expect_refusal(ErrorCode.FILE_MISSING):
         drop_raw(scan, tmp_path / "none", yes=True)
     quality = scan / "products" / "quality.json"
-    said = json.loads(quality.read_text())
-    for board in said["boards"].values():
-        board["raw_crc32"] = dict.fromkeys(board["raw_crc32"], "00000000")  # of another scan
-    quality.write_text(json.dumps(said))
+    # Products of other data.
+    content = json.loads(quality.read_text())
+    for board in content["boards"].values():
+        board["raw_crc32"] = dict.fromkeys(board["raw_crc32"], "00000000")
+    quality.write_text(json.dumps(content))
     capsys.readouterr()
     with pytest.raises(DataError):
         drop_raw(scan, None, yes=True)
@@ -233,7 +243,7 @@ class PowerCut(BaseException):
 
 
 @pytest.mark.parametrize("cut_after", range(ROWS * (BOARDS + 1)))
-def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, monkeypatch, cut_after):
+def test_a_drop_that_was_interrupted_leaves_a_valid_folder_and_the_next_one_ends_it(scan, monkeypatch, cut_after):
     """The steps: a line in the manifest and a removal for each board, row after row. The program ends before each."""
     digests = find_processed_digests(scan / "products")
     steps = iter(range(ROWS * (BOARDS + 1)))
@@ -266,7 +276,7 @@ def test_whatever_ends_it_the_folder_is_whole_and_the_next_run_ends_it(scan, mon
     assert [f["row"] for f in load_facts(scan, "raw_dropped")] == list(range(ROWS))
 
 
-def test_what_remains_is_on_the_disk_before_raw_data_is_deleted(scan):
+def test_samples_and_products_are_on_the_disk_before_raw_data_is_deleted(scan):
     """Samples are written without waiting for the disk: a power cut must not destroy both them and the raw data."""
     disk = FaultyDisk(scan)
     with disk():
@@ -291,7 +301,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
     drop(ScanFolder.load(copy), find_processed_digests(copy / "products"), copy / "products")
     raw = (copy / MANIFEST).read_bytes()
     line = raw.splitlines(keepends=True)[-1]
-    # The rows before the last are deleted
+    # Raw data of the rows before the last is deleted.
     for name in ("0000.bin", "0001.bin", "0002.bin"):
         for board in ("RH", "RV"):
             (scan / "raw" / board / name).unlink()
@@ -301,7 +311,7 @@ def test_a_line_torn_anywhere_drops_nothing(scan):
     assert len(list_payloads(scan)) == BOARDS
 
 
-def test_a_row_taken_again_is_there_again(scan):
+def test_a_row_that_was_retaken_after_the_drop_does_not_count_as_dropped(scan):
     drop(ScanFolder.load(scan), find_processed_digests(scan / "products"), scan / "products")
     folder = ScanFolder.load(scan)
     committed = load_facts(folder, "row_committed")[1]

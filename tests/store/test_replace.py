@@ -24,7 +24,10 @@ from polysight_shared.raster import plan_raster
 
 
 def scan_with(folder: Path, lost: int | Collection[int], has_wrong_packet: bool = False) -> tuple[ScanFolder, bytes]:
-    """One row of each board, with packets lost and a leftover; `wrong`: all masked, as by an earlier release."""
+    """Write a scan of one row, with lost packets, a leftover and a duplicate; return it and the sent bytes.
+
+    `has_wrong_packet`: the committed row is masked as a whole, as an earlier release would have done.
+    """
     rig = make_rig_with(grid={"columns": 3, "rows": 1}, limits={"free_disk_bytes": 0})
     scan = ScanFolder.create(folder, rig, plan_raster(rig.grid))
     size = rig.row_bytes
@@ -61,13 +64,14 @@ def commit(writer: ManifestWriter, boards: dict, pulses: int) -> None:
     writer.append({**row, **incomplete})
 
 
-def holds(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None:
-    want = np.frombuffer(data, dtype=np.uint8)
+def check_rows(scan: ScanFolder, data: bytes, missing: list[tuple[int, int]]) -> None:
+    """Check that the rows have these bytes, masked exactly in these ranges."""
+    expected = np.frombuffer(data, dtype=np.uint8)
     for board in scan.instrument.recorded:
         row = scan.read_row(board.name, 0)
         assert row.mask is not None
-        assert (row.mask == make_mask(want.size, missing)).all()
-        assert (row.payload[~row.mask] == want[~row.mask]).all()
+        assert (row.mask == make_mask(expected.size, missing)).all()
+        assert (row.payload[~row.mask] == expected[~row.mask]).all()
 
 
 def test_rows_with_the_same_result_are_not_touched(tmp_path):
@@ -75,7 +79,7 @@ def test_rows_with_the_same_result_are_not_touched(tmp_path):
     contents_before = {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()}
     assert [(r.changed, r.why_unchanged) for r in replace_rows(scan)] == [(False, "")] * 2
     assert {p: p.read_bytes() for p in scan.path.rglob("*") if p.is_file()} == contents_before
-    holds(scan, data, [(9 * 1456, 10 * 1456)])
+    check_rows(scan, data, [(9 * 1456, 10 * 1456)])
 
 
 def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
@@ -87,11 +91,11 @@ def test_a_row_masked_without_reason_is_replaced(tmp_path, capsys):
     assert f"{len(data)} bytes missing before, 1456 now" in capsys.readouterr().out
     scan.reload()
     assert list_errors(scan.path) == []
-    holds(scan, data, [(9 * 1456, 10 * 1456)])
+    check_rows(scan, data, [(9 * 1456, 10 * 1456)])
     board = scan.committed_rows()[0].boards["RH"]
+    # The manifest has the counts of the new index: all packets but the lost one.
     placed = -(-len(data) // 1456) - 1
-    counts = (board.packets, board.leftover, board.duplicates)
-    assert counts == (placed, 1, 1), "the manifest counts as the new index does"
+    assert (board.packets, board.leftover, board.duplicates) == (placed, 1, 1)
     names = {p.name for p in scan.path.rglob("raw/RH/*")}
     assert names == {"0000-1.bin", "0000-1.idx", f"0000-1{PACKETS_SUFFIX}"}
     assert inspect_placement(scan.path / "raw/RH/0000-1.idx", as_json=True) == 0
@@ -109,7 +113,7 @@ def test_of_more_than_eight_missing_ranges_the_first_are_printed(tmp_path, capsy
         assert line.split(maxsplit=1)[1].split(", ") == [*ranges[:8], *["..."] * (count > 8)]
 
 
-# A killed program does not close files
+# A killed program does not close its files.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("fault", ["killed within", "power cut", "worst power cut"])
 def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fault):
@@ -125,8 +129,8 @@ def test_a_kill_or_power_cut_while_rows_are_replaced_loses_nothing(tmp_path, fau
         scan = ScanFolder.load(scan.path)
         assert list_errors(scan.path) == [], counting.done[position - 1]
         replace_rows(scan)
-        holds(scan, data, [(9 * 1456, 10 * 1456)])
-    # Unclosed files must be reported in this test, not in the next one
+        check_rows(scan, data, [(9 * 1456, 10 * 1456)])
+    # Files that were not closed are to be reported in this test, not in the next one.
     gc.collect()
 
 
@@ -168,6 +172,8 @@ def test_batches_that_take_packets_back_are_damage(tmp_path):
     scan, _ = scan_with(tmp_path / "scan", lost=9)
     path = scan.path / f"raw/RH/0000{PACKETS_SUFFIX}"
     line, _, tail = path.read_bytes().partition(b"\n")
+    # The file begins with batches of packets, each a time and the number of packets so far: the first one has so many
+    # that the second one's number is smaller.
     batches = np.frombuffer(tail, dtype="<i8", count=4).copy()
     batches[1] += 1 << 40
     path.write_bytes(line + b"\n" + batches.tobytes() + tail[32:])
@@ -175,7 +181,7 @@ def test_batches_that_take_packets_back_are_damage(tmp_path):
         read_packets(path, np.zeros(10**6, np.uint8))
 
 
-def test_a_row_without_its_packets_is_left(tmp_path):
+def test_a_row_without_its_packet_file_is_not_changed(tmp_path):
     scan, _ = scan_with(tmp_path / "scan", lost=9)
     (scan.path / f"raw/RH/0000{PACKETS_SUFFIX}").unlink()
     (scan.path / f"raw/RV/0000{PACKETS_SUFFIX}").write_bytes(b"no")

@@ -32,7 +32,7 @@ facts = st.dictionaries(st.text(max_size=6).filter(lambda k: k not in ("fact", "
 
 
 @given(st.lists(facts, max_size=4))
-def test_manifest_round_trip(facts):
+def test_a_manifest_has_the_facts_that_were_written(facts):
     raw = b"".join(map(encode_line, facts))
     content = parse(raw)
     assert content.facts == [parse_fact(fact) for fact in facts]
@@ -40,8 +40,8 @@ def test_manifest_round_trip(facts):
 
 
 @given(st.lists(facts, min_size=1, max_size=3), st.data())
-def test_flipped_bit_is_never_a_fact(facts, data):
-    """One flipped bit in a line: only that line is refused."""
+def test_a_line_with_a_flipped_bit_is_never_read_as_another_fact(facts, data):
+    """It is refused, unless the bit does not change its meaning (such as E for e in 1e5)."""
     lines = [encode_line(f) for f in facts]
     line_number = data.draw(st.integers(0, len(lines) - 1))
     bad = bytearray(lines[line_number])
@@ -67,11 +67,9 @@ def test_after_every_truncation_the_lines_before_it_are_valid_and_the_chain_cont
     for n in range(len(raw) + 1):
         whole_lines = max(k for k, e in enumerate(ends) if e <= n)
         content = parse(raw[:n])
-        assert (content.facts, content.torn, content.faults) == (
-            [parse_fact(fact) for fact in facts[:whole_lines]],
-            n not in ends,
-            [],
-        )
+        assert content.facts == [parse_fact(fact) for fact in facts[:whole_lines]]
+        assert content.torn == (n not in ends)
+        assert content.faults == []
         path.write_bytes(raw[:n])
         with ManifestWriter(path, create=False) as writer:
             writer.append({"fact": "scan_resumed"})
@@ -96,7 +94,7 @@ def whole_scan(tmp_path) -> Path:
     return write_scan(tmp_path / "scan", {("RV", 1): [(100, 200), (5000, 6000)]})
 
 
-def test_whole_scan_is_valid_and_reads_back(whole_scan):
+def test_a_scan_without_damage_is_valid_and_read_with_its_missing_bytes(whole_scan):
     assert validate(whole_scan) == []
     scan: RawSource = ScanFolder.load(whole_scan)
     assert list(scan.rows()) == [0, 1, 2, 3]
@@ -110,7 +108,7 @@ def test_whole_scan_is_valid_and_reads_back(whole_scan):
     assert data.frames_expected == scan.instrument.burst.pulses * scan.instrument.grid.columns
 
 
-def test_last_take_wins(whole_scan):
+def test_of_several_takes_of_a_row_the_last_is_read(whole_scan):
     scan = ScanFolder.load(whole_scan)
     fact = load_facts(scan, "row_committed")[2]
     with scan.writer() as writer:
@@ -121,11 +119,13 @@ def test_last_take_wins(whole_scan):
 
 
 def flip(path: Path, at: int = 50) -> None:
+    """Flip one bit of the byte at this place."""
     raw = bytearray(path.read_bytes())
     raw[at] ^= 1
     path.write_bytes(raw)
 
 
+# What is damaged, the place that an error names, and a word of its text.
 DAMAGE = {
     "flipped bit in a row": (lambda p: flip(p / "raw/RH/0002.bin"), "raw/RH/0002.bin", "CRC"),
     "truncated row": (lambda p: (p / "raw/RV/0000.bin").write_bytes(b"x"), "raw/RV/0000.bin", "1 bytes"),
@@ -168,7 +168,7 @@ def test_events_after_the_last_commit_may_be_damaged_by_a_power_cut(undisturbed_
         ({"boards": {}}, "boards"),
     ],
 )
-def test_validate_compares_with_the_plan(whole_scan, change, what):
+def test_validate_reports_rows_that_disagree_with_the_plan(whole_scan, change, what):
     scan = ScanFolder.load(whole_scan)
     fact = load_facts(scan, "row_committed")[0]
     with scan.writer() as writer:
@@ -176,7 +176,8 @@ def test_validate_compares_with_the_plan(whole_scan, change, what):
     assert any(what in f.what for f in validate(whole_scan) if f.level == "error")
 
 
-def test_notes_damage_nothing(whole_scan):
+def test_what_an_interrupted_program_leaves_is_only_a_note(whole_scan):
+    """A torn last line, a row that was being written, and a torn event; the last one: the scan has not ended."""
     raw = (whole_scan / "manifest.jsonl").read_bytes()
     (whole_scan / "manifest.jsonl").write_bytes(raw[:-5])
     (whole_scan / "raw/RH/0009.part").write_bytes(b"half")
@@ -203,10 +204,11 @@ def test_a_scan_that_is_being_recorded_has_not_ended(whole_scan):
         assert "2 of 4 rows" in note.what
         flip(whole_scan / "raw/RH/0001.bin")
         assert [f.level for f in validate(whole_scan)] == ["error", "note"]
-    assert any("resume" in f.do for f in validate(whole_scan)), "the program has ended: rows are missing"
+    # The program has ended, so that the missing rows are a fault now.
+    assert any("resume" in f.do for f in validate(whole_scan))
 
 
-def test_read_row_refuses_damage(whole_scan):
+def test_a_damaged_row_and_one_that_does_not_exist_are_not_read(whole_scan):
     flip(whole_scan / "raw/RH/0002.bin")
     scan = ScanFolder.load(whole_scan)
     with expect_refusal(ErrorCode.FILE_DAMAGED, "0002.bin"):
@@ -235,7 +237,7 @@ def test_pieces_of_any_size_are_the_payload(whole_scan, size):
     assert row.payload.tobytes() == b"".join(piece.tobytes() for piece in split_pieces(row.payload)(size))
 
 
-def test_other_folders_are_refused(whole_scan, tmp_path):
+def test_folders_without_a_valid_first_line_of_a_manifest_are_refused(whole_scan, tmp_path):
     with expect_refusal(ErrorCode.FILE_MISSING):
         validate(tmp_path / "nothing")
     (whole_scan / "manifest.jsonl").write_bytes(b"")
@@ -269,7 +271,7 @@ def test_truncated_events_continue_after_the_last_whole_one(tmp_path_factory, cu
     assert path.read_bytes() == raw
 
 
-def test_what_is_cut_off_the_events_is_kept_once(tmp_path):
+def test_damaged_events_that_are_cut_off_are_kept_in_a_file_of_their_own(tmp_path):
     path = tmp_path / "events.msgpack"
     writer = EventWriter(path)
     writer.append(Fault(scan_id="s", seq=1, t_mono_ns=1, number=1, problem="x"))
@@ -282,7 +284,7 @@ def test_what_is_cut_off_the_events_is_kept_once(tmp_path):
     assert (tmp_path / "events.msgpack.damaged").read_bytes() == b"\x84\xa4\xc1\xc1"
 
 
-def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
+def test_a_scan_can_begin_in_a_folder_whose_first_line_was_never_completed(tmp_path):
     instrument = make_small_instrument()
     for torn in (b"", b'{"fact":"scan_star'):
         (tmp_path / "manifest.jsonl").write_bytes(torn)
@@ -291,6 +293,6 @@ def test_start_that_died_before_its_first_line_is_repeated(tmp_path):
 
 
 @given(st.binary(max_size=3000))
-def test_it_is_that_of_zlib(data):
+def test_the_crc_is_that_of_zlib(data):
     assert crc32(data) == zlib.crc32(data)
     assert crc32(np.frombuffer(data, np.uint8).data) == zlib.crc32(data)

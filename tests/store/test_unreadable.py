@@ -33,26 +33,32 @@ def test_a_disk_without_locks_is_not_a_scan_in_use(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("suffix", [".bin", ".idx"])
 @pytest.mark.parametrize("error_number", [errno.EIO, errno.ESTALE])
-def test_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypatch, suffix, error_number):
+def test_a_row_that_cannot_be_read_now_is_not_withdrawn(undisturbed_scan, monkeypatch, suffix, error_number):
     scan = ScanFolder.load(undisturbed_scan.path)
-    bad = (undisturbed_scan.path / next(iter(scan.committed_rows()[0].boards.values())).file).with_suffix(suffix)
-
-    def raise_for_bad(path: Path) -> None:
-        if path == bad:
-            raise OSError(error_number, os.strerror(error_number))
-
+    board = next(iter(scan.committed_rows()[0].boards.values()))
+    unreadable_file = (undisturbed_scan.path / board.file).with_suffix(suffix)
     path_open = Path.open
     path_read = Path.read_bytes
-    monkeypatch.setattr(
-        Path, "open", lambda path, *arguments, **options: raise_for_bad(path) or path_open(path, *arguments, **options)
-    )
-    monkeypatch.setattr(Path, "read_bytes", lambda path: raise_for_bad(path) or path_read(path))
+
+    def raise_if_unreadable(path: Path) -> None:
+        if path == unreadable_file:
+            raise OSError(error_number, os.strerror(error_number))
+
+    def open_or_raise(path: Path, *arguments, **options):
+        raise_if_unreadable(path)
+        return path_open(path, *arguments, **options)
+
+    def read_or_raise(path: Path) -> bytes:
+        raise_if_unreadable(path)
+        return path_read(path)
+
+    monkeypatch.setattr(Path, "open", open_or_raise)
+    monkeypatch.setattr(Path, "read_bytes", read_or_raise)
     with expect_refusal(ErrorCode.FILE_UNREADABLE, os.strerror(error_number)) as e:
         validation.find_damaged_rows(scan)
     assert f"polysight resume {undisturbed_scan.path}" in e.value.remedy
-    assert [f.where for f in validation.validate(undisturbed_scan.path)] == [
-        str(bad.relative_to(undisturbed_scan.path))
-    ]
+    unreadable_name = str(unreadable_file.relative_to(undisturbed_scan.path))
+    assert [f.where for f in validation.validate(undisturbed_scan.path)] == [unreadable_name]
 
 
 def test_a_row_without_its_file_is_taken_again(undisturbed_scan, monkeypatch):
@@ -70,7 +76,7 @@ def test_a_row_without_its_file_is_taken_again(undisturbed_scan, monkeypatch):
 
 
 def list_operations_that_need_space(samples: Samples, folder: Path, disk_of: str) -> list[int]:
-    """Numbers of the operations of a scan that need space."""
+    """Return the numbers of the disk operations of a scan that need space."""
     folder.mkdir()
     disk = FaultyDisk(folder / disk_of)
     with disk():
@@ -90,7 +96,9 @@ def run_on_disk(scan: SmallScan, disk: FaultyDisk) -> PolysightError | None:
 
 @pytest.mark.parametrize("fault", ["full", "short"])
 @pytest.mark.parametrize("disk_of", ["scan", "journal"])
-def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_path, sample, fault, disk_of):
+def test_a_full_disk_is_an_error_and_no_committed_row_is_lost(
+    samples, undisturbed_scan, tmp_path, sample, fault, disk_of
+):
     failures = 0
     for position in sample(list_operations_that_need_space(samples, tmp_path / "count", disk_of), 10):
         folder = tmp_path / str(position)
@@ -106,16 +114,17 @@ def test_full_disk_is_an_error_and_loses_nothing(samples, undisturbed_scan, tmp_
         if scan.begun:
             assert list_errors(scan.path) == []
         committed_rows = scan.rows() if scan.begun else {}
-        # There is space again
+        # There is space again: the scan resumes.
         assert scan.run().exit_status == "success"
         assert validate(scan.path) == []
         assert scan.rows() == undisturbed_scan.digests
         assert committed_rows.items() <= undisturbed_scan.digests.items()
         shutil.rmtree(folder)
+    # Most of the ten positions: some operations do without the space.
     assert failures > 5
 
 
-def test_disk_that_has_space_again_while_the_program_still_runs(samples, tmp_path):
+def test_a_line_that_the_full_disk_did_not_take_is_not_written_when_there_is_space_again(samples, tmp_path):
     """Bytes that one call could not write are not written by a later call."""
     disk = FaultyDisk(tmp_path, "short", at=10**6)
     scan = SmallScan(samples, tmp_path)

@@ -36,6 +36,7 @@ from polysight_shared.config import load_instrument
 from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode, PolysightError
 from polysight_shared.files import write_atomically
 
+# Names that lead out of the scan folder, or to no file of a row.
 OUTSIDE = ["../victim.bin", "/etc/passwd", "raw/../../victim.bin", "raw/a\0b.bin", "", ".", "manifest.jsonl"]
 
 
@@ -55,7 +56,7 @@ def commit_first_row_as(scan: ScanFolder, file: str) -> None:
 
 
 @pytest.mark.parametrize("file", OUTSIDE)
-def test_a_row_outside_the_scan_is_refused_by_whatever_reads_it(scan, file):
+def test_a_row_whose_file_is_outside_the_scan_is_refused_by_every_reader(scan, file):
     victim = scan.path.parent / "victim.bin"
     victim.write_bytes(b"mine")
     commit_first_row_as(scan, file)
@@ -99,7 +100,7 @@ def test_only_bytes_that_were_committed_are_dropped(scan):
 
 
 def write_bomb(path: Path, size: int = 6 << 30) -> Path:
-    """An archive of 64 KB with an array of 6 GB, by its directory and its header."""
+    """Write an archive of 64 KB that claims to have an array of 6 GB, in its directory and in the array's header."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (size,)})
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as z:
@@ -115,6 +116,9 @@ def test_an_archive_that_claims_too_much_is_refused_by_its_size(read, tmp_path):
         read(write_bomb(tmp_path / "big.npz"))
 
 
+# Changes of a packet log: each takes the head and the runs of equal packets, and returns the runs.
+
+
 def enlarge_row(head, runs):
     head["evidence"]["expected"] = 1 << 45
     return runs
@@ -122,7 +126,7 @@ def enlarge_row(head, runs):
 
 def claim_overflow(head, _runs):
     head["runs"] = 1 << 16
-    # 2**63 bytes in all: 64 bits call that negative
+    # 2**63 bytes in all, which is a negative number in 64 bits.
     return claim_runs(1 << 16, 0xFFFFFFFF, 0x8000)
 
 
@@ -202,13 +206,14 @@ def test_nothing_is_written_through_a_link(write, tmp_path):
     victim.write_bytes(b"mine")
     (tmp_path / "there").symlink_to(victim)
     (tmp_path / ".there.part").symlink_to(victim)
-    with suppress(OSError, DeviceError):  # or the link itself is replaced
+    # It is an error, or the link itself is replaced.
+    with suppress(OSError, DeviceError):
         write(tmp_path / "there", b"theirs")
     assert victim.read_bytes() == b"mine"
 
 
 def rewrite_first_line(scan: ScanFolder, **answer: object) -> Path:
-    """The scan's folder, with a changed first line of its manifest."""
+    """Change fields of the first line of the manifest; return the scan's folder."""
     first, *rest = (scan.path / "manifest.jsonl").read_bytes().splitlines(keepends=True)
     fact = {**manifest.decode_line(first.rstrip()), **answer}
     (scan.path / "manifest.jsonl").write_bytes(manifest.encode_line(fact) + b"".join(rest))
@@ -240,7 +245,7 @@ def test_a_manifest_with_another_form_of_calibration_is_refused(scan, answer):
 
 def test_a_row_that_is_larger_than_was_committed_is_refused_by_its_size(scan):
     name, board = next(iter(scan.committed_rows()[0].boards.items()))
-    # A hole: the file takes no space, its bytes would
+    # A sparse file of 4 TB, which takes no space on the disk.
     os.truncate(scan.path / board.file, 1 << 42)
     with expect_refusal(ErrorCode.FILE_DAMAGED, 1 << 42):
         _ = scan.read_row(name, 0).payload
@@ -257,6 +262,7 @@ def test_files_of_any_size_are_refused_before_they_are_read(scan, file):
             use(path)
 
 
+# Text that a recursive decoder cannot read.
 DEEP = "[" * 100_000
 
 

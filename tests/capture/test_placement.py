@@ -306,6 +306,18 @@ def test_a_packet_with_a_wrong_header_is_masked_and_damages_no_other_byte(flip, 
     assert is_original_or_masked(record, placed, out)
 
 
+@pytest.mark.parametrize(("rows_ahead", "is_later"), [(84, True), (85, False)])
+@pytest.mark.parametrize("sequence", [1, SEQUENCE - 30])
+def test_a_packet_far_ahead_is_damaged_and_a_near_one_may_be_of_a_later_record(sequence, rows_ahead, is_later):
+    """Four rows of 20 packets and a bit, and four packets more, are 84 packets and a bit."""
+    record = Record.make(20 * FULL + 100, 0, sequence)
+    other = encode_packet(sequence + rows_ahead, len(record.data), b"x" * FULL)
+    placed, out = place(len(record.data), [*record.packets, other], Counters(0, sequence), 4096)
+    assert placed.located
+    assert out.tobytes() == record.data
+    assert (find_next_start(placed) is None) == is_later
+
+
 def test_a_record_longer_than_a_row_is_not_placed():
     record = Record.make(6 * 4096, 0, 1)
     placed, _ = place(5 * 4096, record.packets, Counters(0, 1), 4096)

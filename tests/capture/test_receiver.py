@@ -22,7 +22,7 @@ from polysight.acquisition.control import read_start_ticks
 from polysight.capture import network, receiver_process
 from polysight.capture.dca1000 import Status
 from polysight.capture.network import BatchReceiver, bind_udp, enlarge_receive_buffer, usable_packets
-from polysight.capture.receiver import BeginRow, EndRow, Open, Progress, ReceiverProcess, RowCapture
+from polysight.capture.receiver import BeginRow, EndRow, Open, Progress, ReceiverProcess, Report, RowCapture
 from polysight.capture.row_files import read_index
 from polysight_shared.config import Board
 from polysight_shared.errors import DeviceError, ErrorCode
@@ -117,6 +117,13 @@ def test_packets_of_other_machines_and_from_before_the_row_are_not_data(board, c
     assert row.complete
     assert (row.strangers, row.stale) == (1, 4)
     assert (tmp_path / "a.part").read_bytes() == data
+
+
+def test_between_rows_the_progress_is_that_of_no_row():
+    receiver = receiver_process.Receiver(Connection(os.open(os.devnull, os.O_RDWR)))
+    answer = receiver._answer(Report())
+    assert answer == Progress(row=-1, take=0, received=0, complete=False, last_arrival_ns=0)
+    receiver._connection.close()
 
 
 @pytest.mark.parametrize("last_bytes", [FULL, 100])

@@ -1,5 +1,7 @@
 """The chain of a manifest: count and digest of the line before in every line, so that missing lines are found."""
 
+import hashlib
+import itertools
 import json
 from pathlib import Path
 
@@ -28,6 +30,12 @@ def make_chain_lines(path: Path, facts=FACTS) -> list[bytes]:
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory) -> list[bytes]:
     return make_chain_lines(tmp_path_factory.mktemp("chain"))
+
+
+def test_a_line_has_the_first_16_digits_of_the_sha_256_of_the_line_before(lines):
+    """As docs/spec/scan-folder.md says, for programs that check the chain themselves."""
+    for before, line in itertools.pairwise(lines):
+        assert json.loads(line)["previous"] == hashlib.sha256(before.rstrip(b"\n")).hexdigest()[:16]
 
 
 @given(st.integers(0, len(FACTS) - 2), st.integers(1, 3))

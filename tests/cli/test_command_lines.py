@@ -14,7 +14,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import build_parser, main
-from polysight.cli.options import join_negative_values
+from polysight.cli.options import CommandParser, join_negative_values
 from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.products import write_json
 from polysight_pi.cli import main as polysight_pi
@@ -234,3 +234,52 @@ def test_where_the_report_is(scan, capsys):
         assert capsys.readouterr().out == f"report:   {scan / 'products' / 'report.html'}\n"
     (scan / "products" / "report.html").unlink()
     assert main(["report", str(scan)]) == 3, "it is made again from the raw rows, and there are none"
+
+
+@pytest.mark.parametrize(("words", "error"), [([], 0.1), (["--amplitude", "5"], 0.05), (["--amplitude", "0.5"], 0.005)])
+def test_the_error_of_amplitudes_is_given_in_per_cent(monkeypatch, words, error):
+    given = []
+    monkeypatch.setattr("polysight.jobs.materials.permittivity", lambda **options: given.append(options) or 0)
+    args = build_parser().parse_args(["permittivity", "out", "--layer", "paint,?,0.1", *words])
+    assert args.run(args) == 0
+    assert given[0]["amplitude_error"] == pytest.approx(error)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_taken"), [("-1", False), ("0", False), ("0.01", True), ("50", True), ("51", False)]
+)
+def test_places_measured_by_hand_have_an_error_above_0_of_at_most_50_mm(text, is_taken):
+    parse = functools.partial(
+        build_parser().parse_args, ["calibrate", "direct-path", "s", "--target", "t", "--prior", text]
+    )
+    if is_taken:
+        assert parse().prior_mm == float(text)
+    else:
+        with pytest.raises(SystemExit), contextlib.redirect_stderr(io.StringIO()) as said:
+            parse()
+        assert "a length above 0, at most 50 mm" in said.getvalue()
+
+
+@pytest.mark.parametrize(("options", "shown"), [(2, 3), (3, 4), (4, 3), (9, 3)])
+def test_a_help_lists_each_option_once_and_the_most_used_ones_first(options, shown):
+    """With --help, four options are one section: a second one would have --help alone."""
+    parser = CommandParser(prog="polysight try", description="Try.", epilog="example:\n  polysight try a")
+    parser.add_argument("data", help="a scan")
+    for number in range(options):
+        parser.add_argument(f"--option-{number}", help=f"option {number}")
+    group = parser.add_argument_group("layers", "a stack")
+    group.add_argument("--layer", help="one of the stack")
+    parser.most_used = (f"--option-{options - 1}",)
+    text = parser.format_help()
+    sections = {title: text.index(f"\n{title}:") for title in ("arguments", "options", "layers")}
+    assert list(sections.values()) == sorted(sections.values())
+    more = text.find("\nmore options:")
+    listed = [f"--option-{options - 1}", *(f"--option-{number}" for number in range(options - 1)), "--help"]
+    places = [text.index(f"{name} ") for name in listed]
+    assert places == sorted(places)
+    assert all(text.count(f"{name} ") == 1 for name in listed)
+    first = [name for name, place in zip(listed, places, strict=True) if more < 0 or place < more]
+    assert first == listed[:shown]
+    assert text.index("one of the stack") > sections["layers"]
+    assert "a scan" in text[sections["arguments"] : sections["options"]]
+    assert text.index("example:") < sections["arguments"]

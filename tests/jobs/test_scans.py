@@ -5,8 +5,10 @@ import os
 import shutil
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from msgspec import UNSET
 from msgspec.structs import replace
 from tests.support.page.live_view import open_control
 from tests.support.products import write_judged_products
@@ -19,7 +21,7 @@ from polysight.cli.main import build_parser, main
 from polysight.jobs import scans
 from polysight.results import ComplexNumber
 from polysight.store import MANIFEST, manifest
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import DataError, ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
 
@@ -183,3 +185,20 @@ def test_products_of_a_running_scan_are_left_to_it(root, monkeypatch, command):
         with expect_refusal(ErrorCode.BUSY, "polysight preview one"):
             args.run(args)
     assert not (root / "one" / "products").exists()
+
+
+@pytest.mark.parametrize(
+    ("digests", "is_complete"),
+    [({"RH": ["a"], "RV": ["b"]}, True), ({"RH": ["a"]}, False), ({}, False)],
+    ids=["both boards", "one board", "none"],
+)
+def test_processed_rows_are_proven_by_the_digests_of_all_their_boards(monkeypatch, tmp_path, digests, is_complete):
+    """Products of an earlier release have none; raw data is deleted only if every board's are known."""
+    boards = {name: SimpleNamespace(raw_crc32=digests.get(name, UNSET)) for name in ("RH", "RV")}
+    products = SimpleNamespace(folder=tmp_path, images=None, quality=SimpleNamespace(boards=boards))
+    monkeypatch.setattr(scans, "read_products", lambda _: products)
+    if is_complete:
+        assert scans.find_processed_digests(tmp_path) == digests
+    else:
+        with pytest.raises(DataError, match="does not say what it was made from"):
+            scans.find_processed_digests(tmp_path)

@@ -3,9 +3,11 @@
 import json
 
 import numpy as np
+import pytest
 from tests.support.refusals import expect_refusal
 
 from polysight.cli.main import main
+from polysight.jobs import materials as jobs
 from polysight.jobs.materials import report
 from polysight.materials import Entry, Library
 from polysight_shared.errors import ErrorCode
@@ -49,3 +51,10 @@ def test_the_command_judges_classifiers_by_scans_left_out_and_by_pixels_left_out
     assert out.startswith("simulated: 2 materials, 3 scans")
     assert "whole scans left out" in out
     assert "by pixel (optimistic)" in out
+
+
+@pytest.mark.parametrize(("source", "head"), [("simulated", "simulated: 0 patches"), ("measured", "0 patches")])
+def test_names_of_simulated_data_are_headed_as_such(capsys, source, head):
+    content = {"incidence_deg": [54.9], "patches": [], "source": source, "contradictions": [], "refused": []}
+    jobs._print_names(content, several=False)
+    assert capsys.readouterr().out == f"{head} at 54.9 degrees\n"

@@ -1,5 +1,6 @@
 """Positions of boards and plane: a displaced rig is recovered from a scan of points, and processing uses the result."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -10,6 +11,7 @@ from tests.support.kept import assert_kept
 from tests.support.processes import read_output
 from tests.support.refusals import expect_refusal
 
+from polysight.calibration import places
 from polysight.calibration.files import Calibration, PlacesFile, load_calibration, open_raw, read_calibration
 from polysight.calibration.places import Prior, TargetPoint, fit_places, load_echoes, places_file, read_target
 from polysight.imaging.geometry import Antennas
@@ -118,6 +120,23 @@ def test_a_displaced_rig_is_recovered_within_its_standard_errors(case, file):
         # The rig file's direct path was wrong by more than half a millimetre.
         assert abs(board.direct_path_was_mm - direct_mm) > 0.5
         assert board.direct_path_mm == pytest.approx(direct_mm, abs=5 * board.direct_path_standard_error_mm)
+
+
+def test_a_target_that_was_laid_up_to_12_mm_beside_its_place_is_found(case):
+    """To half a step of the coarse grid, from which the fit starts: it would end at another fringe."""
+    folder, _, believed, _ = case
+    centre = np.array(specular_midpoint_m(believed, believed.receivers[0]))
+    points_mm = np.array(POINTS)
+    laid_mm = (-11.0, 8.5)
+    unknown = np.array([0.0, *laid_mm, 0.0])
+    boards = []
+    for loaded in load_echoes(open_raw(folder, None), believed).values():
+        # A few positions suffice without noise.
+        board = replace(loaded, samples=loaded.samples[:, ::20], offsets_m=loaded.offsets_m[::20])
+        echoes = places._model_echoes(board, np.zeros(3), places._place_points(centre, points_mm, unknown))
+        boards.append(replace(board, samples=echoes.sum(axis=1).reshape(board.samples.shape)))
+    found_mm = places._find_target(boards, centre, points_mm)
+    assert np.abs(np.subtract(found_mm, laid_mm)).max() <= places._STEP_MM / 2
 
 
 def test_an_active_calibration_corrects_every_antenna(case, file):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from polysight.sync.loops import block_edges, block_times, cis, estimate_tone, phasor
+from polysight.sync.loops import block_edges, block_times, cis, estimate_tone, find_band, phasor
 
 
 @given(st.floats(-0.49, 0.49), st.floats(-3.1, 3.1), st.integers(24, 256))
@@ -55,3 +55,12 @@ def test_phasor_is_the_exponential():
     from_centre = np.arange(250) - centre
     expected = np.exp(1j * (2 * np.pi * frequency[:, None] * from_centre + phase[:, None]))
     np.testing.assert_allclose(phasor(frequency, phase, 250, centre), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("frequency", [0.0, 0.0005, 0.25, 0.5, 0.9995])
+def test_the_band_of_a_tone_has_its_frequency_in_its_middle_also_at_zero(frequency):
+    """In cycles per sample, on a circle: the search of each chirp begins there."""
+    chirps = np.exp(2j * np.pi * (frequency * np.arange(192) + np.array([[[0.1]], [[0.7]]]))).astype(np.complex64)
+    middle = find_band(np.tile(chirps, (1, 4, 1)))
+    assert ((middle >= 0) & (middle < 1)).all()
+    assert np.abs(np.angle(np.exp(2j * np.pi * (middle - frequency)))).max() / (2 * np.pi) < 0.05 / 48

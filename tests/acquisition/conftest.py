@@ -21,6 +21,8 @@ def rig(monkeypatch):
     fake = FakeRig(make_small_instrument())
 
     class Pi(PiClient):
+        """A client that waits for a reply as long as it takes, unless the Pi has lost one more."""
+
         def __init__(self, *settings):
             super().__init__(*settings)
             replies_lost = fake.pi.replies_lost
@@ -37,8 +39,12 @@ def rig(monkeypatch):
             self._commands.poll = poll_until_lost
 
     class Card(CardClient):
+        """A client that does not wait for a card that is silent."""
+
         def _try(self, code, data, limit_s):
-            return super()._try(code, data, 0.01 if fake.cards[self.board.name].mute else limit_s)
+            if fake.cards[self.board.name].mute:
+                limit_s = 0.01
+            return super()._try(code, data, limit_s)
 
     monkeypatch.setattr(scan, "PiClient", Pi)
     monkeypatch.setattr(capture_rig, "CardClient", Card)
@@ -74,7 +80,7 @@ def config(rig, tmp_path):
 
 @pytest.fixture
 def payload():
-    """`payload(board, row, size)`: bytes that a fake card sends in a row."""
+    """Function of board, row and size that returns the bytes that a fake card sends in a row."""
     return make_payload
 
 

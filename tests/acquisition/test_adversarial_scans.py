@@ -27,7 +27,8 @@ class AdversarialCard(FakeCard):
     def __init__(self, board: Board, row_bytes: int, frame_bytes: int, rng: random.Random) -> None:
         self._rng = rng
         self._frame = frame_bytes
-        self.rate = 0.5  # share of records with faults
+        # Share of records with faults.
+        self.rate = 0.5
         self.adversary = Adversary(rng, frame_bytes)
         self.sent: list[tuple[int, int, tuple[str, ...]]] = []
         super().__init__(board, row_bytes)
@@ -35,11 +36,9 @@ class AdversarialCard(FakeCard):
     def send_row(self, row: int, take: int) -> None:
         if not self.recording:
             return
-        troubled = self._rng.random() < self.rate
-        if troubled:
+        troubles: tuple[str, ...] = ()
+        if self._rng.random() < self.rate:
             troubles = tuple(self._rng.sample(NETWORK_TROUBLES, self._rng.randint(1, 3)))
-        else:
-            troubles = ()
         sent = self.adversary.record(
             self.row_bytes // self._frame, troubles, make_payload(self.board.name, row, self.row_bytes)
         )
@@ -49,6 +48,7 @@ class AdversarialCard(FakeCard):
 
     def _send(self, arrivals: list[Arrival]) -> None:
         for k, arrival in enumerate(arrivals):
+            # The receive buffer holds more than 100 packets.
             if k % 100 == 99:
                 time.sleep(0.002)
             self.out.sendto(arrival.packet, (self.board.host_address, self.board.data_port))
@@ -57,13 +57,13 @@ class AdversarialCard(FakeCard):
         super()._command(code, sender)
         if code == Code.RESET_FPGA:
             self.adversary.reset_by_host()
-        # Before the row runs; after its stop
+        # Delayed packets of earlier records come before the row runs, and after its stop.
         if code in (Code.RECORD_START, Code.RECORD_STOP):
             self._send(self.adversary.take_late(0.3))
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
-# Points, pulses; 91 ends in a full packet
+# Points and pulses of a row; one with 91 frames ends in a full packet.
 GRIDS = [(3, 3), (91, 1), (7, 4)]
 
 
@@ -84,10 +84,11 @@ def check(folder: Path, rig: FakeRig, incomplete: list[int]) -> None:
     for row, committed in scan.committed_rows().items():
         for name, board in committed.boards.items():
             data = scan.read_row(name, row)
-            want = np.frombuffer(make_payload(name, row, rig.instrument.row_bytes), dtype=np.uint8)
-            mask = np.zeros(want.size, dtype=bool) if data.mask is None else data.mask
-            assert (data.payload[~mask] == want[~mask]).all(), (row, name)
+            truth = np.frombuffer(make_payload(name, row, rig.instrument.row_bytes), dtype=np.uint8)
+            mask = np.zeros(truth.size, dtype=bool) if data.mask is None else data.mask
+            assert (data.payload[~mask] == truth[~mask]).all(), (row, name)
             assert not mask.any() or row in incomplete
+            # The stored packets give the same result again, unless frames were moved by the times of pulses.
             placed_again = place_again(folder / board.file)
             assert placed_again.by_pulses or placed_again.placed.missing == placed_again.missing_before
 
@@ -97,11 +98,14 @@ def test_committed_bytes_are_right_or_masked(request, tmp_path):
         rig = make_adversarial_rig(number)
         folder = tmp_path / str(number)
         try:
+            # Every second scan keeps incomplete rows. One that has too many retakes is resumed, up to five times.
+            keep_incomplete = number % 2 == 1
             for attempt in range(6):
-                run = resume_scan if attempt else run_scan
-                arguments = (folder,) if attempt else (rig.instrument, folder)
                 try:
-                    result = run(*arguments, keep_incomplete=number % 2 == 1)
+                    if attempt == 0:
+                        result = run_scan(rig.instrument, folder, keep_incomplete=keep_incomplete)
+                    else:
+                        result = resume_scan(folder, keep_incomplete=keep_incomplete)
                 except ScanError as e:
                     assert "not complete after" in e.what  # noqa: PT017 - how an attempt ends is drawn
                     continue
@@ -111,8 +115,8 @@ def test_committed_bytes_are_right_or_masked(request, tmp_path):
                 assert result.folder.complete
                 break
             else:
+                # When the faults have ended the scan completes.
                 for card in rig.cards.values():
-                    # The fault has ended, so the scan completes
                     card.rate = 0.0
                 assert resume_scan(folder).exit_status == "success"
                 check(folder, rig, ScanFolder.load(folder).recording_facts()["rows_incomplete"])

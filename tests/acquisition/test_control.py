@@ -46,10 +46,12 @@ def test_commands_are_obeyed_once(control):
     assert not stop.paused
     assert not stop.after_row
     send_command(folder, ScanCommand.STOP)
-    assert (stop.after_row, stop.now) == (True, False)
-    # A double click, or two phones
+    assert stop.after_row
+    assert not stop.now
+    # The same command again, from a double click or a second phone, does not stop the scan within the row.
     send_command(folder, ScanCommand.STOP)
-    assert (stop.after_row, stop.now) == (True, False)
+    assert stop.after_row
+    assert not stop.now
     send_command(folder, ScanCommand.ABORT)
     assert stop.now
 
@@ -75,7 +77,8 @@ def test_a_sender_waits_until_its_command_is_obeyed(tmp_path):
     assert still_waiting == [True]
 
 
-def test_touch_in_a_shell_is_a_command(control):
+def test_an_empty_file_with_the_name_of_a_command_is_that_command(control):
+    """Such as one that `touch` makes in a shell."""
     folder, stop = control
     (folder / CONTROL_FOLDER / "pause").touch()
     wait_for(lambda: stop.paused, "the pause")
@@ -85,6 +88,7 @@ def test_the_status_of_a_scan_names_its_host_and_requests_and_ends_with_it(tmp_p
     assert read_life(tmp_path) is None
     stop = StopRequest()
     with ControlFolder(tmp_path, stop) as control:
+        # A second call does nothing.
         control.open()
         control.open()
         wait_for(lambda: read_life(tmp_path), "the first sign of life")
@@ -132,7 +136,10 @@ def test_a_sign_of_life_is_written_once_an_interval(tmp_path, monkeypatch):
 
 
 def test_a_killed_program_is_distinguished_from_a_silent_one(tmp_path):
-    """Also if another process has its process number now."""
+    """Also if another process has its process id now: that has another start time.
+
+    A process of another machine cannot be seen from here, and does not count as killed.
+    """
     (tmp_path / CONTROL_FOLDER).mkdir()
     lives = [
         (SignOfLife(os.getpid(), read_start_ticks(os.getpid()) or 0, socket.gethostname()), False),
@@ -140,9 +147,10 @@ def test_a_killed_program_is_distinguished_from_a_silent_one(tmp_path):
         (SignOfLife(2**22 + 1, 1, socket.gethostname()), True),
         (SignOfLife(2**22 + 1, 1, "another machine"), False),
     ]
-    for life, killed in lives:
+    for life, is_killed in lives:
         (tmp_path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(msgspec.json.encode(life))
-        assert read_life(tmp_path).killed is killed
+        assert read_life(tmp_path).killed is is_killed
+    # A file that cannot be read shows nothing.
     for content in (b"", b"{", b"[]", b"\xff", b'{"pid": "x"}'):
         (tmp_path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(content)
         assert not read_life(tmp_path).killed
@@ -154,10 +162,11 @@ def test_commands_for_an_earlier_scan_are_deleted(tmp_path):
         (tmp_path / CONTROL_FOLDER / command).touch()
     with open_control(tmp_path) as stop:
         send_command(tmp_path, ScanCommand.CONTINUE)
-    assert (stop.after_row, stop.paused) == (False, False)
+    assert not stop.after_row
+    assert not stop.paused
 
 
-def test_control_folder_that_was_not_opened_touches_nothing(tmp_path):
+def test_a_control_folder_that_was_not_opened_writes_nothing(tmp_path):
     with ControlFolder(tmp_path, StopRequest()):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -175,7 +184,7 @@ def test_command_that_is_not_accepted_is_withdrawn(tmp_path):
     assert list((tmp_path / CONTROL_FOLDER).iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_written_costs_the_scan_nothing(tmp_path):
+def test_a_control_folder_that_cannot_be_written_does_not_disturb_the_scan(tmp_path):
     with ControlFolder(tmp_path / "not" / "there", StopRequest()) as control:
         control.open()
         with expect_refusal(ErrorCode.NO_ANSWER):
@@ -187,15 +196,15 @@ def load_fact_contents(path: Path) -> list[str]:
 
 
 def scan_with(samples, folder: Path, stop: StopRequest, at_row_1) -> SmallScan:
-    """A scan with its stop request; `at_row_1` is called when row 0 is committed."""
+    """Run a scan with this stop request; call `at_row_1` when row 0 is committed."""
     scan = SmallScan(samples, folder)
 
-    def answer(progress) -> None:
+    def call_at_row_1(progress) -> None:
         if progress.phase == "committed" and progress.row == 0:
             at_row_1()
 
     with scan._connect_pi():
-        host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=answer)
+        host_run.run_scan(samples.instrument, scan.path, stop=stop, progress=call_at_row_1)
     return scan
 
 
@@ -209,7 +218,7 @@ def call_when_paused(folder: Path, act: Callable[[], None]) -> None:
     threading.Thread(target=wait).start()
 
 
-def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished_scan, tmp_path):
+def test_a_paused_scan_waits_between_rows_and_then_records_the_others(samples, finished_scan, tmp_path):
     stop = StopRequest()
 
     def pause() -> None:
@@ -217,13 +226,13 @@ def test_a_paused_scan_waits_between_rows_and_loses_nothing(samples, finished_sc
         call_when_paused(tmp_path / "scan", lambda: setattr(stop, "paused", False))
 
     scan = scan_with(samples, tmp_path, stop, pause)
-    answer = [f for f in load_fact_contents(scan.path) if f != "radars"]
-    assert answer[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
-    assert answer[4:] == ["row_committed", "row_committed", "scan_ended"]
+    facts = [f for f in load_fact_contents(scan.path) if f != "radars"]
+    assert facts[:4] == ["scan_started", "row_committed", "scan_paused", "scan_continued"]
+    assert facts[4:] == ["row_committed", "row_committed", "scan_ended"]
     assert validate(scan.path) == []
     rows = ScanFolder.load(scan.path).committed_rows()
-    other_items = ScanFolder.load(finished_scan).committed_rows()
-    assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in other_items.items()}
+    rows_without_pause = ScanFolder.load(finished_scan).committed_rows()
+    assert {r: c.boards for r, c in rows.items()} == {r: c.boards for r, c in rows_without_pause.items()}
 
 
 def test_a_paused_scan_can_be_stopped(samples, tmp_path):

@@ -14,12 +14,15 @@ from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import read_index, write_index
 from polysight_shared.raster import Row
 
+# Bytes of a frame, and the bursts and pulses of a row.
 FRAME = 4096
 BURSTS = 20
 PULSES = 16
 ALL = BURSTS * PULSES
+# Stalls of card and network a second, and their mean length in ms, which delay packets.
 QUIET = Load()
 LOADS = [QUIET, Load(5, 3), Load(20, 3), Load(200, 2), Load(30, 15)]
+# Relative differences between the clocks of Pi and host: 50 ppm is common for crystals of computers.
 DRIFTS = [0.0, 50e-6, -50e-6]
 
 
@@ -60,13 +63,13 @@ def place_missed(missed: list[int], seed: int, load: Load = QUIET, drift: float 
     st.sets(st.integers(0, ALL * FRAME // PAYLOAD), max_size=8),
 )
 def test_every_frame_of_a_short_row_is_at_its_pulse_or_masked(missed, load, seed, drift, lost):
-    """Pulses missed here and there, in a run, or the first of many bursts; packets are lost, too."""
+    """Single pulses are missed, a run of them, or the first of many bursts; packets are lost, too."""
     place_missed(sorted(missed), seed, load, drift, frozenset(lost))
 
 
 @pytest.mark.parametrize("missed", [[5 * 16 + 7], [0], [ALL - 1], [79, 80], [*range(80, 96)]])
 def test_frames_are_kept_up_to_where_frames_and_packets_last_began_together(missed):
-    """That is every 91 frames: nearer to the missed pulses the card may have dropped the bytes of a frame in pieces."""
+    """That is every 91 frames. Nearer to the missed pulses it is not known which bytes the card has dropped."""
     results = [place_missed(missed, seed) for seed in range(5)]
     assert np.median([r.uncertain for r in results]) <= 2 * 91
     assert all("SYNC_IN" in describe(r, PULSES) for r in results)
@@ -77,34 +80,44 @@ def test_a_whole_row_of_too_few_bursts_is_not_contradicted(bursts):
     pulses = draw_pulse_times(bursts)
     arrivals, answer = receive(pulses.reshape(-1), pulses, FRAME, np.random.default_rng(1))
     placed = place(pulses, answer, arrivals)
-    assert (placed.is_timed, placed.contradicted) == (False, False)
+    assert not placed.is_timed
+    assert not placed.contradicted
     assert "needs 3 bursts" in placed.reason
 
 
-def test_undetermined_frames_are_masked_each_for_its_own_reason():
+def test_frames_whose_pulse_cannot_be_determined_are_masked_with_the_reason():
     pulses = draw_pulse_times(BURSTS)
     rng = np.random.default_rng(1)
     arrivals, answer = receive(np.delete(pulses.reshape(-1), 9), pulses, FRAME, rng)
-    asleep = arrivals.copy()
-    asleep[:, 0] = arrivals[-1, 0]
+    # All packets have the time of the last one, as after a sleep of the machine.
+    simultaneous_arrivals = arrivals.copy()
+    simultaneous_arrivals[:, 0] = arrivals[-1, 0]
+    late_events = answer + (np.arange(BURSTS) > 0) * 100 * MS
     results = [
-        place(pulses * 40, answer, arrivals),  # simulated time
-        place(pulses, answer, arrivals, frame=1024),  # several frames in a packet
-        place(draw_pulse_times(BURSTS, between_ms=25), answer, arrivals),  # no pause between bursts
-        place(pulses, answer + (np.arange(BURSTS) > 0) * 100 * MS, arrivals),  # late events
-        place(pulses[:1], answer[:1], arrivals[:20]),  # a single burst
-        place(pulses[:6], answer[:6], arrivals),  # more frames than pulses
-        place(pulses, answer, arrivals[:0]),  # no frame
+        # Simulated time, which passes faster than that of the arrivals.
+        place(pulses * 40, answer, arrivals),
+        # Several frames in a packet.
+        place(pulses, answer, arrivals, frame=1024),
+        # No pause between bursts.
+        place(draw_pulse_times(BURSTS, between_ms=25), answer, arrivals),
+        place(pulses, late_events, arrivals),
+        # A single burst.
+        place(pulses[:1], answer[:1], arrivals[:20]),
+        # More frames than pulses.
+        place(pulses[:6], answer[:6], arrivals),
+        # No frame.
+        place(pulses, answer, arrivals[:0]),
     ]
     assert all((r.slots == -1).all() and r.reason and not r.contradicted for r in results)
     assert len({r.reason for r in results}) >= len(results) - 1
     assert not any(r.is_timed for r in results)
     assert "simulated time, 40 times as fast" in results[0].reason
     no_events = find_frames(Path("0000.part"), Row(0, 0.0, 0.0, 2.0, 3), [], load_published_rig())
-    assert (no_events.is_timed, no_events.reason) == (False, "capture events of the row are missing")
-    everything_at_once = place(pulses, answer, asleep)
-    assert everything_at_once.contradicted
-    assert everything_at_once.reason in describe(everything_at_once, PULSES)
+    assert not no_events.is_timed
+    assert no_events.reason == "capture events of the row are missing"
+    simultaneous_frames = place(pulses, answer, simultaneous_arrivals)
+    assert simultaneous_frames.contradicted
+    assert simultaneous_frames.reason in describe(simultaneous_frames, PULSES)
 
 
 @settings(max_examples=40)
@@ -118,6 +131,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     frame = 64
     path = tmp_path_factory.mktemp("r") / "0000.part"
     slots = np.delete(np.arange(30), sorted(missed))
+    # Each two of the drawn places are the begin and end of a hole in the received bytes.
     pairs = sorted(cuts)[: len(cuts) // 2 * 2]
     extent = slots.size * frame
     holes = [(a, min(b, extent)) for a, b in zip(pairs[::2], pairs[1::2], strict=True) if a < extent]
@@ -125,10 +139,10 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     received[:extent] = np.random.default_rng(1).integers(1, 256, extent)
     for a, b in holes:
         received[a:b] = 0
-    want = np.zeros(30 * frame, dtype=np.uint8)
+    expected = np.zeros(30 * frame, dtype=np.uint8)
     for k, slot in enumerate(slots):
         if slot not in unsure:
-            want[slot * frame : (slot + 1) * frame] = received[k * frame : (k + 1) * frame]
+            expected[slot * frame : (slot + 1) * frame] = received[k * frame : (k + 1) * frame]
     received.tofile(path)
     write_index(path.with_suffix(".idx"), {"missing": [[0, 30 * frame]]}, np.array([[1, extent]], dtype=np.int64))
     frames = PlacedFrames(np.where(np.isin(slots, list(unsure)), -1, slots), sorted(missed), 30)
@@ -136,8 +150,8 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     row = {"expected": 30 * frame, "missing": [(0, 30 * frame)], "located": False, "reason": "", "holes": holes}
     capture = rewrite_row(path, RowCapture(**{**none, **row}), frames, frame)
     stored_bytes = np.fromfile(path, dtype=np.uint8)
-    np.testing.assert_array_equal(stored_bytes, want)
-    np.testing.assert_array_equal(make_mask(stored_bytes.size, capture.missing), want == 0)
+    np.testing.assert_array_equal(stored_bytes, expected)
+    np.testing.assert_array_equal(make_mask(stored_bytes.size, capture.missing), expected == 0)
     facts, arrivals = read_index(path.with_suffix(".idx"))
     assert [tuple(x) for x in facts["missing"]] == capture.missing
     assert facts["pulses_missed"] == sorted(missed)
@@ -148,7 +162,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
 
 @settings(max_examples=60, derandomize=True)
 @given(st.sampled_from(LOADS), st.integers(0, 2**32), st.sampled_from(DRIFTS), st.sampled_from([1456, 4096]))
-def test_a_whole_row_is_never_taken_for_a_slipped_one(load, seed, drift, frame):
+def test_a_complete_row_is_never_reported_as_one_with_missed_pulses(load, seed, drift, frame):
     pulses = draw_pulse_times(BURSTS)
     arrivals, answer = receive(pulses.reshape(-1), pulses, frame, np.random.default_rng(seed), load, drift=drift)
     result = place(pulses, answer, arrivals, frame)

@@ -69,8 +69,10 @@ def test_each_row_sends_the_line_once_over_one_connection(server):
 def test_a_server_that_closes_after_each_line_gets_a_new_connection(server):
     with LineServers({"RH": server.address}, 5.0) as radars:
         for row in range(3):
-            client = server.accept() if row == 0 else None
-            if client is None:
+            # The first connection exists before a row is armed.
+            if row == 0:
+                client = server.accept()
+            else:
                 radars.arm(1)
                 client = server.accept()
                 assert client.recv(100) == RETRIGGER_LINE
@@ -84,6 +86,7 @@ def test_a_reset_is_a_fault_until_the_next_line(server):
         client = server.accept()
         radars.arm(1)
         assert client.recv(100) == RETRIGGER_LINE
+        # Closed without delay: the connection is reset.
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.close()
         wait_for(lambda: radars.states()["RH"].state is RadarState.FAULT, "radar")
@@ -116,6 +119,8 @@ def test_unknown_host_is_named():
     assert "no-such-host.invalid:5000" in e.value.what
 
 
+# Program in a network of its own: it connects to a server, and then switches the network off without closing the
+# connection, as when the server's machine loses power.
 HALF_OPEN_PROGRAM = """
 import socket, subprocess
 from polysight.radar.control import LineServers
@@ -132,8 +137,8 @@ except DeviceError as e:
 """
 
 
-def test_half_open_connection_is_noticed():
-    """The peer's machine disappears: here the network of a separate namespace is switched off."""
+def test_a_server_whose_machine_has_disappeared_is_an_error():
+    """Its connection is still open at this end ("half-open"), but no line is acknowledged."""
     if shutil.which("ip") is None or subprocess.run(["unshare", "-rn", "true"], check=False).returncode:
         pytest.skip("needs iproute2 and user namespaces")
     process = subprocess.run(
@@ -185,7 +190,7 @@ class Native(RadarControl):
         self._script = script
         self.armed = []
         self.closed = False
-        # Boards that still wait after the pulses of an arming, from 1
+        # Boards that still wait after the pulses of an arming, by its number from 1.
         self.waiting: dict[int, list[str]] = {}
 
     def arm(self, frames: int) -> None:
@@ -207,20 +212,20 @@ def list_rejection_reasons(scan: ScanFolder) -> list[str]:
     return [reason for fact in load_facts(scan, "row_rejected") for reason in fact["reasons"]]
 
 
-def test_radars_are_armed_for_every_take_and_let_go_at_the_end(rig, tmp_path):
+def test_radars_are_armed_for_every_take_and_closed_at_the_end(rig, tmp_path):
     rig.cards["RV"].drop[1, 1] = {3}
     radars = Native(RadarState.ARMED)
     assert run_scan(rig.instrument, tmp_path / "s", radars=radars).exit_status == "success"
-    # Four rows and a retake, 3 points x 3 pulses each
+    # Four rows and a retake, each with 3 points of 3 pulses.
     assert radars.armed == [9] * 5
     assert radars.closed
 
 
-def test_radar_in_fault_is_not_scanned_with_but_armed_again(rig, tmp_path):
+def test_a_row_whose_radar_is_in_fault_is_not_begun_and_the_radar_armed_again(rig, tmp_path):
     radars = Native(RadarState.FAULT, RadarState.ARMED)
     result = run_scan(rig.instrument, tmp_path / "s", radars=radars)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    # The first take was never sent to the stage
+    # The first take was never sent to the stage.
     assert rig.pi.rows_run[0] == (0, 2)
     (fact,) = load_facts(result.folder, "row_rejected")
     assert fact["faults"] == [{"kind": "radar_stopped", "board": "RH"}, {"kind": "radar_stopped"}]
@@ -271,11 +276,12 @@ def test_board_that_sends_nothing_ends_the_row_before_its_end(rig, tmp_path):
     result = run_scan(msgspec.structs.replace(rig.instrument, limits=limits), tmp_path / "s", progress=progress)
     assert (result.exit_status, result.retakes) == ("success", 1)
     faults = load_facts(result.folder, "row_rejected")[0]["faults"]
-    assert faults[0] == {"kind": "no_data"}, "of the row that was aborted"
+    # The first fault is the reason of the abort, which is not that of a single board.
+    assert faults[0] == {"kind": "no_data"}
     assert {"kind": "no_data", "board": "RH"} in faults
 
 
-def test_silent_rearming_is_named_when_the_retakes_are_used_up(rig, server, tmp_path):
+def test_without_data_after_all_retakes_the_error_names_the_radars_line_server(rig, server, tmp_path):
     rig.cards["RH"].silent_data = True
     radar = Radar("line_server", dict.fromkeys((b.name for b in rig.instrument.boards), server.address))
     with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RH", server.address):

@@ -24,7 +24,7 @@ from polysight_shared.stage_line import HOMING_TIMEOUT_S
 
 
 class HomingPi:
-    """Homes forever; fails after `limit_s` with a reason, as the Pi does."""
+    """A Pi that homes without end, or fails after `limit_s` with a reason; also the clock, in place of `time`."""
 
     def __init__(self, limit_s: float) -> None:
         self.now = 0.0
@@ -39,7 +39,7 @@ class HomingPi:
         return self.now
 
     def home(self) -> None:
-        # Accepted, and begun later
+        # The command is accepted, and homing begins later.
         self._began = self.now + 10.0
 
     def status(self) -> SimpleNamespace:
@@ -63,8 +63,8 @@ def test_homing_that_fails_or_never_ends_is_an_error_with_the_pis_reason(monkeyp
         make_ready(pi, StopRequest(), lambda *_: None)
 
 
-@pytest.mark.parametrize(("state", "times_asked"), [("idle", 2), ("ready", 2), ("homing", 1)])
-def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, times_asked):
+@pytest.mark.parametrize(("state", "times_sent"), [("idle", 2), ("ready", 2), ("homing", 1)])
+def test_a_home_command_without_a_reply_is_sent_again_unless_the_stage_homes(state, times_sent):
     """A stage that is still `ready` has not begun to home: its lost steps would be those of an earlier homing."""
     sent = []
     pi: Any = SimpleNamespace(_owner="",
@@ -72,7 +72,7 @@ def test_a_lost_home_is_sent_again_unless_the_stage_homes(state, times_asked):
         status=lambda: SimpleNamespace(state=state),
     )  # fmt: skip
     PiClient.home(pi)
-    assert len(sent) == times_asked
+    assert len(sent) == times_sent
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_between_rows_a_stage_that_must_be_homed_needs_a_person(state, homed, is
         check_between_rows(status, "s", first=True)
 
 
-def test_pi_and_host_have_the_same_homing_timeout():
+def test_pi_and_host_agree_on_the_homing_timeout_and_the_host_waits_longer():
     from polysight_pi import rules, stage
 
     assert rules.TIMEOUTS_S["homing"] == stage.MOTION_TIMEOUT_S == HOMING_TIMEOUT_S < ready._HOMING_TIMEOUT_S
@@ -112,10 +112,10 @@ def test_disk_space_checked_is_that_of_the_rows(make_instrument, tmp_path, monke
     """Rows x recorded boards x bytes of a board's row; plan, doctor and scan use the same size."""
     rig = make_instrument(free_disk_bytes=1000)
     assert len(rig.recorded) == 2
-    need = rows * 2 * rig.grid.columns * rig.burst.pulses * rig.frame_bytes
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 1000))
+    needed_bytes = rows * 2 * rig.grid.columns * rig.burst.pulses * rig.frame_bytes
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes + 1000))
     check_disk(tmp_path, rig, rows)
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=need + 999))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=needed_bytes + 999))
     with expect_refusal(ErrorCode.DISK_FULL, rows):
         check_disk(tmp_path, rig, rows)
 
@@ -128,16 +128,17 @@ def test_plan_and_doctor_show_the_size_of_a_scan(make_instrument):
 
 
 @pytest.mark.parametrize("key", ["steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2"])
-def test_a_pi_that_places_rows_elsewhere_is_refused_before_a_folder_is_made(rig, tmp_path, key):
+def test_a_pi_with_other_stage_settings_is_refused_before_a_folder_is_made(rig, tmp_path, key):
     own_value = rig.instrument.stage.placement_settings[key]
     rig.pi.stage = {**rig.pi.stage, key: own_value + 0.5}
     with expect_refusal(ErrorCode.STAGE_DIFFERS, key, f"{own_value:g}", f"{own_value + 0.5:g}"):
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
-    assert rig.pi.commands[-1:] == rig.pi.commands[:1], "nothing but Hello was asked"
+    # The only command was Hello.
+    assert rig.pi.commands[-1:] == rig.pi.commands[:1]
 
 
-def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_old_one(rig, tmp_path):
+def test_resuming_with_another_rig_file_on_the_pi_is_refused_until_it_has_the_old_one(rig, tmp_path):
     stop = StopRequest()
     right = rig.pi.stage
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
@@ -150,7 +151,8 @@ def test_resuming_after_the_pis_rig_file_changed_is_refused_and_mended_by_its_ol
     with expect_refusal(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
         resume_scan(tmp_path / "s")
     scan.reload()
-    assert (list(scan.rows()), len(load_facts(scan))) == (rows, facts), "nothing was written"
+    # Nothing was written.
+    assert (list(scan.rows()), len(load_facts(scan))) == (rows, facts)
     rig.pi.stage = right
     assert resume_scan(tmp_path / "s").folder.complete
     scan.reload()
@@ -201,25 +203,27 @@ def start_scan(rig, folder, **stage):
 
 
 @pytest.mark.parametrize(
-    ("lost_mm", "answer"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((-0.05, 0.0), True), ((0.0, -1.2), True)]
+    ("lost_mm", "is_warned"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((-0.05, 0.0), True), ((0.0, -1.2), True)]
 )
-def test_what_was_lost_is_in_the_manifest_and_what_matters_is_a_warning(rig, tmp_path, lost_mm, answer):
+def test_lost_steps_are_in_the_manifest_and_large_ones_are_a_warning(rig, tmp_path, lost_mm, is_warned):
     rig.pi.lost_mm = lost_mm
     result, ended = start_scan(rig, tmp_path / "s")
     assert (result.exit_status, rig.pi.homings) == ("success", 2)
     assert ended["lost_mm"] == list(lost_mm)
-    assert any(f"{lost_mm[1]:.3f} mm in y" in w for w in result.warnings) == answer
+    assert any(f"{lost_mm[1]:.3f} mm in y" in w for w in result.warnings) == is_warned
 
 
 def test_a_stage_without_switches_is_not_homed_again(rig, tmp_path):
     result, ended = start_scan(rig, tmp_path / "s", home_after_scan=False)
-    assert (result.exit_status, rig.pi.homings, "lost_mm" in ended) == ("success", 1, False)
+    assert (result.exit_status, rig.pi.homings) == ("success", 1)
+    assert "lost_mm" not in ended
 
 
 def test_homing_that_fails_after_the_last_row_ends_no_scan(rig, tmp_path):
     rig.pi.home_fails = {2}
     result, ended = start_scan(rig, tmp_path / "s")
-    assert (result.exit_status, ended["exit_status"], "lost_mm" in ended) == ("success", "success", False)
+    assert result.exit_status == ended["exit_status"] == "success"
+    assert "lost_mm" not in ended
     assert any("switch was not found" in w for w in result.warnings)
     assert ScanFolder.load(tmp_path / "s").complete
 

@@ -13,7 +13,9 @@ from polysight.store import validate
 PROCESSING = (
     "api calibration catalogue imaging materials page pipeline plan polarimetry process products report results"
 )
+# Folders of the host's program that a recorded scan does not need.
 NOT_LOADED = {*PROCESSING.split(), "serve", "sync", "verdict"}
+# Runs a command, and writes its exit status and the names of the loaded modules to a file.
 PROGRAM = """
 import json, sys
 from polysight.cli.main import main

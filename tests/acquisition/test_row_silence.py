@@ -12,7 +12,10 @@ NS_PER_S = 1_000_000_000
 
 
 def find_silent(rig, received: dict[str, int], bursts: int, age_s: float) -> list[str]:
-    """Boards reported as silent in a row whose bursts were all sent at one moment, so long ago."""
+    """Return the boards reported as silent in a row whose bursts were all sent `age_s` ago.
+
+    `received`: bytes of each board.
+    """
     progress = {name: SimpleNamespace(received=count) for name, count in received.items()}
     check = _SilenceCheck(rig, SimpleNamespace(reports=lambda: progress))
     event = SimpleNamespace(received_ns=time.monotonic_ns() - int(age_s * NS_PER_S))
@@ -24,7 +27,9 @@ def test_a_board_is_silent_when_it_sent_nothing_of_two_packets(pulses):
     rig = make_rig_with(burst={"pulses": pulses})
     two_packets_bytes = 2 * rig.card.packet_bytes
     burst_bytes = pulses * rig.frame_bytes
+    # Bursts whose data fills two packets.
     enough = next(count for count in range(1, 100) if count * burst_bytes >= two_packets_bytes)
+    # Longer than a board may be silent.
     long_ago_s = rig.limits.end_of_record_s + 10
     assert find_silent(rig, {"RH": 0, "RV": 1}, enough, long_ago_s) == ["RH"]
     assert find_silent(rig, {"RH": 0, "RV": 0}, enough + 5, long_ago_s) == ["RH", "RV"]

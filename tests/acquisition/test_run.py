@@ -32,14 +32,15 @@ from polysight_shared.messages import Capture, RunStarted, RunStopped
 
 
 def compute_digests(scan: ScanFolder) -> dict[str, str]:
-    return {
-        b.file: hashlib.sha256((scan.path / b.file).read_bytes()).hexdigest()
-        for r in scan.committed_rows().values()
-        for b in r.boards.values()
-    }
+    """Return the digest of each committed payload by its file."""
+    digests = {}
+    for row in scan.committed_rows().values():
+        for board in row.boards.values():
+            digests[board.file] = hashlib.sha256((scan.path / board.file).read_bytes()).hexdigest()
+    return digests
 
 
-def test_whole_scan_is_bit_exact_and_valid(rig, payload, tmp_path):
+def test_a_scan_without_faults_is_bit_exact_and_valid(rig, payload, tmp_path):
     rows = []
     calls = []
     result = run_scan(rig.instrument, tmp_path / "s", on_row=rows.append, progress=calls.append)
@@ -71,20 +72,22 @@ def test_lost_events_are_fetched_from_the_journal(rig, tmp_path):
     assert ended["events_refetched"] >= 7
 
 
-def test_lost_reply_runs_no_row_twice(rig, tmp_path):
-    losing = {"done": False}
+def test_a_row_whose_reply_was_lost_runs_once(rig, tmp_path):
+    has_lost_replies = False
 
     def progress(p):
-        if p.phase == "row" and p.row == 1 and not losing["done"]:
-            losing["done"] = True
+        nonlocal has_lost_replies
+        if p.phase == "row" and p.row == 1 and not has_lost_replies:
+            has_lost_replies = True
             rig.pi.lose_replies = 2
 
     assert run_scan(rig.instrument, tmp_path / "s", progress=progress).exit_status == "success"
     assert rig.pi.rows_run == [(0, 1), (1, 1), (2, 1), (3, 1)]
 
 
+# Numbers of the packets of a row: 0 to 25.
 @pytest.mark.parametrize("dropped", [{0}, {5}, {25}, {0, 1, 25}])
-def test_lost_packets_make_the_row_be_taken_again(rig, payload, tmp_path, dropped):
+def test_a_row_with_lost_packets_is_retaken(rig, payload, tmp_path, dropped):
     rig.cards["RV"].drop[1, 1] = dropped
     said = []
     result = run_scan(
@@ -124,14 +127,14 @@ def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
     assert load_facts(result.folder, "row_committed")[1]["faults"] == [{"kind": "lost_on_the_way", "board": "RV"}]
     data = ScanFolder.load(tmp_path / "s").read_row("RV", 1)
     assert data.missing == [(3 * 1456, 5 * 1456), (9 * 1456, 10 * 1456)]
-    want = np.frombuffer(payload("RV", 1, rig.instrument.row_bytes), dtype=np.uint8)
+    truth = np.frombuffer(payload("RV", 1, rig.instrument.row_bytes), dtype=np.uint8)
     assert data.mask is not None
-    assert np.array_equal(data.payload[~data.mask], want[~data.mask])
+    assert np.array_equal(data.payload[~data.mask], truth[~data.mask])
     assert not data.payload[data.mask].any()
     assert list_errors(tmp_path / "s") == []
 
 
-def test_keep_incomplete_masks_a_slipped_row_as_a_whole(rig, tmp_path):
+def test_an_incomplete_row_with_a_frame_too_few_is_masked_as_a_whole(rig, tmp_path):
     for take in (1, 2, 3):
         rig.cards["RH"].short[1, take] = rig.instrument.frame_bytes
     run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
@@ -140,7 +143,7 @@ def test_keep_incomplete_masks_a_slipped_row_as_a_whole(rig, tmp_path):
     assert scan.committed_rows()[1].boards["RH"].frames_received == 0
 
 
-def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
+def test_a_scan_that_was_stopped_after_a_row_resumes_and_keeps_its_rows(rig, payload, tmp_path):
     stop = StopRequest()
 
     def progress(p):
@@ -151,6 +154,7 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     assert result.exit_status == "abort"
     assert list(result.folder.committed_rows()) == [0, 1]
     digests_before = compute_digests(result.folder)
+    # What a killed program may leave.
     (tmp_path / "s" / "raw" / "RH" / "0002.part").write_bytes(b"half a row")
     with (tmp_path / "s" / "manifest.jsonl").open("ab") as f:
         f.write(b'{"fact": "row_comm')
@@ -165,8 +169,8 @@ def test_stop_after_the_row_then_resume(rig, payload, tmp_path):
     assert set(find_last_takes(result.folder)) == {0, 1, 2, 3}
 
 
-def test_killed_host_resumes_and_committed_rows_stay(rig, config, payload, tmp_path):
-    """SIGKILL in the middle of row 2. The Pi finishes that row; the new take must not use its end."""
+def test_a_scan_whose_host_was_killed_resumes_and_keeps_its_rows(rig, config, payload, tmp_path):
+    """It is killed in row 2. The Pi finishes that row; its report must not end the new take."""
     code = (
         "import sys\nfrom pathlib import Path\nfrom polysight_shared.config import load_instrument\n"
         "from polysight.acquisition.scan import run_scan\n"
@@ -201,27 +205,27 @@ def test_processing_error_does_not_stop_the_scan(rig, tmp_path):
     assert isinstance(result.processing_error, ScanError)
 
 
-def test_no_pi(make_instrument, tmp_path):
+def test_without_a_pi_the_error_has_its_port_and_the_command_that_starts_it(make_instrument, tmp_path):
     instrument = make_instrument(command_timeout_s=0.3)
     with expect_refusal(ErrorCode.NO_ANSWER, 5601, "polysight-pi run"):
         run_scan(instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
 
 
-def test_mute_card_is_named(rig, tmp_path):
+def test_the_error_of_a_card_that_does_not_reply_names_it(rig, tmp_path):
     rig.cards["RV"].mute = True
     with expect_refusal(ErrorCode.NO_ANSWER, "RV", rig.instrument.by_name("RV").card_address):
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
 
 
-def test_radar_without_data_is_not_a_mute_card(rig, tmp_path):
+def test_the_error_of_a_radar_without_data_is_not_that_of_a_silent_card(rig, tmp_path):
     rig.cards["RH"].silent_data = True
     with expect_refusal(ErrorCode.ROW_INCOMPLETE, "RH", "SYNC_IN", "armed"):
         run_scan(rig.instrument, tmp_path / "s")
 
 
-def test_port_in_use_is_named(rig, tmp_path):
+def test_the_error_of_a_port_in_use_has_its_address(rig, tmp_path):
     board = rig.instrument.by_name("RV")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other_socket:
         other_socket.bind((board.host_address, board.data_port))
@@ -252,7 +256,8 @@ def test_existing_scan_is_not_overwritten(rig, tmp_path):
     assert compute_digests(ScanFolder.load(tmp_path / "s")) == digests_before
 
 
-TAIL_S = 0.6  # time from the last data to the short last packet; a real card takes 2 s
+# Time from the last data to the short last packet; a real card takes 2 s.
+TAIL_S = 0.6
 CONFIGURE = int(Code.CONFIGURE_FPGA)
 
 
@@ -302,7 +307,7 @@ class LateCard(FakeCard):
 
 
 @pytest.mark.parametrize("lag_ms", [0, 5, 30])
-def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tmp_path, monkeypatch, lag_ms):
+def test_the_retake_of_a_row_that_ended_early_is_complete(make_instrument, payload, tmp_path, monkeypatch, lag_ms):
     """The Pi reports a fault in row 1. The last packet and the status arrive some ms after the reply to the stop."""
     assert lag_ms < 1000 * capture_rig._COMPLETED_TIMEOUT_S / 2
     monkeypatch.setattr(capture_rig, "_COMPLETED_TIMEOUT_S", HANG_S)
@@ -312,6 +317,7 @@ def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tm
         card.cut[1, 1] = 4 * FULL + 100
         rig.cards[board.name] = card
     rig.start_pi()
+    # Fault 103: an edge was lost.
     rig.pi.fail_rows[1, 1] = 103
     try:
         result = run_scan(rig.instrument, tmp_path / "s")
@@ -323,7 +329,7 @@ def test_take_after_a_row_that_ended_early_is_whole(make_instrument, payload, tm
     assert validate(tmp_path / "s") == []
 
 
-def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path):
+def test_a_card_that_sent_nothing_is_configured_again_before_the_retake(rig, tmp_path):
     """The card lost power for a moment: it replies again, but its configuration is lost."""
     card = rig.cards["RH"]
 
@@ -333,7 +339,9 @@ def test_card_that_sent_nothing_is_set_up_again_before_the_retake(rig, tmp_path)
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=mute_until_set_up_again)
     assert (result.exit_status, result.retakes) == ("success", 1)
-    assert (card.codes_received.count(CONFIGURE), rig.cards["RV"].codes_received.count(CONFIGURE)) == (4, 2)
+    # Configured twice at the start, and RH twice more.
+    assert card.codes_received.count(CONFIGURE) == 4
+    assert rig.cards["RV"].codes_received.count(CONFIGURE) == 2
 
 
 def test_a_scan_is_not_resumed_with_the_cards_of_two_boards_exchanged(rig, tmp_path, monkeypatch):
@@ -355,7 +363,8 @@ def test_a_scan_is_not_resumed_with_the_cards_of_two_boards_exchanged(rig, tmp_p
     assert resume_scan(tmp_path / "s").exit_status == "success"
 
 
-@pytest.mark.parametrize(("limit_s", "warned"), [(0.25, True), (3.0, False)])
-def test_limit_below_the_cards_own_is_a_warning(make_instrument, limit_s, warned):
+@pytest.mark.parametrize(("limit_s", "is_warned"), [(0.25, True), (3.0, False)])
+def test_a_time_limit_below_that_of_the_card_is_a_warning(make_instrument, limit_s, is_warned):
+    """A card sends the short last packet of a record 2 s after its last data."""
     with CaptureRig(make_instrument(end_of_record_s=limit_s)) as rig:
-        assert any("end_of_record_s" in w for w in rig.warnings) == warned
+        assert any("end_of_record_s" in w for w in rig.warnings) == is_warned

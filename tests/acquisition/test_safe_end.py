@@ -30,6 +30,7 @@ from polysight_shared.faults import explain
 
 
 def list_motion_commands(pi) -> list[type]:
+    """Return the types of the commands that the Pi got, without questions and signs of life."""
     return [type(c) for c in pi.commands if not isinstance(c, m.Status | m.Replay | m.Alive)]
 
 
@@ -50,15 +51,15 @@ class MovingPi(PiClient):
         self.aborts.append(reason)
 
 
-def test_after_an_abort_the_stage_is_waited_for_but_not_for_ever(monkeypatch):
+def test_after_an_abort_the_host_waits_until_the_stage_rests_or_a_time_limit(monkeypatch):
     monkeypatch.setattr(pi_client, "_POLL_S", 0.001)
     pi = MovingPi("mine", ["running", "held", "done", "ready"])
     pi.come_to_rest("an error")
     assert (pi.aborts, pi.states) == (["an error"], ["ready"])
     monkeypatch.setattr(pi_client, "_REST_TIMEOUT_S", 0.01)
-    endless = MovingPi("mine", ["running"])
-    endless.come_to_rest("an error")
-    assert endless.aborts == ["an error"]
+    restless_pi = MovingPi("mine", ["running"])
+    restless_pi.come_to_rest("an error")
+    assert restless_pi.aborts == ["an error"]
 
 
 @pytest.mark.parametrize("other", ["", "another", "z"])
@@ -69,22 +70,23 @@ def test_a_run_of_another_host_is_not_aborted(other):
 
 
 def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
-    """The progress callback opens the control folder, because not every rig has a warning that opens it."""
-    first = []
+    """The scan reports its progress before BeginRun: at the first report it opens the folder for commands."""
+    begun_at_reports = []
 
     def note(p) -> None:
         if p.phase not in ("connect", "warning"):
-            first.append(m.BeginRun in list_motion_commands(rig.pi))
+            begun_at_reports.append(m.BeginRun in list_motion_commands(rig.pi))
 
     run_scan(rig.instrument, tmp_path / "s", progress=note)
-    assert not first[0]
+    assert not begun_at_reports[0]
 
 
-# --- what moves by itself ---------------------------------------------------------------------------------------------
+# --- the stage does not move by itself --------------------------------------------------------------------------------
 
 
+# 102: alarm of the stage; 109: the journal could not be written.
 @pytest.mark.parametrize("fault", [102, 109])
-def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig, tmp_path, fault):
+def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_that_of_the_fault(rig, tmp_path, fault):
     """The Pi ends row 1 with this fault and stays in state `fault`, as after an emergency stop."""
     rig.pi.fail_rows[1, 1] = fault
     rig.pi.latched = "stage alarm 14: the emergency stop is pressed"
@@ -95,33 +97,37 @@ def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_the_faults(rig,
     assert rig.pi.latched in e.value.what
     assert e.value.remedy.startswith(explain(fault).remedy)
     assert f"1 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
-    assert list_motion_commands(rig.pi).count(m.Home) == 1, "the one at the start"
+    # The stage was homed at the start only.
+    assert list_motion_commands(rig.pi).count(m.Home) == 1
     assert list_motion_commands(rig.pi)[-2:] == [m.Abort, m.EndRun]
     ended = load_facts(tmp_path / "s", "scan_ended")[0]
     assert (ended["exit_status"], ended["remedy"]) == ("fail", e.value.remedy)
 
 
 @pytest.mark.parametrize(("fault", "homes"), [(102, 0), (109, 2)])
-def test_a_scan_that_begins_homes_out_of_faults_that_are_not_the_stages(rig, tmp_path, fault, homes):
+def test_at_its_start_a_scan_homes_after_any_fault_but_that_of_the_stage(rig, tmp_path, fault, homes):
+    """An alarm of the stage may be its emergency stop, and a person has to look at it. `homes`: at start and end."""
     rig.pi.state = "fault"
     rig.pi.fault = fault
-    rig.pi.latched = "told"
+    rig.pi.latched = "the reason"
     if homes:
         assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     else:
         with expect_refusal(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
             run_scan(rig.instrument, tmp_path / "s")
         assert "polysight-pi home" in e.value.remedy
-    assert list_motion_commands(rig.pi).count(m.Home) == homes, "at the start, and after the last row"
+    assert list_motion_commands(rig.pi).count(m.Home) == homes
 
 
-def test_fault_of_a_row_alone_is_retaken_without_homing(rig, tmp_path):
+def test_a_row_with_a_fault_that_does_not_last_is_retaken_without_homing(rig, tmp_path):
+    # 108: the Pi did not hear from its host.
     rig.pi.fail_rows[1, 1] = 108
     assert run_scan(rig.instrument, tmp_path / "s").retakes == 1
     sent = list_motion_commands(rig.pi)
-    assert sent.index(m.Home) < sent.index(m.RunRow), "the one at the start"
+    # The stage is homed at the start, and not between rows.
+    assert sent.index(m.Home) < sent.index(m.RunRow)
     last_row = len(sent) - 1 - sent[::-1].index(m.RunRow)
-    assert m.Home not in sent[sent.index(m.RunRow) : last_row], "none between rows"
+    assert m.Home not in sent[sent.index(m.RunRow) : last_row]
 
 
 def test_pi_that_restarted_between_rows_ends_the_scan_immediately(rig, tmp_path):
@@ -136,7 +142,8 @@ def test_pi_that_restarted_between_rows_ends_the_scan_immediately(rig, tmp_path)
     assert "2 of 4 rows are safe" in e.value.remedy
     assert list_motion_commands(rig.pi).count(m.Home) == 1
     assert resume_scan(tmp_path / "s").exit_status == "success"
-    assert list_motion_commands(rig.pi).count(m.Home) == 3, "somebody asked for it, and after the last row"
+    # Once for the first scan; at the start of the resumed one, which a person requested, and after its last row.
+    assert list_motion_commands(rig.pi).count(m.Home) == 3
 
 
 def test_run_that_another_host_has_begun_is_left_alone(rig, tmp_path):
@@ -174,23 +181,21 @@ def test_homing_that_another_program_started_is_waited_for():
     assert make_ready(pi, StopRequest(), lambda *_: None, "s", first=False)
 
 
-# --- what is left behind ----------------------------------------------------------------------------------------------
+# --- errors and the rows that are safe --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("board", ["RH", "RV"])
 def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, receivers, tmp_path, board):
     """For each board: the Pi gets Abort, and the error is reported before the queued rows are processed."""
     rig.pi.hang_at = {1}
-    answer = []
-    said_at_end = []
+    messages_at_end = []
     release = threading.Event()
 
     def progress(p) -> None:
-        answer.append(p.phase)
         if p.phase == "state" and (p.state, p.row) == ("running", 1):
             os.kill(receivers[board], signal.SIGKILL)
         if p.phase == "end":
-            said_at_end.append((release.is_set(), p.message))
+            messages_at_end.append((release.is_set(), p.message))
             release.set()
 
     with expect_refusal(ErrorCode.NO_ANSWER, board) as e:
@@ -200,7 +205,7 @@ def test_receiver_that_dies_in_a_row_is_noticed_and_the_row_is_aborted(rig, rece
     assert rig.pi.hanging is None
     scan = ScanFolder.load(tmp_path / "s")
     assert rig.pi.journal[scan.scan_id][-1].exit_status == "fail"
-    assert said_at_end == [(False, f"{e.value.what}; 1 rows wait to be processed")]
+    assert messages_at_end == [(False, f"{e.value.what}; 1 rows wait to be processed")]
 
 
 def test_every_error_names_the_rows_that_are_safe(rig, tmp_path, monkeypatch):
@@ -215,7 +220,7 @@ def test_every_error_names_the_rows_that_are_safe(rig, tmp_path, monkeypatch):
     assert convert_os_error(e.value).remedy.endswith(safe)
 
 
-def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
+def test_the_error_of_a_pi_that_is_lost_has_the_rows_that_are_safe(rig, tmp_path):
     def answer(p) -> None:
         if p.phase == "committed" and p.row == 1:
             rig.pi.lose_replies = 10_000
@@ -228,7 +233,7 @@ def test_pi_that_is_lost_in_mid_scan(rig, tmp_path):
 # --- a display that fails ---------------------------------------------------------------------------------------------
 
 
-def test_failing_progress_output_ends_no_scan(rig, tmp_path):
+def test_a_display_that_fails_does_not_end_the_scan(rig, tmp_path):
     calls = []
 
     def answer(p) -> None:
@@ -238,7 +243,8 @@ def test_failing_progress_output_ends_no_scan(rig, tmp_path):
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=answer)
     assert result.exit_status == "success"
-    assert calls[-1].state == "running", "told no more"
+    # After its error it is not called any more.
+    assert calls[-1].state == "running"
     assert [w for w in result.warnings if "No space left" in w]
 
 
@@ -290,7 +296,8 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", streams[0])
         patch.setattr(sys, "stdout", streams[1])
-        with suppress(OSError):  # one of the summary's lines, which come last
+        # Printing the summary, which comes last, fails.
+        with suppress(OSError):
             live.scan(config, tmp_path / "s", DEFAULT, None, False, True)
     for stream in streams:
         stream.close()
@@ -298,7 +305,7 @@ def test_scan_without_a_terminal_is_recorded_and_processed(config, tmp_path, mon
     assert len(commands) == 1
 
 
-def test_lost_terminal_is_ignored_and_then_as_before():
+def test_the_signal_of_a_closed_terminal_is_ignored_during_the_block_only():
     signals = []
     earlier_handler = signal.signal(signal.SIGHUP, lambda *_: signals.append(1))
     try:
@@ -306,13 +313,14 @@ def test_lost_terminal_is_ignored_and_then_as_before():
             os.kill(os.getpid(), signal.SIGHUP)
         os.kill(os.getpid(), signal.SIGHUP)
         wait_for(lambda: signals, "the signal")
-        assert signals == [1], "the second one alone"
+        # Only the second signal has reached the handler from before.
+        assert signals == [1]
     finally:
         signal.signal(signal.SIGHUP, earlier_handler)
 
 
 @pytest.mark.parametrize("error", [ValueError("oops"), ScanError("no images", "", "look")])
-def test_processing_that_fails_does_not_hide_that_every_row_is_there(config, tmp_path, monkeypatch, capsys, error):
+def test_when_processing_fails_it_is_reported_that_every_row_is_there(config, tmp_path, monkeypatch, capsys, error):
     monkeypatch.setattr(processing, "check_inputs", lambda *_: None)
 
     def broken(*_: object, **__: object):

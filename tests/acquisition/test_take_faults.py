@@ -17,7 +17,11 @@ from polysight_shared.messages import RowFinished
 from polysight_shared.raster import Row
 
 SPEC = REPO / "docs/spec/scan-folder.md"
+# The Pi's remark on a row during which the stage was held.
 HELD = "held on the way: some positions were passed below full speed"
+
+
+# Faults of the first take of row 0.
 
 
 def lose_a_packet_on_the_way(rig) -> None:
@@ -89,12 +93,12 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
     card = rig.cards["RV"]
     send_row = rig.cards["RV"].send_row
 
-    def overflowing(row: int, take: int) -> None:
+    def report_overflow_and_send(row: int, take: int) -> None:
         if (row, take) == (0, 1):
             card.report_status(bit)
         send_row(row, take)
 
-    card.send_row = overflowing
+    card.send_row = report_overflow_and_send
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 1)
     (fact,) = load_facts(result.folder, "row_rejected")
@@ -102,7 +106,8 @@ def test_data_that_the_card_dropped_rejects_the_row_and_its_status_is_kept(rig, 
     assert [bool(fact["boards"][name]["card_status"] & bit) for name in ("RH", "RV")] == [False, True]
 
 
-def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
+def test_a_take_that_was_stopped_on_request_has_no_other_fault(rig, tmp_path):
+    """Two requests stop a scan within its row; what is missing then is no fault of the rig."""
     rig.pi.hang_at = {0}
     stop = StopRequest()
 
@@ -118,7 +123,8 @@ def test_stopped_now_is_on_request_whatever_else_is_missing(rig, tmp_path):
     assert not list((tmp_path / "s" / "raw").rglob("*.part"))
 
 
-def test_every_kind_has_its_words_and_its_line_in_the_specification():
+def test_every_kind_of_fault_has_a_cause_a_remedy_and_a_line_in_the_specification():
+    # The kind is in the first of two columns.
     table = SPEC.read_text(encoding="utf-8").split("| kind | what is wrong |")[1].split("\n\n")[0]
     assert set(re.findall(r"`([a-z_]+)`(?=[^|\n]*\|[^|\n]*\|$)", table, re.MULTILINE)) >= set(FaultKind)
     for kind in FaultKind:
@@ -129,8 +135,7 @@ def test_every_kind_has_its_words_and_its_line_in_the_specification():
     assert set(CAUSES) == set(FaultKind) - {FaultKind.PI_FAULT}
 
 
-def test_words_follow_the_kind_alone():
-    """The cause shown depends on the kind of the fault, not on the text of the reason."""
+def test_the_shown_cause_depends_on_the_kind_of_the_fault_and_not_on_the_text_of_the_reason():
     reason = "RV: no data, the radar has stopped, held, pulse, dropped by this machine"
     for kind, (cause, do) in CAUSES.items():
         notice = make_rejection_notice(0, 1, [reason], [TakeFault(kind, reason, "RV").to_row_fault()], "")
@@ -138,6 +143,7 @@ def test_words_follow_the_kind_alone():
     pulse_too_long = TakeFault(FaultKind.PI_FAULT, "a pulse was too long", number=int(PiFault.PULSE_TOO_LONG))
     notice = make_rejection_notice(0, 1, [str(pulse_too_long)], [pulse_too_long.to_row_fault()], "")
     assert notice.why.lower() == explain(PiFault.PULSE_TOO_LONG).cause.lower()
+    # A fault of a later release has no known cause.
     for unknown in ([], [RowFault("of_a_newer_release", "RV")]):
         notice = make_rejection_notice(0, 1, [reason], unknown, "")
         assert (notice.why, notice.facts["detail"]) == ("", reason)

@@ -1,4 +1,4 @@
-"""What a take's counts, its end and its boards say, one difference at a time, without a rig."""
+"""Faults of a take: its counts, its end and its boards differ from the plan one at a time, without a rig."""
 
 import threading
 from os import PRIO_PROCESS, getpriority
@@ -49,19 +49,21 @@ def test_without_a_report_the_hosts_own_reason_is_the_fault():
         ("fault", ABORTED, FaultKind.PI_FAULT),
     ],
 )
-def test_a_row_that_the_host_aborted_has_the_hosts_kind(status, aborted, kind):
+def test_a_row_that_the_host_aborted_has_the_fault_for_which_it_did(status, aborted, kind):
     end = make_end(status=status, fault=int(PiFault.EDGE_LOST))
     (fault,) = Take(ROW, 1, finished=end, aborted=aborted).faults(PULSES)
     assert fault.kind is kind
     assert fault.number == (int(PiFault.EDGE_LOST) if kind is FaultKind.PI_FAULT else 0)
 
 
-def test_the_text_is_the_pis_reason_or_else_the_faults_own():
+def test_the_text_of_a_fault_is_the_pi_s_reason_or_else_the_general_one_of_its_number():
     number = int(PiFault.EDGE_LOST)
-    (said,) = Take(ROW, 1, finished=make_end(status="fault", fault=number, reason="a wire is off")).faults(PULSES)
-    assert said.text == "the row ended as fault: a wire is off"
-    (unsaid,) = Take(ROW, 1, finished=make_end(status="fault", fault=number)).faults(PULSES)
-    assert unsaid.text == f"the row ended as fault: {explain(number).problem}"
+    end_with_reason = make_end(status="fault", fault=number, reason="a wire is off")
+    (fault,) = Take(ROW, 1, finished=end_with_reason).faults(PULSES)
+    assert fault.text == "the row ended as fault: a wire is off"
+    end_without_reason = make_end(status="fault", fault=number)
+    (fault,) = Take(ROW, 1, finished=end_without_reason).faults(PULSES)
+    assert fault.text == f"the row ended as fault: {explain(number).problem}"
 
 
 def test_data_of_an_aborted_row_count_only_if_pulses_were_sent():

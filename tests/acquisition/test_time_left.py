@@ -22,6 +22,7 @@ from polysight.page.history import parse_seconds
 from polysight.page.status import estimate_time_left
 from polysight_shared.raster import Row
 
+# Durations of a row, a pause and a homing in these tests.
 ROW_S = 12.0
 PAUSE_S = 7200.0
 HOMING_S = 240.0
@@ -32,14 +33,17 @@ def test_time_left_is_rows_times_their_time_minus_elapsed_time():
     assert time_left(0, ROW_S, 5.0) == 0
     for elapsed in (0.0, 1.0, ROW_S):
         assert time_left(10, ROW_S, elapsed) == 10 * ROW_S - elapsed
-    assert time_left(10, ROW_S, 1e6) == 9 * ROW_S, "an overdue row ends now, the others still take their time"
+    # A row that lasts longer than expected is taken to end now; the others still take their time.
+    assert time_left(10, ROW_S, 1e6) == 9 * ROW_S
+    # A clock that was set back does not lengthen it.
     assert time_left(10, ROW_S, -3.0) == 10 * ROW_S
 
 
 def test_one_long_row_does_not_change_the_typical_row_time():
     usual = [11.0, 12.0, 13.0] * 20
     assert typical_row_s([*usual, 900.0]) == statistics.median(usual)
-    assert typical_row_s([*usual, *[6.0] * 25]) == 6.0, "a rig that was sped up is believed after 25 rows"
+    # Rows of a rig that was sped up are the typical ones after 25 of them.
+    assert typical_row_s([*usual, *[6.0] * 25]) == 6.0
 
 
 def test_the_time_limit_of_a_row_is_a_minute_and_four_times_its_travel():
@@ -52,7 +56,7 @@ def test_the_time_limit_of_a_row_is_a_minute_and_four_times_its_travel():
 
 
 class Clock:
-    """Replaces `time`: it advances only on demand; a sleep during a pause takes PAUSE_S."""
+    """A clock in place of the module `time`: it advances when a test says so, and by a sleep, which ends a pause."""
 
     def __init__(self, stop: StopRequest) -> None:
         self.now = 1000.0
@@ -69,7 +73,8 @@ class Clock:
 def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
     """Rows of 12 s, the first after homing, the third after a pause of two hours."""
     stop = StopRequest()
-    answer = []
+    # Time left, with the number of committed rows or the message of a pause.
+    reported = []
     clock = Clock(stop)
     monkeypatch.setattr(running, "time", clock)
 
@@ -79,18 +84,19 @@ def test_neither_pause_nor_homing_is_time_of_a_row(rig, tmp_path, monkeypatch):
         if p.state == "checking" and p.phase == "state":
             clock.now += ROW_S
         if p.phase == "committed":
-            answer.append((p.committed, p.remaining_s))
+            reported.append((p.committed, p.remaining_s))
             stop.paused = p.committed == 2
         if p.phase == "wait":
-            answer.append((p.message, p.remaining_s))
+            reported.append((p.message, p.remaining_s))
 
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=progress)
     assert result.exit_status == "success"
     assert [f["fact"] for f in load_facts(result.folder, "scan_paused")] == ["scan_paused"]
-    assert [t for t in answer if isinstance(t[0], int)] == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
-    assert [remaining for word, remaining in answer if isinstance(word, str)] == [2 * ROW_S] * 2, (
-        "before the pause and after it"
-    )
+    after_rows = [report for report in reported if isinstance(report[0], int)]
+    assert after_rows == [(n, (4 - n) * ROW_S) for n in (1, 2, 3, 4)]
+    # At the begin of the pause and at its end.
+    at_pause_s = [remaining_s for message, remaining_s in reported if isinstance(message, str)]
+    assert at_pause_s == [2 * ROW_S] * 2
 
 
 def test_the_page_has_the_same_time_left(rig, tmp_path):
@@ -118,6 +124,7 @@ def show_progress(*steps: ScanProgress, terminal: bool, colours: Literal["standa
             bar.update(step)
     if colours:
         return out.getvalue()
+    # Without the escape codes of the terminal.
     return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue())
 
 
@@ -125,7 +132,7 @@ def make_progress(n: int, left_s: float | None) -> ScanProgress:
     return ScanProgress("committed", "", ROWS, n, row=n - 1, take=1, remaining_s=left_s)
 
 
-def test_a_line_at_every_tenth_of_the_scan():
+def test_a_log_has_a_line_at_every_tenth_of_the_scan():
     progress_text = show_progress(
         *(make_progress(n, 60.0 * (ROWS - n)) for n in range(1, ROWS + 1)), terminal=False
     ).splitlines()
@@ -133,18 +140,17 @@ def test_a_line_at_every_tenth_of_the_scan():
     assert progress_text[1:] == [f"{n} of 20 rows, {ROWS - n}:00 left" for n in range(2, ROWS + 1, 2)]
 
 
-def test_notices_are_shown_and_steps_are_not():
+def test_a_log_has_notices_and_not_every_step():
     step = {"rows": ROWS, "committed": 3, "row": 4, "take": 1}
-    answer = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
-    progress_text = show_progress(
-        *(ScanProgress(phase, f"so {phase}", **step) for phase in (*answer, "row", "state")), terminal=False
-    )
-    assert progress_text.splitlines() == [f"{phase}: so {phase}" for phase in answer]
+    notices = ("warning", "retake", "home", "check", "connect", "stop", "held", "wait", "end")
+    steps = [ScanProgress(phase, f"so {phase}", **step) for phase in (*notices, "row", "state")]
+    progress_text = show_progress(*steps, terminal=False)
+    assert progress_text.splitlines() == [f"{phase}: so {phase}" for phase in notices]
 
 
 @pytest.mark.parametrize("phase", ["warning", "end"])
-def test_messages_are_shown_as_they_are(phase):
-    """Brackets and colons are no markup, and numbers have no colours."""
+def test_messages_are_shown_without_a_change(phase):
+    """Brackets and colons, which are markup for the display's library, and numbers, which it colours."""
     message = "the Pi's [stage] differs in 'travel_x_mm' = 12.5: see [/tmp/rig] :x:"
     step = ScanProgress(phase, message, ROWS, committed=3, row=4, take=1)
     assert f"{phase}: {message}\n" in show_progress(step, terminal=True, colours="standard")

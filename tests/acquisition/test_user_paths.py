@@ -11,6 +11,7 @@ from polysight.cli.main import main
 from polysight.store import ScanFolder
 from polysight_simulators.scene import decode_scene, simulate
 
+# Forms of the path of the folder "a scan" in the current folder `out`: by its parent, through a link, and absolute.
 FORMS = ["../out/a scan", "./../out/./a scan", "a scan/../a scan/", "../out/link/a scan", "{tmp}/out/../out/a scan"]
 
 

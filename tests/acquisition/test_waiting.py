@@ -28,7 +28,7 @@ def limit_rows(instrument, **limits):
     return msgspec.structs.replace(instrument, limits=msgspec.structs.replace(instrument.limits, **limits))
 
 
-def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
+def test_the_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     """Processing hangs on row 0 and one row may wait: row 1 is the last one recorded until processing continues."""
     release = threading.Event()
     started = []
@@ -47,13 +47,15 @@ def test_next_row_waits_for_processing_with_a_notice(rig, tmp_path):
     result = run_scan(limit_rows(rig.instrument, rows_waiting=1), tmp_path / "s", on_row=on_row, progress=progress)
     assert result.exit_status == "success"
     message, begun = at_wait[0]
-    assert (message[0], begun) == ("2", [0, 1]), "two rows wait"
+    # The message begins with the number of rows that wait.
+    assert message[0] == "2"
+    assert begun == [0, 1]
     assert started == [0, 1, 2, 3]
     assert result.processing_error is None
     assert validate(tmp_path / "s") == []
 
 
-def test_stop_while_waiting_for_processing(rig, tmp_path):
+def test_a_scan_that_waits_for_processing_can_be_stopped(rig, tmp_path):
     release = threading.Event()
     stop = StopRequest()
 
@@ -69,14 +71,15 @@ def test_stop_while_waiting_for_processing(rig, tmp_path):
     assert (result.exit_status, sorted(result.folder.committed_rows())) == ("abort", [0, 1])
 
 
-def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
+def test_a_resumed_scan_does_not_wait_for_the_processing_of_earlier_rows(rig, tmp_path):
     stop = StopRequest()
     run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=lambda p: p.row == 2 and stop.request())
     release = threading.Event()
     waits = []
 
     def progress(p) -> None:
-        waits.extend([p.message] if p.phase == "wait" else [])
+        if p.phase == "wait":
+            waits.append(p.message)
         if p.phase == "committed":
             release.set()
 
@@ -84,7 +87,7 @@ def test_rows_of_an_earlier_run_hold_nothing_up(rig, tmp_path):
     assert waits == []
 
 
-def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, receivers, payload, tmp_path, monkeypatch):
+def test_the_scan_waits_for_a_slow_disk_and_loses_nothing(rig, receivers, payload, tmp_path, monkeypatch):
     """The receivers are stopped (SIGSTOP) before the request to write row 1, until the notice appears."""
     monkeypatch.setattr(row, "_DISK_NOTICE_S", 0.05)
     notices: list[tuple[int, str]] = []
@@ -99,7 +102,8 @@ def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, receivers, payload, 
                 os.kill(pid, signal.SIGCONT)
 
     result = run_scan(rig.instrument, tmp_path / "s", progress=progress)
-    assert notices[0][0] == 2, "the next row has not begun"
+    # The next row has not begun.
+    assert notices[0][0] == 2
     assert "disk" in notices[0][1]
     assert (result.exit_status, result.retakes) == ("success", 0)
     for index in range(4):
@@ -107,12 +111,14 @@ def test_slow_disk_holds_the_scan_up_and_loses_nothing(rig, receivers, payload, 
 
 
 def test_full_disk_between_rows_ends_the_scan_before_the_next_row(rig, tmp_path, monkeypatch):
-    real = shutil.disk_usage
+    disk_usage = shutil.disk_usage
 
-    def filling(path):
-        return real(path)._replace(free=rig.instrument.row_bytes if len(rig.pi.rows_run) >= 2 else 1 << 40)
+    def fill_after_two_rows(path):
+        # Space for one board's row, and there are two boards.
+        free_bytes = rig.instrument.row_bytes if len(rig.pi.rows_run) >= 2 else 1 << 40
+        return disk_usage(path)._replace(free=free_bytes)
 
-    monkeypatch.setattr(ready.shutil, "disk_usage", filling)
+    monkeypatch.setattr(ready.shutil, "disk_usage", fill_after_two_rows)
     with expect_refusal(ErrorCode.DISK_FULL):
         run_scan(rig.instrument, tmp_path / "s")
     assert rig.pi.rows_run == [(0, 1), (1, 1)]
@@ -150,16 +156,20 @@ def test_capture_has_priority_over_processing(rig, receivers, tmp_path):
     def progress(p) -> None:
         if p.state == "running" and not capture:
             for pid in receivers.values():
-                rt = os.sched_getscheduler(pid) in (os.SCHED_RR, os.SCHED_FIFO)
-                capture.append(-100 if rt else os.getpriority(os.PRIO_PROCESS, pid))
+                # Real-time priority counts as lower than any nice value.
+                if os.sched_getscheduler(pid) in (os.SCHED_RR, os.SCHED_FIFO):
+                    capture.append(-100)
+                else:
+                    capture.append(os.getpriority(os.PRIO_PROCESS, pid))
 
     run_scan(rig.instrument, tmp_path / "s", on_row=on_row, progress=progress)
     assert len(capture) == 2
     assert len(processing) == 4
+    # 19 is the largest nice value.
     assert min(processing) - max(capture) >= NICE or min(processing) == 19
 
 
-def test_held_row_that_is_whole_counts_with_a_note(rig, tmp_path):
+def test_a_complete_row_that_was_held_is_committed_with_a_note(rig, tmp_path):
     rig.pi.notes[1, 1] = "held on the way: some positions were passed below full speed"
     result = run_scan(rig.instrument, tmp_path / "s")
     assert (result.exit_status, result.retakes) == ("success", 0)
@@ -198,8 +208,8 @@ def test_a_report_that_comes_while_the_program_is_held_ends_the_row(rig, monkeyp
     assert take.finished == "the Pi's report"
 
 
-def test_held_row_is_waited_for_however_long(rig, tmp_path, monkeypatch):
-    """The limit passes at every reading of the clock, which stands still before the delay and after the loop's end."""
+def test_a_row_that_is_held_has_no_time_limit(rig, tmp_path, monkeypatch):
+    """While it is held each reading of the clock is a minute later, and the limit of a row is half a second here."""
     rig.pi.hang_at = {1}
     rig.pi.hang_held = True
     readings_s = []
@@ -228,7 +238,8 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     points = []
     requests = []
     aborted = []
-    sleeps: list[float] = []  # timeouts of the loop, in ms; None would be endless
+    # Timeouts with which the loop waits, in ms; None would be endless.
+    sleeps: list[float] = []
 
     class Poller(zmq.Poller):
         def poll(self, timeout=None):
@@ -244,10 +255,12 @@ def test_stop_now_sends_abort_before_anything_else(rig, tmp_path, monkeypatch):
     monkeypatch.setattr(row.PiClient, "abort", lambda *words: aborted.append(len(sleeps)) or abort(*words))
     result = run_scan(rig.instrument, tmp_path / "s", stop=stop, progress=lambda p: points.append(p.points))
     assert result.exit_status == "abort"
-    first, commands = requests[0]
-    until = aborted[0]
-    assert until - first == 1, "the turn in hand is the last one"
-    assert 0 <= max(sleeps[:until]) <= 100, "ms: a request is seen though nothing comes"
+    waits_at_request, commands = requests[0]
+    waits_at_abort = aborted[0]
+    # The wait during which the stop was requested was the last one.
+    assert waits_at_abort - waits_at_request == 1
+    # A request is seen within 0.1 s, also if no event comes.
+    assert 0 <= max(sleeps[:waits_at_abort]) <= 100
     assert isinstance(rig.pi.commands[commands], m.Abort)
     ended = load_facts(result.folder, "scan_ended")[0]
     assert (ended["exit_status"], ended["reason"]) == ("abort", "stopped on request, 4 of 4 rows are missing")
@@ -269,17 +282,16 @@ def test_stop_now_before_the_row_begins_moves_nothing(rig, tmp_path, state):
     assert resume_scan(tmp_path / "s").exit_status == "success"
 
 
-def test_every_end_is_written_down(rig, tmp_path, monkeypatch):
-    """An unexpected exception is recorded with its reason, too."""
+def test_an_unexpected_exception_is_recorded_as_the_end_of_the_scan(rig, tmp_path, monkeypatch):
 
     class BugError(Exception):
         pass
 
-    def no_place_for_row_2(*_: object) -> None:
+    def fail_before_row_2(*_: object) -> None:
         if len(rig.pi.rows_run) == 2:
             raise BugError("oops")
 
-    monkeypatch.setattr(running, "check_disk", no_place_for_row_2)
+    monkeypatch.setattr(running, "check_disk", fail_before_row_2)
     with pytest.raises(BugError):
         run_scan(rig.instrument, tmp_path / "s")
     monkeypatch.undo()

@@ -83,7 +83,7 @@ def test_processing_uses_the_filter_that_the_rig_file_names(filter_run, tmp_path
 
 
 def test_a_single_start_frequency_is_refused(scans, tmp_path):
-    # Exit status 3: the data do not suffice.
+    # The exit status of an error of the data (`DataError`)
     assert main(["calibrate", "hpf", str(scans[-1]), "--out", str(tmp_path / "c")]) == 3
     assert not (tmp_path / "c").exists()
 

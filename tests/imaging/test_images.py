@@ -32,6 +32,7 @@ from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
 
 def _build(rig, rows, **options):
+    """An image builder with the rows of both receivers; `rows(board)` makes those of one."""
     builder = ImageBuilder(rig, **options)
     for board in rig.receivers:
         for index, row in rows(board):
@@ -56,7 +57,7 @@ def _find_peak(image, x_m, y_m):
 
 @pytest.mark.parametrize("behind_m", [0.0, 0.004, -0.004])
 def test_a_point_on_a_pixel_has_its_phase_and_amplitude_in_both_channels(make_rig, points_rows, behind_m):
-    rig = make_rig(41, 41)
+    rig = make_rig(columns=41, rows=41)
     grid = image_grid(rig)
     point = np.array([grid.x_m[25], grid.y_m[14], grid.z_m + behind_m])
     amplitude = 0.8 * np.exp(1j)
@@ -84,7 +85,7 @@ def test_resolution_is_that_of_the_aperture(make_rig, points_rows):
     cos = np.cos(np.radians(54.93))
     # 41 positions, 4 mm each
     length_mm = 164.0
-    # Middle of the sweep, 78.6 GHz
+    # At 78.6 GHz, the middle of all 256 samples
     wavelength_mm = 3.814
     # The plane is 499 mm from the stage's, the antennas stand some 11 mm before it.
     height_mm = 488.0
@@ -97,11 +98,16 @@ def test_resolution_is_that_of_the_aperture(make_rig, points_rows):
 
 @pytest.fixture
 def plane_rows(synced_row):
-    """Rows of a uniform mirror of reflectivity r; positions in `holes` are missing."""
+    """`plane_rows(rig, board, reflectivity, holes)`: rows of a uniform plane.
 
-    def make(rig, board, r=1.0, holes=()):
+    Positions (row, i) in `holes` are missing. The direct path has the amplitude of one over its length, as the builder
+    assumes, so that all receivers' gains are 1.
+    """
+
+    def make(rig, board, reflectivity=1.0, holes=()):
         antennas = Antennas.from_rig(rig, board)
-        samples = r * mirror_samples(antennas, image_grid(rig).z_m, rig.chirp) + 1 / antennas.direct_m[:, None]
+        echo = reflectivity * mirror_samples(antennas, image_grid(rig).z_m, rig.chirp)
+        samples = echo + 1 / antennas.direct_m[:, None]
         for row in plan_raster(rig.grid):
             valid = np.array([(row.index, i) not in holes for i in range(row.points)])
             yield row.index, synced_row(np.repeat(samples[:, None], row.points, axis=1), valid)
@@ -118,6 +124,7 @@ def test_a_uniform_plane_is_flat_after_division_with_missing_positions(make_rig,
     images = _build(rig, lambda b: plane_rows(rig, b, 0.5j, holes), taper=taper).finish()
     assert images.valid.mean() > 0.9
     for flat, raw in ((images.h, images.h_raw), (images.v, images.v_raw)):
+        # Samples are conjugates of waves, images are not.
         np.testing.assert_allclose(flat[images.valid], np.conj(0.5j), atol=2e-3)
         # Without the division by the footprint it is not flat.
         level = np.abs(raw[images.valid])
@@ -158,7 +165,7 @@ def test_receiver_gains_are_measured_on_the_direct_path_and_removed(make_rig, po
 
 
 def test_rows_may_come_in_any_order_and_a_row_added_again_replaces_the_earlier_one(make_rig, points_rows, synced_row):
-    rig = make_rig(15, 12)
+    rig = make_rig(columns=15, rows=12)
     point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     board = rig.receivers[0]
     rows = list(points_rows(rig, board, [point], [1.0]))
@@ -174,7 +181,7 @@ def test_rows_may_come_in_any_order_and_a_row_added_again_replaces_the_earlier_o
 
 
 def test_without_rows_the_image_is_empty(make_rig):
-    images = ImageBuilder(make_rig(5, 5, pixels=(6, 6))).finish()
+    images = ImageBuilder(make_rig(columns=5, rows=5, pixels=(6, 6))).finish()
     assert not images.valid.any()
     assert not images.h.any()
 
@@ -194,8 +201,8 @@ def test_rows_of_another_plan_are_refused(make_rig, synced_row):
 
 
 def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_rows):
-    """Raw chirps with offsets, direct path as strong as the echoes and noise, through the whole chain."""
-    rig = make_rig(31, 25)
+    """Raw chirps with offsets and noise, and a direct path as strong as the echoes, are synchronised and imaged."""
+    rig = make_rig(columns=31, rows=25)
     pulses = 3
     rig = msgspec.structs.replace(rig, burst=msgspec.structs.replace(rig.burst, pulses=pulses))
     rng = np.random.default_rng(6)
@@ -224,6 +231,7 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
 
     images = _build(rig, disturb).finish()
     for image, ideal_image in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
+        # 1 for equal images; the limit is chosen, for the noise.
         correlation = abs(np.vdot(image, ideal_image)) / np.linalg.norm(image) / np.linalg.norm(ideal_image)
         assert correlation > 0.98
 
@@ -265,7 +273,7 @@ def _draw_rows(rig, synced_row, rng):
 
 
 def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig, synced_row):
-    rig = make_rig(15, 9, pixels=(16, 14))
+    rig = make_rig(columns=15, rows=9, pixels=(16, 14))
     rng = np.random.default_rng(8)
     live = ImageBuilder(rig, live=True)
     plain = ImageBuilder(rig)
@@ -344,7 +352,7 @@ def test_jittered_positions_are_imaged_exactly_with_a_notice(make_rig, points_ro
 
 def test_a_row_far_from_its_planned_position_is_imaged_correctly(make_rig, synced_row):
     """Beyond the range of the running sums the live image is computed from all rows."""
-    rig = make_rig(15, 9, pixels=(16, 14))
+    rig = make_rig(columns=15, rows=9, pixels=(16, 14))
     live = ImageBuilder(rig, live=True)
     for name, index, row in _draw_rows(rig, synced_row, np.random.default_rng(13)):
         planned = row_offsets_m(rig, plan_raster(rig.grid).row(index))
@@ -355,7 +363,7 @@ def test_a_row_far_from_its_planned_position_is_imaged_correctly(make_rig, synce
 
 
 def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row):
-    rig = make_rig(15, 9, pixels=(16, 14))
+    rig = make_rig(columns=15, rows=9, pixels=(16, 14))
     rng = np.random.default_rng(12)
     is_scanned = rng.uniform(size=(9, 15)) > 0.4
     masked = ImageBuilder(rig, live=True)
@@ -373,7 +381,7 @@ def test_a_masked_position_equals_one_that_was_not_scanned(make_rig, synced_row)
 
 def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_within_0_05_rad(make_rig, points_rows):
     """The place is the peak on a ten times finer grid (0.2 mm); the phase is that at the true place, its middle."""
-    rig = make_rig(61, 41, pixels=(60, 50))
+    rig = make_rig(columns=61, rows=41, pixels=(60, 50))
     rng = np.random.default_rng(10)
     grid = image_grid(rig)
     for board in rig.receivers:

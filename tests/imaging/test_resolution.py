@@ -95,14 +95,14 @@ def test_missing_positions_cost_what_is_reported(make_rig, points_rows):
 
 
 def test_notices_of_images_are_reported_if_there_are_any(make_rig):
-    builder = ImageBuilder(make_rig(5, 5))
+    builder = ImageBuilder(make_rig(columns=5, rows=5))
     notice = "the direct sum is slower"
     assert describe_imaging(builder, SimpleNamespace(notices=(notice,)))["notices"] == [notice]
     assert list(describe_imaging(builder, SimpleNamespace(notices=()))) == ["RH", "RV"]
 
 
 def test_without_data_there_is_no_response(make_rig):
-    facts = describe_board(ImageBuilder(make_rig(5, 5)).boards["RV"])
+    facts = describe_board(ImageBuilder(make_rig(columns=5, rows=5)).boards["RV"])
     assert facts.masked == 1
     assert facts.loss_db is UNSET
 

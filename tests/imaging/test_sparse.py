@@ -84,7 +84,7 @@ def test_weak_reflectors_near_a_strong_one_are_kept(board):
 
 
 def test_no_data_gives_an_empty_image(make_rig):
-    reconstruction = reconstruct(ImageBuilder(make_rig(5, 5, pixels=(6, 6))).boards["RH"], iterations=2)
+    reconstruction = reconstruct(ImageBuilder(make_rig(columns=5, rows=5, pixels=(6, 6))).boards["RH"], iterations=2)
     assert not reconstruction.image.any()
 
 

@@ -1,4 +1,8 @@
-"""H / V of a point, which both receivers see under different angles, compared with the series of a sphere."""
+"""H / V of a point, which both receivers see under different angles.
+
+It is compared with simulated echoes of spheres and cylinders by their exact series (the solution of Maxwell's equations
+as a sum over modes), of which the estimator uses nothing.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -99,7 +103,7 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
 
 
 def find_pattern(antenna: Antenna, points: np.ndarray, at_m: np.ndarray) -> np.ndarray:
-    """Gain of an antenna of the worlds in the directions of points [n, 3] from stage offsets [n, 3]."""
+    """Gain of a simulated antenna in the directions of points [n, 3], at stage offsets [n, 3]."""
     from_antenna = points - at_m - antenna.position
     return (from_antenna @ antenna.boresight / np.linalg.norm(from_antenna, axis=1)) ** antenna.exponent
 
@@ -114,9 +118,10 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
     x, y, _ = CENTRE_M
     # Fronts are 0.5 m before the stage; radii of 100 and 150 mm.
     z = 0.5
-    solid: WorldShape = sphere("solid", Stack(below=medium), (x, y, z + 0.1), 0.1)
+    stack = Stack(below=medium)
+    solid: WorldShape = sphere("solid", stack, (x, y, z + 0.1), radius_m=0.1)
     if axis is not None:
-        solid = cylinder("solid", Stack(below=medium), (x, y, z + 0.15), 0.15, 4.0, axis=axis)
+        solid = cylinder("solid", stack, (x, y, z + 0.15), radius_m=0.15, length_m=4.0, axis=axis)
     measured, shape = see_exactly(solid, optics)
     voltages = find_voltages(measured, optics, shape)
     published = published_boards()
@@ -131,7 +136,7 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
     fit = fit_permittivity(voltages, UNIT_GAINS, optics.wave_number)
     errors = add_common_errors(fit, voltages, UNIT_GAINS, [], optics.wave_number)
     std = np.sqrt(np.trace(errors["model"]))
-    # The reported error is not too small by more than two, nor too large by more than about three.
+    # The reported error is at most two times too small, and about three times too large.
     assert 0.3 * std < abs(fit.eps - medium) < 2 * std
 
 

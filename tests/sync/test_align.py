@@ -26,14 +26,14 @@ def burst(paths, noise, rig, counts):
 
     def make(positions, snr_db, echo=1.0, seed=0, chirps=CHIRPS):
         rng = np.random.default_rng(seed)
-        signal, _ = paths(rig.receivers[0], positions, echo, rng)
+        signal, _ = paths(rig.receivers[0], positions=positions, echo=echo, rng=rng)
         n = np.arange(signal.shape[-1]) - CENTRE
         df = rng.uniform(-0.1, 0.1, (positions, chirps))
         phase = rng.uniform(-np.pi, np.pi, (positions, chirps))
         # [position, chirp, sample], the same for all RX
         turn = np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))
         frames = signal[:, :, None] * turn[:, None]
-        frames = frames + noise(frames.shape, -snr_db, rng)
+        frames = frames + noise(frames.shape, power_db=-snr_db, rng=rng)
         return counts(frames.swapaxes(0, 1)), df, phase, signal
 
     return make
@@ -154,7 +154,7 @@ def test_the_residual_is_the_true_error(burst):
 def test_a_chirp_of_noise_is_left_out(burst, noise, noisy_chirp):
     frames, df, _, _ = burst(12, snr_db=15)
     rng = np.random.default_rng(5)
-    frames[:, noisy_chirp] = np.rint(COUNTS * noise(frames[:, noisy_chirp].shape, 3, rng).real)
+    frames[:, noisy_chirp] = np.rint(COUNTS * noise(frames[:, noisy_chirp].shape, power_db=3, rng=rng).real)
     aligned = align_row(frames, np.ones(df.shape, bool), LINEAR)
     other_chirps = np.delete(np.arange(CHIRPS), noisy_chirp)
     assert not aligned.good[:, noisy_chirp].any()

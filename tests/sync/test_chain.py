@@ -37,11 +37,12 @@ def make_row(short_bursts_rig, paths, noise):
     board = short_bursts_rig.receivers[1]
 
     def make(offsets=True, filtered=False, snr_db=12.0, seed=0):
-        signal, direct = paths(board, POSITIONS, 1.0, np.random.default_rng(8))
+        signal, direct_m = paths(board, positions=POSITIONS, echo=1.0, rng=np.random.default_rng(8))
         rng = np.random.default_rng(seed)
         chirp = short_bursts_rig.chirp
         f = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
-        ideal = signal * np.exp(-2j * np.pi * f * direct[:, None] / SPEED_OF_LIGHT_M_S)
+        # Relative to the direct path, sample by sample
+        ideal = signal * np.exp(-2j * np.pi * f * direct_m[:, None] / SPEED_OF_LIGHT_M_S)
         n = np.arange(chirp.samples)
         # The direct path is at 0.35 cycles per sample.
         shape = (POSITIONS, PULSES)
@@ -50,13 +51,16 @@ def make_row(short_bursts_rig, paths, noise):
         if offsets:
             df = df + rng.uniform(-0.08, 0.08, shape)
             phase = rng.uniform(-np.pi, np.pi, shape)
-        frames = signal[:, None] * np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))[:, :, None]
+        turn = np.exp(1j * (2 * np.pi * df[..., None] * n + phase[..., None]))
+        # [position, chirp, rx, sample]
+        frames = signal[:, None] * turn[:, :, None]
         if filtered:
-            # The analogue filter's steady state, tone by tone: no start-up inside the window.
+            # Each tone is multiplied by the filter's response. 1024 zeros before the chirp, so that the filter starts
+            # with it.
             spectrum = np.fft.fft(np.pad(frames, [(0, 0)] * 3 + [(1024, 0)], mode="constant"), axis=-1)
             bins = np.fft.fftfreq(1280, 1 / chirp.sample_rate_hz) % chirp.sample_rate_hz
             frames = np.fft.ifft(spectrum * high_pass(chirp).response(bins), axis=-1)[..., 1024:]
-        frames = frames + noise(frames.shape, -snr_db, rng)
+        frames = frames + noise(frames.shape, power_db=-snr_db, rng=rng)
         counts = np.round(frames * COUNTS).transpose(2, 0, 1, 3).reshape(4, -1, chirp.samples)
         # The middle of each block of four samples, by a cubic through them
         blocks = ideal[..., :192].reshape(*ideal.shape[:2], -1, 4)
@@ -131,14 +135,14 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     positions = 400
     snr_db = 12.0
     board = rig.receivers[1]
-    signal, _ = paths(board, 1, 1.0, np.random.default_rng(8))
+    signal, _ = paths(board, positions=1, echo=1.0, rng=np.random.default_rng(8))
     rng = np.random.default_rng(3)
     shape = (positions, PULSES)
     n = np.arange(256)
     df = 0.35 + rng.uniform(-0.08, 0.08, shape)
     phase = rng.uniform(-np.pi, np.pi, shape)
     frames = signal[0][:, None, None] * np.exp(2j * np.pi * df[..., None] * n + 1j * phase[..., None])
-    frames = COUNTS * (frames + noise(frames.shape, -snr_db, rng))
+    frames = COUNTS * (frames + noise(frames.shape, power_db=-snr_db, rng=rng))
     full_setup = replace(setup, examined=positions)
     synchronised = synchronise_row(frames.reshape(4, -1, 256).astype(np.complex64), np.ones(df.size, bool), full_setup)
 
@@ -158,11 +162,11 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
 
 def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, noise, setup):
     """Residuals are measured at `examined` positions of a row only."""
-    signal, _ = paths(rig.receivers[1], 300, 1.0, np.random.default_rng(8))
+    signal, _ = paths(rig.receivers[1], positions=300, echo=1.0, rng=np.random.default_rng(8))
     rng = np.random.default_rng(3)
     phases = np.exp(2j * np.pi * rng.uniform(size=(1, 300, PULSES, 1)))
     frames = COUNTS * (signal.swapaxes(0, 1)[:, :, None] * phases)
-    frames = (frames + COUNTS * noise(frames.shape, -12.0, rng)).reshape(4, -1, 256).astype(np.complex64)
+    frames = (frames + COUNTS * noise(frames.shape, power_db=-12.0, rng=rng)).reshape(4, -1, 256).astype(np.complex64)
     few_examined = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=64))
     all_positions = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=300))
     assert {name: values.shape[1] for name, values in few_examined.errors.items() if name != "referenced"} == {

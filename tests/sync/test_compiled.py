@@ -217,10 +217,10 @@ def test_loops_agree_on_the_direct_path(loops, rig, paths, noise, counts):
     """
     board = rig.receivers[0]
     rng = np.random.default_rng(5)
-    ideal, _ = paths(board, 37, 1.5, rng)
+    ideal, _ = paths(board, positions=37, echo=1.5, rng=rng)
     ideal[7] = 0
     phase_of_chirps = np.exp(2j * np.pi * rng.uniform(size=(37, 4, 1, 1)))
-    frames = (ideal + noise(ideal.shape, -20, rng))[:, None] * phase_of_chirps
+    frames = (ideal + noise(ideal.shape, power_db=-20, rng=rng))[:, None] * phase_of_chirps
     words = counts(frames.transpose(2, 0, 1, 3))
     valid = np.ones((37, 4), bool)
     valid[11] = False

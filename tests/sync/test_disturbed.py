@@ -39,13 +39,13 @@ def receive_bursts(paths, noise, rig):
 
     def make(snr_db=8.0, seed=0, echo=1.0):
         rng = np.random.default_rng(seed)
-        signal, _ = paths(rig.receivers[0], POSITIONS, echo, rng)
+        signal, _ = paths(rig.receivers[0], positions=POSITIONS, echo=echo, rng=rng)
         shape = POSITIONS, CHIRPS, 1, 1
         n = np.arange(signal.shape[-1])
         # The direct path is at 0.35 cycles per sample; each chirp has its own offset of frequency and phase.
         turns = 0.35 * n + rng.uniform(-0.09, 0.09, shape) * n + rng.uniform(size=shape)
         frames = signal[:, None] * np.exp(2j * np.pi * turns)
-        return frames + noise(frames.shape, -snr_db, rng)
+        return frames + noise(frames.shape, power_db=-snr_db, rng=rng)
 
     return make
 

@@ -25,7 +25,7 @@ def test_error_is_at_the_cramer_rao_bound(noise, snr_db):
     trials = 20_000
     f = rng.uniform(-0.49, 0.49, trials)
     t = np.arange(n) - (n - 1) / 2
-    z = np.exp(2j * np.pi * f[:, None] * t) + noise((trials, n), -snr_db, rng)
+    z = np.exp(2j * np.pi * f[:, None] * t) + noise((trials, n), power_db=-snr_db, rng=rng)
     tone = estimate_tone(z.astype(np.complex64))
     power = 10 ** (-snr_db / 10)
     w_bound = np.sqrt(power / 2 / (t**2).sum())

@@ -78,7 +78,7 @@ def test_the_offset_predicted_by_geometry_puts_the_expected_if_in_the_middle(mak
     rig = make_rig(set_offset(50e3))
     board = rig.receivers[1]
     board_of_advice = msgspec.structs.replace(board, start_offset_hz=predict_by_geometry(rig, board))
-    # The radar's start frequency has steps of 54 Hz; each board may be off by some of them.
+    # The start frequencies of the boards have steps of 54 Hz; the limit of some steps is chosen.
     assert direct_if_hz(rig, board_of_advice) == pytest.approx(0.45 * rig.chirp.sample_rate_hz, abs=200)
 
 

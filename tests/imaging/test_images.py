@@ -154,7 +154,7 @@ def test_the_image_of_a_sheet_has_its_reflection_coefficient(make_rig, plane_row
 def test_receiver_gains_are_measured_on_the_direct_path_and_removed(make_rig, points_rows):
     rig = make_rig()
     point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
-    # 800: a usual amplitude in units of the converter
+    # Gains in units of the converter: 800 and differences between the RX; any would do.
     gains = np.array([1.0, 0.8 * np.exp(0.4j), 1.3 * np.exp(-0.3j), 0.9]) * 800
     equal_gains = _build(rig, lambda b: points_rows(rig, b, [point], [0.7])).finish()
     builder = _build(rig, lambda b: points_rows(rig, b, [point], [0.7], gains=gains))
@@ -285,7 +285,8 @@ def test_the_live_image_after_every_row_is_the_image_of_the_rows_so_far(make_rig
         pairs = [(live_images.h_raw, images.h_raw), (live_images.v_raw, images.v_raw)]
         pairs += zip(live_images.illumination.footprints, images.illumination.footprints, strict=True)
         for live_image, image in pairs:
-            # Rounding errors of the running sums, in single precision; images of few rows are weaker than 0.2.
+            # Rounding errors of the running sums, in single precision. After a few rows an image is weaker than 0.2,
+            # but its errors are not smaller.
             assert np.abs(live_image - image).max() <= 2e-5 * max(np.abs(image).max(), 0.2)
     for channel in ("h", "v", "valid"):
         np.testing.assert_array_equal(getattr(live.finish(), channel), getattr(plain.finish(), channel))

@@ -59,7 +59,8 @@ def test_each_of_two_objects_has_its_own_place_and_strength(apart_m, with_one_rx
 def test_echoes_of_one_window_are_separated_along_known_paths():
     """V is measured along paths that H gives: a neighbour's echo must not leak into an object's ratio.
 
-    The spheres are 70 mm apart in y. Measured one by one, the echo of the weaker one is wrong by more than a tenth.
+    The spheres are 70 mm apart in y. Measured one by one, the weaker echo is wrong by more than a tenth in some
+    windows.
     """
     scan, fronts = scan_two((0.0, 0.07, 0.0), 0.2)
     echoes = find_echoes(scan, GATE_M)

@@ -153,7 +153,9 @@ def test_a_region_is_as_wide_as_the_points_ripple(ripple, columns, rows):
 
 
 def test_a_level_that_an_uncertain_rig_explains_does_not_refuse_a_segment():
-    voltages = make_voltages(np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), 0.005)
+    voltages = make_voltages(
+        np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), stated_noise=0.005
+    )
     fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
     # H and V are 30 % too strong: no half space of this permittivity has such a level.
     strong = replace(voltages, voltage=1.3 * voltages.voltage)
@@ -171,7 +173,9 @@ def test_a_level_that_an_uncertain_rig_does_not_explain_refuses_a_segment():
 
     The level is reduced by two standard errors, as squares: sqrt(ln(0.893)^2 - (2 ln(1.037))^2) = 0.087.
     """
-    voltages = make_voltages(np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), 0.005)
+    voltages = make_voltages(
+        np.full(400, 0.005), np.random.default_rng(1).uniform(0, 0.3, (400, 2)), stated_noise=0.005
+    )
     fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
     coated = replace(voltages, voltage=0.893 * voltages.voltage)
     displaced = DisturbedScan("places", replace(coated, voltage=1.037 * coated.voltage), UNIT_GAINS)
@@ -186,7 +190,7 @@ def test_a_rise_over_the_band_that_is_within_its_scatter_refuses_no_segment():
     that its mean over the blocks has a standard deviation of 1 %.
     """
     rng = np.random.default_rng(1)
-    voltages = make_voltages(np.full(400, 0.005), rng.uniform(0, 0.3, (400, 2)), 0.005)
+    voltages = make_voltages(np.full(400, 0.005), rng.uniform(0, 0.3, (400, 2)), stated_noise=0.005)
     fit = fit_permittivity(voltages, UNIT_GAINS, WAVE_NUMBER)
     blocks = 1 + number_blocks(voltages.at_m, (0.0, 0.0)).max()
     scatter = rng.standard_normal((400, 2))

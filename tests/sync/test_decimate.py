@@ -19,7 +19,7 @@ def decimate_tone(cycles):
 
 
 # Largest deviation in the inside of the record, and at its first and last three blocks, where the filter has fewer
-# samples; chosen. The scene is within 5.4 bins of the middle.
+# samples; chosen. The passband is 13 bins to either side of the middle.
 @pytest.mark.parametrize(
     ("bins", "max_inside", "max_at_ends"), [(0, 1e-4, 1e-3), (2, 1e-4, 2e-3), (5.4, 1e-4, 2e-3), (12, 1e-3, 1e-2)]
 )

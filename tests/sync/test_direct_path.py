@@ -1,7 +1,8 @@
 """The direct path is found in the presence of an equally strong object, with its phase at the Cramer-Rao bound.
 
 The direct path from TX to RX is the reference of frequency and phase of each position. The echo of the object lies only
-3 to 4 bins of the 192 linear samples above it.
+3 to 4 bins of the 192 linear samples above it. A bin is 11 kHz; limits of errors in hertz and radians are chosen where
+no bound is named.
 """
 
 import msgspec
@@ -86,7 +87,6 @@ def run(rig, paths, noise, direct_paths, align_single):
     return synchronise_random_row
 
 
-# The limits of frequency (a bin is 11 kHz) and phase in this file are chosen: so small that images are not affected.
 def test_without_an_object_the_direct_path_is_exact(run, board):
     referenced, error_hz, phase_error = run(board, echo=0.0)
     assert referenced.found.all()

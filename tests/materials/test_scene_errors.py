@@ -27,22 +27,23 @@ from polysight.polarimetry import calibrate as to_metal_by_paper
 PIXEL_M = 2e-3
 SIDE = 120
 AXIS = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_M
+# Centres of nine plates in three rows, metres. The metal reference is the one in the middle.
 PLACES_M = [(x, y) for y in (-0.064, 0.0, 0.064) for x in (-0.064, 0.0, 0.064)]
 ORIGIN_M = PLACES_M[4]
 
 
 def draw_plates(ratio=0.25, seed=0):
-    """H and V of copper and three dielectrics of one ratio, 46 mm wide, with noise 40 dB below."""
+    """Return H and V of copper, at the top left, and three dielectrics with V / H of `ratio`.
+
+    The plates are 23 pixels, 46 mm, wide, and blurred by a pixel; each part of the noise is 50 dB below them.
+    """
     rng = np.random.default_rng(seed)
-    h, v = np.zeros((2, SIDE, SIDE), complex)
+    h, v = np.zeros((2, SIDE, SIDE))
     for number, (x0, y0) in enumerate([(20, 20), (70, 20), (20, 70), (70, 70)]):
         h[y0 : y0 + 23, x0 : x0 + 23] = 1.0
         v[y0 : y0 + 23, x0 : x0 + 23] = 1.0 if number == 0 else ratio
     noise = 0.003 * (rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE)))
-    return [
-        ndimage.gaussian_filter(channel.real, 1.0) + noise_part
-        for channel, noise_part in zip((h, v), noise, strict=True)
-    ]
+    return ndimage.gaussian_filter(h, 1.0) + noise[0], ndimage.gaussian_filter(v, 1.0) + noise[1]
 
 
 def make_images(h, v):
@@ -50,7 +51,7 @@ def make_images(h, v):
 
 
 def dim_copper(h, v):
-    """The same with copper at the end of the scan, which lights V less than H, and less towards the edge."""
+    """Return images in which copper is lit less towards the edge of the scan, and V less than H."""
     light = np.linspace(0.3, 1.0, 23)[:, None]
     h = h.copy()
     v = v.copy()
@@ -59,8 +60,8 @@ def dim_copper(h, v):
     return make_images(h, v)
 
 
-def test_metal_that_is_lit_unevenly_is_measured_as_plates_are():
-    """By the median of V / H, which differs from the root mean square by some per cent."""
+def test_the_reference_of_unevenly_lit_metal_is_its_median_ratio_as_of_other_plates():
+    """The root mean square of both channels, as in the paper, differs from it by some per cent."""
     scene = dim_copper(*draw_plates())
     segmentation = segment(scene.h, scene.v, scene.x_m, scene.y_m)
     metal = take_patch_as_metal(int(segmentation.labels[30, 30]), segmentation)
@@ -84,54 +85,76 @@ def test_uneven_light_on_metal_is_in_the_errors_of_all_plates():
 
 
 @pytest.mark.parametrize("shift_px", [(0.0, 1.5), (-2.0, 1.0), (1.2, 0.0)])
-def test_images_of_h_and_v_that_lie_apart_are_laid_on_each_other(shift_px):
+def test_images_of_h_and_v_that_are_displaced_are_aligned(shift_px):
     h, v = draw_plates()
+    # Rows (y) and columns (x) of 2 mm
     moved = ndimage.shift(v, shift_px, order=3)
-    aligned, apart_mm = align(make_images(h, moved))
-    assert apart_mm == pytest.approx((2 * shift_px[1], 2 * shift_px[0]), abs=0.4)
+    aligned, displacement_mm = align(make_images(h, moved))
+    # To a fifth of a pixel
+    assert displacement_mm == pytest.approx((2 * shift_px[1], 2 * shift_px[0]), abs=0.4)
+    # The border has no data after a shift.
     inside = np.s_[10:110, 10:110]
     assert np.abs(aligned.v - v)[inside].mean() < 0.5 * np.abs(moved - v)[inside].mean()
 
 
-def test_images_that_lie_on_each_other_are_left_alone():
+def test_aligned_images_are_not_changed():
     pair = make_images(*draw_plates())
-    aligned, apart_mm = align(pair)
-    assert apart_mm == (0.0, 0.0)
+    aligned, displacement_mm = align(pair)
+    assert displacement_mm == (0.0, 0.0)
     assert np.array_equal(aligned.v, pair.v)
 
 
-def test_noise_has_no_place():
+def test_images_of_noise_are_not_displaced():
     rng = np.random.default_rng(1)
     h, v = rng.standard_normal((2, SIDE, SIDE)) + 1j * rng.standard_normal((2, SIDE, SIDE))
     assert align(make_images(h, v))[1] == (0.0, 0.0)
 
 
 def make_scatter(slope_of, slope_std=0.1):
-    """Nine plates with the slopes (x, y) that a function of their place gives, known to `slope_std` per metre."""
+    """Return nine plates; `slope_of(x_m, y_m)` is the slope of ln(V / H) along x and y of the plate there, per metre.
+
+    `slope_std` is the error of each part of a slope.
+    """
     std = np.full(2, slope_std * (1 + 1j))
-    return [Scatter(0.01, 0.01, 8.0, np.array(slope_of(*place)), std, place) for place in PLACES_M]
+    return [
+        Scatter(
+            amplitude=0.01,
+            phase=0.01,
+            blocks=8.0,
+            slope=np.array(slope_of(*place)),
+            slope_std=std,
+            centre_m=place,
+        )
+        for place in PLACES_M
+    ]
 
 
-def test_slopes_that_all_plates_have_alike_are_theirs():
+def test_equal_slopes_of_all_plates_are_a_property_of_the_plates_and_not_a_drift():
     change = estimate_common_change(make_scatter(lambda _x, _y: (0.7 + 0.5j, 0.4j)), ORIGIN_M)
     assert np.abs(change.value).max() < 0.01
 
 
 def test_a_drift_over_the_rows_is_followed_within_its_error():
-    """ln(V / H) = 0.06 cos(20 y): both parts, slopes along y."""
-    change = estimate_common_change(make_scatter(lambda _x, y: (0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y))), ORIGIN_M)
-    true = (1 + 1j) * 0.06 * (np.cos(20 * np.array(PLACES_M)[:, 1]) - 1)
-    deviation = change.value - true
+    """Real and imaginary part of ln(V / H) are both 0.06 cos(20 y), relative to y = 0."""
+    y_m = np.array(PLACES_M)[:, 1]
+    true_change = (1 + 1j) * 0.06 * (np.cos(20 * y_m) - 1)
+
+    def slope_of(_x, y):
+        return 0j, -(1 + 1j) * 0.06 * 20 * np.sin(20 * y)
+
+    change = estimate_common_change(make_scatter(slope_of), ORIGIN_M)
+    deviation = change.value - true_change
     assert (np.abs(deviation.real) <= 2 * change.std.real + 1e-6).all()
-    assert np.abs(deviation).max() < 0.6 * np.abs(true).max()
+    # Two rows besides that of the metal show the drift only in part.
+    assert np.abs(deviation).max() < 0.6 * np.abs(true_change).max()
     assert max(change.largest_drift()) > 0.01
     assert change.drifts > 0.9
 
 
 def test_any_drift_is_within_its_error():
-    """An even rise and waves along y, each part its own; slopes as images show them, each with an error of its own.
+    """Random drifts along y: a linear rise and waves, in amplitude and phase of V / H independently.
 
-    Even rises have slopes that all plates share: they were once attributed to the plates, and their errors were too
+    A linear rise has slopes that all plates share: they were once attributed to the plates, and their errors were too
     small.
     """
     rng = np.random.default_rng(11)
@@ -140,6 +163,7 @@ def test_any_drift_is_within_its_error():
     slope_std = 0.25
     standardised = []
     for _ in range(30):
+        # The amplitude drifts by 5 to 25 % over the scan, the phase by 2 to 15 degrees.
         parts = []
         for span in (rng.uniform(0.05, 0.25), np.radians(rng.uniform(2, 15))):
             drift = rng.uniform(-1, 1) * along_m / 0.4
@@ -148,22 +172,25 @@ def test_any_drift_is_within_its_error():
                 drift = drift + rng.standard_normal() / (2 * waves) * wave
             parts.append(span * drift / np.ptp(drift))
         drift = parts[0] + 1j * parts[1]
-        true = np.interp(rows_m, along_m, drift)
+        true_change = np.interp(rows_m, along_m, drift)
         slope = np.interp(rows_m, along_m, np.gradient(drift, along_m))
+        # Images show about nine tenths of a slope, with an error.
         measured_slope = 0.9 * slope + slope_std * (rng.standard_normal(9) + 1j * rng.standard_normal(9))
         slopes = dict(zip(PLACES_M, measured_slope, strict=True))
         change = estimate_common_change(
             make_scatter(lambda x, y, slopes=slopes: (0j, slopes[x, y]), slope_std), ORIGIN_M
         )
+        # Changes are relative to the row of the metal.
         in_other_rows = rows_m != ORIGIN_M[1]
-        deviation = (change.value - true + true[PLACES_M.index(ORIGIN_M)])[in_other_rows]
+        true_change = true_change - true_change[PLACES_M.index(ORIGIN_M)]
+        deviation = (change.value - true_change)[in_other_rows]
         standardised.append(deviation.real / change.std.real[in_other_rows])
         standardised.append(deviation.imag / change.std.imag[in_other_rows])
     assert np.sqrt(np.mean(np.square(standardised))) < 1.3
 
 
 def test_drifts_taken_together_or_one_by_one_give_the_same_change(monkeypatch):
-    """Many plates would need much memory for all drifts at once."""
+    """With many plates, all candidates for a drift together would need too much memory."""
     scatters = make_scatter(lambda x, y: (20 * x * y + 0.1j, 0.8 * np.cos(30 * y)))
     together = estimate_common_change(scatters, ORIGIN_M)
     monkeypatch.setattr(common_change, "MOST_NUMBERS", 1)
@@ -172,11 +199,11 @@ def test_drifts_taken_together_or_one_by_one_give_the_same_change(monkeypatch):
         assert getattr(together, field.name) == pytest.approx(getattr(one_by_one, field.name), rel=1e-9, abs=1e-12)
 
 
-def test_no_plates_have_no_change():
+def test_a_scene_without_plates_has_no_drift():
     assert estimate_common_change([], ORIGIN_M).largest_drift() == (0.0, 0.0)
 
 
-def test_a_slope_along_y_alone_is_rather_drift_than_one_that_plates_have_both_ways():
+def test_a_slope_along_y_alone_is_more_likely_a_drift_than_one_along_x_and_y():
     along_y_alone = estimate_common_change(make_scatter(lambda _x, _y: (0j, 0.8)), ORIGIN_M)
     both_ways = estimate_common_change(make_scatter(lambda _x, _y: (0.8, 0.8)), ORIGIN_M)
     assert np.abs(along_y_alone.value).max() > 2 * np.abs(both_ways.value).max()
@@ -189,8 +216,11 @@ def test_slopes_along_a_row_are_not_a_drift():
 
 
 def test_plates_at_the_border_are_not_evidence_of_a_drift():
+    """Light falls off there: the last row has steep slopes, and does not change the others."""
     steep = make_scatter(lambda _x, y: (0j, 8.0 if y > 0.05 else 0j))
-    change = estimate_common_change(steep, ORIGIN_M, [place[1] > 0.05 for place in PLACES_M])
+    is_at_border = [place[1] > 0.05 for place in PLACES_M]
+    change = estimate_common_change(steep, ORIGIN_M, is_at_border)
+    # The first six plates are those of the other two rows.
     assert np.abs(change.value[:6]).max() < 0.01
 
 
@@ -204,38 +234,43 @@ def test_long_fringes_are_within_the_error():
         wave_vector = 2 * np.pi / rng.uniform(0.2, 0.3) * np.array([np.cos(direction), np.sin(direction)])
         phase = rng.uniform(0, 2 * np.pi)
         fringes = 0.12 * np.exp(1j * (places @ wave_vector + phase))
+        # The derivative of exp(i k . place) is i k exp(i k . place).
         slopes = dict(zip(PLACES_M, 1j * fringes[:, None] * wave_vector, strict=True))
         change = estimate_common_change(make_scatter(lambda x, y, slopes=slopes: slopes[x, y]), ORIGIN_M)
-        true = fringes - fringes[PLACES_M.index(ORIGIN_M)]
+        true_change = fringes - fringes[PLACES_M.index(ORIGIN_M)]
         for place in range(len(PLACES_M)):
             if PLACES_M[place] == ORIGIN_M:
                 continue
             value, (amplitude_std, phase_std) = change.log_ratio(place)
-            deviation = true[place] - value
+            deviation = true_change[place] - value
             standardised += [deviation.real / amplitude_std, deviation.imag / phase_std]
+    # 95 % are expected. The numbers of a scene are not independent: 8 scenes allow for 85 %; chosen.
     assert np.mean(np.abs(standardised) < 2) >= 0.85
 
 
-def test_a_plate_that_a_copy_of_another_disturbs_is_doubted_alone():
+def test_a_disturbed_plate_gets_a_large_error_and_the_others_do_not():
+    """A copy of another plate on it makes its slopes unlike all others."""
     disturbed = make_scatter(lambda x, y: (8 + 6j, 5j) if (x, y) == PLACES_M[0] else (0j, 0j))
-    error = estimate_common_change(disturbed, ORIGIN_M).ripple
-    assert error[0] > 0.05
-    assert error[1:].max() < 0.01
+    error_by_ripple = estimate_common_change(disturbed, ORIGIN_M).ripple
+    assert error_by_ripple[0] > 0.05
+    assert error_by_ripple[1:].max() < 0.01
 
 
-def test_bent_plates_are_not_a_ripple():
-    """Their brightness changes along y, in which direction H and V see different places."""
+def test_slopes_of_bent_plates_are_not_a_ripple():
+    """A bent plate changes in brightness. H and V see places apart along y, so that V / H has a slope along y."""
     rng = np.random.default_rng(3)
     bent = make_scatter(lambda _x, _y: (0j, complex(rng.normal(0, 4))))
     assert estimate_common_change(bent, ORIGIN_M).ripple.max() < 0.01
 
 
-def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
+def test_a_halo_around_the_metal_in_v_alone_shows_an_overdriven_receiver():
+    """A glow in both channels is light of the scene."""
     h, v = draw_plates()
     pair = make_images(h, v)
     patches = segment(h, v, AXIS, AXIS).patches
     metal = next(p for p in patches if np.median(np.abs(v[p.interior])) > 0.8)
     assert find_halo(metal.interior, patches, pair).level == 0
+    # A third of the metal, blurred over 16 mm
     glow = 0.3 * ndimage.gaussian_filter(metal.mask.astype(float), 8.0)
     halo = find_halo(metal.interior, patches, make_images(h, v + glow))
     assert halo.level > 0.005
@@ -243,7 +278,7 @@ def test_an_overdriven_receiver_shows_as_a_halo_of_v_alone():
     assert find_halo(metal.interior, patches, make_images(h + glow, v + glow)).level == 0
 
 
-def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
+def test_only_the_plate_that_is_brightest_in_v_has_a_halo():
     """A dielectric that is declared as metal does not overdrive the receiver."""
     h, v = draw_plates()
     patches = segment(h, v, AXIS, AXIS).patches
@@ -253,6 +288,7 @@ def test_only_a_plate_that_outshines_all_others_in_v_has_a_halo():
     assert find_halo(by_level[0].interior, patches, make_images(h, v + glow)).level == 0
 
 
+# The metal ends at column 42: gaps of 16 and 18 pixels of 2 mm. The limit is 36 mm between the plate and the metal's
 @pytest.mark.parametrize(("left_px", "lies_in_halo"), [(59, True), (61, False)])
 def test_a_plate_within_36_mm_of_the_metal_lies_in_its_halo_even_without_free_pixels_around_it(left_px, lies_in_halo):
     metal = np.zeros((SIDE, SIDE), bool)
@@ -262,14 +298,18 @@ def test_a_plate_within_36_mm_of_the_metal_lies_in_its_halo_even_without_free_pi
     patches = [SimpleNamespace(label=k, mask=mask, interior=mask) for k, mask in enumerate((metal, plate), 1)]
     h = metal + 0.4 * plate + 0.003
     v = metal + 0.1 * plate + 0.003 + 0.3 * ndimage.gaussian_filter(metal.astype(float), 8.0)
-    beside_plate = ndimage.binary_dilation(plate, iterations=10) & ~plate
-    halo = find_halo(metal, patches, Images(h, v, AXIS, AXIS, ~beside_plate))
+    # Nothing was imaged around the plate: its own glow cannot be measured.
+    around_plate = ndimage.binary_dilation(plate, iterations=10) & ~plate
+    halo = find_halo(metal, patches, Images(h, v, AXIS, AXIS, ~around_plate))
     assert halo.level > 0.005
     assert halo.around[2] == (halo.level if lies_in_halo else 0)
 
 
 def _explain_cases(mean: float, std: tuple[float, ...]) -> _ExpectedFromSlopes:
-    """Return cases of one plate with this mean of drift and fringes, and these standard deviations."""
+    """Return what the slopes of one plate show in as many cases (drifts) as there are standard deviations.
+
+    The mean of the change is the same in all cases.
+    """
     square = np.array([[mean**2 + s**2] for s in std])
     mean_of_cases = np.full_like(square, mean)
     return _ExpectedFromSlopes(
@@ -285,7 +325,7 @@ def _explain_cases(mean: float, std: tuple[float, ...]) -> _ExpectedFromSlopes:
 @pytest.mark.parametrize("wide_share", [0.0, 0.03, 0.1, 0.2, 0.5, 1.0])
 def test_the_error_of_the_common_change_holds_95_percent_of_unlike_cases(wide_share: float):
     """A rig is stable or drifts ten times as much: 1.96 times the root mean square hold 92 % if half of them drift."""
-    explained = _explain_cases(0.02, (0.001, 0.01))
+    explained = _explain_cases(mean=0.02, std=(0.001, 0.01))
     weight = np.array([1 - wide_share, wide_share])
     rng = np.random.default_rng(3)
     std = np.where(rng.random(200_000) < wide_share, 0.01, 0.001)
@@ -293,31 +333,34 @@ def test_the_error_of_the_common_change_holds_95_percent_of_unlike_cases(wide_sh
 
     error = float(explained.error(weight)[0])
 
+    # 200,000 draws of 95 % have an error of 0.0005.
     assert np.mean(np.abs(drawn - 0.02) < 1.96 * error) >= 0.947
     assert error >= 0.999 * np.std(drawn - 0.02) - 1e-5
 
 
 def test_the_error_of_a_common_change_is_the_standard_deviation_of_a_single_case():
-    error = _explain_cases(-0.3, (0.004,)).error(np.ones(1))
+    error = _explain_cases(mean=-0.3, std=(0.004,)).error(np.ones(1))
 
     assert error == pytest.approx(0.004, rel=1e-3)
 
 
 def test_fringes_that_only_weak_plates_show_are_not_reported():
-    """Bright edge strips disturb V of plates that reflect little of it; they were called a second path."""
+    """Bright edges disturb V of plates that reflect little of it; such slopes were once reported as a second path."""
     places = np.array(PLACES_M)
     wave_vector = 2 * np.pi / 0.25 * np.array([0.6, 0.8])
     fringes = 0.15 * np.exp(1j * places @ wave_vector)
     slopes = dict(zip(PLACES_M, 1j * fringes[:, None] * wave_vector, strict=True))
     strong_places = {PLACES_M[0], PLACES_M[4], PLACES_M[8]}
     scatters = make_scatter(lambda x, y: (0j, 0j) if (x, y) in strong_places else slopes[x, y])
+    # |V / H| of the plates with fringes is 0.1.
     levels = [0.9 if place in strong_places else 0.1 for place in PLACES_M]
-    by_weak_plates = [replace(s, level=level) for s, level in zip(scatters, levels, strict=True)]
+    scatters_of_weak = [replace(scatter, level=level) for scatter, level in zip(scatters, levels, strict=True)]
     change = estimate_common_change(scatters, ORIGIN_M)
     assert change.fringes > 0.5
-    weak = estimate_common_change(by_weak_plates, ORIGIN_M)
-    assert weak.fringes < 0.5
-    np.testing.assert_array_equal(weak.std, change.std)
+    change_of_weak = estimate_common_change(scatters_of_weak, ORIGIN_M)
+    assert change_of_weak.fringes < 0.5
+    # The errors do not change.
+    np.testing.assert_array_equal(change_of_weak.std, change.std)
 
 
 def test_the_metals_error_is_the_root_of_the_sum_of_squares_of_its_parts():
@@ -326,6 +369,9 @@ def test_the_metals_error_is_the_root_of_the_sum_of_squares_of_its_parts():
         tilts=Tilts({}, across=1), lit_evenly=True, metal_rise=(0.0, 0.0), halo=Halo(level=0.003), metal_std=0.017,
     )  # fmt: skip
     amplitude, phase = relative_errors(None, (0.02, 0.01))
+    # Amplitude and phase are one part each of a complex error whose parts are alike.
     parts = (LEAST_STD, amplitude / np.sqrt(2), phase / np.sqrt(2), 0.003 * HALO_OF_METAL, 0.017)
-    assert scene.prior(RigPrior(0.01), 0.0).reference_std == pytest.approx(np.sqrt(np.sum(np.square(parts))))
-    assert replace(scene, metal_spread=0.1).prior(RigPrior(0.01), 0.0).reference_std == LEAST_STD
+    rig = RigPrior(theta_std_rad=0.01)
+    assert scene.prior(rig, 0.0).reference_std == pytest.approx(np.sqrt(np.sum(np.square(parts))))
+    # Metal of a scan of its own has none of the scene's errors.
+    assert replace(scene, metal_spread=0.1).prior(rig, 0.0).reference_std == LEAST_STD

@@ -19,19 +19,24 @@ PIXEL_MM = 2.0
 SIDE = 150
 AXIS = (np.arange(SIDE) - (SIDE - 1) / 2) * PIXEL_MM / 1e3
 COPPER = 1.0 + 0j
+# Folder of the published rig's own picture and its boxes, which is not part of the repository.
 PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
-"""Folder of the published rig's own picture and its boxes, which is not part of the repository."""
 
 
 def draw_ripple(rng, amplitude, phase_rad):
-    """A multiplicative error of these standard deviations, correlated over some 15 mm."""
+    """Return a random factor with these standard deviations of ln amplitude and phase, correlated over some 15 mm."""
     fields = [ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 7.5 / PIXEL_MM) for _ in range(2)]
     real, imag = (field / field.std() for field in fields)
     return np.exp(amplitude * real + 1j * phase_rad * imag)
 
 
 def draw(seed, plates, strips=1.8, amplitude=0.25, phase_deg=13.0, background_db=-35.0):
-    """H and V of plates: (x0, y0, x1, y1) in pixels to (level of H in dB, V / H); strips of 4 mm along two edges."""
+    """Return H and V, complex [SIDE, SIDE], of plates before a background of noise.
+
+    `plates` is (x0, y0, x1, y1) in pixels to (level of H in dB, V / H). Strips of 4 mm along two edges of a plate are
+    `strips` times as bright. `amplitude` and `phase_deg` are the ripple of V / H over a plate; as large as on metal of
+    the real picture.
+    """
     rng = np.random.default_rng(seed)
     h, v = np.zeros((2, SIDE, SIDE), complex)
     for (x0, y0, x1, y1), (level_db, ratio) in plates.items():
@@ -40,48 +45,55 @@ def draw(seed, plates, strips=1.8, amplitude=0.25, phase_deg=13.0, background_db
         lit[:, -2:] *= strips
         h[y0:y1, x0:x1] = lit
         v[y0:y1, x0:x1] = ratio * lit
-    # The ripple of V / H is that of a metal plate; each channel has half of it.
+    # Each channel has half of the variance of the ripple of V / H.
     share = np.sqrt(0.5)
-    out = []
+    noise_level = 10 ** (background_db / 20)
+    images = []
     for channel in (h, v):
         rippled = channel * draw_ripple(rng, share * amplitude, share * np.radians(phase_deg))
-        noise = (rng.standard_normal((SIDE, SIDE)) + 1j * rng.standard_normal((SIDE, SIDE))) * 10 ** (
-            background_db / 20
-        )
-        blurred = [ndimage.gaussian_filter(part, 1.2) for part in (rippled.real, rippled.imag)]
-        out.append(blurred[0] + 1j * blurred[1] + noise)
-    return out
+        noise = noise_level * (rng.standard_normal((SIDE, SIDE)) + 1j * rng.standard_normal((SIDE, SIDE)))
+        blurred = ndimage.gaussian_filter(rippled.real, 1.2) + 1j * ndimage.gaussian_filter(rippled.imag, 1.2)
+        images.append(blurred + noise)
+    return images
 
 
 def draw_raster(levels_db, ratios, gap_px):
-    """Plates of 46 mm in rows of three, `gap_px` apart."""
+    """Return plates of 46 mm in rows of three, `gap_px` apart, as `draw` takes them."""
     size = 23
+    pitch = size + gap_px
     first = (SIDE - 3 * size - 2 * gap_px) // 2
-    boxes = [(first + (size + gap_px) * (i % 3), first + (size + gap_px) * (i // 3)) for i in range(len(levels_db))]
-    return {
-        (x, y, x + size, y + size): (level, ratio)
-        for (x, y), level, ratio in zip(boxes, levels_db, ratios, strict=True)
-    }
+    plates = {}
+    for i, (level_db, ratio) in enumerate(zip(levels_db, ratios, strict=True)):
+        x = first + pitch * (i % 3)
+        y = first + pitch * (i // 3)
+        plates[(x, y, x + size, y + size)] = (level_db, ratio)
+    return plates
 
 
 def convert_boxes_to_px(segmentation):
-    return [tuple(round(b / PIXEL_MM + SIDE / 2) for b in patch.box_mm) for patch in segmentation.patches]
+    return [tuple(round(edge / PIXEL_MM + SIDE / 2) for edge in patch.box_mm) for patch in segmentation.patches]
 
 
-def assert_found(segmentation, plates, tolerance_px=4):
+def has_box(boxes, plate, tolerance_px=4):
+    """True if the edges of one of the boxes are those of the plate, to 8 mm: chosen, a sixth of a plate."""
+    return any(np.abs(np.subtract(plate, box)).max() <= tolerance_px for box in boxes)
+
+
+def assert_found(segmentation, plates):
     boxes = convert_boxes_to_px(segmentation)
     assert len(boxes) == len(plates), boxes
     for plate in plates:
-        assert any(np.abs(np.subtract(plate, box)).max() <= tolerance_px for box in boxes), (plate, boxes)
+        assert has_box(boxes, plate), (plate, boxes)
 
 
+# V / H of nine plates
 RATIOS = [COPPER, 0.2, 0.22 + 0.05j, 0.3, 0.35 - 0.1j, 0.19, 0.5, 0.28, 0.2]
 
 
 @pytest.mark.parametrize("gap_px", [6, 8])
 @pytest.mark.parametrize("seed", range(4))
 def test_rippled_plates_with_bright_strips_and_narrow_gaps_are_found(seed, gap_px):
-    """Levels as in a real picture: 1.2 times metal's to a quarter of it."""
+    """Levels as in a real picture: from 1.2 times metal's to a quarter of it."""
     levels = np.random.default_rng(seed).permutation([0.0, 1.0, -4.0, 1.5, 1.0, -6.0, 1.5, -8.0, -11.0])
     plates = draw_raster(levels, RATIOS, gap_px)
     assert_found(segment(*draw(seed, plates), AXIS, AXIS), plates)
@@ -100,7 +112,7 @@ def test_sheets_that_only_h_shows_are_found(seed):
 
 
 def draw_band_limited_noise(rng, level_db):
-    """Complex noise [2, SIDE, SIDE] of this level with resolution cells of some 4 mm."""
+    """Return complex noise [2, SIDE, SIDE] of this level with resolution cells of some 4 mm."""
     parts = [ndimage.gaussian_filter(rng.standard_normal((SIDE, SIDE)), 1.0) for _ in range(4)]
     noise = np.array([parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]])
     return noise / np.sqrt(np.mean(np.abs(noise) ** 2)) * 10 ** (level_db / 20)
@@ -108,18 +120,20 @@ def draw_band_limited_noise(rng, level_db):
 
 @pytest.mark.parametrize("noise_db", [-20.0, -14.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_sheet_whose_v_is_noise_is_one_plate_of_one_kind(seed, noise_db):
+def test_a_sheet_whose_v_is_noise_is_accepted_as_a_plate(seed, noise_db):
+    """Its V / H is noise, but that is no sign of several materials."""
     plates = draw_raster([0.0, -3.0], [COPPER, 0.01], 12)
     h, v = draw(seed, plates, strips=1.0, amplitude=0.02, phase_deg=1.0, background_db=-60.0)
     v = v + draw_band_limited_noise(np.random.default_rng(seed), noise_db)[1]
     usable = np.ones(h.shape, bool)
     segmentation, _ = make_patches_from_labels({str(i): box for i, box in enumerate(plates)}, AXIS, AXIS, margin_mm=6.0)
     dark = measure_background(h, v, segmentation, usable)
-    assert [check_patch(patch, h, v, dark, 0.05) for patch in segmentation.patches] == [None, None]
+    findings = [check_patch(patch, h, v, dark, uneven=0.05) for patch in segmentation.patches]
+    assert findings == [None, None]
 
 
 def draw_uneven_light(seed):
-    """An amplitude [SIDE, SIDE] that varies by 5 dB (standard deviation) over some 100 mm."""
+    """Return an amplitude [SIDE, SIDE] that varies by 5 dB (standard deviation) over some 100 mm."""
     field = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal((SIDE, SIDE)), 20.0)
     return 10 ** (5.0 * field / field.std() / 20)
 
@@ -131,8 +145,8 @@ def test_plates_are_found_over_an_uneven_background_whose_levels_overlap_with_th
     channels = np.array(draw(seed, plates, strips=1.0, amplitude=0.15, background_db=-60.0))
     background = draw_band_limited_noise(np.random.default_rng(seed), -24.0) * draw_uneven_light(seed + 50)
     boxes = convert_boxes_to_px(segment(*(channels + background), AXIS, AXIS))
-    is_box_found = [any(np.abs(np.subtract(plate, box)).max() <= 4 for box in boxes) for plate in plates]
-    assert sum(is_box_found) >= 6
+    # Of seven plates one may be missed, and one patch may be background; chosen.
+    assert sum(has_box(boxes, plate) for plate in plates) >= 6
     assert len(boxes) <= len(plates) + 1
 
 
@@ -141,17 +155,19 @@ def test_band_limited_noise_alone_holds_no_plate(seed):
     assert not segment(*draw_band_limited_noise(np.random.default_rng(seed), 0.0), AXIS, AXIS).patches
 
 
-def test_halves_are_as_far_apart_as_their_median_ratios():
-    """V / H that grows along an axis: the medians of the outer halves, without the middle line."""
+def test_the_difference_of_halves_is_that_of_their_median_ratios():
+    """V / H grows by 0.5 a pixel along an axis. The medians of the halves are half of the extent apart.
+
+    With an odd number of lines the middle one belongs to neither half.
+    """
     mask = np.zeros((SIDE, SIDE), bool)
     mask[40:60, 70:79] = True
     across = np.arange(SIDE) * np.ones((SIDE, 1))
     h = np.full((SIDE, SIDE), 2.0 + 0j)
     for ratio in (across, across.T):
-        extent = np.ptp(ratio[mask]) + 1
-        assert measure_difference_of_halves(h, h * (0.3 + 0.4j) * ratio, mask) == pytest.approx(
-            0.5 * ((extent + 1) // 2)
-        )
+        lines = np.ptp(ratio[mask]) + 1
+        difference = measure_difference_of_halves(h, h * (0.3 + 0.4j) * ratio, mask)
+        assert difference == pytest.approx(0.5 * ((lines + 1) // 2))
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
@@ -159,12 +175,15 @@ def test_halves_are_as_far_apart_as_their_median_ratios():
 def test_channels_agree_at_a_coherence_above_0_7_in_any_unit(unit, coherence, agree):
     rng = np.random.default_rng(3)
     box = (-20.0, -20.0, 20.0, 20.0)
-    patch = make_patches_from_labels({"plate": box}, AXIS, AXIS)[0].patches[0]
+    segmentation, _ = make_patches_from_labels({"plate": box}, AXIS, AXIS)
+    # Half of the pixels are turned one way and half the other: the mean of exp(+- j phi) is cos(phi).
     angle = np.arccos(coherence) * np.where(rng.random((SIDE, SIDE)) < 0.5, 1, -1)
     h = np.full((SIDE, SIDE), unit + 0j)
-    cause = check_patch(patch, h, 0.5 * h * np.exp(1j * angle), (0.0, 0.0), 0.0)
-    assert cause is not None
-    assert (cause.what != "H and V do not agree") == agree
+    v = 0.5 * h * np.exp(1j * angle)
+    finding = check_patch(segmentation.patches[0], h, v, dark=(0.0, 0.0), uneven=0.0)
+    # A patch that agrees is refused too: its pixels have different ratios.
+    assert finding is not None
+    assert (finding.what != "H and V do not agree") == agree
 
 
 @pytest.mark.parametrize(("x0", "cut"), [(0, True), (130, True), (8, False)])
@@ -175,34 +194,43 @@ def test_a_plate_at_the_border_is_cut_and_refused(x0, cut):
     assert_found(segmentation, plates)
     patch = min(segmentation.patches, key=lambda p: p.centre_mm[1])
     assert patch.cut is cut
-    refusal_cause = check_patch(patch, h, v, measure_background(h, v, segmentation, np.ones(h.shape, bool)), 0.0)
-    assert (refusal_cause is not None and "border" in refusal_cause.what) is cut
+    dark = measure_background(h, v, segmentation, np.ones(h.shape, bool))
+    finding = check_patch(patch, h, v, dark, uneven=0.0)
+    is_refused_as_cut = finding is not None and "border" in finding.what
+    assert is_refused_as_cut is cut
 
 
-def find_refusal(h, v, box, amplitude_of_metal=0.0):
+def find_refusal(h, v, box, least_uneven=0.0):
+    """Return why the pixels in a box are not a plate; None if they are.
+
+    With `least_uneven` the box is metal, whose halves may differ by this, or by as much as they do.
+    """
     segmentation, _ = make_patches_from_labels({"plate": box}, AXIS, AXIS)
     patch = segmentation.patches[0]
-    uneven = max(amplitude_of_metal, measure_difference_of_halves(h, v, patch.interior) if amplitude_of_metal else 0.0)
-    return check_patch(patch, h, v, measure_background(h, v, segmentation, np.ones(h.shape, bool)), uneven)
+    uneven = 0.0
+    if least_uneven:
+        uneven = max(least_uneven, measure_difference_of_halves(h, v, patch.interior))
+    dark = measure_background(h, v, segmentation, np.ones(h.shape, bool))
+    return check_patch(patch, h, v, dark, uneven)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_metal_that_ripples_as_real_metal_does_is_one_material(seed):
-    """25 % and 13 degrees; its halves are compared with its own, as for a metal reference."""
+    """A ripple of 25 % and 13 degrees."""
     plates = {(60, 60, 88, 88): (0.0, COPPER)}
     h, v = draw(seed, plates, strips=1.0)
-    assert find_refusal(h, v, (64, 64, 84, 84), amplitude_of_metal=0.1) is None
+    assert find_refusal(h, v, (64, 64, 84, 84), least_uneven=0.1) is None
 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("other", [0.2, 0.35 - 0.1j])
-def test_metal_and_a_dielectric_in_one_box_are_not(seed, other):
+def test_metal_and_a_dielectric_in_one_box_are_refused(seed, other):
     plates = {(60, 60, 74, 88): (0.0, COPPER), (74, 60, 88, 88): (0.0, other)}
     h, v = draw(seed, plates, strips=1.0, amplitude=0.1, phase_deg=5.0)
     assert find_refusal(h, v, (62, 62, 86, 86)) is not None
 
 
-def test_clutter_of_a_plates_size_is_counted_but_no_patch():
+def test_clutter_as_large_as_a_plate_is_reported_as_left_out_and_is_not_a_patch():
     rng = np.random.default_rng(3)
     plates = draw_raster([0.0, 0.0, -3.0], [COPPER, 0.25, 0.25], 10)
     h, v = draw(3, plates)
@@ -217,8 +245,11 @@ def test_clutter_of_a_plates_size_is_counted_but_no_patch():
 def test_a_plate_cut_off_from_a_larger_patch_is_reported(seed):
     """Six plates without gaps: four in a square, two in a row at its corner. The last one was once lost."""
     size = 23
-    places = [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]
-    boxes = [(35 + size * i, 35 + size * j, 35 + size * (i + 1), 35 + size * (j + 1)) for i, j in places]
+    boxes = []
+    for column, row in [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]:
+        x0 = 35 + size * column
+        y0 = 35 + size * row
+        boxes.append((x0, y0, x0 + size, y0 + size))
     h, v = draw(seed, dict.fromkeys(boxes, (-6.0, 0.25)), strips=1.0, amplitude=0.05)
     segmentation = segment(h, v, AXIS, AXIS)
     x0, y0, x1, y1 = boxes[-1]
@@ -230,10 +261,11 @@ def test_a_plate_cut_off_from_a_larger_patch_is_reported(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_copies_of_the_plates_by_a_second_path_are_recognised(seed):
-    """Fringes over the scan shift the whole picture; each channel's copies have a place of their own."""
+    """A second path makes a weak copy of the whole picture elsewhere, in each channel at another place."""
     plates = draw_raster([0.0, -3.0, 0.0, -2.0, -1.0, 0.0], RATIOS[:6], 8)
     h, v = draw(seed, plates, amplitude=0.1, phase_deg=6.0)
     assert find_copies(segment(h, v, AXIS, AXIS).patches, h, v, PIXEL_MM) is None
+    # 0.16 is -16 dB. 30 rows and 45 columns of 2 mm are 60 mm along y and 90 mm along x.
     doubled = h + 0.16 * np.roll(h, (30, 45), axis=(0, 1))
     copies = find_copies(segment(doubled, v, AXIS, AXIS).patches, doubled, v, PIXEL_MM)
     assert copies is not None
@@ -246,12 +278,14 @@ def test_weak_plates_one_pitch_away_are_not_copies_if_both_channels_show_them():
     plates = draw_raster([0.0, 0.0, 0.0, 0.0], [COPPER, 0.3, 0.25, 0.35], 8)
     h, v = draw(5, plates, amplitude=0.05, phase_deg=3.0)
     weak_copy = 0.16 * np.roll(h, (30, 45), axis=(0, 1))
-    # Their own ratios have nothing to do with those of the plates beside them.
+    # A real plate has its own V / H: it is not that of the plate one pitch away, as of a copy.
     level = np.where(np.arange(SIDE)[None, :] < SIDE // 2, 2.5, 0.7)
-    own_v = level * weak_copy
-    assert find_copies(segment(h + weak_copy, v, AXIS, AXIS).patches, h + weak_copy, v, PIXEL_MM) is not None
-    segmentation = segment(h + weak_copy, v + own_v, AXIS, AXIS)
-    assert find_copies(segmentation.patches, h + weak_copy, v + own_v, PIXEL_MM) is None
+    h_with_weak = h + weak_copy
+    v_with_weak = v + level * weak_copy
+    seen_in_h_alone = segment(h_with_weak, v, AXIS, AXIS)
+    assert find_copies(seen_in_h_alone.patches, h_with_weak, v, PIXEL_MM) is not None
+    seen_in_both = segment(h_with_weak, v_with_weak, AXIS, AXIS)
+    assert find_copies(seen_in_both.patches, h_with_weak, v_with_weak, PIXEL_MM) is None
 
 
 @pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")
@@ -272,7 +306,7 @@ def test_the_nine_plates_of_the_published_rigs_picture_are_found_and_nothing_els
 
 
 def test_a_dim_plate_outside_patches_is_not_background_but_a_table_is():
-    """A dim plate is not a measure of the background of others; a table behind is as dim, but larger than any plate."""
+    """Both are regions that are left out of the patches. A table behind the plates is larger than any plate."""
     usable = np.ones((AXIS.size, AXIS.size), bool)
     patch_mask = np.zeros_like(usable)
     patch_mask[20:45, 20:45] = True
@@ -287,6 +321,7 @@ def test_a_dim_plate_outside_patches_is_not_background_but_a_table_is():
     assert measure_background(table, table, before_table, usable) == pytest.approx((0.3, 0.3))
 
 
+# The patch has 5 x 5 pixels.
 @pytest.mark.parametrize(("pixels", "is_background"), [(6 * 25, False), (6 * 25 + 1, True)])
 def test_a_dim_region_larger_than_six_plates_is_background(pixels, is_background):
     usable = np.ones((AXIS.size, AXIS.size), bool)
@@ -300,23 +335,26 @@ def test_a_dim_region_larger_than_six_plates_is_background(pixels, is_background
     assert (measure_background(h, h, segmentation, usable)[0] > 0) == is_background
 
 
-def test_a_background_that_is_alike_over_a_plates_size_does_not_average_away():
-    """A table behind the plates adds one number to a plate; noise adds its mean over the plate's pixels."""
+def test_a_background_that_does_not_vary_over_a_plate_does_not_average_out():
+    """A table behind the plates adds one number to all pixels of a plate; noise adds its mean over them."""
     plates = {(20, 20, 44, 44): (0.0, COPPER), (90, 90, 114, 114): (-6.0, 0.3)}
     segmentation = segment(*draw(1, plates, background_db=-60.0), AXIS, AXIS)
     usable = np.ones((SIDE, SIDE), bool)
+    # Complex noise of amplitude 1, and a table of amplitude 0.1
     noise = np.random.default_rng(2).standard_normal((2, SIDE, 2 * SIDE)).view(np.complex128) / np.sqrt(2)
     table = np.full((2, SIDE, SIDE), 0.08 + 0.06j)
+    # The mean over n independent pixels is smaller by sqrt(n), the width of a square plate.
     width_px = np.sqrt(np.median([p.interior.sum() for p in segmentation.patches]))
     assert background_mean(*table, segmentation, usable) == pytest.approx((0.1, 0.1), rel=1e-6)
     assert background_mean(*noise, segmentation, usable) == pytest.approx((1 / width_px, 1 / width_px), rel=0.35)
+    # Without usable pixels the background is not known.
     everywhere = segment(np.ones((SIDE, SIDE), complex), np.ones((SIDE, SIDE), complex), AXIS, AXIS)
     assert background_mean(*table, everywhere, usable & False) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("pixels", [50, 90])
 @pytest.mark.parametrize("stack", [METAL, Stack(below=4.69 - 0.7j)], ids=["copper", "dielectric"])
-def test_a_plate_that_fills_the_picture_is_one_region_and_stated(pixels, stack):
+def test_a_plate_that_fills_the_picture_is_not_a_patch_and_the_reason_is_given(pixels, stack):
     rig = published_rig()
     plate = Plate("board", (rig.centre_m[0], rig.centre_m[1]), (0.34, 0.34), stack)
     pair = simulate(World((plate,)), rig=rig, pixels=pixels)

@@ -1,4 +1,7 @@
-"""Total variation and outlines, compared with scikit-image's, which would load scipy.stats and scipy.signal."""
+"""Smoothing of a picture (total variation) and its outlines, compared with scikit-image.
+
+The program has its own form: scikit-image would load scipy.stats and scipy.signal, which takes long.
+"""
 
 import subprocess
 import sys
@@ -12,23 +15,27 @@ from polysight.materials.segment import drop_corners, reduce_variation
 
 
 @pytest.mark.parametrize("weight", [0.1, 3.0, 12.0])
-def test_level_without_speckle_is_that_of_scikit_image(weight):
+def test_the_smoothed_level_is_that_of_scikit_image(weight):
     rng = np.random.default_rng(7)
+    # Levels in dB: a plate 22 dB above a background of speckle
     level = rng.normal(0, 2.0, (60, 45)) - 30
     level[20:40, 10:30] += 22
     expected = denoise_tv_chambolle(level, weight=weight, max_num_iter=100)
     np.testing.assert_allclose(reduce_variation(level, weight), expected, atol=1e-9)
 
 
-def test_even_level_stays():
-    np.testing.assert_array_equal(reduce_variation(np.full((5, 4), -12.0), 3.0), np.full((5, 4), -12.0))
+def test_a_constant_level_is_not_changed():
+    level = np.full((5, 4), -12.0)
+    np.testing.assert_array_equal(reduce_variation(level, 3.0), level)
 
 
 @pytest.mark.parametrize("tolerance", [0.5, 0.8, 3.0])
 def test_outlines_are_those_of_scikit_image(tolerance):
     y, x = np.indices((50, 60))
-    shapes = (np.hypot(y - 25, x - 30) < 17.3, (abs(y - 24) < 11) & (abs(x - 31) < 14), (abs(y - x) < 6) & (x < 40))
-    for shape in shapes:
+    disc = np.hypot(y - 25, x - 30) < 17.3
+    rectangle = (abs(y - 24) < 11) & (abs(x - 31) < 14)
+    diagonal_strip = (abs(y - x) < 6) & (x < 40)
+    for shape in (disc, rectangle, diagonal_strip):
         outline = max(find_contours(np.pad(shape, 1).astype(float), 0.5), key=len)
         np.testing.assert_allclose(drop_corners(outline, tolerance), approximate_polygon(outline, tolerance))
 

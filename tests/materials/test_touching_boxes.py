@@ -11,12 +11,16 @@ from polysight.polarimetry import fresnel
 X_M = np.arange(60) * 2e-3
 Y_M = np.arange(40) * 2e-3
 THETA = np.radians(55.0)
+# Permittivities of the plates
 LEFT = 4 - 0.4j
 RIGHT = 9 - 2j
 
 
 def _make_scene():
-    """Metal below, two materials side by side above it; channels as complex64 [ny, nx], and boxes in pixels."""
+    """Return H, V, the segmentation by boxes, and name to patch number.
+
+    Metal fills the rows up to 20; above it two plates lie side by side. The box "nowhere" is at the right edge.
+    """
     h = np.full((40, 60), -1, np.complex64)
     v = np.full((40, 60), -1, np.complex64)
     for eps, columns in ((LEFT, slice(0, 30)), (RIGHT, slice(30, 60))):
@@ -26,9 +30,9 @@ def _make_scene():
     return h, v, segmentation, {name: label for label, name in names.items()}
 
 
-def test_each_box_is_filtered_by_itself():
+def test_the_filter_against_speckle_does_not_mix_boxes_that_touch():
     h, _, segmentation, labels = _make_scene()
-    smoothed = smooth_inside(h, segmentation, 2.0)
+    smoothed = smooth_inside(h, segmentation, sigma_px=2.0)
     for name, eps in (("left", LEFT), ("right", RIGHT)):
         interior = next(p for p in segmentation.patches if p.label == labels[name]).interior
         np.testing.assert_allclose(smoothed[interior], fresnel(eps, THETA)[0], atol=1e-6)
@@ -36,11 +40,15 @@ def test_each_box_is_filtered_by_itself():
     assert np.isnan(smoothed[is_outside]).all()
 
 
-def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
+def test_pixels_that_are_not_valid_are_not_measured_and_a_box_of_them_has_no_results():
     h, v, segmentation, labels = _make_scene()
     valid = np.ones(h.shape, bool)
-    valid[:, :12] = valid[:, 58:] = False
-    h[~valid] = v[~valid] = 0  # the sign of images
+    # A third of the left plate, and the whole box "nowhere"
+    valid[:, :12] = False
+    valid[:, 58:] = False
+    # As in images
+    h[~valid] = 0
+    v[~valid] = 0
     pair = Images(h, v, X_M, Y_M, valid)
     optics = Optics(THETA, smooth_px=1.0)
     result = analyse(pair, optics, KnownScene(segmentation, labels["metal"]))
@@ -54,9 +62,9 @@ def test_pixels_that_are_not_valid_do_not_count_and_a_box_of_them_is_nothing():
     assert nowhere.permittivity is None
 
 
-def test_plates_of_one_name_are_patches_each():
+def test_two_plates_of_the_same_name_are_two_patches():
     plates = [TruthPlate("acrylic", box, 4 - 0.4j) for box in ((-50, -30, -20, 0), (10, -30, 40, 0))]
-    segmentation, names = make_patches_from_plates(plates, X_M, Y_M, 0.0)
+    segmentation, names = make_patches_from_plates(plates, X_M, Y_M, margin_mm=0.0)
     assert list(names.values()) == ["acrylic", "acrylic"]
     assert [p.label for p in segmentation.patches] == list(names)
     assert not (segmentation.patches[0].mask & segmentation.patches[1].mask).any()

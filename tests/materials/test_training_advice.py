@@ -9,21 +9,26 @@ from polysight.materials.train import fit_samples
 from polysight.materials.training_advice import FREEDOM_NEEDED
 
 MANY_SCANS = 12
+# Acrylic and resin are nearer to each other than two specimens of one material.
 CLOSE = {"acrylic": 4.0 - 0.4j, "resin": 4.03 - 0.405j, "rubber": 5.06 - 1.11j}
 
 
 @pytest.fixture(scope="module")
 def fit_of_many_specimens():
-    return fit_samples(draw_pixels((0.03, 0.2), MANY_SCANS, seed=2))
+    return fit_samples(draw_pixels(spread=(0.03, 0.2), scans=MANY_SCANS, seed=2))
 
 
 def advise(fit) -> str:
+    """Return the text about a library with this fit."""
     return "\n".join(describe_accuracy(Library((), {"angles": {"60": fit}})))
 
 
-def test_unnamed_pieces_make_an_underconfident_library_that_asks_for_specimens():
-    """They differ by 12 %, which counts as an error of placement for all materials alike."""
-    text = advise(fit_samples(draw_pixels((0.12, 0.6), 6, seed=1, labelled=False)))
+def test_scans_without_names_of_their_specimens_make_an_underconfident_library():
+    """The specimens differ by 12 %: without their names that is an error of placement of all materials.
+
+    The advice is to scan more specimens.
+    """
+    text = advise(fit_samples(draw_pixels(spread=(0.12, 0.6), scans=6, seed=1, labelled=False)))
     assert "underconfident" in text
     assert "each material has one specimen" in text
     assert f"scan {FREEDOM_NEEDED} more" in text
@@ -38,6 +43,7 @@ def test_unnamed_pieces_make_an_underconfident_library_that_asks_for_specimens()
     ],
 )
 def test_overconfident_names_are_reported_with_the_likeliest_cause(fit_of_many_specimens, change, cause):
+    # Of 200 names the mean confidence is 0.97, and 0.8 are right.
     text = advise(fit_of_many_specimens | {"named": 200, "said": 0.97, "right": 0.8} | change)
     assert "overconfident: names are said with 97 % and 80 % are right" in text
     assert cause in text
@@ -50,14 +56,16 @@ def test_a_library_of_many_specimens_needs_none_and_is_neither_over_nor_undercon
 
 
 def test_materials_that_more_specimens_cannot_separate_are_reported():
-    text = advise(fit_samples(draw_pixels((0.03, 0.2), 8, seed=3, kinds=CLOSE)))
+    text = advise(fit_samples(draw_pixels(spread=(0.03, 0.2), scans=8, seed=3, kinds=CLOSE)))
     assert "acrylic and resin lie" in text
-    assert "rubber" not in text.split("lie")[0].splitlines()[-1]
+    names_before_lie = text.split("lie")[0].splitlines()[-1]
+    assert "rubber" not in names_before_lie
 
 
 def test_the_freedom_of_specimens_is_counted_over_the_materials(fit_of_many_specimens):
+    """Each material has one specimen in each scan, and one degree of freedom is spent on its mean."""
     few_scans = 3
-    fit_of_few = fit_samples(draw_pixels((0.03, 0.2), few_scans, seed=4))
+    fit_of_few = fit_samples(draw_pixels(spread=(0.03, 0.2), scans=few_scans, seed=4))
     for scans, fit in ((few_scans, fit_of_few), (MANY_SCANS, fit_of_many_specimens)):
         assert fit["specimen_freedom"] == len(KINDS) * (scans - 1)
         assert np.isfinite([fit["said"], fit["right"]]).all()

@@ -14,13 +14,15 @@ from polysight.materials.result import PATCHES_FORMAT
 from polysight.results import NoResult
 from polysight.results.verdict import LEVELS
 
+# Numbers of the products that must not be printed without a result: real part, loss and ratio.
 NUMBERS = ("2.9", "0.2", "3.0")
 
 
 def write_products_with_pixels(folder: Path) -> Path:
-    """Products that `classify` takes: with patches.npz of three patches of the simulated library's PET."""
+    """Add the patches.npz that `classify` needs: three patches of four pixels of the simulated library's PET."""
     rows = [{"label": n, "centre_mm": [30.0 * n, 0.0], "truth": None, "pixels": 4} for n in (1, 2, 3)]
-    places = np.concatenate([np.array([[30.0 * n + k, 0.0] for k in range(4)]) for n in (1, 2, 3)])
+    places = np.array([[30.0 * n + pixel, 0.0] for n in (1, 2, 3) for pixel in range(4)])
+    # |H|, |V|, and both parts of V / H
     features = np.tile([0.5, 0.15, 0.3, 0.05], (12, 1))
     meta = {"format": PATCHES_FORMAT, "angle_deg": 55.0, "simulated": True, "patches": rows}
     out = io.BytesIO()
@@ -45,6 +47,7 @@ def test_the_verdict_comes_first_and_decides_the_exit_status(tmp_path, capsys, c
     if level != "good":
         assert REASON["do"] in out
     if level == "none":
+        # Neither names nor numbers are printed, although the products of this test contain them.
         assert [word for word in (*NAMES, *NUMBERS) if word in out] == []
         return
     line = next(text for text in out.splitlines() if "PET" in text)
@@ -64,9 +67,14 @@ def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
     content = json.loads(out)
     if command == "materials":
         assert content[0]["verdict"]["level"] == "none"
-        assert {(s["name"], s["permittivity"], s["ratio"]) for s in content[0]["segments"]} == {(None, None, None)}
+        for segment in content[0]["segments"]:
+            assert segment["name"] is None
+            assert segment["permittivity"] is None
+            assert segment["ratio"] is None
     else:
-        assert {(s["name"], s["single_interface"]) for s in content} == {(None, None)}
+        for patch in content:
+            assert patch["name"] is None
+            assert patch["single_interface"] is None
 
 
 def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
@@ -91,20 +99,23 @@ def test_report_prints_the_verdict_and_the_path_of_the_page(tmp_path, capsys, le
 @pytest.mark.parametrize("as_json", [False, True])
 def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, capsys, as_json):
     options = ["--json"] if as_json else []
-    none = write_products_with_pixels(write_judged_products(tmp_path / "none", "none"))
+    without_result = write_products_with_pixels(write_judged_products(tmp_path / "none", "none"))
     good_products = write_products_with_pixels(write_judged_products(tmp_path / "good", "good"))
-    assert main(["classify", str(none), *options]) == NoResult.exit_status
+    assert main(["classify", str(without_result), *options]) == NoResult.exit_status
     out = capsys.readouterr().out
     if as_json:
-        assert {(p["name"], p["confidence"]) for p in json.loads(out)["patches"]} == {(None, None)}
+        for patch in json.loads(out)["patches"]:
+            assert patch["name"] is None
+            assert patch["confidence"] is None
     else:
         assert "pixels:" not in out
     assert main(["classify", str(good_products), *options]) == 0
     out = capsys.readouterr().out
     if as_json:
-        # Patch 1 is the metal reference
-        assert [p["label"] for p in json.loads(out)["patches"]] == [2]
-        assert [p["label"] for p in json.loads(out)["refused"]] == [3]
+        # Patch 1 is the metal reference.
+        answer = json.loads(out)
+        assert [p["label"] for p in answer["patches"]] == [2]
+        assert [p["label"] for p in answer["refused"]] == [3]
     else:
         assert "3  not judged: noise" in out
 

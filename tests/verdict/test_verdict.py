@@ -11,33 +11,40 @@ from polysight.results import PhaseJump, row_rules, rules
 from polysight.results.verdict import Coverage, NoResult, Verdict, join_reasons, percent, read_verdict, reason
 from polysight_shared.findings import Finding
 
-GAINS = Finding("error", "a gain", "leakage", "measure it")
-ALL = [
+# A finding about patches whose permittivity would be that of a material with gain.
+GAIN_FINDING = Finding("error", "a gain", "leakage", "measure it")
+# Reasons with their level, what, why, what to do, and weight.
+THREE_REASONS = [
     reason("care", "a", "because", "do a", 1.0),
     reason("care", "b", "because", "do b", 3.0),
     reason("none", "c", "because", "do c", 0.1),
 ]
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(ALL)))
-def test_the_worst_reason_decides_and_weight_orders(order):
+@pytest.mark.parametrize("order", list(itertools.permutations(THREE_REASONS)))
+def test_the_worst_reason_decides_and_reasons_of_one_level_are_in_order_of_weight(order):
     verdict = join_reasons(order)
     assert verdict.level == "none"
     assert [r.what for r in verdict.reasons] == ["c", "b", "a"]
+    # The reasons of the level "care" are warnings.
     assert join_reasons(r for r in order if r.level == "warning").level == "care"
 
 
-def test_only_no_result_hides_names_and_permittivities():
-    assert [join_reasons(ALL[:n]).usable for n in range(4)] == [True, True, True, False]
+def test_only_a_verdict_without_a_result_hides_names_and_permittivities():
+    # The third reason is the one of the level "none".
+    assert join_reasons([]).usable
+    assert join_reasons(THREE_REASONS[:1]).usable
+    assert join_reasons(THREE_REASONS[:2]).usable
+    assert not join_reasons(THREE_REASONS).usable
 
 
-def test_without_reasons_all_is_good():
+def test_a_verdict_without_reasons_is_good():
     assert join_reasons([]) == Verdict("good")
     assert join_reasons([]).lines() == ["verdict:  good"]
 
 
-def test_json_gives_back_what_was_written():
-    verdict = join_reasons(ALL)
+def test_a_verdict_is_read_back_from_json():
+    verdict = join_reasons(THREE_REASONS)
     content = {"verdict": verdict.to_dict(), "other": 1}
     reread = read_verdict(content)
     assert reread is not None
@@ -56,7 +63,7 @@ def test_damaged_reasons_are_left_out(reasons):
 
 
 def test_no_result_has_an_exit_status_of_its_own():
-    error = join_reasons(ALL).error("the images are kept")
+    error = join_reasons(THREE_REASONS).error("the images are kept")
     assert isinstance(error, NoResult)
     assert error.exit_status == 7
     assert "c" in error.what
@@ -64,12 +71,14 @@ def test_no_result_has_an_exit_status_of_its_own():
 
 
 def level(reasons):
+    """Return the level of the verdict with these reasons."""
     return join_reasons(reasons).level
 
 
 @pytest.mark.parametrize(
-    ("likely", "certain", "given", "contradicted", "only_patch", "want"),
+    ("likely", "certain", "given", "contradicted", "only_patch", "expected"),
     [
+        # Found without a user: good only if certain. Given by a user: good unless contradicted.
         (True, True, False, False, False, "good"),
         (True, False, False, False, False, "care"),
         (False, False, False, True, False, "none"),
@@ -79,21 +88,27 @@ def level(reasons):
         (False, False, True, True, False, "none"),
     ],
 )
-def test_metal_is_never_judged_by_itself(likely, certain, given, contradicted, only_patch, want):
-    assert level(rules.judge_metal("patch 3", likely, certain, given, contradicted, only_patch)) == want
+def test_metal_needs_evidence_of_other_patches_or_a_user(likely, certain, given, contradicted, only_patch, expected):
+    reasons = rules.judge_metal("patch 3", likely, certain, given, contradicted, only_patch)
+    assert level(reasons) == expected
 
 
-def test_evidence_without_a_limit_has_its_level():
+def test_reasons_that_depend_on_no_limit_have_a_level_of_their_own():
+    # No patches; one region is left out that fills most of the picture, or little of it
     assert level(rules.judge_patches({}, 0)) == "none"
     assert rules.judge_patches({}, 0, 1, 0.9)[0].what != rules.judge_patches({}, 0, 1, 0.1)[0].what
+    # The only one of the patches was refused, or one of two
     assert level(rules.judge_patches({1: "noise"}, 1)) == "none"
     assert level(rules.judge_patches({1: "noise"}, 2)) == "care"
+    # Leakage that was measured
     assert level(rules.judge_leakage(True, False, 0.5)) == "good"
+    # A plane that could not be measured
     assert level(rules.judge_plane(False, 0.0, (0.0, 0.0), 0.3)) == "care"
+    # A damaged manifest whose rows are complete
     assert level(rules.judge_recording(Coverage(27, 27, 2700, 2700, ("line 6: damaged",)), 0.0)) == "care"
 
 
-def test_what_is_not_known_is_not_held_against_a_result():
+def test_a_quantity_that_is_not_known_is_not_a_reason():
     assert level(rules.judge_direct_path("RH", None, None, 1.0)) == "good"
     assert level(rules.judge_levels({"H": None})) == "good"
 
@@ -137,6 +152,7 @@ def test_every_reason_has_its_cause_and_a_remedy():
 
 
 def judge_rows(recorded, masked=0.0):
+    """Judge a recording of 1000 planned rows, with this share of masked positions."""
     return rules.judge_recording(Coverage(1000, recorded, 1000, recorded), masked)
 
 
@@ -151,6 +167,7 @@ def judge_plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
 @pytest.mark.parametrize(
     ("judge", "inside", "outside", "levels"),
     [
+        # A function of one quantity, its values on either side of a limit, and the levels there.
         (judge_rows, 1000, 999, ("good", "care")),
         (judge_rows, 500, 499, ("care", "none")),
         (lambda masked: judge_rows(1000, masked), 0.005, 0.0051, ("good", "care")),
@@ -189,13 +206,16 @@ def judge_plane(offset_mm=0.0, tilt_deg=(0.0, 0.0)):
         (lambda angle: rules.judge_incidence(angle, 55.0), 54.701, 54.699, ("good", "care")),
     ],
 )
-def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels):
-    assert (level(judge(inside)), level(judge(outside))) == levels
+def test_the_level_changes_at_each_limit(judge, inside, outside, levels):
+    level_inside, level_outside = levels
+    assert level(judge(inside)) == level_inside
+    assert level(judge(outside)) == level_outside
 
 
 @pytest.mark.parametrize(
-    ("reasons", "said", "never"),
+    ("reasons", "expected_texts", "absent_text"),
     [
+        # Brightness is ln |H|: exp(0.4) = 1.49 and exp(-0.4) = 0.67.
         (rules.judge_brightness({1: 0.4}), ("patch 1 is 49 % brighter",), "darker"),
         (rules.judge_brightness({1: -0.4}), ("patch 1 is 33 % darker",), "brighter"),
         (
@@ -212,7 +232,7 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
         (rules.judge_tilts({1: 0.6, 4: 0.1}), ("patch 1", "+0.6 degrees"), "in all"),
         (rules.judge_patches({1: "noise", 3: "noise"}, 3), ("patches 1, 3 not judged: noise",), "patch 1"),
         (
-            rules.judge_passivity({3: GAINS, 5: GAINS}),
+            rules.judge_passivity({3: GAIN_FINDING, 5: GAIN_FINDING}),
             ("patches 3, 5 have no permittivity: a gain; leakage",),
             "patch ",
         ),
@@ -223,15 +243,16 @@ def test_each_limit_just_inside_and_just_outside(judge, inside, outside, levels)
         (judge_path(share=0.25), ("missing (25 % of the positions",), "weak"),
     ],
 )
-def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reasons, said, never):
+def test_a_reason_shows_the_figure_with_its_sign_and_the_patches_concerned(reasons, expected_texts, absent_text):
     (only_reason,) = reasons
     text = f"{only_reason.what}; {only_reason.why}"
-    assert all(part in text for part in said), text
-    assert never not in text, text
+    for expected_text in expected_texts:
+        assert expected_text in text
+    assert absent_text not in text
 
 
-def test_paint_is_not_the_cause_where_a_dielectric_reference_explains_the_others_better():
-    """The other patch that fits metal least is known only if the evidence, paint included, speaks against metal."""
+def test_a_reference_that_may_be_dielectric_is_not_reported_as_painted():
+    """`culprit` is the patch that speaks most against metal: it is given only if paint does not explain the patches."""
     (doubt,) = rules.judge_metal("patch 5", False, False, True, False, False, culprit=2, painted=1.0, paint_mm=0.1)
     (paint,) = rules.judge_metal("patch 5", False, False, True, False, False, painted=1.0, paint_mm=0.1)
     assert "may be no metal: patch 2" in doubt.what
@@ -243,11 +264,12 @@ def test_smears_are_reported_with_their_own_cause_and_advice(labels):
     assert rules.judge_smears({}) == []
     (reason,) = rules.judge_smears(dict.fromkeys(labels, SMEAR))
     assert all(str(label) in reason.what for label in labels)
-    assert (reason.why, reason.do) == (SMEAR.why, SMEAR.do)
+    assert reason.why == SMEAR.why
+    assert reason.do == SMEAR.do
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_paint_is_reported_on_a_given_reference_and_on_one_that_was_found(given):
+def test_paint_is_reported_of_a_reference_that_a_user_gave_and_of_one_that_the_program_found(given):
     (paint,) = rules.judge_metal("patch 5", True, True, given, False, False, painted=0.9, paint_mm=0.1)
     assert "(patch 5) may be painted: probability 0.90, 0.10 mm" in paint.what
     assert rules.judge_metal("patch 5", True, True, given, False, False, painted=0.1, paint_mm=0.1) == []
@@ -260,8 +282,10 @@ def test_a_single_plate_or_half_of_them_do_not_show_that_h_and_v_are_exchanged(s
 
 
 def test_reasons_come_from_the_recording_to_the_names():
-    """The cause of the others first: without a direct path all is meaningless, without metal every permittivity."""
-    assert order(
+    """The reason that causes others comes first: without a direct path nothing has a meaning, without metal no
+    permittivity has one.
+    """
+    assert list_in_order(
         judge_path(-20.0),
         rules.judge_patches({}, 0),
         rules.judge_metal("metal", False, False, False, True, False),
@@ -275,7 +299,7 @@ def test_reasons_come_from_the_recording_to_the_names():
         judge_path(-3.0),
         rules.judge_metal("metal", True, False, False, False, False),
         judge_path(phase_rad=0.1),
-        rules.judge_passivity({1: GAINS}),
+        rules.judge_passivity({1: GAIN_FINDING}),
         rules.judge_patches({1: "noise"}, 2),
         rules.judge_incidence(57.0, 55.0),
         rules.judge_brightness({1: 0.4}),
@@ -284,7 +308,7 @@ def test_reasons_come_from_the_recording_to_the_names():
         judge_plane(0.0, (1.0, 0.0)),
         rules.judge_tilts({1: 1.0}),
     )
-    assert order(*reasons) == [
+    assert list_in_order(*reasons) == [
         "a damaged",
         "rows are",
         "masked",
@@ -303,6 +327,7 @@ def test_reasons_come_from_the_recording_to_the_names():
     ]
 
 
+# Parts of texts by which the reasons of the test above are recognised.
 PARTS = (
     "direct path is missing", "no patch", "no metal", "a damaged", "rows are", "masked", "relative to", "is weak, -3",
     "likely metal", "residual phase", "no permittivity", "not judged", "incidence angle", "brighter", "the angle was",
@@ -310,18 +335,15 @@ PARTS = (
 )  # fmt: skip
 
 
-def order(*reasons):
-    """Parts of the reasons' texts as the verdict lists them, given in reverse."""
-    listed = join_reasons([r for group in reversed(reasons) for r in group]).reasons
-    return [next(part for part in PARTS if part in r.what) for r in listed]
+def list_in_order(*groups):
+    """Return the recognised parts of the reasons' texts in the order of the verdict; it is given them in reverse."""
+    reversed_reasons = [r for group in reversed(groups) for r in group]
+    return [next(part for part in PARTS if part in r.what) for r in join_reasons(reversed_reasons).reasons]
 
 
-STRANGE = (math.nan, math.inf, -math.inf, 0.0, None)
-
-
-@pytest.mark.parametrize("x", STRANGE)
-def test_no_verdict_shows_a_number_that_is_none(x):
-    """Each rule with a figure that is not finite: what is not known is said so, or not judged."""
+@pytest.mark.parametrize("x", [math.nan, math.inf, -math.inf, 0.0, None])
+def test_no_verdict_shows_a_number_that_is_not_finite(x):
+    """A quantity that is not known is reported as such, or not judged."""
     number = 0.0 if x is None else x
     reasons = [
         *rules.judge_direct_path("RH", x, x, 1.0),
@@ -349,9 +371,10 @@ def test_no_verdict_shows_a_number_that_is_none(x):
 
 
 def test_a_terminal_shows_the_heaviest_reasons_and_how_many_more_there_are():
-    assert join_reasons(ALL).lines(1)[1:] == ["  - c: because", "    do: do c", "  - and 2 more, see the report"]
-    assert join_reasons(ALL).lines(3) == join_reasons(ALL).lines()
-    assert "more" not in "".join(join_reasons(ALL).lines())
+    verdict = join_reasons(THREE_REASONS)
+    assert verdict.lines(1)[1:] == ["  - c: because", "    do: do c", "  - and 2 more, see the report"]
+    assert verdict.lines(3) == verdict.lines()
+    assert "more" not in "".join(verdict.lines())
 
 
 @pytest.mark.parametrize(
@@ -366,7 +389,7 @@ def test_100_percent_is_shown_only_if_nothing_is_missing(part, whole, digits, te
 
 
 def test_ripple_inside_given_boxes_names_the_edges_before_the_direct_path():
-    """Boxes 3 mm inside the edges of undisturbed plates were blamed on a second path (found from outside)."""
+    """Boxes 3 mm inside the edges of undisturbed plates were once explained by a second path."""
     (boxed_finding,) = rules.judge_flatness((0.1, 0.05), 0.0, is_boxed=True)
     assert boxed_finding.why.startswith("boxes that reach the plates' edges")
     assert "6 mm inside" in boxed_finding.do
@@ -374,53 +397,58 @@ def test_ripple_inside_given_boxes_names_the_edges_before_the_direct_path():
     assert "boxes" not in finding.why
 
 
-def test_positions_without_data_are_the_cause_of_what_they_do_to_an_image():
-    """Five of 73 rows without data: plates were called copies of others, by a second path (found from outside)."""
-    gaps = [
+def test_effects_of_positions_without_data_are_explained_by_these():
+    """With five of 73 rows without data, plates were once reported as copies of others by a second path."""
+    findings_with_gaps = [
         *rules.judge_copies([7, 13], (122.0, 0.0), -12.0, has_gaps=True),
         *rules.judge_fringes(0.9, has_gaps=True),
         *rules.judge_flatness((0.1, 0.05), 0.0, has_gaps=True),
         *rules.judge_disturbed_plates({2: 0.2}, has_gaps=True),
     ]
-    assert len(gaps) == 4
+    assert len(findings_with_gaps) == 4
     (masked,) = rules.judge_recording(Coverage(73, 73, 100, 100), 0.034)
-    for finding in (*gaps, masked):
+    for finding in (*findings_with_gaps, masked):
         assert "--sparse" in finding.do
-    for finding in gaps:
+    for finding in findings_with_gaps:
         assert "positions without data" in finding.why
         assert "second path" not in finding.why
         assert finding.weight < masked.weight
-    findings = [
+    findings_without_gaps = [
         *rules.judge_copies([7, 13], (122.0, 0.0), -12.0),
         *rules.judge_fringes(0.9),
         *rules.judge_flatness((0.1, 0.05), 0.0),
         *rules.judge_disturbed_plates({2: 0.2}),
     ]
-    assert all("second path" in found.why and "--sparse" not in found.do for found in findings)
+    for finding in findings_without_gaps:
+        assert "second path" in finding.why
+        assert "--sparse" not in finding.do
 
 
+# A share of 0.03 is missing, and filled already or not; of 0.9 too little is left to fill it.
 @pytest.mark.parametrize(
-    ("masked", "is_filled", "advised"), [(0.03, False, True), (0.03, True, False), (0.9, False, False)]
+    ("masked", "is_filled", "is_advised"), [(0.03, False, True), (0.03, True, False), (0.9, False, False)]
 )
-def test_a_reconstruction_is_advised_where_it_would_help(masked, is_filled, advised):
+def test_a_reconstruction_is_advised_where_it_would_help(masked, is_filled, is_advised):
     (finding,) = rules.judge_recording(Coverage(73, 73, 100, 100), masked, is_filled)
-    assert ("--sparse" in finding.do) is advised
+    assert ("--sparse" in finding.do) is is_advised
 
 
-@pytest.mark.parametrize(("std_deg", "told"), [(0.0, True), (0.29, True), (0.31, False)])
-def test_a_tilt_of_the_plane_beyond_its_standard_deviation_is_reported(std_deg, told):
-    assert bool(rules.judge_plane(True, 0.0, (0.1, -0.8), 0.1, (0.0, std_deg))) is told
+# A tilt of 0.8 degrees is 0.3 above the limit of 0.5: it is reported up to a standard deviation of 0.3.
+@pytest.mark.parametrize(("std_deg", "is_reported"), [(0.0, True), (0.29, True), (0.31, False)])
+def test_a_tilt_of_the_plane_beyond_its_standard_deviation_is_reported(std_deg, is_reported):
+    assert bool(rules.judge_plane(True, 0.0, (0.1, -0.8), 0.1, (0.0, std_deg))) is is_reported
 
 
-def test_fringes_are_ascribed_to_the_background_where_it_disturbs_the_plates():
-    """A table behind the plates was called a second path, before the reason that names it (found from outside)."""
+def test_fringes_are_explained_by_the_background_where_it_disturbs_the_plates():
+    """A table behind the plates was once reported as a second path, before the reason that names the table."""
     (fringes,) = rules.judge_fringes(0.9, behind=0.15)
     (behind,) = rules.judge_background(0.15)
     assert "behind the plates" in fringes.why
     assert fringes.weight < behind.weight
 
 
-def test_a_jump_of_both_boards_alike_is_reported_once_and_blames_no_cable():
+def test_a_jump_of_both_boards_alike_is_reported_once_and_not_explained_by_a_cable():
+    """0.41 rad are 23 degrees. Jumps of the boards that differ are reported for each board."""
     findings = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, 0.38)]})
     assert [r.what for r in findings] == [
         "the phase of the echo jumps by +23 degrees before row 26 in both boards alike"
@@ -432,7 +460,7 @@ def test_a_jump_of_both_boards_alike_is_reported_once_and_blames_no_cable():
     assert [r.what.split(":")[0] for r in findings_of_boards] == ["RH", "RV"]
 
 
-def test_images_apart_after_a_drift_of_the_phase_blame_no_board():
+def test_displaced_images_after_a_drift_of_the_phase_are_not_explained_by_displaced_boards():
     (finding,) = rules.judge_image_shift((0.1, 1.5), has_drift=True)
     assert "boards are out of place" not in finding.why
     assert "drift" in finding.why

@@ -6,6 +6,7 @@ Every operation on the disk fails once. Then the command is repeated, and succee
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tests.support.products import PIXEL, write_judged_products
@@ -22,7 +23,7 @@ Command = Callable[[Path], int]
 
 
 def run(*words: str) -> Command:
-    """A command on the products `one` and `two` in a folder."""
+    """Return a function that runs a command in a folder, whose path replaces % in the words."""
     return lambda folder: main([word.replace("%", str(folder)) for word in words])
 
 
@@ -33,6 +34,7 @@ def save_library(folder: Path) -> int:
     return 0
 
 
+# Commands on the products `one` and `two` in a folder.
 BOXES = ("--box", "sheet=-40,-10,-30,10", "--box", "oak=0,0,10,10", "--metal", "sheet")
 EXPORTS = ("--csv", "--mat", "--netcdf")
 COMMANDS = {
@@ -58,14 +60,14 @@ def scan_before(tmp_path_factory) -> Path:
 def quick(monkeypatch) -> None:
     """Figures are not drawn or compressed again for every fault."""
     monkeypatch.setattr(polysight.report, "label_figure", lambda *_: PIXEL)
-    drawn = type("Drawn", (), {"png": PIXEL})
-    monkeypatch.setattr(polysight.catalogue, "draw_comparison", lambda *_: drawn)
+    comparison = SimpleNamespace(png=PIXEL)
+    monkeypatch.setattr(polysight.catalogue, "draw_comparison", lambda *_: comparison)
     for pack in ("pack_netcdf", "pack_mat"):
         monkeypatch.setattr(exports, pack, lambda _: b"packed")
 
 
 def read_visible_files(folder: Path) -> dict[str, bytes]:
-    """Files that a person sees."""
+    """Return the contents of files that are not hidden, by their path."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.startswith(".")]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
@@ -80,8 +82,9 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_b
     old = read_visible_files(scan_before)
     new = read_visible_files(whole_scan)
     assert old.keys() != new.keys() or old != new
-    (last_rename,) = [step.split()[1] for step in disk.done if step.startswith("rename")][-1:]
-    (committing,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]
+    # The last file that is renamed to its name is the one that counts: with it the command is complete.
+    last_rename = [step.split()[1] for step in disk.done if step.startswith("rename")][-1]
+    (deciding_file,) = [name for name in new if name.endswith(f"/{last_rename}") and new[name] != old.get(name)]
     for position in range(1, len(disk.done) + 1):
         folder = Path(shutil.copytree(scan_before, tmp_path / f"{position}"))
         try:
@@ -90,13 +93,14 @@ def test_everything_or_nothing_is_written_and_the_command_can_be_repeated(scan_b
         except (Killed, OSError, PolysightError):
             status = 1
         remaining = read_visible_files(folder)
-        committed = remaining == new
+        is_complete = remaining == new
         if status == 0:
-            assert committed, (position, disk.done[position - 1])
+            assert is_complete, (position, disk.done[position - 1])
+        # A command that fails, and is not killed, removes its unfinished files.
         if fault in ("full", "short"):
-            assert not list(folder.rglob(".*.part")), "what failed leaves nothing behind"
-        if not committed:
-            # A picture may be new already, but it does not count until its file is replaced.
-            assert remaining.get(committing) == old.get(committing), (position, disk.done[position - 1])
+            assert not list(folder.rglob(".*.part"))
+        if not is_complete:
+            # A picture may be new already, but it does not count until that file is replaced.
+            assert remaining.get(deciding_file) == old.get(deciding_file), (position, disk.done[position - 1])
         assert command(folder) == 0, (position, disk.done[position - 1])
         assert read_visible_files(folder) == new

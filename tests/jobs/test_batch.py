@@ -23,11 +23,13 @@ from polysight.store import ScanFolder, drop
 from polysight_shared.errors import ErrorCode
 from polysight_simulators.scene import decode_scene, simulate
 
+# Program in place of the one that processes a scan: it ends as the name of the scan says. Jobs are plain data, so that
+# it does not import the host's program, which takes seconds.
 WORKER = """
 import json, os, sys, time
 from pathlib import Path
 import msgpack
-job = msgpack.unpackb(sys.stdin.buffer.read())  # plain data: without the host's imports, which take seconds
+job = msgpack.unpackb(sys.stdin.buffer.read())
 out = Path(job["products"])
 out.mkdir(parents=True, exist_ok=True)
 with (out.parent / "runs.txt").open("a") as f:
@@ -45,6 +47,7 @@ if out.name == "late":
     os.kill(os.getpid(), 9)
 """
 
+# Lines in place of the sleep: the first time the program kills the worker that has started it.
 KILLS_ITS_WORKER = """
     told = out.parent / "killed"
     if not told.exists():
@@ -56,13 +59,14 @@ KILLS_ITS_WORKER = """
 
 @pytest.fixture
 def worker(tmp_path, monkeypatch):
-    """Replaces the program that processes a scan: it behaves as the scan's name says."""
+    """Use WORKER as the program that processes a scan."""
     file = tmp_path / "worker.py"
     file.write_text(WORKER)
     monkeypatch.setattr(many, "WORKER_COMMAND", (sys.executable, str(file)))
 
 
-def list_scan_paths(folder, *names):
+def make_scans(folder, *names):
+    """Make folders of published data, with nothing but their settings; return their paths."""
     for name in names:
         (folder / name).mkdir(parents=True)
         (folder / name / "data_collection_cfg.json").write_text('{"total_x": 5, "total_y": 4}')
@@ -70,30 +74,33 @@ def list_scan_paths(folder, *names):
 
 
 def make_job(data, out, **options):
+    """Return the job of one scan with these settings."""
     text = {key: str(value) if isinstance(value, Path) else value for key, value in options.items()}
     return batch.make_jobs([(data, Settings(**text))], out)[0]
 
 
 def make_jobs(folder, *names):
+    """Return the jobs of the scans in a folder, which must have these names."""
     scans_found = batch.find_scans([folder])
     assert sorted(p.name for p in scans_found) == sorted(names)
     return batch.make_jobs([(data, Settings()) for data in scans_found], folder.parent / "out")
 
 
 def read_runs(folder):
+    """Return the names of the scans that WORKER was started for."""
     return sorted((folder / "out" / "runs.txt").read_text().split())
 
 
 @pytest.mark.usefixtures("worker")
-def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not_finished(tmp_path, capsys):
+def test_a_failing_scan_stops_no_other_and_a_second_run_processes_unfinished_scans_only(tmp_path, capsys):
     names = ("a", "bad", "c", "killed")
-    list_scan_paths(tmp_path / "in", *names)
+    make_scans(tmp_path / "in", *names)
     first = batch.process_many(make_jobs(tmp_path / "in", *names), tmp_path / "out", 2)
     assert {o.name: o.status for o in first} == {"a": "done", "bad": "failed", "c": "done", "killed": "failed"}
     assert [o.name for o in first] == list(names)
-    answer = {o.name: o.message for o in first}
-    assert answer["bad"] == "no row is recorded whole"
-    assert "signal 9" in answer["killed"]
+    messages = {o.name: o.message for o in first}
+    assert messages["bad"] == "no row is recorded whole"
+    assert "signal 9" in messages["killed"]
     assert first[0].memory_gb == 0.5
     assert read_runs(tmp_path) == sorted(names)
     summary = json.loads((tmp_path / "out" / "processed.json").read_text())
@@ -106,15 +113,16 @@ def test_one_failing_scan_stops_no_other_and_a_second_run_takes_only_what_is_not
 
 
 @pytest.mark.usefixtures("worker")
-def test_a_program_killed_after_its_mark_has_finished_its_scan(tmp_path):
-    list_scan_paths(tmp_path / "in", "late")
+def test_a_program_that_was_killed_after_its_mark_has_finished_its_scan(tmp_path):
+    """The mark is the last file that it writes."""
+    make_scans(tmp_path / "in", "late")
     (job,) = make_jobs(tmp_path / "in", "late")
     assert many.run_scan(job).status == "done"
 
 
 @pytest.mark.usefixtures("worker")
 def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
-    (folder,) = list_scan_paths(tmp_path / "in", "a")
+    (folder,) = make_scans(tmp_path / "in", "a")
     library = tmp_path / "library.npz"
     rig = tmp_path / "rig.toml"
     library.write_bytes(b"1")
@@ -145,20 +153,20 @@ def test_a_changed_option_library_rig_or_scan_is_processed_again(tmp_path):
 
 
 @pytest.mark.usefixtures("worker")
-def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothing_else(tmp_path):
+def test_a_scan_is_processed_again_only_after_a_change_of_its_data(tmp_path):
     """Notes, programs of the page, exports and labels are not data; manifest, rows, calibration and truth are."""
     folder = write_scan(tmp_path / "in" / "scan")
     sample_file = folder / "samples" / "RH.npy"
     batch.process_many(make_jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
 
-    def done():
+    def is_finished():
         return batch.is_finished(make_jobs(tmp_path / "in", "scan")[0])
 
     no_data = ("operator.json", "program/process.log", "export/image.nc", "labels.json", "control/request.json")
     for name in (*no_data, "products/report.html", "samples/RH.npy", "raw/RH/0004.part"):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text("new")
-        assert done(), name
+        assert is_finished(), name
     for name in ("manifest.jsonl", "raw/RH/0000.bin", "raw/RV/0001.idx", "truth.json"):
         file = folder / name
         file.parent.mkdir(exist_ok=True)
@@ -166,40 +174,42 @@ def test_a_scan_is_processed_again_for_what_its_products_are_made_from_and_nothi
         times = file.stat().st_mtime_ns if file.exists() else 0
         with file.open("a") as appended:
             appended.write("\n")
-        assert not done(), name
+        assert not is_finished(), name
         if earlier_content is None:
             file.unlink()
         else:
             file.write_bytes(earlier_content)
             os.utime(file, ns=(times, times))
-        assert done(), name
+        assert is_finished(), name
     drop(ScanFolder.load(folder), read_raw_digests(folder), tmp_path / "out" / "scan")
     batch.process_many(make_jobs(tmp_path / "in", "scan"), tmp_path / "out", 1)
-    assert done()
+    assert is_finished()
+    # Without raw data the samples are the data.
     sample_file.write_text("other samples")
-    assert not done()  # these are the remaining files
+    assert not is_finished()
 
 
 def read_raw_digests(folder):
+    """Return the digests of the committed rows, by board and row."""
     committed = ScanFolder.load(folder).committed_rows()
     return {name: {row: take.boards[name].crc32 for row, take in committed.items()} for name in ("RH", "RV")}
 
 
 @pytest.mark.usefixtures("worker")
-def test_ended_early_its_programs_end_too(tmp_path):
-    list_scan_paths(tmp_path / "in", "slow", "slow2")
+def test_when_a_batch_ends_early_its_programs_end_too(tmp_path):
+    make_scans(tmp_path / "in", "slow", "slow2")
     todo = make_jobs(tmp_path / "in", "slow", "slow2")
     results = many.run_here(todo, 2)
-    # Slow2, which is not slow
+    # WORKER sleeps for "slow" only.
     first = next(results)
     assert (first.name, first.status) == ("slow2", "done")
-    # Otherwise the test takes 600 s, the sleep of the program
+    # Waits for the program: if it were not ended the test would take the 600 s of its sleep.
     results.close()
     assert not batch.is_finished(todo[0])
 
 
-def test_names_folders_and_what_is_a_scan(tmp_path):
-    scans_found = list_scan_paths(tmp_path / "unsynced", "s1", "s2")
+def test_scans_are_found_in_folders_and_two_of_one_name_are_refused(tmp_path):
+    scans_found = make_scans(tmp_path / "unsynced", "s1", "s2")
     (tmp_path / "unsynced" / "notes").mkdir()
     raw = tmp_path / "raw" / "s1"
     raw.mkdir(parents=True)
@@ -213,12 +223,12 @@ def test_names_folders_and_what_is_a_scan(tmp_path):
         batch.make_jobs([(scans_found[0], Settings()), (raw, Settings())], tmp_path / "out")
 
 
-def test_scans_at_a_time_follow_cores_and_memory():
-    # As docs/how-to/authors-data.md says.
+def test_as_many_scans_are_processed_together_as_cores_and_memory_allow():
+    # docs/how-to/authors-data.md has these figures: 0.4 GB, and 6 kB for each position.
     assert batch.memory_bytes(1_000_000) == pytest.approx(0.4e9 + 6e3 * 1_000_000)
-    need = batch.memory_bytes(70_000)
-    assert batch.fit_scans(70_000, cores=8, free_bytes=100 * need) == 8
-    assert batch.fit_scans(70_000, cores=8, free_bytes=3 * need) == 2
+    needed_bytes = batch.memory_bytes(70_000)
+    assert batch.fit_scans(70_000, cores=8, free_bytes=100 * needed_bytes) == 8
+    assert batch.fit_scans(70_000, cores=8, free_bytes=3 * needed_bytes) == 2
     assert batch.fit_scans(70_000, cores=8, free_bytes=0) == 1
     assert many.free_memory_bytes() > 0
     assert count_cores() >= 1
@@ -240,11 +250,11 @@ def test_the_table_names_every_scan_and_counts(tmp_path):
 
 @pytest.mark.usefixtures("worker")
 def test_a_wrong_folder_fails_and_the_exit_status_shows_it(tmp_path, capsys):
-    list_scan_paths(tmp_path / "in", "a", "bad")
+    make_scans(tmp_path / "in", "a", "bad")
     command = ["process", str(tmp_path / "in" / "a"), str(tmp_path / "in" / "bad"), "--out", str(tmp_path / "out")]
     assert main([*command, "--jobs", "1"]) == 1
     assert "2 scans: 1 done, 1 failed" in capsys.readouterr().out
-    # A single scan: no worker, and its own error
+    # A single scan is processed by this program, and its error is not that of a batch.
     assert main([*command[:2], "--out", str(tmp_path / "one")]) != 0
     assert "out/one" not in capsys.readouterr().out
     (tmp_path / "file").touch()
@@ -254,7 +264,7 @@ def test_a_wrong_folder_fails_and_the_exit_status_shows_it(tmp_path, capsys):
 def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "dask", None)
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    list_scan_paths(tmp_path / "in", "a")
+    make_scans(tmp_path / "in", "a")
     command = ["process", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--dask", "tcp://127.0.0.1:1"]
     assert main(command) == 2
     assert "pip install distributed" in capsys.readouterr().err
@@ -263,7 +273,7 @@ def test_without_dask_the_command_that_installs_it_is_shown(tmp_path, monkeypatc
 @pytest.mark.usefixtures("worker")
 def test_a_dask_cluster_does_the_same(tmp_path):
     distributed = pytest.importorskip("distributed", reason="the host's extra `dask` is not installed")
-    list_scan_paths(tmp_path / "in", "a", "bad", "c")
+    make_scans(tmp_path / "in", "a", "bad", "c")
     todo = make_jobs(tmp_path / "in", "a", "bad", "c")
     # Threads of this process replace the workers; each still starts its own programs.
     with distributed.LocalCluster(
@@ -279,7 +289,7 @@ def test_a_dask_cluster_does_the_same(tmp_path):
 @pytest.mark.usefixtures("worker")
 def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
     """A Dask worker that is killed after the mark has its scan sent to another one."""
-    list_scan_paths(tmp_path / "in", "a")
+    make_scans(tmp_path / "in", "a")
     (job,) = make_jobs(tmp_path / "in", "a")
     assert [many.run_scan(job).status for _ in range(3)] == ["done"] * 3
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\n"
@@ -288,6 +298,7 @@ def test_a_scan_that_carries_its_mark_is_done_and_not_processed_again(tmp_path):
     assert (tmp_path / "out" / "runs.txt").read_text() == "a\na\n"
 
 
+# Program that starts the program of a job, which writes its process id and sleeps.
 STARTER = """
 import sys
 from pathlib import Path
@@ -301,18 +312,19 @@ batch.run_scan(batch.make_jobs([(Path(sys.argv[1]), batch.Settings())], Path(sys
 
 
 def test_the_program_of_a_killed_worker_ends_with_it(tmp_path):
-    list_scan_paths(tmp_path / "in", "a")
-    answer = tmp_path / "pid"
-    starter = subprocess.Popen([sys.executable, "-c", STARTER, str(tmp_path / "in" / "a"), str(answer)])
+    make_scans(tmp_path / "in", "a")
+    pid_file = tmp_path / "pid"
+    starter = subprocess.Popen([sys.executable, "-c", STARTER, str(tmp_path / "in" / "a"), str(pid_file)])
     try:
-        while not (answer.exists() and answer.read_text()):
+        while not (pid_file.exists() and pid_file.read_text()):
             assert starter.poll() is None
             time.sleep(0.1)
-        child = Path("/proc") / answer.read_text()
+        child = Path("/proc") / pid_file.read_text()
         assert child.exists()
     finally:
         starter.kill()
         starter.wait()
+    # It has ended, or is a zombie that no process has waited for.
     while child.exists() and "State:\tZ" not in (child / "status").read_text():
         time.sleep(0.1)
 
@@ -330,7 +342,7 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
         f"batch.WORKER_COMMAND = ({sys.executable!r}, {str(tmp_path / 'worker.py')!r})\n"
     )
     names = ("a", "b", "slow", "c")
-    list_scan_paths(tmp_path / "in", *names)
+    make_scans(tmp_path / "in", *names)
     todo = make_jobs(tmp_path / "in", *names)
     with (
         dask.config.set({"distributed.worker.preload": [str(preload)]}),
@@ -343,8 +355,8 @@ def test_a_killed_dask_worker_loses_no_scan(tmp_path):
     assert (tmp_path / "out" / "runs.txt").read_text().split().count("slow") == 2
 
 
-def test_real_scans_end_to_end(tmp_path, capsys):
-    """The real program processes a simulated scan and a damaged one; then both are marked as finished."""
+def test_the_real_program_processes_a_simulated_scan_and_refuses_a_damaged_one(tmp_path, capsys):
+    """The second run skips the finished one."""
     plate = {"name": "copper", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "metal": True}
     scene = make_scene(plate, name="plate", columns=13, rows=15, image={"columns": 30, "rows": 30, "pixel_mm": 4.0})
     simulate(load_published_rig(), decode_scene(scene, "t"), tmp_path, layout="authors")
@@ -353,14 +365,14 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     (broken / "data_collection_cfg.json").write_text("{")
     command = ["process", str(tmp_path / "unsynced"), "--out", str(tmp_path / "out")]
     assert main(command) == 1
-    answer = capsys.readouterr().out
-    assert "broken  failed" in answer
-    assert "not JSON" in answer
-    assert "plate   done" in answer
+    output = capsys.readouterr().out
+    assert "broken  failed" in output
+    assert "not JSON" in output
+    assert "plate   done" in output
     assert (tmp_path / "out" / "plate" / "report.html").exists()
     mark = json.loads((tmp_path / "out" / "plate" / FINISHED).read_text())
     assert {"versions", "products", "options", "data"} == set(mark["made_with"])
-    # Digest of the rig file
+    # The digest of the rig file, SHA-256 in hexadecimal.
     assert len(mark["made_with"]["options"]["config"]) == 64
     (broken / "data_collection_cfg.json").unlink()
     assert main(command) == 0
@@ -372,7 +384,7 @@ def test_real_scans_end_to_end(tmp_path, capsys):
     [('{"total_x": 5, "total_y": 7}', 35), ('{"total_x": 5}', 70_000), ("[", 70_000), (None, 70_000)],
 )
 def test_positions_are_those_of_the_settings_or_of_the_published_grid(content, positions, tmp_path):
-    """They decide how many scans are processed at a time; what is wrong with a scan its own program says."""
+    """They decide how many scans are processed together. Faults of the settings are reported by the scan's program."""
     if content is not None:
         (tmp_path / "data_collection_cfg.json").write_text(content)
     assert batch._count_positions(tmp_path) == positions

@@ -27,6 +27,7 @@ def test_a_demo_names_the_logs_of_the_rig_if_its_scan_failed(
     assert demo.run_demo(scene, REPO / "instrument.toml", out, None) == exit_status
     printed = capsys.readouterr()
     assert (str(out / "rig" / "logs") in printed.err) == names_logs
+    # The printed duration is that of the demo, rounded.
     if not names_logs:
         seconds = float(re.search(r"(\d+) s in all", printed.out)[1])
         assert seconds <= time.monotonic() - started_s + 1

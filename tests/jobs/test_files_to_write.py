@@ -10,9 +10,10 @@ from polysight.store import MANIFEST
 
 
 class WorkedError(Exception):
-    """The command began its work."""
+    """Raised in place of the work of a command."""
 
 
+# Commands with the option that names a file to write; the name comes last.
 COMMANDS = {
     "train": ["train", "--simulate", "examples/library", "--out"],
     "train --authors": ["train", "--authors", "authors", "--out"],
@@ -25,8 +26,8 @@ PICTURES = ("compare", "check", "inspect")
 
 
 @pytest.fixture(autouse=True)
-def work_is_noticed(monkeypatch, tmp_path: Path) -> None:
-    """The work of each command raises WorkedError."""
+def replace_work(monkeypatch, tmp_path: Path) -> None:
+    """Let the work of each command raise WorkedError."""
 
     def work(*_: object, **__: object) -> None:
         raise WorkedError
@@ -48,6 +49,7 @@ def work_is_noticed(monkeypatch, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("name", ["folder.png", "file/x.png"])
 def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys, command, name):
+    # The exit status depends on the command: wrong usage, wrong data, or an error of the system.
     assert main([*COMMANDS[command], str(tmp_path / name)]) in (2, 3, 5)
     assert name.partition("/")[0] in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
@@ -76,7 +78,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_data_are_read(tmp_pa
 
 @pytest.mark.parametrize("command", PICTURES)
 @pytest.mark.parametrize("name", ["x.jpg", "x.pdf", "x", "x.png.txt"])
-def test_a_picture_has_the_ending_of_its_format(tmp_path, capsys, command, name):
+def test_a_picture_whose_name_does_not_end_in_png_is_refused(tmp_path, capsys, command, name):
     with pytest.raises(SystemExit) as ended:
         main([*COMMANDS[command], str(tmp_path / name)])
     assert ended.value.code == 2

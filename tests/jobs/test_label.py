@@ -14,6 +14,7 @@ from polysight.materials import read_labels
 from polysight.products import find_labels, find_products, replace_products, write_image, write_json
 from polysight_shared.errors import ErrorCode
 
+# Names for patches 1 and 2; the second is "oak" in Chinese.
 NAMED = ["--from-patches", "--rename", "1=copper", "--rename", "2=\u6a61\u6728"]
 
 
@@ -28,7 +29,10 @@ def load_boxes(folder):
 
 
 def script_answers(*answers):
-    """Answers to questions, and the questions that were asked."""
+    """Return a function that answers questions in this order, and the list of questions that it was asked.
+
+    After the last answer the input ends.
+    """
     remaining = list(answers)
     questions = []
 
@@ -43,14 +47,14 @@ def script_answers(*answers):
 
 def test_patches_get_names_by_their_numbers(products, capsys):
     assert main(["label", str(products), *NAMED]) == 0
-    answer = capsys.readouterr().out
+    output = capsys.readouterr().out
     named_boxes = load_boxes(products)
     assert list(named_boxes.boxes) == ["copper", "\u6a61\u6728"]
     assert (named_boxes.unit, named_boxes.metal, named_boxes.by_hand) == ("mm", "copper", True)
-    # 9 mm inside the patch
+    # 9 mm inside the patch, which is x -50 to -20 mm and y -20 to 20 mm.
     assert named_boxes.boxes["copper"] == pytest.approx((-41.0, -11.0, -29.0, 11.0))
-    assert "left out, without a name: 3" in answer
-    assert "\u6a61\u6728" in answer
+    assert "left out, without a name: 3" in output
+    assert "\u6a61\u6728" in output
     assert (products / "labels.png").read_bytes().startswith(b"\x89PNG")
     assert find_labels(products)[1] == named_boxes
 
@@ -76,9 +80,9 @@ def test_a_patch_declared_as_metal_is_named_metal(products):
     assert load_boxes(products).metal == "x"
 
 
-def test_a_box_where_nothing_shines_is_pointed_out(products, capsys):
+def test_a_box_without_an_echo_is_reported_by_a_note(products, capsys):
     result = find_products(products)
-    # -40 dB
+    # In the right third of the image amplitudes are 40 dB lower.
     dim = np.where(result.x_m > 0.02, 0.01, 1.0).astype(np.float32)
     write_image(
         products / "image.npz",
@@ -121,7 +125,7 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
     assert list(load_boxes(products).boxes) == ["metal", "PET", "PET#2"]
     assert load_boxes(products).metal == "metal"
     assert "named PET 80 %" in questions[1]
-    # Pet and PET
+    # Two names that differ only in capitals are reported.
     assert "the name pet" in capsys.readouterr().out
     assert label(products, Edits(), ask=script_answers("yes", "oak", "glass", "", "nothing", "glass")[0]) == 0
     assert load_boxes(products).metal == "glass"
@@ -133,11 +137,11 @@ def test_a_person_is_asked_for_each_patch(products, capsys):
 
 
 def test_without_a_terminal_patches_are_listed(products, capsys):
-    # Pytest's stdin is not a terminal
+    # The standard input of pytest is not a terminal.
     assert main(["label", str(products)]) == 0
-    answer = capsys.readouterr().out
-    assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in answer
-    assert "--from-patches" in answer
+    output = capsys.readouterr().out
+    assert "x -41.0 to -29.0, y -11.0 to 11.0 mm  the metal reference" in output
+    assert "--from-patches" in output
     assert not (products / "labels.json").exists()
 
 
@@ -151,24 +155,24 @@ def test_labels_of_a_scan_folder_are_saved_in_the_folder_of_its_rows(tmp_path):
     assert not (scan / "products" / "labels.json").exists()
 
 
-@pytest.mark.parametrize(("scan_id", "kept"), [("one", True), ("another", False)])
-def test_boxes_by_hand_outlive_products_of_the_same_scan_alone(products, scan_id, kept):
+@pytest.mark.parametrize(("scan_id", "is_kept"), [("one", True), ("another", False)])
+def test_boxes_drawn_by_hand_are_kept_only_with_new_products_of_the_same_scan(products, scan_id, is_kept):
     write_json(products / "scan.json", {"scan_id": "one", "simulated": True})
     assert main(["label", str(products), *NAMED]) == 0
     drawn = load_boxes(products)
     with replace_products(products, scan_id) as new:
         (new / "labels.json").write_text(json.dumps({"labels": {"patch": [0, 0, 3, 3]}}))
-    assert (load_boxes(products) == drawn) == kept
-    assert (products / "labels.png").exists() == kept
+    assert (load_boxes(products) == drawn) == is_kept
+    assert (products / "labels.png").exists() == is_kept
 
 
-def test_the_classifiers_names_are_not_labels(products):
+def test_a_file_with_the_names_of_the_classifier_does_not_count_as_labels(products):
     (products / "labels.json").write_text(json.dumps({"labels": {"metal": [0, 0, 3, 3]}}))
     assert find_labels(products) is None
 
 
 def test_boxes_that_another_command_saved_meanwhile_are_not_overwritten(products, monkeypatch):
-    """Each command would say that its box is saved, and one of them would be gone."""
+    """Otherwise each command would report that its box is saved, and one of them would be lost."""
 
     def edit_during_another_command(*args):
         monkeypatch.undo()

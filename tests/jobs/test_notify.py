@@ -10,9 +10,12 @@ from polysight_shared.config import Notify
 
 
 def test_a_command_and_an_address_get_the_text(tmp_path: Path) -> None:
+    """The text is one argument, and no shell interprets it."""
     received: list[dict[str, str]] = []
 
     class Hook(BaseHTTPRequestHandler):
+        """Keeps the JSON of each request."""
+
         def do_POST(self) -> None:
             received.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
             self.send_response(204)
@@ -34,6 +37,6 @@ def test_a_command_and_an_address_get_the_text(tmp_path: Path) -> None:
     assert received == [{"scan": "oak", "state": "failed", "text": "oak: the Pi is silent; $(rm -r x)"}]
 
 
-def test_what_does_not_work_is_a_note(capsys) -> None:
+def test_a_command_or_address_that_does_not_work_is_only_a_note(capsys) -> None:
     notify(Notify(command="/no/such/program", url="http://127.0.0.1:1/"), Path("oak"), "finished", "done")
     assert capsys.readouterr().err.count("note: notify.") == 2

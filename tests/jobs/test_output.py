@@ -8,20 +8,22 @@ from polysight.jobs.output import count_steps, steps
 
 
 def test_every_step_is_named_before_it_begins(capsys):
-    answer = [(step, capsys.readouterr().err) for step in steps(["a", "b"], ["first", "second"])]
-    assert [step for step, _ in answer] == ["a", "b"]
-    # What the step prints begins on a line of its own.
-    assert answer[0][1] == "[1/2] first ...\n"
-    assert answer[1][1] == "[1/2] first: 0 s\n[2/2] second ...\n"
+    # Each step with the text that was printed before it.
+    steps_with_text = [(step, capsys.readouterr().err) for step in steps(["a", "b"], ["first", "second"])]
+    assert [step for step, _ in steps_with_text] == ["a", "b"]
+    # The line ends, so that what the step prints begins on a line of its own.
+    assert steps_with_text[0][1] == "[1/2] first ...\n"
+    assert steps_with_text[1][1] == "[1/2] first: 0 s\n[2/2] second ...\n"
     assert capsys.readouterr().err == "[2/2] second: 0 s\n"
 
 
 def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
-    now = iter(range(0, 1000, 2))
-    monkeypatch.setattr(output, "monotonic", lambda: next(now))
+    # A clock that advances by 2 s each time it is read.
+    now_s = iter(range(0, 1000, 2))
+    monkeypatch.setattr(output, "monotonic", lambda: next(now_s))
     rows = count_steps(range(40), 40, "rows")
     assert next(rows) == 0
-    # Before the first is done
+    # Printed before the first row is done.
     assert capsys.readouterr().err == "40 rows ...\n"
     assert list(rows) == list(range(1, 40))
     lines = capsys.readouterr().err.splitlines()
@@ -29,7 +31,7 @@ def test_without_a_terminal_rows_are_counted_in_lines(capsys, monkeypatch):
     assert all(line.endswith("of 40 rows ...") for line in lines)
 
 
-def test_a_closed_stderr_stops_nothing(monkeypatch):
+def test_progress_that_cannot_be_printed_raises_no_error(monkeypatch):
     def raise_closed(text: str) -> None:
         raise BrokenPipeError(text)
 

@@ -34,7 +34,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def run_command(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
-    """Output of a command that must succeed."""
+    """Run a command that must succeed; return its output."""
     capsys.readouterr()
     assert main([str(word) for word in words]) == 0
     return capsys.readouterr().out
@@ -69,7 +69,7 @@ def test_names_and_tags_reach_the_terminal_without_control_and_direction_marks(r
     assert max(len(line) for line in lines if not line.startswith("long")) < 120
 
 
-def test_a_running_scan_is_asked(root, capsys):
+def test_a_command_reaches_a_running_scan_and_is_refused_without_one(root, capsys):
     with open_control(root / "one") as stop:
         assert "pause" in run_command(capsys, "ask", root / "one", "pause")
         assert stop.paused
@@ -98,14 +98,14 @@ def test_results_at_a_place_and_of_two_scans_are_printed(root, capsys, tmp_path)
         ("ask nowhere stop", ErrorCode.FILE_MISSING),
     ],
 )
-def test_folders_and_places_that_are_not_there_are_refused(root, monkeypatch, command, code):
+def test_folders_and_places_that_do_not_exist_are_refused(root, monkeypatch, command, code):
     monkeypatch.chdir(root)
     args = build_parser().parse_args(command.split())
     with expect_refusal(code):
         args.run(args)
 
 
-def test_the_metal_reference_is_called_so_at_a_place(root, capsys):
+def test_at_a_place_of_the_metal_reference_that_is_its_name(root, capsys):
     materials = root / "two" / "materials.json"
     content = json.loads(materials.read_text())
     content["segments"][0]["outline_mm"] = [[-50.0, -20.0], [-20.0, -20.0], [-20.0, 20.0], [-50.0, 20.0]]
@@ -120,8 +120,8 @@ def test_compare_says_where_its_picture_is(root, capsys, tmp_path):
 
 
 @pytest.mark.parametrize("folder", ["", "empty"])
-def test_notes_are_of_a_scan(root, folder):
-    """A mistyped folder gets no notes that no list would ever show."""
+def test_notes_of_a_folder_that_is_not_a_scan_are_refused(root, folder):
+    """No list would show them."""
     (root / "empty").mkdir()
     args = build_parser().parse_args(["note", str(root / folder), "--text", "oak"])
     with expect_refusal(ErrorCode.FILE_MISSING, root / folder):
@@ -130,7 +130,7 @@ def test_notes_are_of_a_scan(root, folder):
 
 
 @pytest.mark.parametrize("option", ["--text", "--tag", "--untag"])
-def test_a_text_that_is_not_utf_8_is_refused_and_nothing_is_lost(root, capsys, option):
+def test_a_text_that_is_not_utf_8_is_refused_and_changes_no_notes(root, capsys, option):
     """A terminal of another encoding gives such bytes; they cannot be stored."""
     options = ("--text", "oak", "--tag", "new")
     run_command(capsys, "note", root / "one", *options)
@@ -152,31 +152,31 @@ def test_a_rounded_zero_has_no_sign(root, capsys, monkeypatch):
     assert lines[2].startswith("P = 0 + 0j ")
 
 
-def test_one_scan_is_counted_as_one(root, capsys):
+def test_a_single_scan_is_counted_in_the_singular(root, capsys):
     assert "\n1 scan under" in run_command(capsys, "scans", root, "--find", "one")
 
 
 def test_no_tag_of_commands_at_the_same_time_is_lost(root):
-    tags = [[f"{first}{second}" for second in range(4)] for first in "abcd"]
-    together = threading.Barrier(len(tags))
+    tags_of_threads = [[f"{letter}{number}" for number in range(4)] for letter in "abcd"]
+    all_are_ready = threading.Barrier(len(tags_of_threads))
 
-    def add_tags(of_one: list[str]) -> None:
-        together.wait()
-        for tag in of_one:
+    def add_tags(tags: list[str]) -> None:
+        all_are_ready.wait()
+        for tag in tags:
             scans.note(root / "one", None, [tag], [])
 
-    threads = [threading.Thread(target=add_tags, args=(of_one,)) for of_one in tags]
+    threads = [threading.Thread(target=add_tags, args=(tags,)) for tags in tags_of_threads]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert sorted(read_notes(root / "one").tags) == sorted(tag for of_one in tags for tag in of_one)
+    assert sorted(read_notes(root / "one").tags) == sorted(tag for tags in tags_of_threads for tag in tags)
 
 
 @pytest.mark.parametrize(
     "command", ["report one", "process one --out one/products", "process one --out ./one/products/"]
 )
-def test_products_of_a_running_scan_are_left_to_it(root, monkeypatch, command):
+def test_products_of_a_running_scan_are_not_written_by_another_command(root, monkeypatch, command):
     """Its own processing would find the folder in use at its end, and fail."""
     monkeypatch.chdir(root)
     args = build_parser().parse_args(command.split())

@@ -19,9 +19,10 @@ from polysight_shared.errors import DataError
 from polysight_simulators.scene import decode_scene, simulate
 
 pytestmark = pytest.mark.slow
+# A name with letters outside of ASCII ("hard oak", in German and Chinese), and the places of the two plates in mm.
 MINE = "h\u00e4rtes \u6a61\u6728"
 PLACES = (-40.0, 10.0), (40.0, -10.0)
-# 5 mm inside the plates
+# 5 mm inside the plates, on each side.
 BOXES = ("copper=-60,-10,-20,30", f"{MINE}=20,-30,60,10")
 
 
@@ -56,26 +57,30 @@ def test_a_material_is_labelled_taught_and_named_in_another_scan(scans, tmp_path
     assert f"do: polysight label {first}" in capsys.readouterr().err
     for scan, images in ((first, first / "products"), (second, elsewhere)):
         assert main(["image", str(scan), "--out", str(images)]) == 0
-    # A scan folder, and products without their rows
+    # The first is a scan folder, the second has products without their rows.
     for folder in (first, elsewhere):
         assert main(["label", str(folder), *list_box_options(), "--specimen", f"{MINE}=board 7"]) == 0
     assert main(["train", str(first), str(elsewhere), "--out", str(library)]) == 0
-    answer = capsys.readouterr().out
-    assert f"  {MINE}: 2 patches in 2 scans" in answer
-    assert "which piece" not in answer
+    output = capsys.readouterr().out
+    assert f"  {MINE}: 2 patches in 2 scans" in output
+    # The question for the specimens of a material whose boxes do not name them.
+    assert "which piece" not in output
     trained_library = Library.load(library)
     assert trained_library.names == ("copper", MINE)
     assert trained_library.scans == ("small", "small (2)")
     assert {e.specimen for e in trained_library.entries if e.name == MINE} == {"board 7"}
     assert {e.specimen for e in trained_library.entries if e.name == "copper"} == {None}
-    assert trained_library.simulated  # without a truth it still counts as simulated
+    # Also without their truth the scans count as simulated.
+    assert trained_library.simulated
     assert main(["train", str(first), str(first / "products"), "--out", str(library)]) == 3
     assert "is given twice" in capsys.readouterr().err
 
     assert main(["process", str(third), "--out", str(out), "--library", str(library)]) == 0
     segments = json.loads((out / "materials.json").read_text(encoding="utf-8"))["segments"]
-    patches = [s for s in segments if s["name"] == MINE]
-    assert [np.hypot(*np.subtract(np.reshape(s["box_mm"], (2, 2)).mean(0), PLACES[1])) < 10 for s in patches] == [True]
+    # One patch has the name; its middle is less than 10 mm from that of the plate.
+    (patch,) = [s for s in segments if s["name"] == MINE]
+    middle_mm = np.reshape(patch["box_mm"], (2, 2)).mean(axis=0)
+    assert np.hypot(*(middle_mm - PLACES[1])) < 10
     assert {s["name"] for s in segments} <= {MINE, "unknown", None}
     assert MINE in (out / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()
@@ -98,25 +103,32 @@ def test_rows_and_saved_images_teach_the_same(scans, tmp_path):
     rows = make_entries(load_training_scan(scan, RIG_FILE))
     images = make_entries(load_training_scan(out, RIG_FILE))
     assert [e.name for e in rows] == [e.name for e in images] == ["copper", MINE]
-    for first_item, second_item in zip(rows, images, strict=True):
-        assert first_item.incidence_deg == pytest.approx(second_item.incidence_deg, abs=0.05)
-        assert np.median(first_item.h) == pytest.approx(np.median(second_item.h), rel=0.02)
-        assert abs(np.median(first_item.p) / np.median(second_item.p) - 1) < 0.02
+    # The tolerances are chosen.
+    for of_rows, of_images in zip(rows, images, strict=True):
+        assert of_rows.incidence_deg == pytest.approx(of_images.incidence_deg, abs=0.05)
+        assert np.median(of_rows.h) == pytest.approx(np.median(of_images.h), rel=0.02)
+        assert abs(np.median(of_rows.p) / np.median(of_images.p) - 1) < 0.02
 
 
 def test_labels_override_the_truth_and_drawn_specimens_are_distinguished(tmp_path):
     spread = {**draw_scene(4), "specimen_spread": [0.02, 0.1]}
     scan = simulate(load_published_rig(), decode_scene(spread, "test"), tmp_path / "scan")
-    answer = [(e.name, e.specimen, e.permittivity is None) for e in make_entries(load_training_scan(scan, RIG_FILE))]
-    assert [(name, unknown) for name, _, unknown in answer] == [("copper", True), ("board", False)]
-    assert len({specimen for _, specimen, _ in answer}) == 2
+    entries = make_entries(load_training_scan(scan, RIG_FILE))
+    assert [(e.name, e.permittivity is None) for e in entries] == [("copper", True), ("board", False)]
+    specimens = {e.specimen for e in entries}
+    assert len(specimens) == 2
+
+    # Another simulation of the scene draws other specimens.
     second_scan = simulate(load_published_rig(), decode_scene({**spread, "seed": 1004}, "test"), tmp_path / "again")
     redrawn = {e.specimen for e in make_entries(load_training_scan(second_scan, RIG_FILE))}
-    assert not redrawn & {specimen for _, specimen, _ in answer}, "another simulation of a scene draws other specimens"
+    assert not redrawn & specimens
+
     boxes = {"tin": [-60, -10, -20, 30], f"{MINE}#left": [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
-    answer = [(e.name, e.specimen) for e in make_entries(load_training_scan(scan, RIG_FILE))]
-    assert answer == [("tin", None), (MINE, "left")]
+    entries = make_entries(load_training_scan(scan, RIG_FILE))
+    assert [(e.name, e.specimen) for e in entries] == [("tin", None), (MINE, "left")]
+
+    # Boxes that overlap.
     boxes = {"tin": [-60, -10, 30, 30], MINE: [20, -30, 60, 10]}
     (scan / "labels.json").write_text(json.dumps({"unit": "mm", "labels": boxes, "metal": "tin"}), encoding="utf-8")
     with pytest.raises(DataError) as caught:

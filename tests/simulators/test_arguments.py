@@ -44,14 +44,14 @@ def test_the_link_to_a_port_replaces_no_file(tmp_path):
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
-def test_a_time_scale_that_is_none_is_refused_before_a_process_starts(tmp_path, capsys, speed):
+def test_a_time_scale_that_is_not_a_positive_number_is_refused_before_a_process_starts(tmp_path, capsys, speed):
     arguments = ["--config", str(RIG_FILE), "--pattern", "--dir", str(tmp_path / "rig"), f"--time-scale={speed}"]
     assert simulated_rig.main(arguments) == 2
     assert f"--time-scale {speed}" in capsys.readouterr().err
 
 
 def move_native(boards):
-    """Rig with native control of these boards, one a board of the published rig, on a subnet."""
+    """Return the published rig with native control of these boards, moved to a subnet."""
     rig = load_published_rig()
     native = {board.name: identity for board, identity in zip(rig.boards, boards, strict=True)}
     radar = msgspec.structs.replace(rig.radar, control="native", native=native)
@@ -62,6 +62,7 @@ def test_simulated_boards_replace_those_identified_by_plug_and_die():
     die = "00000001-00000002-00000003-00000004"
     moved = move_native([NativeRadar(usb_path=f"1-4.{n}", die_id=die, ldo_bypass=True) for n in range(3)])
     for board in moved.boards:
+        # The address of the simulated board; the path of the USB plug and the die id are those of real boards.
         place = f"tcp://{board.card_address}:5700"
         assert moved.radar.native[board.name] == NativeRadar(usb_serial=place, ldo_bypass=True)
 

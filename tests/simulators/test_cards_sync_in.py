@@ -13,7 +13,7 @@ from polysight_simulators.cards.sync_in import Pulse, StageTrack, SyncInput
 from polysight_simulators.scene import SimulatedRig, decode_scene, row_offsets_mm
 
 RIG = load_published_rig()
-# Ramp end 128.5 us + 150 us
+# Shortest time between two frames: the ramp, 128.5 us, and 150 us.
 DEAD_NS = 278_500
 
 
@@ -44,22 +44,24 @@ def test_without_burst_motion_all_pulses_of_a_burst_are_at_its_middle() -> None:
     moving = StageTrack(RIG)
     frozen = StageTrack(RIG, burst_motion=False)
     trigger = 1_000_000_000
-    times = [trigger + 200_000 + k * 1_500_000 for k in range(16)]  # as the Pi sends them
+    # As the Pi sends them: 0.2 ms after the trigger, 1.5 ms apart.
+    times = [trigger + 200_000 + k * 1_500_000 for k in range(16)]
     for track in (moving, frozen):
         track.add(WireMotion(0, 400_000, 250_000, 20_000))
         track.trigger(trigger)
-        # The next trigger may be known already
+        # The next trigger may be known already.
         track.trigger(trigger + 100_000_000)
     x, _ = moving.offsets_mm(times)
     frozen_x_mm, _ = frozen.offsets_mm(times)
+    # 15 periods of 1.5 ms at 20 mm/s.
     assert np.ptp(x) == pytest.approx(0.45)
     assert np.ptp(frozen_x_mm) == 0.0
     assert frozen_x_mm[0] == pytest.approx(np.mean(x))
 
 
-@pytest.mark.parametrize("disturbed", [{}, {"backlash_mm": 0.3}, {"backlash_mm": -2.5, "burst_motion": False}])
-def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, object]) -> None:
-    radar = SimulatedRig(RIG, decode_scene({"name": "t"}, "t").with_disturbances(**disturbed))
+@pytest.mark.parametrize("disturbances", [{}, {"backlash_mm": 0.3}, {"backlash_mm": -2.5, "burst_motion": False}])
+def test_the_cards_and_a_simulated_scan_have_the_same_positions_of_a_row(disturbances: dict[str, object]) -> None:
+    radar = SimulatedRig(RIG, decode_scene({"name": "t"}, "t").with_disturbances(**disturbances))
     d = radar.scene.disturbances
     for index in (10, 11):
         row = plan_raster(RIG.grid).row(index)
@@ -67,14 +69,15 @@ def test_the_cards_see_a_row_where_a_simulated_scan_has_it(disturbed: dict[str, 
         bursts = [make_burst_at_point(track, index, row.column(i), 10**9 + i * 10**8) for i in range(row.points)]
         sent = [pulse for burst in bursts for pulse in burst]
         offsets_mm = track.offsets_mm([pulse.t_ns for pulse in sent])
-        for answer, true in zip(offsets_mm, row_offsets_mm(radar, row), strict=True):
-            np.testing.assert_allclose(answer, true, atol=1e-3)
+        # The stage reports its position in micrometres.
+        for card_mm, scan_mm in zip(offsets_mm, row_offsets_mm(radar, row), strict=True):
+            np.testing.assert_allclose(card_mm, scan_mm, atol=1e-3)
         first = index * row.points * RIG.burst.pulses
         assert [p.number for p in track.number_by_plan(sent)] == list(range(first, first + len(sent)))
 
 
 def make_burst_at_point(track: StageTrack, row: int, column: int, t_ns: int) -> list[Pulse]:
-    """The stage raises its trigger at a point of the plan; the pulses of its burst, with arbitrary numbers."""
+    """Let the stage raise its trigger at a point of the plan; return the pulses of its burst, with any numbers."""
     plan = plan_raster(RIG.grid)
     centre = (RIG.stage.centre_x_mm, RIG.stage.centre_y_mm)
     x = (column - (plan.columns - 1) / 2) * plan.step_x_mm + centre[0]
@@ -86,6 +89,7 @@ def make_burst_at_point(track: StageTrack, row: int, column: int, t_ns: int) -> 
 
 @given(st.integers(0, RIG.grid.rows - 1), st.integers(0, RIG.grid.columns - 1), st.integers(0, 10**12))
 def test_a_pulse_has_the_number_of_its_place_whenever_it_comes(row: int, column: int, t_ns: int) -> None:
+    # Odd rows run backwards.
     point = column if row % 2 == 0 else RIG.grid.columns - 1 - column
     first = (row * RIG.grid.columns + point) * RIG.burst.pulses
     track = StageTrack(RIG)

@@ -15,6 +15,7 @@ def list_messages(outputs: list[Output]) -> list[bytes]:
 @pytest.mark.parametrize(
     ("request_hex", "reply_hex"),
     [
+        # Head 5aa5, code, number of bytes, data, tail aaee. A reply has a status in place of the number: 0 is success.
         ("5aa5 0100 0000 aaee", "5aa5 0100 0000 aaee"),
         ("5aa5 0200 0000 aaee", "5aa5 0200 0000 aaee"),
         ("5aa5 0300 0600 01010102031e aaee", "5aa5 0300 0000 aaee"),
@@ -25,14 +26,16 @@ def list_messages(outputs: list[Output]) -> list[bytes]:
         ("5aa5 0b00 0600 be05350c0000 aaee", "5aa5 0b00 0000 aaee"),
         ("5aa5 0e00 0000 aaee", "5aa5 0e00 0204 aaee"),
         ("5aa5 0400 1200 1e21a8c0 b421a8c0 129078563412 0010 0210 aaee", "5aa5 0400 0000 aaee"),
-        ("5aa5 0400 0300 010203 aaee", "5aa5 0400 0100 aaee"),  # EEPROM of the wrong length
-        ("5aa5 0300 0200 0101 aaee", "5aa5 0300 0000 aaee"),  # malformed, but still answered
+        # Settings of the EEPROM with a wrong length, and two malformed requests that a card answers all the same.
+        ("5aa5 0400 0300 010203 aaee", "5aa5 0400 0100 aaee"),
+        ("5aa5 0300 0200 0101 aaee", "5aa5 0300 0000 aaee"),
         ("5aa5 0b00 ff00 be05 aaee", "5aa5 0b00 0000 aaee"),
-        ("5aa5 0b00 0600 000035 0c0000 aaee", "5aa5 0b00 0100 aaee"),  # packets of size zero
+        # Packets of no bytes, and an unknown code.
+        ("5aa5 0b00 0600 000035 0c0000 aaee", "5aa5 0b00 0100 aaee"),
         ("5aa5 7700 0000 aaee", "5aa5 7700 0100 aaee"),
     ],
 )
-def test_requests_and_replies_byte_for_byte(request_hex: str, reply_hex: str) -> None:
+def test_requests_get_the_replies_of_a_real_card(request_hex: str, reply_hex: str) -> None:
     assert list_messages(Card(HOME).command(bytes.fromhex(request_hex), 0.0)) == [bytes.fromhex(reply_hex)]
 
 
@@ -42,7 +45,7 @@ def test_a_packet_that_is_not_a_request_gets_no_answer(junk: bytes) -> None:
 
 
 @given(st.binary(max_size=600))
-def test_no_bytes_break_the_card(junk: bytes) -> None:
+def test_a_card_survives_any_bytes(junk: bytes) -> None:
     card = Card(HOME)
     for datagram in (junk, b"\x5a\xa5" + junk):
         assert len(card.command(datagram, 0.0)) <= 2

@@ -13,17 +13,18 @@ from polysight_simulators.cards.fault_draws import NetworkFaults, OverflowFaults
 from polysight_simulators.cards.sync_in import Pulse
 from polysight_simulators.faults import Faults, read_faults
 
-# Bytes of a packet, 10 of them its header
+# Bytes of a packet, 10 of which are its header.
 SIZE = 20
 EVERYTHING = Faults(loss=0.1, duplicate=0.1, reorder=0.1, truncate=0.1, corrupt=0.2)
 
 
 def make_packets(n: int) -> np.ndarray:
-    """Packets whose bytes are their number."""
+    """Return packets whose bytes all are their number."""
     return np.repeat(np.arange(n, dtype=np.uint8)[:, None], SIZE, axis=1)
 
 
 def send_all(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH") -> list[bytes]:
+    """Send packets in groups of these sizes; return what arrives."""
     network = NetworkFaults(faults, seed, board, Counter())
     data = make_packets(sum(sizes))
     first = 0
@@ -31,7 +32,8 @@ def send_all(faults: Faults, sizes: list[int], seed: int = 1, board: str = "RH")
     for size in sizes:
         received += [r.tobytes() for part in network.transmit(data[first : first + size]) for r in part]
         first += size
-    assert (data == make_packets(sum(sizes))).all(), "what was sent stays as it was"
+    # The sent packets are not changed.
+    assert (data == make_packets(sum(sizes))).all()
     return received + [r.tobytes() for part in network.drain() for r in part]
 
 
@@ -53,7 +55,7 @@ def test_the_same_seed_gives_the_same_faults_and_boards_differ() -> None:
         (Faults(duplicate=1.0), [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5]),
     ],
 )
-def test_each_fault_alone(faults: Faults, numbers: list[int]) -> None:
+def test_all_packets_are_lost_or_doubled_with_a_probability_of_one(faults: Faults, numbers: list[int]) -> None:
     assert send_all(faults, [6]) == [bytes([n] * SIZE) for n in numbers]
 
 
@@ -63,7 +65,7 @@ def test_reordered_packets_all_arrive() -> None:
     assert sorted(received) == sorted(r.tobytes() for r in make_packets(200))
 
 
-def test_truncated_packets_are_half() -> None:
+def test_a_truncated_packet_has_half_of_its_bytes() -> None:
     assert send_all(Faults(truncate=1.0), [2]) == [bytes([n] * (SIZE // 2)) for n in (0, 1)]
 
 
@@ -71,10 +73,12 @@ def test_overflow_takes_the_second_half_of_single_frames() -> None:
     frames = np.arange(100 * 8, dtype=np.int16).reshape(100, 2, 4)
     runs = OverflowFaults(Faults(overflow=0.3), 5, "RH").split(frames)
     overflows = sum(run.lost_bytes > 0 for run in runs)
+    # 30 are expected of 100; the limits are chosen.
     assert 10 < overflows < 60
     assert sum(run.lost_bytes for run in runs) == overflows * 8
     joined = np.concatenate([run.data.reshape(-1) for run in runs])
     assert len(joined) == 100 * 8 - overflows * 4
+    # The numbers rise through all frames: what is left is in its order.
     assert np.all(np.diff(joined) > 0)
 
 
@@ -84,7 +88,7 @@ def test_a_corrupt_packet_has_one_bit_of_its_payload_turned() -> None:
         assert np.unpackbits(flipped_bits).sum() == np.unpackbits(flipped_bits[10:]).sum() == 1
 
 
-def test_missed_pulses_are_those_named() -> None:
+def test_exactly_the_named_pulses_are_missed() -> None:
     pulses = [Pulse(i, 1000 * i) for i in range(10)]
     faults = PulseFaults(Faults(miss_pulses=(0, 4)), 0, "RH")
     pulses_seen = faults.select_seen(pulses[:5]) + faults.select_seen(pulses[5:])

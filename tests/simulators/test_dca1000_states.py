@@ -1,4 +1,7 @@
-"""Any order of commands, LVDS data and waiting: the card sends the stream that it was given."""
+"""Any order of commands, LVDS data and waiting: the card sends the stream that it got.
+
+Codes of commands: 0x01 reset, 0x03 configure, 0x05 start, 0x06 stop, 0x0A status, 0x0B packets.
+"""
 
 import struct
 
@@ -9,6 +12,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from polysight_simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, make_message
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
+# Statuses with which a record ends.
 ENDS = {Status.RECORD_COMPLETED, Status.NO_LVDS_DATA}
 
 
@@ -17,9 +21,9 @@ def request(code: int, body: bytes = b"") -> bytes:
 
 
 class AnyUse(RuleBasedStateMachine):
-    """The card compared with a model of bytes given, bytes received, and recording or not.
+    """The card compared with a model: bytes that it got, bytes that it sent, and if it records.
 
-    `suits` is false while the card is configured for another number of lanes than the LVDS data has.
+    `suits` is False while the card is configured for another number of lanes than the LVDS data has.
     """
 
     @initialize(
@@ -34,13 +38,15 @@ class AnyUse(RuleBasedStateMachine):
         self.recording = False
         self.suits = True
         self.payload = 1456
-        self.given = self.received = b""
+        # Bytes of the record that the card got, and that it has sent.
+        self.given = b""
+        self.received = b""
         self.last_data: float | None = None
         self.next_byte = 0
         self.sizes: list[int] = []
 
     def compare(self, outputs: list[Output], ends: bool) -> None:
-        """Compare what came out with the model; `ends`: True if the record ends with it."""
+        """Compare what the card sent with the model; `ends`: True if the record ends with it."""
         packets = [row.tobytes() for o in outputs if isinstance(o, Packets) for row in o.rows]
         assert self.recording or not packets, "data outside a record"
         for packet in packets:
@@ -67,7 +73,8 @@ class AnyUse(RuleBasedStateMachine):
     def begin(self) -> None:
         self.recording = True
         self.last_data = None
-        self.given = self.received = b""
+        self.given = b""
+        self.received = b""
         self.sizes = []
 
     @rule()
@@ -96,9 +103,12 @@ class AnyUse(RuleBasedStateMachine):
     @rule(seconds=st.sampled_from([0.001, 0.5, TAIL_S, 31.0]))
     def wait(self, seconds: float) -> None:
         self.now += seconds
-        over = 30.0 if self.last_data is None else TAIL_S
-        since = self.started if self.last_data is None else self.last_data
-        self.compare(self.card.tick(self.now), self.recording and self.now >= since + over)
+        # A record ends 30 s after its start if no data came, else some time after the last data.
+        if self.last_data is None:
+            end_s = self.started + 30.0
+        else:
+            end_s = self.last_data + TAIL_S
+        self.compare(self.card.tick(self.now), self.recording and self.now >= end_s)
 
     @rule(code=st.sampled_from([0x02, 0x09, 0x0A, 0x0E, 0x07, 0x77]), body=st.binary(max_size=8))
     def ask(self, code: int, body: bytes) -> None:

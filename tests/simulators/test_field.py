@@ -45,6 +45,7 @@ def test_interpolation_between_frequencies_is_exact() -> None:
     exact = optics.field_exact(rig, scene, board, offset, samples)
     # The difference beyond a common factor is the error of the interpolation over frequency.
     common = np.vdot(everywhere, exact) / np.vdot(everywhere, everywhere)
+    # 1e-4 is chosen, far below the noise of a scan.
     assert np.abs(everywhere * common - exact).max() < 1e-4 * np.abs(exact).max()
 
 
@@ -63,6 +64,7 @@ def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
     f = samples[[128]]
     field = build_field(rig, scene, board, samples)
     field_values = read(field, offsets, f, 0, samples)[:, 0]
+    # The mirror image of the receiver, behind the plane; amplitudes are relative to the direct path.
     image = antennas.rx_m[0] * [1, 1, -1] + [0, 0, 2 * antennas.plane_z_m]
     path = float(np.linalg.norm(image - antennas.tx_m))
     expected = -antennas.direct_m[0] / path * np.exp(2j * np.pi * f[0] * path / SPEED_OF_LIGHT_M_S)
@@ -97,7 +99,8 @@ def test_leakage_mixes_the_two_polarisations() -> None:
     assert np.isclose(interpolate_field(h, leakage_v=[0.1, 0.0]), s_only)
     assert not np.isclose(interpolate_field(v, leakage_v=[0.1, 0.0]), interpolate_field(v))
     leaky = scene.with_disturbances(leakage_v=[0.0, 0.1])
-    assert optics.direct_factor(v, leaky) == 1 - 0.1j  # as sampled
+    # The conjugate, as samples have it.
+    assert optics.direct_factor(v, leaky) == 1 - 0.1j
 
 
 def test_a_point_at_the_specular_midpoint_equals_its_amplitude() -> None:
@@ -116,6 +119,7 @@ def test_an_empty_scene_has_no_echo_and_offsets_outside_are_refused() -> None:
         field.interpolate(np.array([0.3]), np.array([0.0]))
 
 
+# Frequency in the middle of the band, Hz.
 F = 78.5e9
 
 
@@ -128,7 +132,7 @@ def test_a_good_conductor_tends_to_metal_with_p_of_plus_one(theta: float) -> Non
     assert abs(p - m_p) < 1e-4 / np.cos(theta)
 
 
-def test_scene_plates_choose_their_model() -> None:
+def test_a_plate_with_a_thickness_reflects_as_a_slab_and_one_without_as_a_half_space() -> None:
     theta = np.array([0.9, 1.0])
     half_space = Plate("h", (0, 0), (1, 1), permittivity=(3.78, 0.7))
     thin_sheet = Plate("s", (0, 0), (1, 1), permittivity=(3.78, 0.7), thickness_mm=0.5)
@@ -145,8 +149,9 @@ def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None
     sheet = Plate("sheet", (0.0, 0.0), (45.0, 45.0), permittivity=(eps, 0.02), thickness_mm=1e3 * thick_m)
     f = np.linspace(76.3e9, 79.75e9, 400)
     path_m = np.linspace(-1.0, 1.0, 2001)
+    # Echo against path: the spectrum over the band, with a window against side lobes.
     advance = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m, f)) * np.hanning(f.size)
-    # Snell
+    # To the back and again to the front, at the angle inside by Snell's law; relative to the front's echo.
     inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)
     for board in rig.receivers:
         reflect = optics.board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))

@@ -20,17 +20,18 @@ POINT = {"position_mm": [12.0, -9.0], "amplitude": [0.5, 0.0]}
 
 
 def make_radar(seed: int = 1, tables: dict[str, Any] | None = None, **disturbances: Any) -> SimulatedRig:
-    """A rig with only the given disturbances."""
+    """Return a rig with only the given disturbances."""
     raw = {"name": "t", "grid": GRID, **(tables or {}), "disturbances": {"ideal": True, **disturbances}}
     return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
 
 
 def make_default_radar(seed: int = 1, **disturbances: Any) -> SimulatedRig:
-    """A rig with the published disturbances, except as given."""
+    """Return a rig with the default disturbances, except as given."""
     raw = {"name": "t", "grid": GRID, "plates": [PLATE], "disturbances": disturbances}
     return SimulatedRig(RIG, decode_scene(raw, "t"), seed)
 
 
+# The middle of the scan, as x or y of one pulse.
 ZERO = np.zeros(1)
 
 
@@ -75,7 +76,7 @@ def test_pulses_do_not_depend_on_the_batch() -> None:
     all_chirps = make_default_radar().chirps("RH", x, y)
     batched_radar = make_default_radar()
     parts = [batched_radar.chirps("RH", x[a:b], y[a:b]) for a, b in ((0, 1), (1, 17), (17, 70))]
-    # A rounding of float32
+    # Rounding of single precision may change an ADC count by one.
     assert np.abs(all_chirps.astype(int) - np.concatenate(parts)).max() <= 1
     late = make_default_radar().chirps("RH", x[40:], y[40:], first_chirp=40)
     assert np.abs(all_chirps[40:].astype(int) - late).max() <= 1
@@ -86,11 +87,13 @@ def test_the_same_seed_repeats_and_another_seed_or_take_does_not() -> None:
     y = np.zeros(4)
     first = make_default_radar(seed=5).chirps("RV", x, y, 0)
     assert np.array_equal(first, make_default_radar(seed=5).chirps("RV", x, y, 0))
+    # Another seed, and another number of the first chirp. Equal counts are a coincidence.
     for chirps in (make_default_radar(seed=6).chirps("RV", x, y, 0), make_default_radar(seed=5).chirps("RV", x, y, 4)):
         assert np.mean(first == chirps) < 0.1
 
 
 def test_random_numbers_of_pulses_are_uniform_and_independent_of_batches() -> None:
+    # Mean 1/2 and variance 1/12 of a uniform distribution; the limits are several standard errors of 100,000 numbers.
     u = draw_uniform(1234, np.arange(100_000))
     assert abs(u.mean() - 0.5) < 0.005
     assert abs(u.var() - 1 / 12) < 0.002
@@ -134,18 +137,21 @@ def test_h_and_v_have_independent_timing_relative_to_the_transmitter() -> None:
     h = sync_delay_s(d, 1, rig.rig.by_name("RH"), pulses)
     v = sync_delay_s(d, 1, rig.rig.by_name("RV"), pulses)
     correlation = np.corrcoef(h - tx, v - tx)[0, 1]
-    # The transmitter's share is common
+    # The delay of the transmitter is common to both, and has half of the variance of each difference. 0.06 is three
+    # standard errors of 2000 pulses and some more.
     assert abs(correlation - 0.5) < 0.06
 
 
 def test_one_ppm_of_crystal_is_76_khz_and_a_slope_error() -> None:
+    """A crystal that is fast by 1e-6 raises the start by 1e-6 of 76 GHz; the slope by twice that, being Hz a second."""
     on = make_radar(crystal_ppm={"receive_h": 1.0})
     undisturbed = make_radar()
     turn = np.angle(on.signals("RH", ZERO, ZERO)[0, 0] / undisturbed.signals("RH", ZERO, ZERO)[0, 0])
     t = np.arange(256) / on.rig.chirp.sample_rate_hz
-    c2, c1, _ = np.polyfit(t, np.unwrap(turn) / 2 / np.pi, 2)
-    assert abs(c1 - 1e-6 * on.rig.chirp.first_sample_hz) < 10
-    assert abs(2 * c2 / (2e-6 * on.rig.chirp.slope_hz_per_s) - 1) < 0.01
+    # Cycles over time: the linear part is the frequency, and twice the quadratic part the slope.
+    half_slope, frequency_hz, _ = np.polyfit(t, np.unwrap(turn) / 2 / np.pi, 2)
+    assert abs(frequency_hz - 1e-6 * on.rig.chirp.first_sample_hz) < 10
+    assert abs(2 * half_slope / (2e-6 * on.rig.chirp.slope_hz_per_s) - 1) < 0.01
     assert np.array_equal(on.signals("RV", ZERO, ZERO), undisturbed.signals("RV", ZERO, ZERO))
 
 
@@ -163,6 +169,7 @@ def test_start_offset_of_a_board_moves_its_if() -> None:
 def test_phase_is_uniform_from_chirp_to_chirp() -> None:
     rig = make_radar(random_phase=True)
     phase = np.angle(rig.signals("RH", np.zeros(4000), np.zeros(4000))[:, 0, 0])
+    # 500 of 4000 phases are expected in each of eight parts, with a standard deviation of 21.
     counts, _ = np.histogram(phase, 8, (-np.pi, np.pi))
     assert counts.min() > 400
     assert counts.max() < 600
@@ -174,9 +181,11 @@ def test_the_chirp_bends_only_after_the_linear_samples(board: str) -> None:
         on = make_radar(seed, bend_hz=300e3, ripple_hz=3e3)
         undisturbed = make_radar(seed)
         turn = np.unwrap(np.angle(on.signals(board, ZERO, ZERO)[0, 0] / undisturbed.signals(board, ZERO, ZERO)[0, 0]))
+        # The first 192 samples are linear, but for a ripple: what a straight line leaves of the phase is small.
         k = np.arange(192)
         rest = turn[:192] - np.polyval(np.polyfit(k, turn[:192], 1), k)
         assert 1e-4 < np.abs(rest).max() < 0.1
+        # At the end the frequency has bent by 300 kHz, or about that.
         last_hz = np.diff(turn)[-3:] / 2 / np.pi * on.rig.chirp.sample_rate_hz
         assert np.all((np.abs(last_hz) > 150e3) & (np.abs(last_hz) < 400e3))
 
@@ -245,8 +254,9 @@ def test_noise_has_the_set_ratio_on_every_channel_and_averages_down() -> None:
     snr = 10 * np.log10(np.mean(np.abs(clean) ** 2, axis=(0, 2)) / np.mean(np.abs(noise) ** 2, axis=(0, 2)))
     assert np.allclose(snr, 5.5, atol=0.15)
     mean = noise.reshape(-1, 16, 4, 256).mean(axis=1)
-    gained = 10 * np.log10(np.mean(np.abs(clean) ** 2) / np.mean(np.abs(mean) ** 2))
-    assert abs(gained - 17.5) < 0.2
+    # The mean of a burst of 16 has 12 dB more: 5.5 + 12.04.
+    snr_of_mean = 10 * np.log10(np.mean(np.abs(clean) ** 2) / np.mean(np.abs(mean) ** 2))
+    assert abs(snr_of_mean - 17.5) < 0.2
     assert abs(np.mean(noise.real * noise.imag)) < 0.01 * np.mean(np.abs(noise) ** 2)
 
 
@@ -261,6 +271,7 @@ def test_frames_contain_i_of_the_four_rx_then_q() -> None:
     assert frames.dtype == np.int16
     counts = signal * 32767 / 4.0
     for rx in range(4):
+        # Rounded to whole counts.
         assert np.abs(frames[:, :, rx] - counts[:, rx].real).max() <= 0.51
         assert np.abs(frames[:, :, 4 + rx] - counts[:, rx].imag).max() <= 0.51
 
@@ -282,6 +293,7 @@ def test_a_burst_moves_with_the_stage_or_stays_at_its_mean() -> None:
     moving = make_radar(burst_motion=True)
     radar_at_rest = make_radar()
     assert np.allclose(moving.burst_mm(1), 20.0 * (0.2e-3 + np.arange(16) * 1.5e-3))
+    # The mean of the burst: 0.2 ms and 7.5 periods of 1.5 ms, at 20 mm/s.
     assert np.allclose(radar_at_rest.burst_mm(-1), -0.229)
     for direction in (1, -1):
         assert np.isclose(moving.burst_mm(direction).mean(), radar_at_rest.burst_mm(direction).mean())

@@ -17,6 +17,7 @@ from polysight_simulators.scene.radar import sample_frequencies_hz
 RIG = load_published_rig()
 GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "permittivity": [4.0, 0.4]}
+# Six plates at different heights, and flat ones of several materials.
 SIX = [
     {**PLATE, "centre_mm": [60.0 * a, 60.0 * b], "size_mm": [45.0, 45.0], "height_mm": 2.5 * a + b}
     for a in (-1, 0, 1)
@@ -28,6 +29,7 @@ FLAT = [
     {**PLATE, "centre_mm": [-60.0, 61.0], "size_mm": [45.0, 45.0], "thickness_mm": 3.0},
     {**PLATE, "centre_mm": [-58.7, -60.0], "size_mm": [20.0, 45.0], "permittivity": [2.61, 0.01]},
 ]
+# Wave number in the middle of the band, 1/m.
 WAVE = 2 * np.pi * 78.5e9 / SPEED_OF_LIGHT_M_S
 
 
@@ -37,7 +39,7 @@ def make_scene_and_rig(**tables: Any) -> tuple[Instrument, Scene]:
 
 
 def compute_fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The fast and the exact field at random offsets and three frequencies."""
+    """Return the fast and the exact field at random offsets and three frequencies."""
     rig, scene = make_scene_and_rig(**tables)
     board = rig.by_role(role)
     samples = sample_frequencies_hz(rig)
@@ -56,6 +58,7 @@ def compute_rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("tables", "bound"),
     [
+        # Relative RMS errors; the bounds are chosen, below the noise of a scan.
         ({"plates": FLAT, "points": [{"position_mm": [55.0, -60.0], "amplitude": [0.3, 0.2]}]}, 5e-4),
         ({"plates": [{**PLATE, "tilt_deg": [1.0, 0.0]}]}, 0.002),
         ({"plates": [{**PLATE, "tilt_deg": [0.0, 1.0]}]}, 0.002),
@@ -71,7 +74,7 @@ def test_the_fast_field_equals_the_exact_sum(tables: dict[str, Any], bound: floa
     assert compute_rms_error(*compute_fields(role=role, **tables)) < bound
 
 
-def test_a_rough_plate_is_the_same_in_both() -> None:
+def test_the_fast_field_of_a_rough_plate_equals_the_exact_sum() -> None:
     rough = {**PLATE, "size_mm": [45.0, 36.0], "rough_mm": 0.3, "tilt_deg": [0.5, 0.2]}
     assert compute_rms_error(*compute_fields(n=6, plates=[rough])) < 0.002
 
@@ -87,7 +90,7 @@ def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
     field_raised = field_exact(
         rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), frequency_hz
     )[0, 0]
-    # Positive is farther: later
+    # A positive height is farther away: the echo comes later.
     assert np.angle(field_raised / field_at_plane) == pytest.approx(2 * WAVE * cos_theta * 0.2e-3, abs=0.01)
 
 

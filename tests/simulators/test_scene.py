@@ -71,6 +71,7 @@ def test_a_wrong_key_or_value_is_refused_by_name(raw: dict[str, Any], named: str
 
 
 def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
+    # These say where another disturbance acts, and have no value without effect.
     shaping = {"bend_us", "ripple_us"}
     assert set(SWITCHED_OFF) | shaping == set(Disturbances.__struct_fields__)
     ideal = msgspec.to_builtins(make_scene(disturbances={"ideal": True}).disturbances)
@@ -89,7 +90,7 @@ def test_each_disturbance_can_be_switched_off_alone(key: str, word: object) -> N
     assert disturbances == expected
 
 
-def test_overrides_merge_with_the_rig_and_twice_is_once(rig: Instrument) -> None:
+def test_a_scene_replaces_only_the_keys_of_the_rig_that_it_has(rig: Instrument) -> None:
     s = make_scene(object_distance_mm=450.0, grid={"columns": 11}, burst={"pulses": 4}, stage={"speed_mm_s": 10.0})
     once = apply_scene(rig, s)
     assert (once.grid.columns, once.grid.rows) == (11, rig.grid.rows)
@@ -113,7 +114,10 @@ def test_every_example_fits_the_published_rig(rig: Instrument, path: Path) -> No
     boxes = [(*p.centre_mm, *p.size_mm) for p in s.plates if not p.background]
     for i, a in enumerate(boxes):
         for b in boxes[:i]:
-            assert max(abs(a[0] - b[0]) - (a[2] + b[2]) / 2, abs(a[1] - b[1]) - (a[3] + b[3]) / 2) > 0, "plates overlap"
+            # Plates do not overlap: there is a gap between them in x or in y.
+            gap_x_mm = abs(a[0] - b[0]) - (a[2] + b[2]) / 2
+            gap_y_mm = abs(a[1] - b[1]) - (a[3] + b[3]) / 2
+            assert max(gap_x_mm, gap_y_mm) > 0
 
 
 def test_the_library_does_not_contain_the_demo_scan() -> None:

@@ -21,10 +21,13 @@ from polysight_shared.errors import ConfigError
 from polysight_simulators.__main__ import main as simulators
 from polysight_simulators.scene.scene_file import Scene, load_scene
 
+# Tables of the rig file that a scene may override.
 OVERRIDES = ("grid", "burst", "image", "stage")
 WRONG_NUMBERS = (float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 5e-324, 10**30)
 WRONG_TYPES = ("many", [], [[]], {}, True)
+# Texts: none, a long one, a mark that reverses the direction, a line break, a path, format codes, and a usual one.
 WORDS = ("", "x" * 300, "e\u202exe", "a\nb", "../x", "%s{}", "metal")
+# Larger scenes are not simulated, since they take long; and pairs that are drawn without --long. Chosen.
 MOST_POSITIONS = 64
 LARGEST_MM = 300.0
 PAIRS = 16
@@ -63,7 +66,7 @@ def list_keys() -> list[tuple[tuple[str | int, ...], msgspec.inspect.Type]]:
 
 
 def walk(kind: msgspec.inspect.Type, path: tuple[str | int, ...]):
-    """Paths below a type; lists hold what the base scene has there."""
+    """Yield the paths below a type, with their types; lists have the items that the base scene has there."""
     if isinstance(kind, msgspec.inspect.StructType):
         for field in kind.fields:
             yield from walk(field.type, (*path, field.encode_name))
@@ -76,7 +79,7 @@ def walk(kind: msgspec.inspect.Type, path: tuple[str | int, ...]):
 
 
 def look_up(table: Any, path: tuple[str | int, ...]) -> Any:
-    """The list at a path of the base scene; empty where it has none."""
+    """Return the list at a path of the base scene; an empty one where it has none."""
     for key in path:
         if isinstance(table, dict) and key not in table:
             return []
@@ -85,7 +88,7 @@ def look_up(table: Any, path: tuple[str | int, ...]) -> Any:
 
 
 def draw_value(kind: msgspec.inspect.Type, draw: random.Random) -> Any:
-    """A value of a type: at a limit, beyond it, or of another type."""
+    """Draw a value for a type: at a limit, beyond it, or of another type."""
     if draw.random() < 0.15:
         return draw.choice((*WRONG_NUMBERS, *WRONG_TYPES))
     if isinstance(kind, msgspec.inspect.UnionType):
@@ -156,6 +159,7 @@ def check_scene(scene: dict[str, Any], folder: Path, capsys: pytest.CaptureFixtu
 def test_each_pair_of_keys_makes_a_whole_scan_or_is_refused(tmp_path, capsys, request):
     draw = random.Random(1)
     pairs = list(itertools.combinations(list_keys(), 2))
+    # The keys were found.
     assert len(pairs) > 5000
     if not request.config.getoption("--long"):
         pairs = draw.sample(pairs, PAIRS)

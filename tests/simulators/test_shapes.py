@@ -24,7 +24,7 @@ def make_scene(**content: object) -> Scene:
 
 @pytest.fixture
 def worlds_entry_point(tmp_path, monkeypatch):
-    """The worlds' entry point as an installation writes it, for any kind of installation of this environment."""
+    """Offer the shapes of `polysight_worlds` as its installation does, however this environment was installed."""
     package = tmp_path / "offers_shapes-1.dist-info"
     package.mkdir()
     (package / "METADATA").write_text("Name: offers-shapes\nVersion: 1\n", encoding="utf-8")
@@ -47,8 +47,9 @@ def test_a_level_plate_is_the_same_as_a_shape_and_as_a_plate(medium, error):
         expected = of_plates[name]
         ratio = np.vdot(expected, spectrum) / np.vdot(expected, expected)
         ratios.append(ratio)
+        # Chosen.
         assert np.linalg.norm(spectrum - ratio * expected) < 0.15 * np.linalg.norm(expected)
-    # Two models of antennas and obliquity; the phase is the same.
+    # The two programs have different models of antennas and obliquity, so that amplitudes differ by some percent.
     assert ratios == pytest.approx([1, 1], abs=error)
 
 

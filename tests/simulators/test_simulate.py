@@ -39,7 +39,8 @@ def test_rows_contain_the_radars_bytes_at_true_positions(folder: Path) -> None:
     radar = SimulatedRig(RIG, SCENE)
     row = plan_raster(radar.rig.grid).row(1)
     x, y = row_offsets_mm(radar, row)
-    # Odd rows start at the largest x, and move on until the first pulse and during each burst.
+    # Odd rows start at the largest x, and move on until the first pulse and during each burst: 20 mm/s are 0.03 mm
+    # between two pulses.
     assert np.isclose(x[0], 20.0 - RIG.stage.speed_mm_s * FIRST_PULSE_DELAY_S)
     assert np.allclose(np.diff(x.reshape(5, 16), axis=1), -0.03)
     assert np.allclose(np.diff(x.reshape(5, 16)[:, 0]), -10.0)
@@ -87,7 +88,7 @@ def test_truth_json_has_plates_and_points(folder: Path) -> None:
     assert decode_scene(truth["scene"], "truth.json") == SCENE
 
 
-def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path) -> None:
+def test_a_folder_with_files_and_a_burst_longer_than_its_position_are_refused(tmp_path: Path) -> None:
     (tmp_path / "note").write_text("mine")
     with expect_refusal(ErrorCode.FILE_EXISTS, tmp_path):
         simulate(RIG, SCENE, tmp_path)
@@ -103,7 +104,7 @@ def test_a_full_folder_and_a_burst_that_does_not_fit_are_refused(tmp_path: Path)
         ({}, {"burst": {"pulses": 65_536, "period_us": 1500.0}, "stage": {"speed_mm_s": 0.001}}, "MB a board"),
     ],
 )
-def test_what_exceeds_the_memory_is_refused(
+def test_a_scene_that_needs_too_much_memory_is_refused(
     tmp_path: Path, plate: dict[str, Any], run: dict[str, Any], named: str
 ) -> None:
     copper, acrylic = RAW["plates"]

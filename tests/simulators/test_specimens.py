@@ -26,6 +26,7 @@ def make_scene(**tables: Any) -> Scene:
 
 def test_permittivities_have_the_given_spread() -> None:
     many = draw_specimens(make_scene(plates=[PLATE] * 2000, specimen_spread=[0.03, 0.5]))
+    # Spreads are relative: 3 % of the real part, 50 % of the loss. The limits are a few standard errors of 2000 plates.
     real, loss = np.array([p.permittivity for p in many.plates]).T
     assert real.mean() == pytest.approx(4.0, rel=0.005)
     assert real.std() / 4.0 == pytest.approx(0.03, rel=0.1)
@@ -34,7 +35,7 @@ def test_permittivities_have_the_given_spread() -> None:
     assert loss.min() > 0
 
 
-def test_draws_depend_on_seed_and_index_and_repeating_changes_nothing() -> None:
+def test_specimens_depend_on_seed_and_plate_and_are_drawn_only_once() -> None:
     two = make_scene(plates=[PLATE, PLATE], specimen_spread=[0.05, 0.3], plane_tilt_deg=[0.5, 0.2], plane_shift_mm=2.0)
     drawn = draw_specimens(two)
     assert draw_specimens(drawn) == drawn == draw_specimens(two)
@@ -113,12 +114,15 @@ def read_polarimetry(rig: Instrument = RIG, **disturbances: Any) -> tuple[Any, A
 
 
 def test_the_rig_contains_leakage_as_measured() -> None:
-    was = (RIG.polarimetry.leakage_h, RIG.polarimetry.leakage_v, RIG.polarimetry.leakage_std)
-    assert read_polarimetry(leakage_h=[0.0, 0.08]) == was, "never measured: the rig file stays as it is"
-    assert read_polarimetry(ideal=True) == ((0.0, 0.0), (0.0, 0.0), 0.0), "an ideal rig is known"
+    # Leakage that was not measured does not change the rig file.
+    in_rig_file = (RIG.polarimetry.leakage_h, RIG.polarimetry.leakage_v, RIG.polarimetry.leakage_std)
+    assert read_polarimetry(leakage_h=[0.0, 0.08]) == in_rig_file
+    # That an ideal rig has none is known.
+    assert read_polarimetry(ideal=True) == ((0.0, 0.0), (0.0, 0.0), 0.0)
     h, v, std = read_polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.003)
     assert std == 0.003
     error = np.array([*h, *v]) - [0.0, 0.08, 0.03, 0.0]
+    # Five standard errors.
     assert 0 < np.abs(error).max() < 5 * 0.003
     assert read_polarimetry(leakage_h=[0.0, 0.08], leakage_v=[0.03, 0.0], leakage_measured=0.0)[:2] == (
         (0.0, 0.08),
@@ -133,6 +137,7 @@ def test_measured_leakage_has_its_standard_error() -> None:
         p = apply_scene(RIG, drawn_scene).polarimetry
         assert apply_scene(apply_scene(RIG, drawn_scene), drawn_scene).polarimetry == p
         errors += [*p.leakage_h, *p.leakage_v]
+    # 800 errors: their standard deviation is known to 2.5 %.
     assert np.std(errors) == pytest.approx(0.01, rel=0.1)
 
 

@@ -17,7 +17,7 @@ Join = Callable[..., WireClient]
 
 @pytest.fixture
 def join() -> Iterator[Join]:
-    """Joins the wires; leaves them after the test."""
+    """Function that connects a client to the hub; clients are closed after the test."""
     with ExitStack() as joined:
         yield lambda *arguments, **options: joined.enter_context(closing(WireClient(*arguments, **options)))
 
@@ -83,7 +83,8 @@ def test_a_client_gets_its_subscriptions_and_never_its_own_lines(serve: Serve, j
     pi = join(path, (26,))
     cards = join(path, (22,), motion=True)
     stage = join(path)
-    pi.send(WireEdge(1, 26, 1))  # its own line: must not come back
+    # An edge on a line to which it has subscribed itself does not come back.
+    pi.send(WireEdge(1, 26, 1))
     stage.send(WireMotion(2, 0, 0, 5), WireEdge(3, 26, 1), WireEdge(4, 27, 1))
     assert take(pi, 1) == [WireEdge(3, 26, 1)]
     pi.send(WireEdge(5, 22, 1))

@@ -14,6 +14,7 @@ from tests.support.rigs import load_published_rig
 from polysight.acquisition import pi_client
 from polysight.acquisition.pi_client import ATTEMPTS, PiClient, RefusedError
 from polysight.acquisition.ready import make_begin_run
+from polysight.acquisition.scan import RunningScan
 from polysight_shared import messages as m
 from polysight_shared.errors import ErrorCode
 from polysight_shared.faults import PiFault
@@ -236,3 +237,14 @@ def test_a_command_without_a_connection_has_no_reply():
 
     unconnected: Any = SimpleNamespace(_commands=SimpleNamespace(send=raise_again))
     assert PiClient._send_once(unconnected, m.Status(), 1.0) is None
+
+
+@pytest.mark.parametrize(("lost_events", "warnings"), [(0, 0), (1, 1), (7, 1)])
+def test_a_journal_that_is_shorter_than_the_hosts_events_is_a_warning(tmp_path, lost_events, warnings):
+    warned: list[str] = []
+    scan: Any = SimpleNamespace(_scan=SimpleNamespace(path=tmp_path), _warn=warned.append)
+    begun = m.RunStarted(scan_id="s", seq=9, t_mono_ns=1, plan=RUN.plan, resumed=True, lost_events=lost_events)
+    RunningScan._warn_of_lost_events(scan, [make_row_event(m.RowStarted, ROW, TAKE), begun])
+    assert len(warned) == warnings
+    assert all(f"ends {lost_events} events before" in warning for warning in warned)
+    assert all(warning.endswith("the scan continues with event 9") for warning in warned)

@@ -273,3 +273,19 @@ def test_a_card_whose_frames_contradict_the_pulses_is_reset_before_the_next_row(
     take = bench.take()
     assert paths == [tmp_path / "raw" / name / "0004.part" for name in ("whole", "displaced", "slipped")]
     assert (list(take.frames), bench.resets) == (["whole", "displaced", "slipped"], ["displaced", "slipped"])
+
+
+def test_a_held_row_has_no_time_limit_and_is_told_once(bench):
+    """However long the Pi holds it, also if it is held just before the limit; afterwards the limit counts anew."""
+    looks = int(row_limit_s(RIG, ROW) / 0.5)
+
+    def hold_for_three_limits() -> None:
+        held_from_s = 1000.0 + (looks - 1) * 0.5
+        bench.pi.state = "held" if held_from_s <= bench.clock.now < held_from_s + 1.5 * looks else "running"
+
+    bench.at_events = hold_for_three_limits
+    bench.batches = [*([[]] * (5 * looks - 10)), [*BURSTS, make_end()]]
+    # One limit before, three held, and nearly one after
+    assert bench.take().finished == make_end()
+    assert len(bench.notices) == 1
+    assert "row 4 is held" in bench.notices[0]

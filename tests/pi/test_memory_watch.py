@@ -24,8 +24,8 @@ class Ended:
 class DrawnWatch(MemoryWatch):
     """Uses `sizes` bytes at its checks, the last one then on; each cut finds two connections."""
 
-    def __init__(self, sizes: list[int], waits: int) -> None:
-        self.sizes = [0, *sizes]
+    def __init__(self, sizes: list[int], waits: int, at_start: int = 0) -> None:
+        self.sizes = [at_start, *sizes]
         self.cuts = 0
         self.said: list[str] = []
         super().__init__({5601}, self.said.append)
@@ -48,6 +48,13 @@ def test_connections_are_cut_beyond_the_limit_alone(above_bytes, is_cut):
     watch = DrawnWatch([MAX_BYTES + above_bytes, 0], waits=2)
     watch.watch()
     assert (watch.cuts > 0, bool(watch.said)) == (is_cut, is_cut)
+
+
+@pytest.mark.parametrize(("above_bytes", "is_cut"), [(0, False), (1, True)])
+def test_a_program_that_is_large_at_its_start_has_room_above_that(above_bytes, is_cut):
+    watch = DrawnWatch([MAX_BYTES + SPARE_BYTES + above_bytes, 0], waits=2, at_start=MAX_BYTES)
+    watch.watch()
+    assert (watch.cuts > 0) == is_cut
 
 
 def test_connections_that_come_again_are_cut_for_half_a_second():

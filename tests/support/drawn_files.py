@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from polysight_simulators.scene.optics import half_space
 
 Complex = NDArray[np.complexfloating]
-PIXELS = 150  # per side of an image
+# Pixels of each side of an image.
+PIXELS = 150
 METAL = "copper"
 
 
@@ -53,15 +54,19 @@ def draw_pixels(
 ) -> tuple[Complex, Complex]:
     """Draw H and V of n pixels of a box, complex64 [n], with unit gain."""
     r_s, r_p = material.reflection(angle_deg)
-    out = []
+
+    def draw_error(std: float) -> NDArray[np.floating]:
+        """Draw errors of which half of the variance is common to the pixels."""
+        return std * np.sqrt(0.5) * (rng.standard_normal() + rng.standard_normal(n))
+
+    channels = []
     for signal in (r_s + errors.leakage * r_p, r_p + errors.leakage * r_s):
-        parts = [
-            std * np.sqrt(0.5) * (rng.standard_normal() + rng.standard_normal(n))
-            for std in (errors.amplitude, errors.phase_rad)
-        ]
+        amplitude_error = draw_error(errors.amplitude)
+        phase_error = draw_error(errors.phase_rad)
         # The published images are conjugate to a reflection with losses of -j eps''.
-        out.append(np.conj(signal * (1 + parts[0]) * np.exp(1j * parts[1])).astype(np.complex64))
-    return out[0], out[1]
+        drawn = np.conj(signal * (1 + amplitude_error) * np.exp(1j * phase_error))
+        channels.append(drawn.astype(np.complex64))
+    return channels[0], channels[1]
 
 
 def write_material(

@@ -16,10 +16,12 @@ from typing import Any
 
 def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
     """Have this process killed at the `nth` `operation` of `os` on a file whose name ends in `suffix` (0: never)."""
-    real = getattr(os, operation)
-    hits_left = [nth]
+    function = getattr(os, operation)
+    hits_left = nth
 
-    def call(what: Any, *more: Any, **named: Any) -> Any:
+    def count_and_call(what: Any, *more: Any, **named: Any) -> Any:
+        nonlocal hits_left
+        # The first argument is a descriptor, except for a rename, whose second one is the new name.
         if isinstance(what, int):
             name = str(Path(f"/proc/self/fd/{what}").readlink())
         else:
@@ -27,15 +29,16 @@ def kill_at(hits: Path, operation: str, suffix: str, nth: int) -> None:
         if name.endswith(suffix):
             with hits.open("a", encoding="utf-8") as f:
                 f.write(f"{operation}:{suffix}\n")
-            hits_left[0] -= 1
-            if not hits_left[0]:
+            hits_left -= 1
+            if not hits_left:
+                # Half of the data is written.
                 if operation == "pwrite":
                     data, offset = more
-                    real(what, bytes(data)[: len(data) // 2], offset)
+                    function(what, bytes(data)[: len(data) // 2], offset)
                 os.kill(os.getpid(), signal.SIGKILL)
-        return real(what, *more, **named)
+        return function(what, *more, **named)
 
-    setattr(os, operation, call)
+    setattr(os, operation, count_and_call)
 
 
 def main(words: list[str]) -> int:

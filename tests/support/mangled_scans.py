@@ -58,26 +58,31 @@ class Mangled:
 
 
 def compute_distances(source: Any, findings: Findings) -> list[float]:
-    """Squared distances of the true permittivities in the regions."""
+    """Return for each patch the squared distance of its permittivity from the truth, in standard deviations."""
     scene = decode_scene(SCENE, "test")
     plates = read_true_plates(truth(source.instrument, scene, scene.seed))
-    true = match_truth([r.patch for r in findings.analysis.patches], plates)
-    out = []
-    for r in findings.analysis.patches:
-        e = r.permittivity
-        plate = true.get(r.patch.label)
-        if e.value is not None and plate is not None and plate.permittivity is not None:
-            d = e.value - plate.permittivity
-            out.append(float(np.array([d.real, d.imag]) @ np.linalg.solve(np.array(e.covariance), [d.real, d.imag])))
-    return out
+    plates_of_patches = match_truth([result.patch for result in findings.analysis.patches], plates)
+    squared_distances = []
+    for result in findings.analysis.patches:
+        estimate = result.permittivity
+        plate = plates_of_patches.get(result.patch.label)
+        if estimate.value is not None and plate is not None and plate.permittivity is not None:
+            error = estimate.value - plate.permittivity
+            error_parts = np.array([error.real, error.imag])
+            covariance = np.array(estimate.covariance)
+            squared_distances.append(float(error_parts @ np.linalg.solve(covariance, error_parts)))
+    return squared_distances
 
 
 ProcessMangled = Callable[..., tuple[Pipeline, Images, Findings]]
 
 
 def make_processor(source: Source) -> ProcessMangled:
-    """`process(mangle)`: pipeline, images and findings of the scan with changed words; `of`: of another source."""
-    done: dict[Any, tuple[Pipeline, Images, Findings]] = {}
+    """Return a function that processes the scan, with its words changed by `mangle`, or another source `of`.
+
+    It returns pipeline, images and findings. A scan without changes is processed once.
+    """
+    processed: dict[Any, tuple[Pipeline, Images, Findings]] = {}
 
     def make(mangle: Mangle | None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
         pipeline = make_pipeline(Mangled(of, mangle) if mangle else of)  # type: ignore[arg-type]
@@ -87,8 +92,8 @@ def make_processor(source: Source) -> ProcessMangled:
     def process_once(mangle: Mangle | None = None, of: Source = source) -> tuple[Pipeline, Images, Findings]:
         if mangle is not None:
             return make(mangle, of)
-        if of not in done:
-            done[of] = make(None, of)
-        return done[of]
+        if of not in processed:
+            processed[of] = make(None, of)
+        return processed[of]
 
     return process_once

@@ -6,7 +6,8 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parents[2]
 RIG_FILE = REPO / "instrument.toml"
 EXAMPLES = REPO / "examples"
-BIN = Path(sys.executable).parent  # of the environment that runs the tests
+# Commands of the environment that runs the tests.
+BIN = Path(sys.executable).parent
 POLYSIGHT = BIN / "polysight"
-# Packets of a real card, where somebody has them
+# Packets of a real card, which are not part of the repository and need not exist.
 REAL_CAPTURES = REPO.parent / "shared/data/dca1000-real"

@@ -9,7 +9,7 @@ from polysight.store import Source
 
 
 def make_pipeline(source: Source, live: bool = False, samples: SampleUse = "none", **settings: Any) -> Pipeline:
-    """A pipeline to which all rows of a source were added; `settings` as of :class:`polysight.settings.Settings`."""
+    """Return a pipeline with all rows of a source; `settings` are those of :class:`polysight.settings.Settings`."""
     pipeline = Pipeline(source, Settings(**settings), live=live, samples=samples)
     for row in source.rows():
         pipeline.add_row(row)

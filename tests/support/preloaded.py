@@ -47,15 +47,16 @@ LIBRARIES = (
     "scipy.interpolate", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.stats", "skimage.measure",
     "sklearn.discriminant_analysis", "sklearn.model_selection", "sklearn.neighbors", "uvicorn", "xarray",
 )  # fmt: skip
-# Of pytest-xdist, which has execnet start it by `python -u -c CODE`.
+# Name for a worker of pytest-xdist, which execnet starts by `python -u -c CODE`.
 WORKER = "worker"
 # Runs a program of ours: `python killed_at.py HITS PLACES polysight scan ...`.
 KILLED_AT = str(Path(__file__).with_name("killed_at.py"))
+# Programs that start other programs of ours, and commands of `polysight` that do.
 STARTING_OTHERS = ("polysight_simulators.rig", "polysight_simulators", WORKER)
 COMMANDS_STARTING_OTHERS = frozenset({"demo", "doctor", "process", "resume", "scan", "serve"})
 # Variables that affect only a new process.
 READ_AT_START = ("PYTHON", "LD_", "LC_", "LANG", "OMP_", "OPENBLAS_", "MPL", "MALLOC_")
-# Descriptors below are the program's; above are those on their way to it.
+# Descriptors below this number are the program's own; above are copies of those that are passed to it.
 FIRST_SPARE = 700
 # Length of the server's own command line, over which a program's arguments are written.
 ROOM_FOR_WORDS = 8000
@@ -222,7 +223,7 @@ def preload() -> None:
         for module in pkgutil.walk_packages(importlib.import_module(package).__path__, f"{package}.")
     ]
     with warnings.catch_warnings():
-        # As pytest, which imports nothing of this in its workers
+        # As pytest does, whose workers import nothing of this themselves.
         warnings.simplefilter("error")
         for name in (*modules, *LIBRARIES):
             if not name.endswith("__main__"):
@@ -281,7 +282,7 @@ def move_descriptor_up(file: int) -> int:
 
 
 def become(request: Request, files: list[int], starter: int) -> None:
-    """Take over files, arguments, environment and folder; report the process number, and wait for the adoption."""
+    """Take over files, arguments, environment and folder; report the process id, and wait for the adoption."""
     os.closerange(0, FIRST_SPARE)
     for file, number in zip(files, request.descriptors, strict=True):
         os.dup2(file, number)
@@ -309,6 +310,7 @@ def become(request: Request, files: list[int], starter: int) -> None:
 
 def show_in_process_list(words: list[str]) -> None:
     """Write the arguments over this process's own ones, see proc(5), `arg_start`."""
+    # Fields 48 and 49 of proc_pid_stat(5): the addresses of the arguments; the first field here is the third.
     fields = Path("/proc/self/stat").read_bytes().rpartition(b")")[2].split()
     start = int(fields[45])
     end = int(fields[46])

@@ -15,18 +15,19 @@ import pytest
 from polysight.cli.main import main
 from tests.support.paths import BIN
 
+# Idle seconds of this machine after which a test that waits for something fails (see `read_idle_s`); chosen.
 LIMIT_S = 60.0
-"""Seconds in which this machine may idle while a test waits for something: see :func:`read_idle_s`."""
-
+# Seconds by the clock after which a call that blocks (socket, queue, thread) counts as hanging. Chosen: no busy machine
+# reaches it.
 HANG_S = 900.0
-"""Seconds by the clock after which a call that blocks (socket, queue, thread) hangs. No busy machine reaches it."""
 
 
 def read_idle_s() -> float:
-    """Seconds that a core of this machine was idle so far, the mean of all.
+    """Return the seconds that this machine was idle since its start, the mean over its cores.
 
-    Waits are limited by these seconds, not by the clock: slowness of a busy machine does not count as a hang.
+    Waits are limited by these seconds, not by the clock: a busy machine that is slow does not count as hanging.
     """
+    # The first line of proc_stat(5): after the name the ticks in user, nice, system and idle state.
     ticks = Path("/proc/stat").read_text(encoding="ascii").split(maxsplit=5)[4]
     return int(ticks) / os.sysconf("SC_CLK_TCK") / (os.cpu_count() or 1)
 
@@ -58,7 +59,7 @@ def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S)
 
 
 def list_processes_naming(text: str) -> dict[int, str]:
-    """Command lines of living processes in which `text` occurs."""
+    """Return the command lines of running processes that have `text` in them, by process id."""
     processes = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and int(entry.name) != os.getpid():
@@ -114,12 +115,12 @@ class Program:
         while (status := self.process.poll()) is None:
             if read_idle_s() > deadline:
                 self.kill()
-                pytest.fail(f"{self.process.args} hangs; it said:\n{self.out}\n{self.err}")
+                pytest.fail(f"{self.process.args} hangs; its output:\n{self.out}\n{self.err}")
             time.sleep(0.02)
         return Ended(status, self.out, self.err)
 
     def wait_ready(self) -> str:
-        """The rest of its `ready` line."""
+        """Wait until the program prints its line `ready`; return the rest of that line."""
 
         def is_ready() -> bool:
             assert self.process.poll() is None, self.err
@@ -142,7 +143,7 @@ class Program:
 
 
 class Bench:
-    """Starts programs in a folder and ends them all."""
+    """A folder in which programs are started; `close` ends them all."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -170,7 +171,8 @@ class Bench:
         try:
             with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
                 status = main([str(word) for word in arguments])
-        except SystemExit as e:  # of argparse
+        except SystemExit as e:
+            # The parser of arguments ends so.
             status = e.code if isinstance(e.code, int) else 1
         finally:
             signal.signal(signal.SIGTERM, handler_before)

@@ -39,11 +39,12 @@ PERMITTIVITY = {
     "shares": {"noise": 0.1, "metal reference": 0.1, "leakage": 0.6, "incidence": 0.1, "brightness": 0.1},
     "do": "measure leakage with metal strips (polysight leakage)",
 }  # fmt: skip
-_OLD = ("covariance", "dominated_by", "shares", "do")
+# Keys that files of earlier releases do not have.
+_NEW_KEYS = ("covariance", "dominated_by", "shares", "do")
 
 
 def make_segments(level: str | None) -> list[dict[str, Any]]:
-    """Three patches as materials.json has them with this verdict; None: as earlier releases wrote them."""
+    """Return three patches as materials.json has them with this verdict; None: as earlier releases wrote them."""
     metal = {**COMMON, "label": 1, "box_mm": [-50.0, -20.0, -20.0, 20.0], "metal_reference": True}
     pet = {
         **COMMON, "label": 2, "box_mm": [-10.0, -20.0, 15.0, 20.0], "name": "PET", "confidence": 0.8,
@@ -53,7 +54,7 @@ def make_segments(level: str | None) -> list[dict[str, Any]]:
     noise = {**COMMON, "label": 3, "box_mm": [25.0, -20.0, 50.0, 20.0]}
     noise["refused"] = {"what": "noise", "why": "its pixels do not agree", "do": "look at the image"}
     if level is None:
-        pet["permittivity"] = {k: v for k, v in PERMITTIVITY.items() if k not in _OLD}
+        pet["permittivity"] = {k: v for k, v in PERMITTIVITY.items() if k not in _NEW_KEYS}
         return [{k: v for k, v in s.items() if k != "refused"} for s in (metal, pet, noise)]
     if level == "none":
         no_result = {"name": None, "confidence": None, "permittivity": None, "ratio": None, "votes": {}, "truth": None}
@@ -94,7 +95,7 @@ def name_check_plate(products: Path, plate: CheckPlate) -> None:
 
 
 def make_result(images: Images, content: dict[str, Any] | None, quality: dict[str, Any], **more: Any) -> ProcessedScan:
-    """A result that was just computed, with these contents of materials.json (None: images only) and quality.json."""
+    """Return a computed result with these contents of materials.json (None: images only) and quality.json."""
     results: dict[str, Any] = {"facts": ScanFacts(scan_id="s", simulated=True), "plates": (), **more}
     materials = None if content is None else ScanMaterials.decode(content)
     return ProcessedScan.from_results(
@@ -103,7 +104,7 @@ def make_result(images: Images, content: dict[str, Any] | None, quality: dict[st
 
 
 def replace_results(scan: ProcessedScan, **content: Any) -> ProcessedScan:
-    """The same result with other contents."""
+    """Return the result with other contents."""
     results = {name: value for name, value in vars(scan).items() if name in ComputedContent.__annotations__}
     return ProcessedScan.from_results(scan.folder, **{**results, **content})
 
@@ -112,13 +113,13 @@ def _encode_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
+# A PNG of one pixel.
 PIXEL = (
     b"\x89PNG\r\n\x1a\n"
     + _encode_chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 8, 0, 0, 0, 0))
     + _encode_chunk(b"IDAT", zlib.compress(b"\0\0"))
     + _encode_chunk(b"IEND", b"")
 )
-"""A PNG of one pixel."""
 
 
 @contextmanager

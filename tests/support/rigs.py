@@ -15,31 +15,31 @@ Change = Callable[[dict[str, Any]], None]
 
 
 def load_published_rig() -> Instrument:
-    """The rig of instrument.toml."""
+    """Return the rig of instrument.toml."""
     return load_instrument(RIG_FILE)
 
 
 def time_by_the_program(rig: Instrument) -> Instrument:
-    """The same without one-shot and return wire, as the published rig had it: the program makes the pulses."""
+    """Return the rig without one-shot and return wire, as it was published: the program makes the width of pulses."""
     pi = msgspec.structs.replace(rig.pi, one_shot=False, pulses_in=None)
     return msgspec.structs.replace(rig, pi=pi)
 
 
 def time_by_spi(rig: Instrument) -> Instrument:
-    """The same with SYNC_IN on MOSI, and MISO as its return wire."""
+    """Return the rig with SYNC_IN on the SPI output MOSI (GPIO 10), and the input MISO (GPIO 9) as its return wire."""
     pi = msgspec.structs.replace(rig.pi, wiring="spi", sync_out=(10,), pulses_in=9, one_shot=False)
     return msgspec.structs.replace(rig, pi=pi)
 
 
 def load_rig_table() -> dict[str, Any]:
-    """The published rig as plain values, to be changed and written or decoded."""
+    """Return the published rig as plain values, to be changed and written or decoded."""
     return to_builtins(load_published_rig())
 
 
 def make_rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Instrument:
-    """The published rig with some keys of tables replaced, then changed by hand.
+    """Return the published rig with some keys of tables replaced, and then changed by a function.
 
-    `rig_with(grid={"columns": 3}, burst={"pulses": 2})`; `change` gets the whole rig as plain values.
+    `make_rig_with(grid={"columns": 3}, burst={"pulses": 2})`; `change` gets the whole rig as plain values.
     """
     table = load_rig_table()
     for name, keys in tables.items():
@@ -50,12 +50,15 @@ def make_rig_with(change: Change | None = None, **tables: dict[str, Any]) -> Ins
 
 
 def set_stage_port(rig: Instrument, port: str) -> Instrument:
-    """The rig with its stage at another serial port."""
+    """Return the rig with its stage at another serial port."""
     return msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, port=port))
 
 
 def make_programmed_rig(offset_hz: float = MID_BAND_OFFSET_HZ, **tables: dict[str, Any]) -> Instrument:
-    """As :func:`make_rig_with`, with this start offset of every receiver; by default the direct path is mid-band."""
+    """Return a rig as :func:`make_rig_with`, with this start offset of every receiver.
+
+    By default the direct path is in the middle of the band.
+    """
 
     def program(table: dict[str, Any]) -> None:
         for board in table["boards"]:

@@ -19,7 +19,7 @@ def write_small_scene(
     metal: bool = True,
     seed: int = 3,
 ) -> str:
-    """Text of a scene file: grid, burst and a square image; with `metal` a plate of 60 mm in its middle."""
+    """Return the text of a scene file: grid, burst and a square image; with `metal` a plate of 60 mm in its middle."""
     scene: dict[str, Any] = {
         "name": "a metal plate" if metal else "nothing",
         "seed": seed,
@@ -41,7 +41,7 @@ def make_scene(
     pulses: int = 2,
     **more: Any,
 ) -> dict[str, Any]:
-    """A scene of plates on a coarse grid; `more` are its other tables."""
+    """Return a scene of plates on a coarse grid; `more` are its other tables."""
     return {
         "name": "small",
         "grid": {"columns": columns, "rows": rows, "step_x_mm": step_mm[0], "step_y_mm": step_mm[1]},

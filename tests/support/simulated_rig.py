@@ -44,6 +44,7 @@ class Rig(Bench):
         self.simulators = self.start("python", "-m", "polysight_simulators.rig", *options, env=self._env)
         base = Path(self.simulators.wait_ready())
         table = to_builtins(load_instrument(base))
+        # Short limits, so that tests of lost programs do not wait long.
         table["limits"] |= {"command_timeout_s": 1.5, "end_of_record_s": 1.0}
         table["pi"]["heartbeat_ms"] = 100
         self.instrument = decode(table, Instrument, "test")
@@ -79,8 +80,8 @@ class Rig(Bench):
         wait_for(is_received, f"row {rows} being received")
 
     def count_committed_rows(self) -> int:
-        """Number of committed rows of the scan."""
-        with suppress(PolysightError):  # not begun yet
+        """Return the number of committed rows of the scan, 0 before it has begun."""
+        with suppress(PolysightError):
             return len(ScanFolder.load(self.folder / "scan").committed_rows())
         return 0
 

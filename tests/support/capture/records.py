@@ -15,13 +15,13 @@ FULL = 1456
 
 
 def encode_packet(sequence: int, byte_count: int, payload: bytes) -> bytes:
-    """A packet as the card sends it; both counters wrap."""
+    """Return a packet as the card sends it; both counters begin again at 0 after their last value."""
     count = byte_count % 2**48
     return (sequence % 2**32).to_bytes(4, "little") + count.to_bytes(6, "little") + payload
 
 
 def encode_packets(data: bytes, sequence: int, byte_count: int) -> list[bytes]:
-    """All packets of a record that starts with these counters."""
+    """Return all packets of a record that starts with these counters."""
     starts = range(0, len(data), FULL)
     return [encode_packet(sequence + k, byte_count + a, data[a : a + FULL]) for k, a in enumerate(starts)]
 
@@ -35,7 +35,7 @@ class Record:
 
     @staticmethod
     def make(size: int, count: int, sequence: int, seed: int = 0) -> Record:
-        # no zero bytes, so that a wrongly zeroed byte shows
+        # No byte is zero, so that one that is wrongly set to zero differs.
         data = np.random.default_rng(seed).integers(1, 256, size, dtype=np.uint8).tobytes()
         return Record(data, encode_packets(data, sequence, count))
 
@@ -93,7 +93,7 @@ def place(
 
 
 def find_next_start(placed: PlacedRecord) -> Counters | None:
-    """Counters with which the card's next record starts; None if that is uncertain."""
+    """Return the counters with which the card's next record starts; None if they are uncertain."""
     return placed.past.start
 
 
@@ -112,7 +112,7 @@ def is_original_or_masked(record: Record, placed: PlacedRecord, out: np.ndarray)
 
 
 def log_packets(sent: SentRecord, expected: int, batch: int) -> PacketLog:
-    """The arrivals as a receiver logs them, some at a time, each with the time of its arrival."""
+    """Return the arrivals as a receiver logs them, `batch` together, each with the time of its arrival."""
     log = PacketLog(expected)
     for k in range(0, len(sent.arrivals), batch):
         batch_of_arrivals = sent.arrivals[k : k + batch]

@@ -16,7 +16,7 @@ TOKEN = "the-right-token"
 def ask(
     view: Any, path: str, method: str = "GET", body: Any = None, **headers: str
 ) -> tuple[int, bytes, dict[str, str]]:
-    """Status, body and headers (lower case) of one request; header names with `_` for `-`."""
+    """Send a request; return status, body and headers with names in lower case. Names given have `_` for `-`."""
     connection = http.client.HTTPConnection("127.0.0.1", view.port, timeout=HANG_S)
     raw = body if isinstance(body, bytes | None) else json.dumps(body).encode()
     try:
@@ -58,11 +58,12 @@ def _receive(s: socket.socket) -> bytes:
 
 
 def compute_digest(folder: Path) -> dict[str, str]:
-    """SHA-256 of every file below a folder, and the targets of links."""
-    return {
-        str(p.relative_to(folder)): f"-> {p.readlink()}"
-        if p.is_symlink()
-        else hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in sorted(folder.rglob("*"))
-        if p.is_symlink() or p.is_file()
-    }
+    """Return the SHA-256 of every file below a folder, and the targets of links."""
+    digests = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.is_symlink():
+            digests[name] = f"-> {path.readlink()}"
+        elif path.is_file():
+            digests[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return digests

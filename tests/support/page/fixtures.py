@@ -49,7 +49,7 @@ class Watched(Watch):
 
 @pytest.fixture
 def watching() -> Iterator[Callable[..., Watched]]:
-    """Makes watches, as `Watch`, that run until the test ends."""
+    """Function that starts a `Watch`, which runs until the test ends."""
     with ExitStack() as watched:
 
         def watch(*arguments: Any, **options: Any) -> Watched:

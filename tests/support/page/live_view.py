@@ -23,7 +23,7 @@ from tests.support.store.facts import load_facts
 
 
 def begin_history(started: dict[str, Any]) -> ScanHistory:
-    """A history with only the first fact."""
+    """Return the history of a scan of which only the first fact is there."""
     content = manifest.parse(manifest.encode_line(started))
     assert content.started is not None
     return ScanHistory(content, content.started)
@@ -36,7 +36,7 @@ def add_fact(history: ScanHistory, fact: dict[str, Any]) -> None:
 
 
 class GrowingScan:
-    """A copy of a finished scan whose manifest and events are written line by line; `live` touches its `alive` file."""
+    """A copy of a finished scan whose manifest and events a test writes line by line."""
 
     def __init__(self, finished: Path, folder: Path) -> None:
         self._facts = load_facts(finished)
@@ -112,7 +112,7 @@ class Served:
 
 @contextmanager
 def serve_view(watch: Watch, token: str = "", host: str = "127.0.0.1", port: int = 0) -> Iterator[Served]:
-    """A server of one live view for the block."""
+    """Serve one live view during the block."""
     access = Access(token, loopback=host == "127.0.0.1", control=bool(token))
     scans = Scans(watch.folder.parent, watch.folder.name)
     server = Served(Site(scans, Watches(bool(token), {watch.folder.name: watch})), access, host, port)
@@ -130,7 +130,7 @@ def serve_folder(
     config: Path | None = None,
     place: ServerAddress | None = None,
 ) -> Iterator[Served]:
-    """A server of all scans under a folder for the block; with a rig file it starts programs."""
+    """Serve all scans under a folder during the block; with a rig file the page can start programs."""
     access = access or Access(token, control=bool(token))
     programs = Programs() if config is not None else None
     server = Served(Site(Scans(root), Watches(access.control), programs, config), access, place=place)

@@ -236,6 +236,7 @@ class FakeStage:
             if not events & select.POLLIN:
                 continue
             for c in os.read(self.master, 4096):
+                # Immediate bytes are outside of ASCII; 10 is the end of a line.
                 if c >= 0x80:
                     self._immediate(c)
                 elif c == 10:

@@ -63,12 +63,12 @@ def require_stand_in_chip() -> None:
 
 
 def read_resident_bytes(pid: int | str = "self") -> int:
-    """Memory of a process."""
+    """Return the resident memory of a process; the kernel counts pages of 4096 bytes."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
 
 
 def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Any command, to its end."""
+    """Run a command of `polysight-pi` to its end."""
     process = subprocess.run(
         [*PROGRAM, *map(str, args)],
         capture_output=True,
@@ -103,7 +103,7 @@ class WiresLog:
         return [e.t_ns for e in self.edges if e.line == line and e.value]
 
     def read_level(self, line: int) -> int:
-        """The last one seen; 0 before the first."""
+        """Return the last level of a line; 0 before its first edge."""
         return next((e.value for e in reversed(self.edges) if e.line == line), 0)
 
     def drive(self, *edges: WireEdge) -> None:

@@ -56,11 +56,13 @@ class Restarts(BoardWords):
 
     def __init__(self, board: RadarBoard, clock: VirtualClock, after: int) -> None:
         super().__init__(board, clock)
+        # Commands until the restart, and commands after it.
         self.left = after
         self.later = 0
 
     def write(self, words: Sequence[int]) -> None:
         super().write(words)
+        # A command begins with this word.
         if words[0] == 0x1234:
             self.left -= 1
             self.later += self.left < 0
@@ -70,7 +72,7 @@ class Restarts(BoardWords):
 
 
 def make_native_rig() -> Instrument:
-    """The published rig under native control, each receiver's direct path in the middle of its IF window."""
+    """Return the published rig under native control, with the direct path in the middle of each receiver's IF band."""
     rig = load_published_rig()
     boards = tuple(b if b.role == "transmit" else msgspec.structs.replace(b, start_offset_hz=790e3) for b in rig.boards)
     radar = Radar(control="native", native={b.name: NativeRadar(usb_serial=f"FT{b.name}") for b in boards})
@@ -78,5 +80,5 @@ def make_native_rig() -> Instrument:
 
 
 def change_radar_table(rig: Instrument, **values: object) -> Instrument:
-    """The rig with other values in its table [radar]."""
+    """Return the rig with other values in its table [radar]."""
     return msgspec.structs.replace(rig, radar=msgspec.structs.replace(rig.radar, **values))

@@ -20,11 +20,12 @@ from typing import Any, Literal
 import pytest
 
 Fault = Literal["full", "short", "killed", "killed within", "power cut", "worst power cut"]
+# Operations that are counted.
 SEEN = ("open", "pwrite", "fsync", "mkdir", "rename", "replace", "unlink", "ftruncate", "posix_fallocate")
 # The real functions, while those of `os` and `io` are replaced.
 REAL_OPEN = io.open
 REAL = SimpleNamespace(**{name: getattr(os, name) for name in SEEN})
-# Smaller than a real disk's 512 bytes, for the files of the tests are small.
+# Smaller than the 512 bytes of a real disk, because the files of the tests are small.
 SECTOR_BYTES = 64
 # Operations that need space on the disk.
 GROWS = ("write", "pwrite", "posix_fallocate", "create", "mkdir", "rename", "fsync")
@@ -56,8 +57,10 @@ class FaultyDisk:
         self._fault = fault
         self.at = at
         self._random = random.Random(seed)
-        # True once the program was killed; True once there is space again.
-        self._dead = self._space = False
+        # True once the program was killed.
+        self._dead = False
+        # True once there is space again.
+        self._space = False
         # Operations so far, with the name of the file.
         self.done: list[str] = []
         # Content of a touched file that is on the disk for certain.
@@ -180,7 +183,8 @@ class FaultyDisk:
 
     def _fsync(self, fd: int) -> None:
         self._hit("fsync", _read_descriptor_path(fd))
-        self._sync(_read_descriptor_path(fd))  # not the real sync, which would only cost time
+        # The real sync would only cost time.
+        self._sync(_read_descriptor_path(fd))
 
     def _mkdir(self, path: Any, *more: Any, **named: Any) -> None:
         self._hit("mkdir", Path(path))
@@ -219,7 +223,7 @@ class FaultyDisk:
 
 
 class _SeenFile(io.FileIO):
-    """A file whose writes the disk sees."""
+    """A file whose writes the disk counts."""
 
     def __init__(self, disk: FaultyDisk, path: str, mode: str) -> None:
         self._disk = disk

@@ -1,0 +1,47 @@
+"""A stage that rests in a motion without having said how the motion ended, by its statuses alone."""
+
+import pytest
+from tests.support.pi.machine_bench import Bench
+
+from polysight_pi.machine import MAX_REPEAT_REQUESTS, RESTING_STATUSES
+from polysight_shared import messages as m
+from polysight_shared.faults import PiFault
+from polysight_shared.stage_line import Reply
+
+JOG = m.Jog(axis="x", from_mm=0.0, distance_mm=5.0, speed_mm_s=10.0, heartbeat_ms=500, owner="o")
+
+
+def begin(motion: str) -> Bench:
+    bench = Bench().begin_and_home()
+    if motion == "row":
+        bench.start()
+        return bench
+    bench.machine.command("EndRun")
+    bench.run_posted()
+    if motion == "jog":
+        bench.machine.command("Jog", JOG)
+    else:
+        bench.machine.command("Home")
+    bench.run_posted()
+    bench.send_reply(Reply("ok", bench.stage.number))
+    return bench
+
+
+@pytest.mark.parametrize("motion", ["row", "jog", "homing"])
+def test_a_stage_that_rests_in_any_motion_is_a_fault_after_it_was_asked_for_its_end(motion):
+    bench = begin(motion)
+    for _ in range(RESTING_STATUSES * MAX_REPEAT_REQUESTS):
+        bench.send_status(0, state="idle")
+    assert bench.machine.fault == 0
+    bench.send_status(0, state="idle")
+    assert (bench.machine.state, bench.machine.fault) == ("fault", PiFault.STAGE_LOST)
+
+
+@pytest.mark.parametrize("motion", ["row", "jog", "homing"])
+def test_statuses_count_only_in_sequence(motion):
+    bench = begin(motion)
+    for _ in range(3):
+        for _ in range(RESTING_STATUSES * MAX_REPEAT_REQUESTS):
+            bench.send_status(0, state="idle")
+        bench.send_status(0, state="jog")
+    assert bench.machine.fault == 0

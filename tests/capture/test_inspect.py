@@ -73,9 +73,12 @@ def write_faulty_file(words: np.ndarray, fault: str) -> np.ndarray:
         return np.clip(words * (0.9 * 32767 / words.std()), -32768, 32767).astype("<i2")
     if fault == "no clear peak":
         return np.random.default_rng(1).normal(scale=20, size=words.size).astype("<i2")
-    return {"I and Q": draw_row(4, True), "on RX1:": draw_row(4, False, dead=0), "on RX4:": draw_row(4, False, dead=3)}[
-        fault
-    ]
+    if fault == "I and Q":
+        return draw_row(4, q_first=True)
+    if fault == "on RX1:":
+        return draw_row(4, q_first=False, dead=0)
+    assert fault == "on RX4:"
+    return draw_row(4, q_first=False, dead=3)
 
 
 @pytest.mark.parametrize(
@@ -92,14 +95,16 @@ def test_a_fault_causes_its_own_remark_and_no_other(tmp_path, fault):
 def test_the_legend_of_the_range_profile_says_which_antenna_has_no_signal(tmp_path, monkeypatch, dead):
     draw_row(4, False, dead=dead).tofile(tmp_path / "x.bin")
     legends = []
-    monkeypatch.setattr(
-        Figure, "savefig", lambda f, *_, **__: legends.append([t.get_text() for t in f.axes[0].get_legend().texts])
-    )
+
+    def keep_legend(figure: Figure, *_: object, **__: object) -> None:
+        legends.append([text.get_text() for text in figure.axes[0].get_legend().texts])
+
+    monkeypatch.setattr(Figure, "savefig", keep_legend)
     plot_profile(inspect_bin(tmp_path / "x.bin"), tmp_path / "x.png")
     assert legends == [[f"RX{i + 1}" + " (no signal)" * (i == dead) for i in range(4)] + ["mean"]]
 
 
-def test_whole_packets_in_a_file_are_not_taken_for_samples(tmp_path):
+def test_the_counters_of_packets_in_a_file_are_left_out_with_a_remark(tmp_path):
     """A program that writes packets as they come leaves ten bytes of counters before every 1456 of payload."""
     data = draw_row(4, False).tobytes()
     path = tmp_path / "x.bin"
@@ -115,6 +120,7 @@ def test_of_a_huge_file_only_the_beginning_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr("polysight.capture.inspect.MAX_BYTES", 1 << 20)
     path = tmp_path / "x.bin"
     draw_row(4, False).tofile(path)
+    # 16 GiB, most of which takes no space on the disk.
     with path.open("r+b") as f:
         f.truncate(1 << 34)
     report = inspect_bin(path)

@@ -25,10 +25,10 @@ TICK_S = 0.01
 
 
 class TickingClock:
-    """The Pi's clock in this process: each turn of a thread advances it by `TICK_S`, however long the turn takes.
+    """The clock of the Pi's program in this process: a thread advances it by `TICK_S` in each of its turns.
 
-    So nothing is late because a busy machine gives the process little processor time. It stands still
-    while `stands`.
+    So nothing is late because a busy machine gives the process little processor time. It does not advance while
+    `stands` is True.
     """
 
     def __init__(self) -> None:
@@ -82,7 +82,7 @@ class HostSide:
         self.wait_for_event(object)
 
     def ask(self, command: Any) -> Any:
-        """The reply to a command, or to bytes."""
+        """Send a command, or bytes; return the reply."""
         self.commands.send(command if isinstance(command, bytes) else m.pack(command))
         wait_for(lambda: self.commands.poll(POLL_MS) != 0, f"a reply to {command}", self.limit_s)
         return m.unpack_reply(self.commands.recv())
@@ -93,7 +93,7 @@ class HostSide:
         return reply
 
     def must_refuse(self, command: Any) -> int:
-        """Fault number of the refusal."""
+        """Send a command that must be refused; return the fault number of the refusal."""
         reply = self.ask(command)
         assert isinstance(reply, m.Refused), reply
         assert reply.problem

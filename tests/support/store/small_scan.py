@@ -59,7 +59,7 @@ class Samples:
 
 
 class SmallPi:
-    """Replaces PiClient: writes the Pi's journal; rows end immediately."""
+    """A Pi in place of its client: it writes the Pi's journal, and rows end immediately."""
 
     def __init__(self, instrument: Instrument, folder: Path) -> None:
         self._instrument = instrument
@@ -72,7 +72,7 @@ class SmallPi:
         self.state: m.State = "ready"
         self.fault = ""
         self.gaps_filled = 0
-        # Data is always ready to be read
+        # A socket with data that is always ready to be read.
         self.event_socket = os.eventfd(1)
 
     def follow(self, scan_id: str, last_seq: int, on_event: Any) -> None:
@@ -81,7 +81,7 @@ class SmallPi:
         self._take = on_event
 
     def _commit(self, kind: type[m.AnyEvent], *events: dict[str, Any]) -> None:
-        """As the executor: a failing journal puts the Pi into fault."""
+        """Write events as the Pi's executor does: if the journal fails the Pi is in fault."""
         try:
             self._journal.write([NewEvent.now(kind, **event) for event in events])
         except JournalFullError as e:
@@ -157,7 +157,7 @@ class SmallPi:
 
 
 class SmallRig:
-    """Replaces CaptureRig: every byte arrives; rows are written as by its receivers."""
+    """Cards and receivers in place of CaptureRig: every byte arrives, and rows are written as by its receivers."""
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
@@ -255,13 +255,13 @@ class SmallScan:
             self.acknowledged.add(progress.row)
 
     def rows(self) -> dict[str, str]:
-        """SHA-256 of the payload of every committed row."""
+        """Return the SHA-256 of the payload of every committed row, by file."""
         committed = ScanFolder.load(self.path).committed_rows().values()
         files = [self.path / board.file for row in committed for board in row.boards.values()]
         return {str(f.relative_to(self.path)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
     def image(self) -> bytes:
-        """The final image's bytes, both channels and their mask."""
+        """Return the bytes of the final image: both channels and their mask."""
         images = make_pipeline(ScanFolder.load(self.path)).form_images()
         return b"".join(part.tobytes() for part in (images.h, images.v, images.valid))
 

@@ -49,21 +49,22 @@ def process_six_plates(six_plates: ScanFolder) -> mangled_scans.ProcessMangled:
 
 @pytest.fixture(scope="session")
 def image_scene(tmp_path_factory: pytest.TempPathFactory) -> Make:
-    """`imaged("nine-materials", seed=2, leakage_h=[0, 0])`: the example scene with changed disturbances, imaged.
+    """`image_scene("nine-materials", seed=2, leakage_h=[0, 0])`: the example scene with changed disturbances, imaged.
 
     Four pulses per position instead of sixteen: a scan takes a third of the time.
     """
     rig = make_rig_with(burst={"pulses": 4})
-    fields = tmp_path_factory.mktemp("fields")  # shared by scans of a scene with different disturbances
-    done: dict[str, Imaged] = {}
+    # Echoes of a scene, which scans with different disturbances share.
+    fields = tmp_path_factory.mktemp("fields")
+    imaged_scans: dict[str, Imaged] = {}
 
     def make(name: str, seed: int | None = None, **disturbances: Any) -> Imaged:
         key = f"{name} {seed} {disturbances}"
-        if key not in done:
+        if key not in imaged_scans:
             scene: Scene = load_scene(EXAMPLES / f"{name}.toml").with_disturbances(**disturbances)
             folder = tmp_path_factory.mktemp("scan")
-            done[key] = Imaged(simulate(rig, scene, folder / "scan", seed=seed, cache_dir=fields))
-        return done[key]
+            imaged_scans[key] = Imaged(simulate(rig, scene, folder / "scan", seed=seed, cache_dir=fields))
+        return imaged_scans[key]
 
     return make
 

@@ -20,6 +20,7 @@ from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate, write_cube
 
 RIG = load_published_rig()
+# The rig with an image of few pixels, which is formed quickly.
 SMALL = msgspec.structs.replace(RIG, image=Image(columns=60, rows=50, pixel_mm=4.0))
 SCENE = {
     "name": "two plates",
@@ -33,13 +34,13 @@ SCENE = {
 
 
 def read_images(folder):
-    """Both images of a recording, and its pipeline."""
+    """Return both images of a recording, and its pipeline."""
     pipeline = make_pipeline(open_source(folder, SMALL))
     return pipeline.form_images(), pipeline
 
 
 def correlate(a, b, channel):
-    """Normalised correlation of two images where both are valid; 1 is the same up to a factor."""
+    """Return the normalised correlation of two images where both are valid; 1 if they are equal up to a factor."""
     valid_in_both = a.valid & b.valid
     x = getattr(a, channel)[valid_in_both]
     y = getattr(b, channel)[valid_in_both]
@@ -47,23 +48,25 @@ def correlate(a, b, channel):
 
 
 @pytest.fixture(scope="module")
-def quiet(tmp_path_factory):
-    """A scan without disturbances, row by row: its image is the reference for the others."""
+def undisturbed_images(tmp_path_factory):
+    """Images of a scan without disturbances, recorded row by row: the reference for the other forms."""
     scene = decode_scene(SCENE, "t").with_disturbances(ideal=True)
     return read_images(simulate(RIG, scene, tmp_path_factory.mktemp("rows"), layout="authors"))[0]
 
 
-def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
+def test_a_scan_by_columns_makes_the_image_of_one_by_rows(undisturbed_images, tmp_path):
     scene = decode_scene(SCENE, "t").with_disturbances(packet_loss=0.002)
+    # RV lacks positions 0 and 7 of its fourth column.
     folder = simulate(
         RIG, scene, tmp_path, layout="authors", by_columns=True, zero_filling=False, skipped={("RV", 3): {0, 7}}
     )
     image, pipeline = read_images(folder)
-    assert image.h.shape == quiet.h.shape == (50, 60)
-    np.testing.assert_allclose(image.x_m, quiet.x_m, atol=1e-12)
-    np.testing.assert_allclose(image.y_m, quiet.y_m, atol=1e-12)
+    assert image.h.shape == undisturbed_images.h.shape == (50, 60)
+    np.testing.assert_allclose(image.x_m, undisturbed_images.x_m, atol=1e-12)
+    np.testing.assert_allclose(image.y_m, undisturbed_images.y_m, atol=1e-12)
+    # All disturbances and lost packets leave 2 %; chosen.
     for channel in ("h", "v"):
-        assert correlate(image, quiet, channel) > 0.98
+        assert correlate(image, undisturbed_images, channel) > 0.98
     facts = pipeline.quality.notes["recording"]
     assert facts.direction == "col"
     assert facts.boards["RV"]["positions_missing"] == 2
@@ -75,35 +78,39 @@ def test_a_scan_by_columns_makes_the_image_of_one_by_rows(quiet, tmp_path):
     "form",
     [{}, {"keep_direct": False, "from_transmitter": True}, {"common_reference": True, "conjugate": True}],
 )
-def test_a_synchronised_cube_of_any_convention_makes_the_same_image(quiet, tmp_path, form):
+def test_a_synchronised_cube_of_any_convention_makes_the_same_image(undisturbed_images, tmp_path, form):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path, **form)
     image, pipeline = read_images(folder)
     for channel in ("h", "v"):
-        assert correlate(image, quiet, channel) > 0.999
+        assert correlate(image, undisturbed_images, channel) > 0.999
     assert set(pipeline.quality.notes["recording"].cubes) == {"RH", "RV"}
     assert pipeline.quality.result().boards["RH"].positions_masked == 0
 
 
-def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros_are_masked(quiet, tmp_path):
+def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros_are_masked(
+    undisturbed_images, tmp_path
+):
+    """Each position has a random phase and delay, as before synchronisation; one is zero and one is not a number."""
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
     rng = np.random.default_rng(1)
     for board in ("RH", "RV"):
         file = folder / f"{board}_synced.npy"
         cube = np.load(file)
-        turn = rng.uniform(0, 1, cube.shape[1:3])
-        bins = rng.uniform(40, 60, cube.shape[1:3])
-        time = np.arange(256) / 256
-        cube *= np.exp(2j * np.pi * (turn[..., None] + bins[..., None] * time)).astype(np.complex64)
+        phase_turns = rng.uniform(0, 1, cube.shape[1:3])
+        range_bins = rng.uniform(40, 60, cube.shape[1:3])
+        part_of_chirp = np.arange(256) / 256
+        turns = phase_turns[..., None] + range_bins[..., None] * part_of_chirp
+        cube *= np.exp(2j * np.pi * turns).astype(np.complex64)
         cube[:, 4, 5] = 0
         cube[:, 5, 6] = np.nan
         np.save(file, cube)
     image, pipeline = read_images(folder)
     for channel in ("h", "v"):
-        assert correlate(image, quiet, channel) > 0.99
+        assert correlate(image, undisturbed_images, channel) > 0.99
     assert pipeline.quality.result().boards["RH"].positions_masked == 2
 
 
-def test_an_empty_cube_is_an_error(tmp_path):
+def test_a_cube_of_zeros_is_refused(tmp_path):
     folder = write_cube(RIG, decode_scene(SCENE, "t"), tmp_path)
     source = open_source(folder, SMALL)
     assert isinstance(source, PublishedCubes)

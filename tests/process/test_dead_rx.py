@@ -21,6 +21,7 @@ from polysight_simulators.scene import decode_scene
 
 
 def draw_noise(row: int, words: np.ndarray, rms: float) -> np.ndarray:
+    """Return noise for one RX in the form of `words` [..., rx]: complex for a cube, otherwise ADC units."""
     rng = np.random.default_rng(row)
     if np.iscomplexobj(words):
         return rms * (rng.standard_normal(words.shape[:-1]) + 1j * rng.standard_normal(words.shape[:-1]))
@@ -41,20 +42,24 @@ def kill(
     """
 
     def mangle(name: str, row: int, words: np.ndarray) -> None:
-        if name == board and row in rows:
-            for k in rx:
-                positions_of_rx = words[_select_chirps(positions, words)]
-                positions_of_rx[..., k - 1] = (
-                    draw_noise(100 * row + k, positions_of_rx, rms) if value is None else value
-                )
+        if name != board or row not in rows:
+            return
+        changed_words = words[_select_chirps(positions, words)]
+        for k in rx:
+            if value is None:
+                changed_words[..., k - 1] = draw_noise(100 * row + k, changed_words, rms)
+            else:
+                changed_words[..., k - 1] = value
 
     return mangle
 
 
 def _select_chirps(positions: slice, words: np.ndarray) -> slice:
-    """The chirps of some positions; a row of a cube has one for each."""
+    """Return the chirps of some positions; a row of a cube has one for each."""
     chirps = len(words) // SCENE["grid"]["columns"]
-    return slice(*(None if end is None else end * chirps for end in (positions.start, positions.stop)))
+    start = None if positions.start is None else positions.start * chirps
+    stop = None if positions.stop is None else positions.stop * chirps
+    return slice(start, stop)
 
 
 @pytest.fixture
@@ -76,7 +81,7 @@ def list_reasons_about_rx(findings: Findings) -> list[str]:
 
 
 def list_other_reasons(findings: Findings) -> set[str]:
-    """All reasons except those about an RX, without their numbers."""
+    """Return all reasons except those about an RX, without the digits in them."""
     return {"".join(c for c in r.what if not c.isdigit()) for r in findings.verdict.reasons if "RX" not in r.what}
 
 
@@ -89,16 +94,16 @@ def test_noise_instead_of_an_rx_is_reported_and_changes_nothing_else(source, pro
     assert f"RX{rx} of {board}" in reason
     assert list_other_reasons(findings) <= list_other_reasons(healthy)
     assert len(compute_distances(source, findings)) == len(PLATES)
+    # Each true permittivity is within three standard deviations.
     assert max(compute_distances(source, findings)) < 9
     assert pipeline.quality.result().boards[board].dead_rx == {rx: list(range(ROWS))}
+    # The images are nearly those of all RX.
     in_both_images = images.valid & healthy_images.valid
     for image, healthy_image in ((images.h, healthy_images.h), (images.v, healthy_images.v)):
-        cosine = (
-            abs(np.vdot(image[in_both_images], healthy_image[in_both_images]))
-            / np.linalg.norm(image[in_both_images])
-            / np.linalg.norm(healthy_image[in_both_images])
-        )
-        assert cosine > 0.995
+        pixels = image[in_both_images]
+        healthy_pixels = healthy_image[in_both_images]
+        correlation = abs(np.vdot(pixels, healthy_pixels)) / np.linalg.norm(pixels) / np.linalg.norm(healthy_pixels)
+        assert correlation > 0.995
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +113,7 @@ def images_without_rx2(six_plates: ScanFolder) -> Images:
 
 
 @pytest.mark.parametrize("dead_signal", [{"rms": 60.0}, {"value": 0}, {"value": 1000}, {"value": 32767}], ids=str)
-def test_whatever_a_dead_rx_sends_the_images_are_the_same(source, images_without_rx2, dead_signal):
+def test_the_images_do_not_depend_on_what_a_dead_rx_sends(source, images_without_rx2, dead_signal):
     images = form_images(source, kill("RV", 2, **dead_signal))
     tolerance = 1e-6 * np.abs(images_without_rx2.v).max()
     np.testing.assert_allclose(images.v, images_without_rx2.v, atol=tolerance)
@@ -116,9 +121,9 @@ def test_whatever_a_dead_rx_sends_the_images_are_the_same(source, images_without
 
 
 def test_the_images_are_those_of_a_rig_without_the_rx(source):
-    """RX3 of both boards is dead, against a rig with three RX whose cards sent no other words."""
+    """RX3 of both boards is dead. The other rig has three RX, and its recorded words are those of these three."""
 
-    class Three(Mangled):
+    class WithThreeRx(Mangled):
         def __init__(self) -> None:
             super().__init__(source, lambda *_: None)
             rig = source.instrument
@@ -131,9 +136,10 @@ def test_the_images_are_those_of_a_rig_without_the_rx(source):
             return replace(recorded, pieces=split_pieces(np.ascontiguousarray(words).reshape(-1).view(np.uint8)))
 
     def kill_rx3(name: str, row: int, words: np.ndarray) -> None:
+        """Kill RX3 of any board."""
         kill(name, 3)(name, row, words)
 
-    images_of_three_rx = make_pipeline(Three()).form_images()  # type: ignore[arg-type]
+    images_of_three_rx = make_pipeline(WithThreeRx()).form_images()  # type: ignore[arg-type]
     images = form_images(source, kill_rx3)
     for image, image_without_rx in ((images.h, images_of_three_rx.h), (images.v, images_of_three_rx.v)):
         np.testing.assert_allclose(image, image_without_rx, atol=2e-5 * np.abs(image_without_rx).max())
@@ -159,7 +165,7 @@ def test_an_rx_without_a_signal_in_a_few_positions_of_a_row_is_dead_in_the_row(s
     assert synchroniser.synchronise("RV", mangled.read_row("RV", 19))[0].dead_rx == []
 
 
-def test_a_weak_rx_stays(process):
+def test_an_rx_that_is_10_db_weaker_is_not_dead(process):
     def weaken(name: str, _: int, words: np.ndarray) -> None:
         if name == "RV":
             words[..., 1] = np.rint(words[..., 1] * 10 ** (-10 / 20))
@@ -169,7 +175,7 @@ def test_a_weak_rx_stays(process):
     assert pipeline.quality.result().boards["RV"].dead_rx == {}
 
 
-def test_two_dead_rx_leave_an_image(source, process):
+def test_with_two_dead_rx_of_a_board_the_permittivities_are_still_right(source, process):
     _, _, findings = process(kill("RH", 2, 3))
     assert len(list_reasons_about_rx(findings)) == 1
     assert list_other_reasons(findings) <= list_other_reasons(process()[2])
@@ -183,7 +189,7 @@ def test_a_board_without_any_rx_is_refused(process):
     assert list_reasons_about_rx(findings) == []
 
 
-def test_the_operator_hears_of_it_with_the_first_row(source, monkeypatch, caplog):
+def test_a_dead_rx_is_reported_to_the_operator_with_the_first_row(source, monkeypatch, caplog):
     monkeypatch.setattr(ScanFolder, "load", lambda _: Mangled(source, kill("RV", 3)))
     processing = LiveProcessing(source.path, Settings())
     for row in range(3):
@@ -192,7 +198,8 @@ def test_the_operator_hears_of_it_with_the_first_row(source, monkeypatch, caplog
     assert message.startswith("row 0: RX3 of RV gives no signal")
 
 
-def test_kept_samples_and_live_images_know_it(source):
+def test_live_images_and_images_of_kept_samples_leave_out_the_dead_rx_too(source):
+    """Reduced samples are kept in memory: images formed from them again are the same."""
     mangle = kill("RV", 4, rows=range(16, ROWS))
     expected = form_images(source, mangle)
     live = make_pipeline(Mangled(source, mangle), live=True)  # type: ignore[arg-type]
@@ -205,12 +212,13 @@ def test_kept_samples_and_live_images_know_it(source):
     np.testing.assert_allclose(next_pipeline.form_images().v, expected.v, atol=1e-6 * np.abs(expected.v).max())
 
 
+# Noise relative to the signal of the other RX
 @pytest.mark.parametrize("rms", [0.0, 0.03])
-def test_a_cube_with_a_dead_rx_is_read_like_rows(process, rms):
+def test_a_dead_rx_in_a_cube_is_reported_like_one_in_rows(process, rms):
     cubes = Cubes(load_published_rig(), decode_scene(SCENE, "test"))
     level = float(np.sqrt(np.mean(np.abs(cubes.read_row("RV", 15).cube) ** 2)))
-    _, _, healthy = process(None, cubes)
-    _, _, findings = process(kill("RV", 4, rms=rms * level), cubes)
+    _, _, healthy = process(None, of=cubes)
+    _, _, findings = process(kill("RV", 4, rms=rms * level), of=cubes)
     (reason,) = list_reasons_about_rx(findings)
     assert "RX4 of RV" in reason
     assert list_other_reasons(findings) <= list_other_reasons(healthy)

@@ -11,7 +11,8 @@ from polysight.process import Inputs, convert_boxes_to_patches
 from polysight.settings import DEFAULT
 
 
-def analyse_again(scan, path):
+def analyse_with_labels(scan, path):
+    """Return the materials of a scan with the boxes of a label file as patches, and patch number to name."""
     inputs = Inputs(labels=read_labels(path))
     scene = convert_boxes_to_patches(DEFAULT, inputs, scan.images.x_m, scan.images.y_m)
     classifier = Classifier(Library.load(SIMULATED_LIBRARY))
@@ -23,19 +24,23 @@ def test_drawn_boxes_are_the_patches_and_copper_is_the_reference(image_scene, tm
     scan = image_scene("nine-materials")
     copper = next(p for p in scan.plates if p.metal)
     other_plate = next(p for p in scan.plates if not p.metal)
-    x = scan.images.x_m * 1e3
-    y = scan.images.y_m * 1e3
-    x = x - (x[0] + x[-1]) / 2
-    y = y - (y[0] + y[-1]) / 2
+    # Axes from the middle of the image, as the truth has them.
+    x_mm = scan.images.x_m * 1e3
+    y_mm = scan.images.y_m * 1e3
+    x_mm = x_mm - (x_mm[0] + x_mm[-1]) / 2
+    y_mm = y_mm - (y_mm[0] + y_mm[-1]) / 2
 
-    def pixels(box_mm):
+    def convert_to_pixels(box_mm, rim_mm=8):
+        """Return the corners in pixels of a box without its rim; the last ones are the first pixels outside."""
         x0, y0, x1, y1 = box_mm
-        inside = [np.flatnonzero((a >= low + 8) & (a <= high - 8)) for a, low, high in ((x, x0, x1), (y, y0, y1))]
-        return [int(inside[0][0]), int(inside[1][0]), int(inside[0][-1]) + 1, int(inside[1][-1]) + 1]
+        columns = np.flatnonzero((x_mm >= x0 + rim_mm) & (x_mm <= x1 - rim_mm))
+        rows = np.flatnonzero((y_mm >= y0 + rim_mm) & (y_mm <= y1 - rim_mm))
+        return [int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1]
 
     path = tmp_path / "drawn.json"
-    path.write_text(json.dumps({"labels": {"mine": pixels(other_plate.box_mm), "copper foil": pixels(copper.box_mm)}}))
-    result, names = analyse_again(scan, path)
+    boxes = {"mine": convert_to_pixels(other_plate.box_mm), "copper foil": convert_to_pixels(copper.box_mm)}
+    path.write_text(json.dumps({"labels": boxes}))
+    result, names = analyse_with_labels(scan, path)
     assert names == {1: "mine", 2: "copper foil"}
     assert result.metal.label == 2
     assert np.nanmedian(np.abs(result.p[result.metal.mask])) == pytest.approx(1, abs=0.02)

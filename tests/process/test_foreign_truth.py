@@ -14,6 +14,7 @@ from polysight_shared.errors import DataError
 from polysight_shared.files import read_json
 
 PLATE = {"name": "PET", "centre_mm": [0, 0], "size_mm": [30, 30], "permittivity": [3.0, 0.1]}
+# Name of the case to the content of truth.json.
 FOREIGN = {
     "other keys": b'{"answer": 42}',
     "not JSON": b"the plate is copper\n",
@@ -43,7 +44,7 @@ def test_a_foreign_truth_gives_one_note_and_no_plates(tmp_path, capsys, kind):
     assert "truth.json" in str(caught.value)
 
 
-def test_a_folder_of_that_name_gives_a_note_and_no_file_none(tmp_path, capsys):
+def test_a_folder_named_truth_json_gives_a_note_and_a_missing_file_gives_none(tmp_path, capsys):
     assert find_plates(tmp_path) == ()
     assert capsys.readouterr().err == ""
     (tmp_path / "truth.json").mkdir()

@@ -29,6 +29,7 @@ MATERIALS = {
     "rubber": Material("rubber", 5.06 - 1.11j),
     "PET": Material("PET", 3.78 - 0.70j),
 }
+# Corners x0, y0, x1, y1 in pixels of images of 150 x 150.
 BOXES = {
     "copper": (15, 15, 40, 40), "acrylic": (60, 15, 85, 40), "ceramic": (105, 15, 130, 40),
     "rubber": (15, 90, 40, 115), "PET": (60, 90, 85, 115),
@@ -38,18 +39,19 @@ BOXES = {
 @pytest.fixture(scope="module")
 def labels_folder(tmp_path_factory):
     """`labels/<scan>` of five plates, without leakage."""
-    return write_labels(tmp_path_factory.mktemp("labels"), "plates", BOXES, MATERIALS, ANGLE, Errors(), seed=4)
+    folder = tmp_path_factory.mktemp("labels")
+    return write_labels(folder, "plates", BOXES, MATERIALS, angle_deg=ANGLE, errors=Errors(), seed=4)
 
 
 @pytest.fixture(scope="module")
 def pair(labels_folder):
-    """The same images with our sign of phase."""
+    """The images of that folder with our sign of phase; published ones are conjugate."""
     return {name: np.load(labels_folder / f"sar_{name}.npy").conj() for name in "hv"}
 
 
 @pytest.fixture
 def save_images(tmp_path, pair):
-    """`save_images(h=..., x_m=None)`: the pair as a file, with changed arrays; None leaves one out."""
+    """`save_images(h=..., x_m=None)` writes the pair to a file, with changed arrays; None leaves one out."""
 
     def save(name="plates", **changed):
         arrays = {**pair, "incidence_deg": ANGLE, "conjugate": False, **changed}
@@ -60,11 +62,13 @@ def save_images(tmp_path, pair):
 
 
 def analyse_file(path, rig, **settings):
+    """Return the results of given images, which are not named."""
     pair = read_given_images(path, rig)
     return analyse_given_images(pair, Settings(model="none", **settings), Inputs(), rig)[0]
 
 
 def list_permittivities(scan):
+    """Return the permittivity of each segment by its place, x and y in whole millimetres."""
     return {(round(s.centre_x_mm), round(s.centre_y_mm)): s.permittivity for s in scan.segments}
 
 
@@ -74,50 +78,53 @@ def test_plates_of_an_npz_and_of_a_labels_folder_are_the_same(labels_folder, sav
     by_file = analyse_file(save_images(), rig)
     assert {s.box for s in by_folder.segments} == set(BOXES)
     assert len(by_file.segments) == len(by_folder.segments)
-    upside_down = {(x, -y): e for (x, y), e in list_permittivities(by_file).items()}
-    for place, permittivity in list_permittivities(by_folder).items():
-        nearest_place = min(upside_down, key=lambda other: np.hypot(other[0] - place[0], other[1] - place[1]))
-        assert np.hypot(nearest_place[0] - place[0], nearest_place[1] - place[1]) < 5
-        assert (permittivity is None) == (upside_down[nearest_place] is None)
+    of_file = {(x, -y): permittivity for (x, y), permittivity in list_permittivities(by_file).items()}
+    for (x, y), permittivity in list_permittivities(by_folder).items():
+        # Boxes and patches of one plate have their centres within 5 mm; plates are 90 mm apart.
+        nearest = min(of_file, key=lambda place: np.hypot(place[0] - x, place[1] - y))
+        assert np.hypot(nearest[0] - x, nearest[1] - y) < 5
+        assert (permittivity is None) == (of_file[nearest] is None)
         if permittivity is not None:
-            assert permittivity.real == pytest.approx(upside_down[nearest_place].real, rel=0.05)
+            assert permittivity.real == pytest.approx(of_file[nearest].real, rel=0.05)
 
 
 def test_a_labels_folder_may_be_renamed(labels_folder, tmp_path, rig):
     renamed = shutil.copytree(labels_folder, tmp_path / "oak")
-    read, expected = (read_given_images(folder, rig) for folder in (renamed, labels_folder))
-    assert read.labels == expected.labels
+    expected = read_given_images(labels_folder, rig)
+    assert read_given_images(renamed, rig).labels == expected.labels
     assert expected.labels is not None
 
 
 def test_permittivities_are_those_of_the_plates(labels_folder, rig):
-    for s in analyse_file(labels_folder, rig, incidence_deg=ANGLE).segments:
-        if s.permittivity is not None:
-            true = MATERIALS[s.box].permittivity
-            difference = complex(s.permittivity.real, s.permittivity.imag) - true
-            assert abs(difference) < 0.2 * abs(true)
-            assert abs(difference) < 3 * np.hypot(s.permittivity.real_std, s.permittivity.imag_std)
+    for segment in analyse_file(labels_folder, rig, incidence_deg=ANGLE).segments:
+        estimate = segment.permittivity
+        if estimate is not None:
+            true = MATERIALS[segment.box].permittivity
+            error = abs(complex(estimate.real, estimate.imag) - true)
+            assert error < 0.2 * abs(true)
+            assert error < 3 * np.hypot(estimate.real_std, estimate.imag_std)
 
 
-def test_the_direction_of_an_axis_does_not_matter(save_images, pair, rig):
+def test_images_with_axes_that_fall_have_the_same_results(save_images, pair, rig):
     x = 1.3 + np.arange(150) * 2e-3
     raised_m = np.linspace(-0.01, 0.01, 150 * 150).reshape(150, 150)
-    upwards = analyse_file(save_images(x_m=x, y_m=x, raised_m=raised_m), rig)
+    rising = analyse_file(save_images(x_m=x, y_m=x, raised_m=raised_m), rig)
     rotated = {name: image[::-1, ::-1] for name, image in {**pair, "raised_m": raised_m}.items()}
-    downwards = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **rotated), rig)
-    np.testing.assert_array_equal(upwards.images.h, downwards.images.h)
-    np.testing.assert_array_equal(upwards.images.raised_m, downwards.images.raised_m)
-    assert list_permittivities(upwards) == list_permittivities(downwards)
-    assert upwards.images.x_m[0] == 1.3
+    falling = analyse_file(save_images(x_m=x[::-1], y_m=x[::-1], **rotated), rig)
+    np.testing.assert_array_equal(rising.images.h, falling.images.h)
+    np.testing.assert_array_equal(rising.images.raised_m, falling.images.raised_m)
+    assert list_permittivities(rising) == list_permittivities(falling)
+    assert rising.images.x_m[0] == 1.3
 
 
 def test_the_angle_of_the_option_comes_before_that_of_the_file_and_the_rigs(save_images, rig):
     with_angle = save_images()
-    without = save_images("bare", incidence_deg=None)
+    without_angle = save_images("bare", incidence_deg=None)
+    # The published rig has 54.9 degrees.
     for path, option, expected_deg, source in (
         (with_angle, 60.0, 60.0, "option"),
         (with_angle, None, ANGLE, "file"),
-        (without, None, 54.9, "rig file"),
+        (without_angle, None, 54.9, "rig file"),
     ):
         scan = analyse_file(path, rig, incidence_deg=option)
         assert scan.quality.incidence.one_deg == pytest.approx(expected_deg, abs=0.05)
@@ -136,17 +143,18 @@ def test_the_angle_in_the_description_of_a_labels_folder_comes_before_the_rigs(l
     assert is_reported == ("60" not in text)
 
 
-def test_without_a_direct_path_the_verdict_is_never_good_and_nothing_is_invented(save_images, rig):
+def test_given_images_have_at_best_the_verdict_care_and_no_results_of_a_recording(save_images, rig):
     axis = np.arange(150) * 2e-3
     scan = analyse_file(save_images(x_m=axis, y_m=axis), rig)
     assert scan.verdict.level == "care"
     assert scan.quality.given_images.assumed == []
     bare = analyse_file(save_images("bare", incidence_deg=None), rig)
-    added = {r.what for r in bare.verdict.reasons} - {r.what for r in scan.verdict.reasons}
-    for unknown in ("the incidence angle is not known", "assumed, not in the file: no x_m"):
-        assert any(reason.startswith(unknown) for reason in added)
-    for unknown in (scan.rig, scan.rows, scan.plan):
-        assert unknown is None
+    further_reasons = {r.what for r in bare.verdict.reasons} - {r.what for r in scan.verdict.reasons}
+    for beginning in ("the incidence angle is not known", "assumed, not in the file: no x_m"):
+        assert any(reason.startswith(beginning) for reason in further_reasons)
+    assert scan.rig is None
+    assert scan.rows is None
+    assert scan.plan is None
     assert scan.quality.boards == {}
     assert scan.simulated is False
 
@@ -164,12 +172,14 @@ def test_exchanged_images_are_reported_and_give_no_permittivity(save_images, pai
 def test_pixels_marked_invalid_are_left_out(save_images, pair, rig):
     valid = np.ones((150, 150), bool)
     valid[80:] = False
-    holed = {name: np.where(valid, image, np.nan) for name, image in pair.items()}
-    scan = analyse_file(save_images(valid=valid, **holed), rig)
+    without_upper_rows = {name: np.where(valid, image, np.nan) for name, image in pair.items()}
+    scan = analyse_file(save_images(valid=valid, **without_upper_rows), rig)
+    # Three of the five plates lie below row 80.
     assert len(scan.segments) == 3
     assert not scan.images.valid[80:].any()
 
 
+# Name of the case to changed arrays, the code of the refusal, and a text in it.
 WRONG = {
     "no v": ({"v": None, "sar_v": np.ones(3)}, ErrorCode.KEY_MISSING, "sar_v"),
     "magnitude": ({"h": np.ones((150, 150))}, ErrorCode.TYPE_WRONG, "float64"),
@@ -208,10 +218,10 @@ WITHOUT_PHASE = {
 }
 
 
-@pytest.mark.parametrize("lose", WITHOUT_PHASE.values(), ids=WITHOUT_PHASE.keys())
-def test_images_without_a_phase_between_the_channels_are_refused(save_images, pair, rig, lose):
-    """Without it every loss would be found to be zero, with a small error."""
-    h, v = lose(pair["h"], pair["v"])
+@pytest.mark.parametrize("remove_phase", WITHOUT_PHASE.values(), ids=WITHOUT_PHASE.keys())
+def test_images_without_a_phase_between_the_channels_are_refused(save_images, pair, rig, remove_phase):
+    """Without it every loss would be estimated as zero, with a small error."""
+    h, v = remove_phase(pair["h"], pair["v"])
     path = save_images(h=h, v=v)
     with expect_refusal(ErrorCode.VALUE_INVALID, path, "no phase between h and v"):
         analyse_file(path, rig)
@@ -236,7 +246,7 @@ def test_options_that_need_rows_are_refused(save_images, tmp_path, capsys, optio
     assert not (tmp_path / "out").exists()
 
 
-def test_every_reader_of_products_reads_them(save_images, tmp_path, capsys):
+def test_every_command_that_reads_products_reads_those_of_given_images(save_images, tmp_path, capsys):
     out = tmp_path / "out"
     assert main(["process", str(save_images()), "--out", str(out), "--metal", "-94,-94,40,40"]) == 0
     for command in (
@@ -260,21 +270,25 @@ def test_every_reader_of_products_reads_them(save_images, tmp_path, capsys):
 
 
 def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
-    """A mirror's echo from TX over the plate to RX grows by (cos + cos) of both legs times the height."""
+    """A plate lower by a height makes the path from TX over the plate to RX longer by 2 cos(angle) times the height."""
+    # Along x and along y
     degrees = (0.6, -0.8)
     axis = np.arange(150) * 2e-3
     height_m = np.tan(np.radians(degrees[0])) * axis[None, :] + np.tan(np.radians(degrees[1])) * axis[:, None]
-    wave = 2 * np.pi * 78.0e9 / 299792458.0
-    # The drawn files have a ramp of their own, see write_labels.
-    ramp = np.exp(-2j * np.pi * np.add.outer(*2 * [np.arange(150) / 900.0]))
+    # About the middle of the sweep
+    wave_number = 2 * np.pi * 78.0e9 / 299792458.0
+    # The drawn files have a phase of their own that grows by a turn in 900 pixels along both axes, see write_labels.
+    turns = np.arange(150) / 900.0
+    ramp = np.exp(-2j * np.pi * np.add.outer(turns, turns))
     pair = {name: image * ramp for name, image in pair.items()}
-    tilted = {name: image * np.exp(-2j * wave * np.cos(np.radians(ANGLE)) * height_m) for name, image in pair.items()}
+    tilt_factor = np.exp(-2j * wave_number * np.cos(np.radians(ANGLE)) * height_m)
+    tilted = {name: image * tilt_factor for name, image in pair.items()}
     level = analyse_file(save_images("level", x_m=axis, y_m=axis, **pair), rig, incidence_deg=ANGLE)
     rising = analyse_file(save_images("rising", x_m=axis, y_m=axis, **tilted), rig, incidence_deg=ANGLE)
     changes = [
-        b.tilt_across_deg - a.tilt_across_deg
-        for a, b in zip(level.segments, rising.segments, strict=True)
-        if not (a.tilt_across_deg is UNSET or b.tilt_across_deg is UNSET)
+        after.tilt_across_deg - before.tilt_across_deg
+        for before, after in zip(level.segments, rising.segments, strict=True)
+        if before.tilt_across_deg is not UNSET and after.tilt_across_deg is not UNSET
     ]
     assert len(changes) >= 3
     assert np.median(changes) == pytest.approx(degrees[1], abs=0.05)
@@ -282,9 +296,10 @@ def test_the_tilt_of_a_plate_is_read_from_its_phase(save_images, pair, rig):
 
 def test_a_plate_over_the_plane_is_the_reference_of_every_pixel(save_images, pair, tmp_path):
     """The gains of the images need not be uniform: they are divided out."""
-    uneven = np.exp(np.add.outer(np.linspace(0, 0.5, 150), np.linspace(0, 0.3j, 150)))
-    plate = save_images("plate", h=-uneven, v=-0.5 * uneven)
-    scene = save_images(h=-pair["h"] * uneven, v=-0.5 * pair["v"] * uneven)
+    # The amplitude grows by 65 % over the rows, the phase by 0.3 rad over the columns.
+    gain = np.exp(np.add.outer(np.linspace(0, 0.5, 150), np.linspace(0, 0.3j, 150)))
+    plate = save_images("plate", h=-gain, v=-0.5 * gain)
+    scene = save_images(h=-pair["h"] * gain, v=-0.5 * pair["v"] * gain)
     out = tmp_path / "out"
     assert main(["process", str(scene), "--reference", str(plate), "--out", str(out), "--model", "none"]) == 0
     assert ProcessedScan(out).materials.metal_reference.certain
@@ -295,9 +310,11 @@ def test_a_library_is_trained_on_labelled_products_of_given_images(labels_folder
         folder = Path(shutil.copytree(labels_folder, tmp_path / name))
         (folder / "plates.json").rename(folder / f"{name}.json")
         assert main(["process", str(folder), "--out", str(tmp_path / "out" / name), "--model", "none"]) == 0
-        name_options = [f"{number}={box}" for number, box in enumerate(BOXES, 1)]
-        words = [word for pair in name_options for word in ("--rename", pair)]
-        assert main(["label", str(tmp_path / "out" / name), "--from-patches", "--metal", "1", *words]) == 0
+        # Patch 1 is copper, and so on.
+        options = []
+        for number, box_name in enumerate(BOXES, 1):
+            options += ["--rename", f"{number}={box_name}"]
+        assert main(["label", str(tmp_path / "out" / name), "--from-patches", "--metal", "1", *options]) == 0
     products = [str(tmp_path / "out" / name) for name in ("first", "second")]
     assert main(["train", *products, "--out", str(tmp_path / "library.npz")]) == 0
     entries = Library.load(tmp_path / "library.npz").entries
@@ -310,8 +327,8 @@ def test_all_images_of_a_folder_are_found(labels_folder):
     assert find_scans([labels_folder.parent]) == [copied_folder, labels_folder]
 
 
+# Folder of the published rig's own picture and its boxes, which is not part of the repository.
 PUBLISHED = os.environ.get("POLYSIGHT_PUBLISHED_IMAGES")
-"""Folder of the published rig's own picture and its boxes, which is not part of the repository."""
 
 
 @pytest.mark.skipif(PUBLISHED is None, reason="POLYSIGHT_PUBLISHED_IMAGES is not set: the folder of the real picture")
@@ -338,13 +355,15 @@ def test_the_published_picture_has_nine_plates_and_copper_is_the_reference(rig, 
     assert scan.verdict.level == "care"
     (metal,) = (s for s in scan.segments if s.metal_reference)
     x0, y0, x1, y1 = boxes["copper"]
-    row = 150 - (y0 + y1) / 2 if form == "labels" else (y0 + y1) / 2  # a folder has its top row first
+    # A folder has its top row first.
+    row = 150 - (y0 + y1) / 2 if form == "labels" else (y0 + y1) / 2
+    # Pixels of 2 mm, from the middle of the image.
     assert (metal.centre_x_mm, metal.centre_y_mm) == pytest.approx((x0 + x1 - 150, 2 * row - 150), abs=4)
 
 
-@pytest.mark.parametrize("has_scan_file", [True, False], ids=["beside scan.json", "alone"])
-def test_images_of_a_simulated_scan_stay_simulated(tmp_path, rig, pair, has_scan_file):
-    """Files of earlier states say it in scan.json only."""
+@pytest.mark.parametrize("has_scan_file", [True, False], ids=["with scan.json", "alone"])
+def test_images_of_a_simulated_scan_are_reported_as_simulated(tmp_path, rig, pair, has_scan_file):
+    """Earlier releases wrote this into scan.json only."""
     name = "image.npz" if has_scan_file else "copy.npz"
     axis_m = 0.002 * (np.arange(len(pair["h"])) - len(pair["h"]) / 2)
     images = Images(pair["h"], pair["v"], axis_m, axis_m, np.ones(pair["h"].shape, bool), pair["h"] / pair["v"])
@@ -357,7 +376,7 @@ def test_images_of_a_simulated_scan_stay_simulated(tmp_path, rig, pair, has_scan
 
 
 def test_train_on_published_images_says_to_process_them_first(labels_folder, tmp_path, capsys):
-    """`polysight label` refuses the folder itself."""
+    """The advice is not to label the folder itself, which `polysight label` refuses."""
     assert main(["train", str(labels_folder), "--out", str(tmp_path / "own.npz")]) == 3
     err = capsys.readouterr().err
     assert f"do: polysight process {labels_folder} --out out/{labels_folder.name}" in err

@@ -20,12 +20,13 @@ def test_a_library_is_fitted_once_and_again_when_its_file_was_replaced(tmp_path)
     assert load_classifier(settings, load_published_rig()) is first
 
     library = Library.load(SIMULATED_LIBRARY)
-    fewer = Library(tuple(e for e in library.entries if e.name != library.names[0]), library.fit)
-    fewer.save(tmp_path / "fewer.npz")
+    removed_material = library.names[0]
+    smaller = Library(tuple(entry for entry in library.entries if entry.name != removed_material), library.fit)
+    smaller.save(tmp_path / "fewer.npz")
     (tmp_path / "fewer.npz").replace(file)
     second = load_classifier(settings, load_published_rig())
     assert second is not None
-    assert set(first.names) - set(second.names) == {library.names[0]}
+    assert set(first.names) - set(second.names) == {removed_material}
 
     file.unlink()
     with pytest.raises(DataError, match="no such library"):

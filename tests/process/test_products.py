@@ -39,54 +39,58 @@ def scan(two_plates: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_image_is_written_before_anything_is_derived_from_it(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls: list[bool] = []
+    image_was_written: list[bool] = []
     finish = Pipeline.finish
 
     def finish_scan(self: Pipeline, *words: object) -> object:
-        calls.append(read_products(tmp_path / "out").valid.any())
+        image_was_written.append(read_products(tmp_path / "out").valid.any())
         return finish(self, *words)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Pipeline, "finish", finish_scan)
     assert main(["process", str(scan), "--out", str(tmp_path / "out")]) in (0, 5)
-    assert calls == [True]
+    assert image_was_written == [True]
     assert str(tmp_path / "out" / "image.npz") in capsys.readouterr().err
     assert (tmp_path / "out" / "report.html").exists()
 
 
 def test_an_image_appears_with_its_whole_quality(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A later write would be without the folder's lock, and could change products of another program."""
-    first: list[object] = []
+    quality_at_first: list[object] = []
 
     @contextmanager
-    def making(out: Path, scan_id: str) -> Iterator[Path]:
-        with replace_products(out, scan_id) as new:
-            yield new
-        first.append(read_json(out / QUALITY))
+    def replace_and_read(out: Path, scan_id: str) -> Iterator[Path]:
+        with replace_products(out, scan_id) as new_folder:
+            yield new_folder
+        quality_at_first.append(read_json(out / QUALITY))
 
-    monkeypatch.setattr(process, "replace_products", making)
+    monkeypatch.setattr(process, "replace_products", replace_and_read)
     assert main(["image", str(scan), "--out", str(tmp_path)]) == 0
-    assert first == [read_json(tmp_path / QUALITY)]
+    assert quality_at_first == [read_json(tmp_path / QUALITY)]
 
 
 def test_images_published_during_a_scan_are_those_of_all_rows_together(scan: Path, tmp_path: Path) -> None:
     pipeline = make_pipeline(ScanFolder.load(scan), live=True)
     publish_images(pipeline, tmp_path)
-    first = read_products(tmp_path)
-    whole_band = pipeline.form_images()
-    assert (first.valid == whole_band.valid).mean() > 0.999
-    valid_in_both = first.valid & whole_band.valid
-    for first_item, second_item in ((first.h, whole_band.h), (first.v, whole_band.v)):
-        assert np.abs(first_item - second_item)[valid_in_both].max() < 1e-5 * np.abs(second_item[valid_in_both]).max()
+    published = read_products(tmp_path)
+    images = pipeline.form_images()
+    assert (published.valid == images.valid).mean() > 0.999
+    valid_in_both = published.valid & images.valid
+    for published_image, image in ((published.h, images.h), (published.v, images.v)):
+        difference = np.abs(published_image - image)[valid_in_both]
+        # Sums in single precision
+        assert difference.max() < 1e-5 * np.abs(image[valid_in_both]).max()
 
 
-def test_the_images_stay_if_a_later_step_fails(scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
+def test_published_images_are_kept_if_a_later_step_fails(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
         raise DataError("no metal", code=ErrorCode.NO_DATA)
 
     pipeline = process_rows(ScanFolder.load(scan), scan)
     out = tmp_path / "out"
     publish_images(pipeline, out)
-    monkeypatch.setattr(Pipeline, "examine", fails)
+    monkeypatch.setattr(Pipeline, "examine", fail)
     with expect_refusal(ErrorCode.NO_DATA):
         make_products(pipeline, out, ())
     assert read_products(out).valid.any()
@@ -104,6 +108,7 @@ def test_a_scan_waits_at_its_end_for_a_program_that_is_writing_its_products(
     running = LiveProcessing(scan, Settings(model="none"))
     waited_s = []
 
+    # No time passes. The other program ends after a little more than two minutes of waiting.
     def wait(pause_s: float) -> None:
         waited_s.append(pause_s)
         if sum(waited_s) > 130:
@@ -123,7 +128,7 @@ def test_a_scan_waits_at_its_end_for_a_program_that_is_writing_its_products(
     assert read_products(out).quality.coverage.rows_recorded == 11
 
 
-def test_products_without_the_rows_that_were_recorded_meanwhile_replace_none(
+def test_products_that_lack_rows_recorded_in_the_meantime_do_not_replace_those_of_the_scan(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     resumed = Path(shutil.copytree(scan, tmp_path / "scan"))
@@ -141,13 +146,13 @@ def test_products_without_the_rows_that_were_recorded_meanwhile_replace_none(
     with expect_refusal(ErrorCode.BUSY, f"polysight process {resumed} --out {resumed / 'products'}"):
         process.process(resumed, resumed / "products")
     assert not (resumed / "products").exists()
-    # Elsewhere they are what was asked for.
+    # In another folder they are written: a user asked for them.
     (resumed / MANIFEST).write_bytes(unfinished)
     process.process(resumed, tmp_path / "out")
     assert read_products(tmp_path / "out").quality.coverage.rows_absent
 
 
-def test_products_are_left_to_a_scan_that_was_resumed_meanwhile(
+def test_products_in_the_folder_of_a_scan_that_was_resumed_are_refused(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     resumed = Path(shutil.copytree(scan, tmp_path / "scan"))
@@ -165,7 +170,7 @@ def test_products_are_left_to_a_scan_that_was_resumed_meanwhile(
 
 
 @pytest.mark.parametrize("is_steep", [True, False])
-def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
+def test_surfaces_are_measured_if_a_patch_is_too_steep(
     make_scan: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_steep: bool
 ) -> None:
     scan = make_scan(tmp_path / "scan", make_scene(COPPER, PET, columns=10, rows=11))
@@ -173,8 +178,8 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
 
     def examine_tilted(self: Pipeline, *words: object) -> object:
         findings = examine(self, *words)  # type: ignore[arg-type]
-        first, *other_items = findings.analysis.patches
-        patches = (replace(first, refused=STEEP_FINDING if is_steep else None), *other_items)
+        first_patch, *other_patches = findings.analysis.patches
+        patches = (replace(first_patch, refused=STEEP_FINDING if is_steep else None), *other_patches)
         return replace(findings, analysis=replace(findings.analysis, patches=patches))
 
     monkeypatch.setattr(Pipeline, "examine", examine_tilted)
@@ -185,10 +190,10 @@ def test_surfaces_are_measured_where_a_patch_is_neither_flat_nor_level(
     assert (b"Surfaces from three sides" in (out / "report.html").read_bytes()) == is_steep
 
 
-def test_another_plane_and_grid_from_the_command_line(scan: Path, tmp_path: Path) -> None:
+def test_the_command_forms_images_at_another_distance_and_on_another_grid(scan: Path, tmp_path: Path) -> None:
     scan_folder = tmp_path / "scan"
     shutil.copytree(scan, scan_folder)
-    # The samples are enough.
+    # The kept samples are enough; raw data are not needed.
     shutil.rmtree(scan_folder / "raw")
     options = ("--out", tmp_path / "out", "--depth", "4", "--grid", "60x30@2.5")
     read_output("image", scan_folder, *options)
@@ -207,7 +212,7 @@ def test_an_invalid_grid_is_refused(grid: str) -> None:
         main(["image", "scan", "--out", "out", "--grid", grid])
 
 
-# A box inside the copper.
+# A box inside the copper: centre and size in millimetres.
 METAL = "-40,10,30,30"
 
 

@@ -13,14 +13,17 @@ from polysight.materials.segment import Segmentation, box_mask, make_patch
 from polysight.polarimetry import ratio_from_permittivity
 from polysight_simulators.scene import decode_scene
 
+# Centres of six plates in millimetres, and their tilts along x and y.
 PLACES = [(-60.0, 40.0), (0.0, 40.0), (60.0, 40.0), (-60.0, -40.0), (0.0, -40.0), (60.0, -40.0)]
 TILTS_DEG = [(0.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-0.7, 0.7), (0.5, -1.0)]
 
 
 @pytest.fixture(scope="module")
 def tilted_images(rig):
-    """Images of six plates of one material, each tilted as TILTS_DEG; and of the same six, level."""
-    return [_form_images(rig, tilts) for tilts in (TILTS_DEG, [(0.0, 0.0)] * 6)]
+    """Images of six plates of one material, each tilted as TILTS_DEG, and of the same six plates level."""
+    tilted = _form_images(rig, TILTS_DEG)
+    level = _form_images(rig, [(0.0, 0.0)] * 6)
+    return tilted, level
 
 
 def _form_images(rig, tilts, size=None):
@@ -28,6 +31,7 @@ def _form_images(rig, tilts, size=None):
 
 
 def _make_pipeline(rig, tilts, size=None):
+    """Return the pipeline of a scan of the plates with these tilts; `size` changes fields of the scan's grid."""
     plates = [
         {
             "name": "a",
@@ -44,23 +48,31 @@ def _make_pipeline(rig, tilts, size=None):
 
 
 def _make_inside_masks(images):
+    """Return the pixels within 12 mm of the middle of each plate, whose sides are 45 mm."""
     return [box_mask((x - 12, y - 12, x + 12, y + 12), images.x_m, images.y_m) for x, y in PLACES]
 
 
 def _compute_ratios(h, v, masks):
+    """Return the median V / H of each mask."""
     return np.array([np.median((v[m] / h[m]).real) + 1j * np.median((v[m] / h[m]).imag) for m in masks])
 
 
 def _turn_polarisation():
-    """Change of H and of V / H by each plate's turn of the polarisations: that of a tilted mirror's image."""
+    """Return the factors by which a tilt across the plane of incidence changes H and V / H of each plate.
+
+    Such a tilt turns the plane of incidence, and with it the polarisations: each channel gets some of the other.
+    """
     t = np.conj(1 / ratio_from_permittivity(4.0 - 0.4j, np.radians(55.0)))
-    d = np.sin(np.radians(55.0)) * np.radians([y for _, y in TILTS_DEG])
-    leak = 0.05  # of the rig's channels
-    turned_h = (1 - d) - d * t
-    turned_v = (1 + d) * t + d
-    h = turned_h + leak * turned_v
-    v = turned_v + leak * turned_h
-    return h / (1 + leak * t), v / h / ((t + leak) / (1 + leak * t))
+    turn_rad = np.sin(np.radians(55.0)) * np.radians([tilt_y for _, tilt_y in TILTS_DEG])
+    # Leakage of the rig's channels
+    leakage = 0.05
+    turned_h = (1 - turn_rad) - turn_rad * t
+    turned_v = (1 + turn_rad) * t + turn_rad
+    h = turned_h + leakage * turned_v
+    v = turned_v + leakage * turned_h
+    level_h = 1 + leakage * t
+    level_ratio = (t + leakage) / level_h
+    return h / level_h, v / h / level_ratio
 
 
 def test_the_tilt_of_a_patch_is_estimated_from_its_phase(tilted_images):
@@ -74,21 +86,27 @@ def test_plates_at_the_ends_of_a_small_scan_do_not_seem_tilted(rig, grid):
     """A scan that ends close to the plates has more positions on one side of them."""
     columns, rows = grid
     images = _form_images(rig, [(0.0, 0.0)] * 6, {"columns": columns, "rows": rows})
-    insides = _make_inside_masks(images)
-    plates = [box_mask((x - 22.5, y - 22.5, x + 22.5, y + 22.5), images.x_m, images.y_m) for x, y in PLACES]
-    apparent_deg = np.degrees([images.illumination.estimate_rise(images.h, images.v, inside) for inside in insides])
-    pairs = zip(insides, plates, strict=True)
-    deg = np.degrees([images.illumination.estimate_rise(images.h, images.v, inside, plate) for inside, plate in pairs])
+    apparent_rises = []
+    rises = []
+    for (x, y), inside in zip(PLACES, _make_inside_masks(images), strict=True):
+        plate = box_mask((x - 22.5, y - 22.5, x + 22.5, y + 22.5), images.x_m, images.y_m)
+        apparent_rises.append(images.illumination.estimate_rise(images.h, images.v, inside))
+        # With the whole plate its edges are known, and the effect of the end of the scan is removed.
+        rises.append(images.illumination.estimate_rise(images.h, images.v, inside, plate))
+    apparent_deg = np.degrees(apparent_rises)
     assert np.abs(apparent_deg).max() > 0.25
-    assert np.sqrt(np.mean(deg**2)) < 0.4 * np.sqrt(np.mean(apparent_deg**2))
+    assert np.sqrt(np.mean(np.degrees(rises) ** 2)) < 0.4 * np.sqrt(np.mean(apparent_deg**2))
 
 
 @pytest.mark.parametrize(("plates", "by_phase"), [(3, False), (4, True), (6, True)])
-def test_phases_of_four_plates_which_can_contradict_a_plane_decide_it(rig, plates, by_phase):
+def test_the_plane_is_measured_by_phases_from_four_plates_on(rig, plates, by_phase):
+    # A plane has three unknowns: only a fourth plate can contradict it.
     pipeline = _make_pipeline(rig, [(0.0, 0.0)] * 6, {"columns": 25, "rows": 25})
     insides = _make_inside_masks(pipeline.form_images())[:plates]
     plane = find_plane(pipeline.samples.filled, insides)
-    assert (plane.plates, plane.by_phase) == (plates, by_phase)
+    assert plane.plates == plates
+    assert plane.by_phase is by_phase
+    # By phases it is known to less than 0.1 mm.
     assert (plane.offset_std_m < 1e-4) is by_phase
 
 
@@ -102,16 +120,21 @@ def test_a_corrected_tilted_plate_has_the_ratio_and_brightness_of_a_level_one(ti
     error_before = np.abs(_compute_ratios(images.h, images.v, masks) / truth - 1)
     error_after = np.abs(_compute_ratios(corrected.h, corrected.v, masks) / truth - 1)
     assert error_before.max() > 0.02
-    assert error_after.max() < 0.02  # the turn is a first order in the rise
-    brightness = [np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks] / np.abs(h_turned)
-    across = [i for i, (x, _) in enumerate(TILTS_DEG) if x == 0]
-    assert np.array(brightness)[across] == pytest.approx(1, abs=0.015)
+    # The expected turn is of the first order in the rise only.
+    assert error_after.max() < 0.02
+    brightness = np.array([np.median(np.abs(corrected.h[m])) / np.median(np.abs(level.h[m])) for m in masks])
+    brightness = brightness / np.abs(h_turned)
+    # A tilt along x changes the incidence angle, and so the brightness.
+    tilted_across_only = [i for i, (tilt_x, _) in enumerate(TILTS_DEG) if tilt_x == 0]
+    assert brightness[tilted_across_only] == pytest.approx(1, abs=0.015)
 
 
-def test_tilts_follow_a_transposed_image(tilted_images):
+def test_tilts_of_a_transposed_image_are_those_of_the_image_with_axes_exchanged(tilted_images):
     images = tilted_images[0]
     transposed = images.transpose()
-    assert (images.illumination.across, transposed.illumination.across) == (1, 0)
+    # Axis across the plane of incidence
+    assert images.illumination.across == 1
+    assert transposed.illumination.across == 0
     for mask in _make_inside_masks(images):
         rise = images.illumination.estimate_rise(images.h, images.v, mask)
         transposed_rise = transposed.illumination.estimate_rise(transposed.h, transposed.v, mask.T)
@@ -121,10 +144,17 @@ def test_tilts_follow_a_transposed_image(tilted_images):
         assert np.sort(swapped, axis=1) == pytest.approx(np.sort(factors, axis=1), rel=1e-6)
 
 
+def make_illumination(footprints):
+    """Return an illumination with these footprints [2, ny, nx] of both channels and pixels of 2 mm.
+
+    For a rise of 1 the phase grows by 1900 radians per metre, about as on the rig, and specular points move by 1 m.
+    """
+    return Illumination(footprints, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+
+
 def test_noise_gives_no_tilt_and_steep_phases_are_reported():
     rng = np.random.default_rng(1)
-    flat = np.ones((2, 40, 40), np.complex64)
-    lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    lit = make_illumination(np.ones((2, 40, 40), np.complex64))
     mask = np.ones((40, 40), bool)
     noise = rng.standard_normal((40, 80)).view(np.complex128)
     assert lit.estimate_rise(noise, noise, mask) == (0.0, 0.0)
@@ -137,7 +167,7 @@ def test_noise_gives_no_tilt_and_steep_phases_are_reported():
 def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     footprints = np.ones((2, 20, 20), np.complex64)
     footprints[:, :, 10:] = 0
-    lit = Illumination(footprints, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    lit = make_illumination(footprints)
     factors = lit.to_level(np.ones((20, 20), bool), (0.02, 0.0))
     assert np.isfinite(factors).all()
     assert factors.min() > 0.5
@@ -148,8 +178,10 @@ def test_correction_factors_stay_finite_at_the_edge_of_the_illumination():
     ("level_h", "level_v", "row", "refused"),
     [
         (0.05, 0.05, 70, SMEAR),
-        (0.3, 0.002, 70, SMEAR),  # of H alone, as by a row that only H's board lacks
-        (0.05, 0.05, 40, STEEP_FINDING),  # not at the end of what is illuminated: a curved object is as dim
+        # Of H alone, as by a row that only H's board lacks
+        (0.3, 0.002, 70, SMEAR),
+        # Not at the end of what is illuminated: a curved object is as dim
+        (0.05, 0.05, 40, STEEP_FINDING),
         (0.5, 0.2, 70, STEEP_FINDING),
     ],
 )
@@ -162,14 +194,12 @@ def test_a_dim_steep_patch_at_the_end_of_the_scan_is_a_smear(level_h, level_v, r
     plate[5:23, 30:50] = True
     second_plate = np.zeros((100, 100), bool)
     second_plate[row : row + 18, 30:50] = True
-    h, v = (
-        (plate + level * second_plate * np.exp(-1j * 0.1 * 1900 * axis_m)).astype(np.complex64)
-        for level in (level_h, level_v)
-    )
+    # The second patch has a rise of 0.1 along x: steeper than any plate's tilt (0.06).
+    steep = second_plate * np.exp(-1j * 0.1 * 1900 * axis_m)
+    h = (plate + level_h * steep).astype(np.complex64)
+    v = (plate + level_v * steep).astype(np.complex64)
     images = Images(h, v, axis_m, axis_m, usable)
-    lit = Illumination(
-        np.ones((2, 100, 100), np.complex64), np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3)
-    )
+    lit = make_illumination(np.ones((2, 100, 100), np.complex64))
     patches = tuple(make_patch(i, mask, axis_m, axis_m, 5.0, usable) for i, mask in ((1, plate), (2, second_plate)))
     tilts = Tilts.estimate(images, lit, Segmentation(plate + 2 * second_plate.astype(np.int32), patches))
     assert tilts.refusals() == {2: refused}
@@ -177,8 +207,7 @@ def test_a_dim_steep_patch_at_the_end_of_the_scan_is_a_smear(level_h, level_v, r
 
 @pytest.mark.parametrize("radius_m", [0.1, 0.3, np.inf])
 def test_the_curvature_of_a_patch_is_estimated_from_its_phase(radius_m):
-    flat = np.ones((2, 24, 24), np.complex64)
-    lit = Illumination(flat, np.stack([np.eye(2)] * 2), np.array([1900.0, 1900.0]), (2e-3, 2e-3))
+    lit = make_illumination(np.ones((2, 24, 24), np.complex64))
     x_m = (np.arange(24) - 11.5) * 2e-3
     height_m = 0.01 * x_m + x_m**2 / (2 * radius_m)
     noise = np.random.default_rng(1).standard_normal((24, 48)).view(np.complex128)

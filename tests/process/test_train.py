@@ -11,13 +11,13 @@ from polysight.cli.main import main
 from polysight.materials import Library
 from polysight_shared.tables import to_builtins
 
-MORE = {"name": "rubber", "centre_mm": [-40.0, -50.0], "size_mm": [50.0, 50.0], "permittivity": [5.06, 1.11]}
+RUBBER = {"name": "rubber", "centre_mm": [-40.0, -50.0], "size_mm": [50.0, 50.0], "permittivity": [5.06, 1.11]}
 NAMES = ("PET", "copper", "rubber")
 
 
 def make_scene_named(name: str):
-    """A scene with the same power cycle under another name."""
-    return make_scene(COPPER, PET, MORE, columns=15, rows=21, pulses=1, seed=7) | {"name": name}
+    """Return a scene of three plates under this name; all have the same seed, and so the same random numbers."""
+    return make_scene(COPPER, PET, RUBBER, columns=15, rows=21, pulses=1, seed=7) | {"name": name}
 
 
 @pytest.fixture
@@ -36,16 +36,19 @@ def test_scans_and_their_scenes_give_the_same_library(make_scan, rig_file, tmp_p
     output = read_output("train", scan, *options)
     assert "6 patches of 3 materials from 2 scans" in output
     library = Library.load(out)
-    assert (library.names, library.scans) == (NAMES, ("first", "second"))
+    assert library.names == NAMES
+    assert library.scans == ("first", "second")
     assert library.fit
-    first, second = ([e for e in library.entries if e.scan == name] for name in library.scans)
-    for first_item, second_item in zip(first, second, strict=True):
-        assert first_item.simulated
-        assert first_item.h.size >= 10
+    entries_of_scan = [entry for entry in library.entries if entry.scan == "first"]
+    entries_of_scene = [entry for entry in library.entries if entry.scan == "second"]
+    for of_scan, of_scene in zip(entries_of_scan, entries_of_scene, strict=True):
+        assert of_scan.simulated
+        assert of_scan.h.size >= 10
         for key in ("h", "v", "p"):
-            np.testing.assert_array_equal(getattr(first_item, key), getattr(second_item, key))
-        assert (first_item.name, first_item.permittivity) == (second_item.name, second_item.permittivity)
-    # Relative to the copper of the same scan.
+            np.testing.assert_array_equal(getattr(of_scan, key), getattr(of_scene, key))
+        assert of_scan.name == of_scene.name
+        assert of_scan.permittivity == of_scene.permittivity
+    # |H| is relative to the copper of the same scan.
     level = {name: np.median([np.median(e.h) for e in library.entries if e.name == name]) for name in NAMES}
     assert level["copper"] == pytest.approx(1.0, abs=0.1)
     assert 0.2 < level["PET"] < level["rubber"] < 0.9

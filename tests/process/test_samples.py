@@ -30,12 +30,13 @@ PIXELS = ("h", "v", "h_raw", "v_raw", "valid")
 
 
 def process_scan(folder: Path, samples: SampleUse = "keep", **settings: Any) -> Pipeline:
+    """Return the pipeline of a scan after all of its rows; it reads kept samples, or keeps those it makes."""
     return make_pipeline(ScanFolder.load(folder), samples=samples, **settings)
 
 
-def are_same_images(one: Images, other: Images) -> bool:
-    same_pixels = all(np.array_equal(getattr(one, name), getattr(other, name)) for name in PIXELS)
-    return same_pixels and np.array_equal(one.illumination.footprints, other.illumination.footprints)
+def are_same_images(first: Images, second: Images) -> bool:
+    same_pixels = all(np.array_equal(getattr(first, name), getattr(second, name)) for name in PIXELS)
+    return same_pixels and np.array_equal(first.illumination.footprints, second.illumination.footprints)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +47,7 @@ def from_raw(two_plates: Path) -> Pipeline:
 
 @pytest.fixture(scope="module")
 def expected_images(from_raw: Pipeline) -> Images:
-    """Its images."""
+    """The images of that scan."""
     return from_raw.form_images()
 
 
@@ -94,7 +95,10 @@ def test_rows_on_several_threads_make_the_same_products(
 
 
 def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other rows that have begun continue only after the rest was cancelled, even with a slow main thread."""
+    """After the error of row 0 only rows that have begun are completed: one of each of two threads, perhaps a third.
+
+    They wait here until the others were cancelled, so that a slow main thread changes nothing.
+    """
     begun: list[int] = []
     stopped = threading.Event()
     shutdown = ThreadPoolExecutor.shutdown
@@ -116,14 +120,14 @@ def test_the_first_error_stops_all_threads(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_samples_with_sub_bands_can_be_used_without_them(expected_images: Images, scan: Path) -> None:
-    first = process_scan(scan, bands=3)
-    reprocessed = process_scan(remove_raw(scan), bands=3)
-    for first_item, second_item in zip(reprocessed.sub_bands.finish(), first.sub_bands.finish(), strict=True):
-        assert are_same_images(first_item, second_item)
+    with_raw = process_scan(scan, bands=3)
+    from_samples = process_scan(remove_raw(scan), bands=3)
+    for band_images, expected in zip(from_samples.sub_bands.finish(), with_raw.sub_bands.finish(), strict=True):
+        assert are_same_images(band_images, expected)
     assert are_same_images(process_scan(scan).form_images(), expected_images)
 
 
-def test_samples_without_the_sub_bands_asked_for_are_not_used(scan_with_samples: Path) -> None:
+def test_samples_without_the_requested_sub_bands_are_not_used(scan_with_samples: Path) -> None:
     processed_again = process_scan(scan_with_samples, bands=2)
     assert len(processed_again.sub_bands.finish()) == 2
     assert process_scan(remove_raw(scan_with_samples), bands=2).sub_bands.bands == processed_again.sub_bands.bands
@@ -140,9 +144,9 @@ def test_other_planes_and_grids_come_from_the_same_samples(
     np.testing.assert_array_equal(reprocessed.x_m, expected.x_m)
     pairs = [(reprocessed.h_raw, expected.h_raw), (reprocessed.v_raw, expected.v_raw)]
     pairs += zip(reprocessed.illumination.footprints, expected.illumination.footprints, strict=True)
-    for first_item, second_item in pairs:
+    for from_samples, from_raw_data in pairs:
         # The gates differ, and with them the noise.
-        assert np.abs(first_item - second_item).max() < 2e-3 * np.abs(second_item).max()
+        assert np.abs(from_samples - from_raw_data).max() < 2e-3 * np.abs(from_raw_data).max()
 
 
 def test_a_plane_beyond_what_was_kept_needs_raw_data(scan_with_samples: Path) -> None:
@@ -185,7 +189,7 @@ def test_damaged_samples_are_made_again(expected_images: Images, scan_with_sampl
 def test_rows_with_other_raw_data_are_synchronised_again(
     scan_with_samples: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As after a retake or a new placement of the row: the committed digest differs."""
+    """After a retake or a new placement of a row its digest in the manifest differs from that of its samples."""
     committed = ScanFolder.committed_rows
 
     def change_row(self: ScanFolder) -> dict:
@@ -220,7 +224,8 @@ def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, scan_
     head = json.loads((folder / "samples.json").read_text())
     records = np.load(folder / "RH.npy", mmap_mode="r")
     lines = [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
-    cube = records["samples"]  # complex64 [row, rx, frequency, column]
+    # complex64 [row, rx, frequency, column]
+    cube = records["samples"]
     assert cube.shape[:2] == (17, 4)
     assert cube.shape[2] == len(head["frequencies_hz"]["samples"])
     assert [line["row"] for line in lines] == list(range(17))
@@ -228,18 +233,20 @@ def test_samples_can_be_read_as_the_specification_says(from_raw: Pipeline, scan_
 
 
 @pytest.mark.parametrize(
-    ("needed_m", "covered"),
+    ("needed_m", "is_covered"),
     [((0.1, 1.0), True), ((0.2, 0.9), True), ((0.099, 0.9), False), ((0.2, 1.001), False), ((0.0, 2.0), False)],
 )
-def test_samples_are_kept_only_if_their_paths_are_those_of_every_other_image(needed_m, covered) -> None:
+def test_samples_are_kept_only_with_the_usual_range_of_paths(needed_m, is_covered) -> None:
+    """Samples of an image that needs other paths would be of no use to the next one."""
     samples = SimpleNamespace(_head={}, _keep=True)
     usual_m = (0.1, 1.0)
-    assert KeptSamples._gate_m(samples, None, needed_m, usual_m) == (usual_m if covered else needed_m)
-    assert samples._keep is covered
+    assert KeptSamples._gate_m(samples, None, needed_m, usual_m) == (usual_m if is_covered else needed_m)
+    assert samples._keep is is_covered
 
 
+# Keys that are missing, of another type, or have numbers that no scan has.
 @pytest.mark.parametrize(
-    "head",
+    "change_head",
     [
         lambda h: {k: v for k, v in h.items() if k != "made_with"},
         lambda h: {k: v for k, v in h.items() if k != "frequencies_hz"},
@@ -252,9 +259,9 @@ def test_samples_are_kept_only_if_their_paths_are_those_of_every_other_image(nee
         lambda h: [h],
     ],
 )
-def test_an_invalid_head_is_ignored(expected_images: Images, scan_with_samples: Path, head) -> None:
+def test_an_invalid_head_is_ignored(expected_images: Images, scan_with_samples: Path, change_head) -> None:
     path = scan_with_samples / "samples" / "samples.json"
-    path.write_text(json.dumps(head(json.loads(path.read_text()))))
+    path.write_text(json.dumps(change_head(json.loads(path.read_text()))))
     assert are_same_images(process_scan(scan_with_samples, "read").form_images(), expected_images)
 
 
@@ -295,13 +302,14 @@ def damage_raw(monkeypatch: pytest.MonkeyPatch, change: Callable[[str, np.ndarra
 
 @pytest.mark.parametrize("dead", [("RH", "RV"), ("RV",)])
 @pytest.mark.parametrize("command", ["image", "process"])
-def test_an_image_without_a_valid_pixel_is_an_error_that_names_the_board(
+def test_an_image_without_a_valid_pixel_is_refused_with_the_name_of_the_board(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dead: tuple[str, ...], command: str
 ) -> None:
-    def silent(board: str, words: np.ndarray) -> None:
-        words *= board not in dead
+    def silence(board: str, words: np.ndarray) -> None:
+        if board in dead:
+            words[:] = 0
 
-    damage_raw(monkeypatch, silent)
+    damage_raw(monkeypatch, silence)
     with expect_refusal(ErrorCode.NO_DATA, " and ".join(dead)):
         if command == "image":
             image(scan, tmp_path / "out")
@@ -314,10 +322,11 @@ def test_an_image_without_a_valid_pixel_is_an_error_that_names_the_board(
 def test_rows_of_dead_receivers_are_kept(
     scan: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def one_rx(_: str, words: np.ndarray) -> None:
+    # The words of a sample are those of four RX, twice: only the first RX is left.
+    def keep_one_rx(_: str, words: np.ndarray) -> None:
         words[:, [1, 2, 3, 5, 6, 7]] = 0
 
-    damage_raw(monkeypatch, one_rx)
+    damage_raw(monkeypatch, keep_one_rx)
     first = process_scan(scan)
     assert not caplog.text
     processed_again = process_scan(remove_raw(scan))

@@ -14,8 +14,11 @@ from polysight_shared.files import read_json
 COLUMNS = 10
 ROWS = 3
 PULSES = 8
-SYNC_NS = 5.0  # each board samples SYNC_IN up to this much late, uniformly distributed
-TRUE_KHZ = [350.0, 1400.0]  # the receivers' filters; the chirp profile has others
+# Each board samples SYNC_IN up to this much late, uniformly distributed.
+SYNC_NS = 5.0
+# The true corners of the receivers' filters; those that were programmed are 175 and 350 kHz.
+TRUE_KHZ = [350.0, 1400.0]
+# Names of the figures in sync.json, and of the same figures in quality.json.
 NAMES = {"frequency_hz_std": "frequency_std_hz", "phase_rad_std": "phase_std_rad", "amplitude_std": "amplitude_std"}
 
 
@@ -44,7 +47,7 @@ def scan(make_scan, tmp_path_factory):
 
 
 def _believe_programmed(scan):
-    """Set the filters in the scan's manifest to those of the published rig."""
+    """Set the filters in the scan's manifest to the programmed ones, those of the published rig."""
     facts = load_facts(scan)
     facts[0]["instrument"]["chirp"] |= {"hpf1_khz": 175.0, "hpf2_khz": 350.0}
     (scan / "manifest.jsonl").write_bytes(b"".join(manifest.encode_line(fact) for fact in facts))
@@ -69,9 +72,11 @@ def test_residuals_are_the_simulated_ones_and_those_of_processing(scan, tmp_path
     for name in ("RH", "RV"):
         figures = report["boards"][name]
         stages = report["boards"][name]["stages"]
-        assert (figures["positions"], figures["chirps"]) == (COLUMNS * ROWS, COLUMNS * ROWS * PULSES)
+        assert figures["positions"] == COLUMNS * ROWS
+        assert figures["chirps"] == COLUMNS * ROWS * PULSES
         assert str(figures["chirps"]) in output
-        # Two boards sample the trigger, each evenly within SYNC_NS; the direct path's phase is then random.
+        # Two boards sample the trigger, each uniformly within SYNC_NS: a standard deviation of SYNC_NS / sqrt(12) each.
+        # The phase of the direct path is then uniform within +- pi: pi / sqrt(3).
         two_boards_hz = slope * SYNC_NS * 1e-9 * np.sqrt(2 / 12)
         assert stages["received"]["frequency_hz_std"] == pytest.approx(two_boards_hz, rel=0.15)
         assert stages["received"]["phase_rad_std"] == pytest.approx(np.pi / np.sqrt(3), rel=0.15)

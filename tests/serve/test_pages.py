@@ -45,7 +45,7 @@ PAGES = {
 }
 
 
-# Check plate in each scan's rig file: the truth, and values that disagree with every measurement.
+# Permittivity of the check plate in each scan's rig file: the true one, and one that disagrees with every measurement.
 KNOWN_PERMITTIVITY = {"one": (3.78, 0.7), "two": (9.0, 0.01)}
 
 
@@ -57,7 +57,7 @@ class Page:
         self.view = view
 
     def open(self, path: str, size: tuple[int, int, bool] = DESK, token: str = TOKEN) -> None:
-        """Open the page, and wait until it has content; without a token, as on a first visit."""
+        """Open the page, and wait until it has content. With token "" the browser is one that was never here."""
         if not token:
             self.browser.forget(self.view.address)
         self.browser.visit(f"{self.view.address}{path}{f'#token={token}' if token else ''}", size)
@@ -171,7 +171,7 @@ NAMELESS = """[...document.querySelectorAll('button, a[href], input, select, tex
 """Controls without an accessible name."""
 
 
-def test_axe_is_here():
+def test_axe_core_is_installed():
     """Without axe-core the rules of accessibility are not checked; everything else is."""
     if find_axe() is None:
         pytest.skip("no axe-core here: npm install --no-save axe-core")
@@ -306,7 +306,7 @@ def test_the_new_page_lists_the_checks_as_the_doctor_prints_them(page, scans):
         assert more == bool(finding.why) + bool(finding.do)
 
 
-def test_an_abort_goes_before_pictures_that_hang(page, scans, monkeypatch):
+def test_an_abort_does_not_wait_for_pictures_that_hang(page, scans, monkeypatch):
     """A browser has six connections to a server, and pictures on a disconnected drive occupy all of them."""
     released = threading.Event()
 
@@ -342,7 +342,7 @@ def test_long_names_and_tags_fit(page, scans):
         assert page.browser.evaluate("document.documentElement.scrollWidth - innerWidth") <= 0, path
 
 
-def test_a_scan_that_is_not_there_shows_the_error_alone(page):
+def test_the_page_of_a_scan_that_does_not_exist_shows_only_the_error(page):
     page.browser.errors.clear()
     page.open("/scan?scan=nowhere")
     page.browser.wait("document.getElementById('told').innerText.includes('nowhere')", "the error")
@@ -354,7 +354,7 @@ def test_a_scan_that_is_not_there_shows_the_error_alone(page):
     assert "choose a scan from the list" in page.browser.read_text("told")
 
 
-def test_a_scan_that_is_not_there_is_not_taken_for_a_server_that_is_not_there(page):
+def test_the_live_view_of_a_scan_that_does_not_exist_does_not_report_a_lost_server(page):
     page.open("/watch?scan=nowhere")
     page.browser.wait("document.title.length > 9 && document.body.classList.contains('lost')", "the status")
     assert page.browser.read_text("headline") == "No scan of this name"
@@ -362,7 +362,7 @@ def test_a_scan_that_is_not_there_is_not_taken_for_a_server_that_is_not_there(pa
     assert "choose a scan from the list" in page.browser.read_text("do")
 
 
-def test_the_list_is_searched_and_two_are_compared(page):
+def test_scans_are_searched_in_the_list_and_two_are_compared(page):
     page.open("/")
     page.browser.fill("#find", "tw")
     page.browser.wait("document.querySelectorAll('#list li').length == 1", "the search")
@@ -404,7 +404,7 @@ def test_a_place_is_probed_by_keyboard_alone(page):
     page.check_whole()
 
 
-def test_what_is_named_to_harm_is_shown_as_text(page, scans):
+def test_markup_in_names_and_notes_is_shown_as_text(page, scans):
     evil = "<img src=x onerror=\"document.title='broken'\">"
     products = scans / "one" / "products"
     answer = json.loads((products / "materials.json").read_text())
@@ -473,7 +473,7 @@ def test_a_wrong_number_is_reported_with_the_labels_of_the_page(page):
     assert not re.search(r"\w_\w|stage\.|grid\.|changed|rule of its format", shown_text), shown_text
     invalid_fields = "[...document.querySelectorAll('[aria-invalid=true]')].map((field) => field.id).join()"
     assert page.browser.evaluate(invalid_fields) == "columns,step_x_mm,speed_mm_s"
-    # The refused requests
+    # The browser itself reports the refused requests.
     page.browser.errors.clear()
 
 
@@ -534,7 +534,7 @@ def test_a_long_list_is_shown_while_it_is_read(browser, tmp_path, monkeypatch):
         assert len(requests) >= 6
 
 
-def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, scans):
+def test_without_the_token_nothing_is_changed_and_the_page_asks_for_it(page, scans):
     page.browser.forget(page.view.address)
     page.open("/scan?scan=one", token="wrong")
     page.browser.wait("document.getElementById('token-bar')", "that it asks")
@@ -552,15 +552,15 @@ def test_without_the_token_nothing_can_be_asked_and_the_page_asks_for_it(page, s
     wait_for(lambda: read_notes(scans / "one").notes == "mine", "the notes")
 
 
-def test_a_view_that_is_read_only_has_no_buttons_that_ask(browser, scans):
+def test_a_read_only_view_has_no_buttons_that_change_anything(browser, scans):
     with serve_folder(scans) as view:
         page = Page(browser, view)
         for path in ("/", "/scan?scan=one"):
             page.open(path, token="")
             page.check_whole()
             buttons = "[...document.querySelectorAll('button')].filter(b => b.checkVisibility()).map(b => b.innerText)"
-            asking = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
-            assert not asking & set(browser.evaluate(buttons))
+            changing = {"Label", "Process again", "Resume", "Save", "Write", "Make a library", "Start the scan"}
+            assert not changing & set(browser.evaluate(buttons))
 
 
 def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, scans):
@@ -573,13 +573,14 @@ def test_a_token_of_the_server_that_had_the_port_before_is_forgotten(browser, sc
         page.check_whole()
 
 
-def test_advice_for_a_terminal_is_in_the_words_of_the_page(page):
+def test_advice_with_an_option_of_a_command_is_shown_in_the_words_of_the_page(page):
     """No text on materials that pages show names an option, which no page has."""
     texts = []
     for name in ("results/verdict.py", "results/rules.py", "materials/analyse.py", "materials/labels.py",
                  "materials/sub_bands.py", "materials/training_advice.py"):  # fmt: skip
         source = (Path(polysight.__file__).parent / name).read_text(encoding="utf-8")
         texts += re.findall(r'"([^"\n]*--[a-z][^"\n]*)"', re.sub(r"\{[^}]*\}", "5", source))
+    # Such texts were found.
     assert len(texts) > 9
     page.open("/")
     shown_texts = page.browser.evaluate(
@@ -657,5 +658,5 @@ def test_two_hundred_scans_are_shown_together(browser, tmp_path, monkeypatch):
         browser.wait("document.querySelectorAll('#list li').length == 200", "all of them")
         page.check_whole()
         drawn = [url for url in browser.requests if "thumbnail" in url]
-        # Pictures come as they are scrolled to
+        # Pictures are loaded when they are scrolled to.
         assert len(drawn) < 100

@@ -20,7 +20,7 @@ from polysight.serve.guard import Access
 
 # Browsers resolve every name under `localhost` to this machine.
 NAME = "lab.localhost"
-# Caddy's certificate: no system port, no certificate from the network, no installation.
+# Options of Caddy for a test: it uses no system port, gets no certificate from the network, and installs none.
 GLOBAL_OPTIONS = """{
   admin off
   skip_install_trust
@@ -36,7 +36,7 @@ def find_free_port() -> int:
 
 
 def read_example(port: int, served_port: int) -> str:
-    """The Caddyfile of the how-to, with these ports and a certificate of Caddy's own."""
+    """Return the Caddyfile of the how-to with these ports, and with a certificate that Caddy makes itself."""
     page = (REPO / "docs/how-to/reverse-proxy.md").read_text(encoding="utf-8")
     block = re.search(r"```text\n(.*?)```", page, re.DOTALL)
     assert block is not None
@@ -83,7 +83,7 @@ def _is_listening(port: int) -> bool:
     return True
 
 
-def test_behind_the_documented_proxy_everything_works_for_who_has_the_token(browser, address, scans):
+def test_behind_the_documented_proxy_everything_works_with_the_token(browser, address, scans):
     browser.forget(address)
     browser.visit(f"{address}/watch?scan=one")
     browser.wait("document.getElementById('token-bar')", "that it asks for the token")

@@ -26,8 +26,10 @@ from polysight.serve.guard import Access
 from polysight.serve.programs import Programs
 from polysight.serve.site import Site, Watches
 
+# States of the table without the facts of a scan, and those that only the page itself finds out.
 WITHOUT_SCAN = ("empty", "starting", "start_failed", "unreadable", "folder_gone")
 OF_THE_PAGE = ("offline", "server_frozen")
+# Values for the places of the table's texts.
 WORDS: dict[str, Any] = {
     "folder": "scans/one", "safe": "1 of 3 rows are safe.", "asker": "the page", "row": 1, "take": 2,
     "what": "RV: no data.", "why": "The cable is out", "do": "Put it in", "now": "Row 1 is being scanned.",
@@ -36,7 +38,7 @@ WORDS: dict[str, Any] = {
 
 
 class StillWatch:
-    """A live view that shows the state that a test sets."""
+    """A live view in place of `Watch`: it shows the state that a test sets."""
 
     def __init__(self, folder: Path, history: ScanHistory) -> None:
         self.folder = folder
@@ -46,7 +48,7 @@ class StillWatch:
         self._history = history
 
     def show(self, key: str, **words: str) -> None:
-        """Publish a state of the table, with other texts than `WORDS`."""
+        """Publish a state of the table; `words` replace some of `WORDS`."""
         signs = LifeSigns(
             life=SignOfLife(), alive=True, killed=False, alive_s=0.0, pi_silent_s=0.1, pi_limit_s=6.0, now_s=1.8e9
         )

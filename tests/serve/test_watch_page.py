@@ -16,7 +16,7 @@ PICTURES = "[...document.querySelectorAll('.view img')]"
 
 
 def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
-    """The page; without a token, for a visitor who was never there."""
+    """Open the page and wait for its first state. Without a token the browser is one that was never here."""
     if not token:
         browser.forget(view.address)
     browser.visit(view.address + (f"/#token={token}" if token else "/"), size)
@@ -24,7 +24,7 @@ def open_page(browser: Browser, view, size=DESK, token: str = "") -> None:
 
 
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
-def test_a_finished_scan_at_a_glance(browser, finished_scan, watching, tmp_path, size):
+def test_the_live_view_of_a_finished_scan_shows_state_and_pictures(browser, finished_scan, watching, tmp_path, size):
     watch = watching(finished_scan)
     watch.wait_for(lambda s: s["pictures"]["rows"] == 3)
     with serve_view(watch) as view:
@@ -46,7 +46,7 @@ def test_a_finished_scan_at_a_glance(browser, finished_scan, watching, tmp_path,
         browser.check_whole(view.address)
 
 
-def test_rows_come_without_touching_the_page(browser, growing: GrowingScan, watching):
+def test_new_rows_are_shown_without_reloading_the_page(browser, growing: GrowingScan, watching):
     watch = watching(growing.path, lapse_s=1e6)
     with serve_view(watch) as view:
         open_page(browser, view)
@@ -82,7 +82,7 @@ def test_buttons_reach_the_scan(browser, growing, watching):
 
 
 def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished_scan, watching):
-    """At an address of its own: a free port of 127.0.0.1 may be used by another program by then."""
+    """The view has an address of its own: a free port of 127.0.0.1 may be taken by another program meanwhile."""
     rig = move_to_free_subnet(load_published_rig())
     host, _, port = rig.pi.command_address.removeprefix("tcp://").rpartition(":")
     watch = watching(finished_scan)
@@ -90,7 +90,7 @@ def test_a_page_reconnects_to_a_view_that_was_restarted(browser, finished_scan, 
         open_page(browser, view)
     browser.wait("document.body.classList.contains('lost')", "that the view is gone is said")
     assert browser.read_text("headline") == STATES["offline"].headline
-    # Some of its attempts to reconnect fail
+    # Meanwhile some attempts to reconnect fail.
     time.sleep(0.5)
     with serve_view(watch, host=host, port=int(port)):
         browser.wait("!document.body.classList.contains('lost')", "the way back")

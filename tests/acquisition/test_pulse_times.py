@@ -9,9 +9,18 @@ from tests.support.acquisition.arrival_model import FRAME_NS, MS, PAYLOAD, Load,
 from tests.support.capture.records import make_mask
 from tests.support.rigs import load_published_rig
 
-from polysight.acquisition.pulse_times import PlacedFrames, describe, find_frames, place_frames, rewrite_row
+from polysight.acquisition.pulse_times import (
+    PlacedFrames,
+    ReceivedCapture,
+    describe,
+    find_frames,
+    place_frames,
+    rewrite_row,
+    time_before_first_pulse_ns,
+)
 from polysight.capture.receiver import RowCapture
 from polysight.capture.row_files import read_index, write_index
+from polysight_shared.messages import Capture
 from polysight_shared.raster import Row
 
 # Bytes of a frame, and the bursts and pulses of a row.
@@ -155,6 +164,7 @@ def test_the_rewritten_row_holds_each_byte_at_its_pulse_or_masks_it(tmp_path_fac
     facts, arrivals = read_index(path.with_suffix(".idx"))
     assert [tuple(x) for x in facts["missing"]] == capture.missing
     assert facts["pulses_missed"] == sorted(missed)
+    assert (facts["located"], facts["reason"]) == (True, "")
     assert arrivals.tolist() == [[1, extent]]
     assert capture.located
     assert capture.bytes + capture.missing_bytes == capture.expected
@@ -188,3 +198,34 @@ def test_one_early_frame_contradicts_a_whole_row_only_if_its_times_are_sharp(ast
     placed = place(pulses, answer, arrivals, PAYLOAD)
     assert placed.contradicted == contradicted
     assert contradicted or placed.slots[17] == -1
+
+
+def make_bursts(first_point: int, bursts: int = 8) -> tuple[list[ReceivedCapture], int]:
+    """Capture events of a row from a position on, read by the host 2 ms after each burst; and the first pulse's time.
+
+    The clocks of Pi and host differ by 5 s.
+    """
+    pulses = draw_pulse_times(bursts)
+    host_ns = 5_000 * MS
+    events = []
+    for burst, times_ns in enumerate(pulses.tolist()):
+        event = Capture(
+            scan_id="s", seq=burst + 1, t_mono_ns=1, row_index=0, take=1, point=first_point + burst, column=burst,
+            pulses=len(times_ns), edge_ns=times_ns[0], first_pulse_ns=times_ns[0], last_pulse_ns=times_ns[-1],
+            width_max_ns=1000, jitter_ns=0,
+        )  # fmt: skip
+        events.append(ReceivedCapture(event, times_ns[-1] + host_ns + 2 * MS))
+    return events, int(pulses[0, 0]) + host_ns
+
+
+def test_the_time_before_a_row_lies_in_the_pause_before_its_first_burst():
+    events, first_pulse_ns = make_bursts(first_point=0)
+    # Events may come in any order.
+    before_ns = time_before_first_pulse_ns(events[::-1])
+    assert before_ns is not None
+    assert first_pulse_ns - 100 * MS < before_ns < first_pulse_ns
+
+
+def test_the_time_before_a_row_is_unknown_without_its_first_burst():
+    assert time_before_first_pulse_ns([]) is None
+    assert time_before_first_pulse_ns(make_bursts(first_point=1)[0]) is None

@@ -275,6 +275,14 @@ def test_paint_is_reported_of_a_reference_that_a_user_gave_and_of_one_that_the_p
     assert rules.judge_metal("patch 5", True, True, given, False, False, painted=0.1, paint_mm=0.1) == []
 
 
+def test_paint_is_reported_on_a_reference_that_is_only_likely_metal_too():
+    likely, paint = rules.judge_metal("patch 5", True, False, False, False, False, painted=0.9, paint_mm=0.1)
+    assert "is likely metal, not certainly" in likely.what
+    assert "(patch 5) may be painted: probability 0.90, 0.10 mm" in paint.what
+    (unpainted,) = rules.judge_metal("patch 5", True, False, False, False, False, painted=0.1, paint_mm=0.1)
+    assert unpainted == likely
+
+
 @pytest.mark.parametrize(("stronger_v", "plates"), [([], 8), ([3], 1), ([1, 2], 4)])
 def test_a_single_plate_or_half_of_them_do_not_show_that_h_and_v_are_exchanged(stronger_v, plates):
     """Layers and liquids behind glass may reflect more V than H."""

@@ -324,9 +324,10 @@ def judge_metal(
             " places",
             f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
         )]  # fmt: skip
-    if (is_given or is_certain) and painted > PAINT_REPORTED:
+    paint = []
+    if painted > PAINT_REPORTED:
         given = "given " if is_given else ""
-        return [reason(
+        paint = [reason(
             "care",
             f"the {given}metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
             "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet"
@@ -334,12 +335,13 @@ def judge_metal(
             f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
     if is_given or is_certain:
-        return []
+        return paint
     if is_likely:
-        return [reason(
+        doubt = reason(
             "care", f"the metal reference ({patch}) is likely metal, not certainly",
             "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
-        )]  # fmt: skip
+        )  # fmt: skip
+        return [doubt, *paint]
     cause = "relative to it the other patches are impossible materials, or too few of them give evidence"
     if only_patch:
         cause = "nothing else in the scene can show that it is metal"

@@ -15,7 +15,7 @@ from polysight.materials.discriminant import (
     estimate_common_error,
     shares_of_materials,
 )
-from polysight.materials.kinds import _compute_shares, _tabulate_coordinate_density
+from polysight.materials.kinds import RatioEvidence, _compute_shares, _tabulate_coordinate_density
 from polysight.materials.names import _evaluate_normal, weigh_kinds
 
 # Covariances of two materials, and the deviations of five patches from the mean of each: any numbers.
@@ -115,10 +115,9 @@ def make_kinds(t: list[complex], effects: np.ndarray, **changes: Any) -> Any:
     return SimpleNamespace(**(fields | changes))
 
 
-def make_evidence(t: complex, covariance: np.ndarray, library_share: float = 0.5) -> Any:
-    return SimpleNamespace(
-        inverse_ratio=t, covariance=covariance, library_share=library_share, dispersion=None, brightness_off=np.nan
-    )
+def make_evidence(t: complex, covariance: np.ndarray, library_share: float = 0.5) -> RatioEvidence:
+    """Return the evidence of one scan whose |H| and change over the sweep are not used."""
+    return RatioEvidence(0.7, t, covariance, library_share)
 
 
 def test_odds_of_kinds_are_bayes_rule_with_sheets_and_other_half_spaces():

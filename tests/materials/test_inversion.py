@@ -283,6 +283,31 @@ def test_error_bars_contain_paint_that_is_not_certain():
     assert np.mean(is_covered) > 0.87
 
 
+def test_names_have_both_cases_of_metal_that_may_be_painted():
+    """Mean and covariance of both cases together are those of the whole."""
+    patches = paint(draw_world(np.random.default_rng(1), (0.003j, 0.004)), 0.03)
+    inversion = invert(patches, RigPrior(1e-3, leakage_std=0.01, leakage_measured=True), KINDS)
+    assert 0.05 < inversion.painted < 0.95
+    for estimate in inversion.patches:
+        painted, bare = estimate.evidence.cases
+        assert painted.probability == pytest.approx(inversion.painted, abs=0.01)
+        assert painted.probability + bare.probability == pytest.approx(1)
+        middle = sum(case.probability * case.inverse_ratio for case in (painted, bare))
+        assert estimate.evidence.inverse_ratio == pytest.approx(middle)
+        covariance = np.zeros((2, 2))
+        for case in (painted, bare):
+            off = np.array([(case.inverse_ratio - middle).real, (case.inverse_ratio - middle).imag])
+            covariance += case.probability * (case.covariance + np.outer(off, off))
+        assert estimate.evidence.covariance == pytest.approx(covariance, rel=0.03, abs=1e-6)
+
+
+def test_metal_that_is_surely_painted_is_one_case():
+    patches = paint(draw_world(np.random.default_rng(11), (0.003j, 0.004)), 0.2)
+    inversion = invert(patches, RigPrior(1e-3, leakage_std=0.01, leakage_measured=True), KINDS)
+    assert inversion.painted > 0.95
+    assert not any(estimate.evidence.cases for estimate in inversion.patches)
+
+
 def test_bare_metal_is_not_called_painted():
     for seed in range(3):
         rng = np.random.default_rng(seed)

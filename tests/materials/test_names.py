@@ -12,11 +12,13 @@ from polysight.materials.kinds import (
     Kind,
     Kinds,
     PatchDispersion,
+    RatioCase,
     RatioEvidence,
     compute_layer_odds,
     draw_sheets,
     inverse_ratio,
     list_literature_kinds,
+    move_to_angle_of_kinds,
 )
 from polysight.materials.names import Odds, add_explanation, may_be_thin, name_patch, summarise_literature, weigh_kinds
 from polysight.polarimetry import fresnel, multilayer, permittivity_from_ratio
@@ -247,3 +249,38 @@ def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
     patch_name = replace(named.patch_name, probabilities={"acrylic": 1 - unknown, UNKNOWN: unknown})
     reason = add_explanation(replace(named, patch_name=patch_name), LIBRARY["acrylic"], None, LIBRARY).patch_name.why
     assert reason.partition("; ")[2].removeprefix("it could also be ").startswith(rival)
+
+
+def test_beside_metal_that_may_be_painted_names_are_as_probable_as_in_both_cases_together():
+    """Rubber if the metal is bare, glass if it is painted; one broad error of t would contain other materials, too."""
+    covariance = 0.004**2 * np.eye(2)
+    bare, painted = (
+        RatioEvidence(ANGLES[0], complex(inverse_ratio(LIBRARY[name], ANGLES[0])), covariance, 0.5)
+        for name in ("rubber", "glass")
+    )
+    cases = tuple(RatioCase(p, e.inverse_ratio, covariance) for p, e in ((0.4, painted), (0.6, bare)))
+    offset = painted.inverse_ratio - bare.inverse_ratio
+    shift = np.array([offset.real, offset.imag])
+    middle = bare.inverse_ratio + 0.4 * offset
+    both = RatioEvidence(ANGLES[0], middle, covariance + 0.24 * np.outer(shift, shift), 0.5, cases=cases)
+    pixels = np.full((20, 1), middle)
+    as_bare, as_painted, as_both = (name_patch(AT_ANGLES[:1], [e], pixels).patch_name for e in (bare, painted, both))
+    assert (as_bare.name, as_painted.name) == ("rubber", "glass")
+    for name in LIBRARY:
+        expected = 0.6 * as_bare.probabilities.get(name, 0.0) + 0.4 * as_painted.probabilities.get(name, 0.0)
+        assert as_both.probabilities.get(name, 0.0) == pytest.approx(expected, abs=0.005)
+    # Also together with a scan at another angle, beside bare metal.
+    other_t = complex(inverse_ratio(LIBRARY["rubber"], ANGLES[1]))
+    other_scan = RatioEvidence(ANGLES[1], other_t, covariance, 0.5)
+    odds = weigh_kinds(AT_ANGLES, [both, other_scan])
+    parts = [weigh_kinds(AT_ANGLES, [e, other_scan]).kinds for e in (bare, painted)]
+    assert odds.kinds == pytest.approx(0.6 * parts[0] + 0.4 * parts[1])
+
+
+def test_both_cases_of_metal_that_may_be_painted_move_to_the_angle_of_the_kinds():
+    cases = (RatioCase(0.5, 0.3 - 0.1j, np.eye(2)), RatioCase(0.5, 0.2 - 0.1j, np.eye(2)))
+    moved = move_to_angle_of_kinds(RatioEvidence(ANGLES[0], 0.3 - 0.1j, np.eye(2), 0.5, cases=cases), AT_ANGLES[1])
+    assert moved.cases[0].inverse_ratio == moved.inverse_ratio
+    for case, moved_case in zip(cases, moved.cases, strict=True):
+        permittivity = permittivity_from_ratio(case.inverse_ratio, ANGLES[0])
+        assert moved_case.inverse_ratio == pytest.approx(complex(inverse_ratio(permittivity, ANGLES[1])))

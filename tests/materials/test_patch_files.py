@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from tests.support.refusals import expect_refusal
 
 from polysight.imaging import Images
 from polysight.materials import UNKNOWN, Classifier, match_patches, pack_patches, read_patches
+from polysight.materials.kinds import RatioCase
 from polysight_shared.errors import ErrorCode
 
 
@@ -31,6 +33,23 @@ def test_a_scan_that_is_named_again_from_its_file_gets_the_same_names(synthetic,
             assert renamed[r.patch.label].name == r.named.patch_name.name
             # Files have single precision.
             assert renamed[r.patch.label].probabilities == pytest.approx(r.named.patch_name.probabilities, abs=1e-3)
+
+
+def test_both_cases_of_metal_that_may_be_painted_are_kept(synthetic, analyse_placement, tmp_path):
+    """One patch has two cases; the others have none."""
+    scene = synthetic(3)
+    analysis = analyse_placement(1000)
+    first, *others = analysis.evidence
+    cases = (RatioCase(0.25, 0.3 - 0.1j, np.diag([1e-4, 2e-4])), RatioCase(0.75, 0.2 + 0.1j, 1e-4 * np.eye(2)))
+    evidence = {**analysis.evidence, first: replace(analysis.evidence[first], cases=cases)}
+    path = tmp_path / "patches.npz"
+    path.write_bytes(pack_patches(replace(analysis, evidence=evidence), scene.x_m, scene.y_m, simulated=True))
+    read = read_patches(path).evidence
+    for case, expected in zip(read[first].cases, cases, strict=True):
+        assert (case.probability, case.inverse_ratio) == (expected.probability, expected.inverse_ratio)
+        assert case.covariance == pytest.approx(expected.covariance)
+    assert others
+    assert not any(read[label].cases for label in others)
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.25])

@@ -40,6 +40,7 @@ from polysight.materials.kinds import (
     Kinds,
     PatchEstimate,
     PatchMeasurement,
+    RatioCase,
     RatioEvidence,
     compute_brightness_density,
     compute_log_layer_odds,
@@ -82,7 +83,8 @@ POSSIBLY_PAINTED = 0.2
 """Prior probability that the metal is painted or coated; and posterior probability above which paint is an error of
 pixels and sub-bands, too. Both chosen: a lower second one would widen the errors of what is rather bare metal."""
 LEAST_PAINTED = 0.05
-"""Probability of paint from which it stays as probable for each patch as for the scene; chosen."""
+"""Probability of paint, and of bare metal, from which it stays as probable for each patch as for the scene, and names
+weigh both cases apart; chosen."""
 MOST_PAINT_RAD = 0.65
 PAINT_RAD_PER_MM = 2.65
 """Largest phase c by paint on metal, and c per thickness: 4 pi / lambda sin^2(theta) / cos(theta) (1 - 1 / eps) of a
@@ -681,5 +683,17 @@ def _collect_evidence(model: SceneLikelihood, kinds: Kinds, z: Real, i: int) -> 
     return RatioEvidence(
         theta_rad=kinds.theta_rad, inverse_ratio=complex(t.mean()), covariance=covariance, library_share=library_share,
         brightness_off=off, brightness_std=float(np.exp(np.log(model.brightness_std(z)).mean())),
-        dispersion=model.dispersions[i],
+        dispersion=model.dispersions[i], cases=_split_by_paint(model, z, t, i),
     )  # fmt: skip
+
+
+def _split_by_paint(model: SceneLikelihood, z: Real, t: Complex, i: int) -> tuple[RatioCase, ...]:
+    """Return t [particle] of patch `i` if the metal is painted, and if it is bare; empty if one of them is unlikely."""
+    painted = model.paint(z)[:, 0] > 0
+    probability = float(painted.mean())
+    if min(probability, 1 - probability) < LEAST_PAINTED:
+        return ()
+    return tuple(
+        RatioCase(share, complex(t[chosen].mean()), np.cov(split_complex(t[chosen]).T) + model.own[i])
+        for share, chosen in ((probability, painted), (1 - probability, ~painted))
+    )

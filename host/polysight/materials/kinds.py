@@ -135,6 +135,18 @@ class PatchDispersion:
 
 
 @dataclass(frozen=True)
+class RatioCase:
+    """t of a patch in one of several cases of the scene, and the probability of the case.
+
+    `covariance`: float64 [2, 2] of the real and imaginary part of `inverse_ratio`.
+    """
+
+    probability: float
+    inverse_ratio: complex
+    covariance: Real
+
+
+@dataclass(frozen=True)
 class PatchMeasurement:
     """Measurement of one patch, relative to metal; leakage is not removed.
 
@@ -193,6 +205,9 @@ class RatioEvidence:
         is NaN if |H| is not used. Thin plates are brighter or darker than half spaces of the same t.
     dispersion
         Change of the patch over the sweep; None if it was not measured.
+    cases
+        t if the metal is painted, and if it is bare, where both are possible; `inverse_ratio` and `covariance` are
+        those of both together. Empty: there is one case.
     """
 
     theta_rad: float
@@ -202,6 +217,19 @@ class RatioEvidence:
     brightness_off: float = np.nan
     brightness_std: float = np.nan
     dispersion: PatchDispersion | None = None
+    cases: tuple[RatioCase, ...] = ()
+
+    def split(self) -> list[tuple[float, RatioEvidence]]:
+        """Return the probability of each case, and the evidence in it; of one case the evidence itself."""
+        if not self.cases:
+            return [(1.0, self)]
+        return [
+            (
+                case.probability,
+                replace(self, inverse_ratio=case.inverse_ratio, covariance=case.covariance, cases=()),
+            )
+            for case in self.cases
+        ]
 
 
 @dataclass(frozen=True)
@@ -315,8 +343,13 @@ def move_to_angle_of_kinds(evidence: RatioEvidence, kinds: Kinds) -> RatioEviden
 
     The covariance is not converted: angles of a library differ from the scan's by a degree at most.
     """
-    t = HalfSpaces(evidence.inverse_ratio, evidence.theta_rad).move_to_angle(kinds.theta_rad)
-    return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=complex(t))
+
+    def move(t: complex) -> complex:
+        return complex(HalfSpaces(t, evidence.theta_rad).move_to_angle(kinds.theta_rad))
+
+    cases = tuple(replace(case, inverse_ratio=move(case.inverse_ratio)) for case in evidence.cases)
+    moved_t = move(evidence.inverse_ratio)
+    return replace(evidence, theta_rad=kinds.theta_rad, inverse_ratio=moved_t, cases=cases)
 
 
 def split_complex(value: npt.ArrayLike) -> Real:

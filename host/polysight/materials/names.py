@@ -9,6 +9,7 @@ possible layer, or unknown. The probabilities of a patch's names sum to one.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -132,7 +133,7 @@ class Odds:
     """Probabilities that a patch is of each kind, `kinds` [kind], of layers, `sheet`, or of no kind, `other`; sum 1.
 
     `distance` [kind]: distance of t from the kind over the radius of its 99 % region. Beyond 1 the kind has probability
-    0, and what it would have is in `other`.
+    0, and what it would have is in `other`. Of several cases it is the least distance.
     """
 
     kinds: Real
@@ -145,7 +146,25 @@ def weigh_kinds(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) 
     """Return the probabilities of materials of a patch from one scan, or from several at different incidence angles.
 
     Errors of different scans are independent. `kinds` has the same materials for each scan, at the angle of that scan.
+    Where the metal may be painted the probabilities are the mean of those with and without paint, by its probability:
+    one broad error around both values of t would make materials between them likely, which neither case allows.
     """
+    cases = list(itertools.product(*(evidence.split() for evidence in scan_evidence)))
+    shares = [float(np.prod([share for share, _ in case])) for case in cases]
+    odds = [_weigh_kinds_of_case(kinds, [evidence for _, evidence in case]) for case in cases]
+    if len(odds) == 1:
+        return odds[0]
+    weights = np.array(shares) / sum(shares)
+    return Odds(
+        kinds=weights @ np.stack([of_case.kinds for of_case in odds]),
+        sheet=float(weights @ [of_case.sheet for of_case in odds]),
+        other=float(weights @ [of_case.other for of_case in odds]),
+        distance=np.min([of_case.distance for of_case in odds], axis=0),
+    )
+
+
+def _weigh_kinds_of_case(kinds: Sequence[Kinds], scan_evidence: Sequence[RatioEvidence]) -> Odds:
+    """Return the probabilities of `weigh_kinds` from evidence of one case each."""
     first = kinds[0]
     size = 2 * len(scan_evidence)
     errors = scipy.linalg.block_diag(*(evidence.covariance for evidence in scan_evidence))

@@ -75,13 +75,12 @@ def _join_estimates(patch: PatchEstimate, other_estimate: PatchEstimate, probabi
     # The evidence contains the ratio that decides the name of the patch.
     evidence = patch.evidence
     if evidence is not None and other_estimate.evidence is not None:
-        joined = join(
-            evidence.inverse_ratio,
-            evidence.covariance,
-            other_estimate.evidence.inverse_ratio,
-            other_estimate.evidence.covariance,
+        other = (other_estimate.evidence.inverse_ratio, other_estimate.evidence.covariance)
+        cases = tuple(
+            replace(case, covariance=join(case.inverse_ratio, case.covariance, *other)) for case in evidence.cases
         )
-        evidence = replace(evidence, covariance=joined)
+        joined = join(evidence.inverse_ratio, evidence.covariance, *other)
+        evidence = replace(evidence, covariance=joined, cases=cases)
     joined_estimate = replace(patch, inverse_ratio_covariance=ratio_covariance, evidence=evidence)
     if patch.permittivity is None or patch.covariance is None:
         return joined_estimate

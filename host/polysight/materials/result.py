@@ -23,7 +23,7 @@ from msgspec import UNSET, structs
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise
 from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior
-from polysight.materials.kinds import PatchDispersion, RatioEvidence, find_permittivity_slope
+from polysight.materials.kinds import PatchDispersion, RatioCase, RatioEvidence, find_permittivity_slope, split_complex
 from polysight.materials.labels import Labels
 from polysight.materials.library import Real, make_features
 from polysight.materials.measure import Permittivity, measure_background, ratio_sigma
@@ -533,10 +533,9 @@ def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike
         evidence_ratio=np.array([e.inverse_ratio for e in evidence], np.complex128),
         evidence_covariance=np.array([e.covariance for e in evidence], np.float64).reshape(-1, 2, 2),
         evidence_share=np.array([e.library_share for e in evidence], np.float64),
-        evidence_brightness=np.array([[e.brightness_off, e.brightness_std] for e in evidence], np.float64).reshape(
-            -1, 2
-        ),
-        evidence_dispersion=np.array([_pack_dispersion(e.dispersion) for e in evidence], np.float64).reshape(-1, 8),
+        evidence_brightness=np.reshape([[e.brightness_off, e.brightness_std] for e in evidence], (-1, 2)),
+        evidence_dispersion=np.reshape([_pack_dispersion(e.dispersion) for e in evidence], (-1, 8)),
+        evidence_cases=np.reshape([_pack_cases(e.cases) for e in evidence], (-1, 2, 7)),
     )
     return buffer.getvalue()
 
@@ -553,6 +552,17 @@ def _unpack_dispersion(row: Real) -> PatchDispersion | None:
     if not np.isfinite(row).all():
         return None
     return PatchDispersion(row[:3], row[3:6], (float(row[6]), float(row[7])))
+
+
+def _pack_cases(cases: Sequence[RatioCase]) -> Real:
+    """Return probability, t and covariance of both cases, float64 [2, 7]; NaN if there is one."""
+    rows = [[case.probability, *split_complex(case.inverse_ratio), *case.covariance.flat] for case in cases]
+    return np.array(rows) if rows else np.full((2, 7), np.nan)
+
+
+def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
+    """Return what :func:`_pack_cases` packed."""
+    return tuple(RatioCase(row[0], complex(*row[1:3]), row[3:].reshape(2, 2)) for row in rows[np.isfinite(rows[:, 0])])
 
 
 def read_patches(path: Path) -> ScanPatches:
@@ -581,28 +591,15 @@ def read_patches(path: Path) -> ScanPatches:
 
 def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> dict[int, RatioEvidence]:
     """Return what the names of the judged patches rest on. Raises ValueError if the arrays do not fit."""
-    shares = arrays["evidence_share"]
-    # Products of earlier states hold neither brightness nor dispersion.
-    brightness = np.full((shares.size, 2), np.nan)
-    if "evidence_brightness" in arrays:
-        brightness = arrays["evidence_brightness"]
-    dispersions = np.full((shares.size, 8), np.nan)
-    if "evidence_dispersion" in arrays:
-        dispersions = arrays["evidence_dispersion"]
-    columns = zip(
-        arrays["evidence_theta_rad"],
-        arrays["evidence_ratio"],
-        arrays["evidence_covariance"],
-        shares,
-        brightness,
-        map(_unpack_dispersion, dispersions),
-        strict=True,
-    )
+    # Products of earlier states hold neither brightness nor dispersion nor cases.
+    brightness = arrays.get("evidence_brightness", np.full((len(judged), 2), np.nan))
+    dispersions = arrays.get("evidence_dispersion", np.full((len(judged), 8), np.nan))
+    cases = arrays.get("evidence_cases", np.full((len(judged), 2, 7), np.nan))
+    numbers = [arrays[f"evidence_{name}"] for name in ("theta_rad", "ratio", "covariance", "share")]
+    columns = zip(*numbers, brightness, map(_unpack_dispersion, dispersions), map(_unpack_cases, cases), strict=True)
     rows = [
-        RatioEvidence(
-            float(angle), complex(ratio), covariance, float(share), float(off), float(std), dispersion=dispersion
-        )
-        for angle, ratio, covariance, share, (off, std), dispersion in columns
+        RatioEvidence(float(angle), complex(ratio), covariance, float(share), float(off), float(std), change, both)
+        for angle, ratio, covariance, share, (off, std), change, both in columns
     ]
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -26,41 +26,81 @@ from tests.support.scenes import write_small_scene
 from tests.support.store.facts import load_facts
 
 from polysight.pipeline import Pipeline
+from polysight.results.verdict import NoResult
 from polysight.store import manifest
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import ScanFolder
 from polysight.store.validation import validate
+from polysight_shared.errors import DeviceError, ScanError
 from polysight_shared.messages import RowStarted
 
 pytestmark = pytest.mark.slow
 KILLED_AT = REPO / "tests/support/killed_at.py"
-NO_RESULT = 7
-SCENE = write_small_scene(6, 4, step_mm=(20.0, 20.0), pulses=4, seed=4)
-# The aperture is too small for the plate to be found by itself
-METAL = ["--metal", "0,0,50,50"]
 ROWS = 4
-FILES = 8
-Place = tuple[str, str, int]
+SCENE = write_small_scene(columns=6, rows=ROWS, step_mm=(20.0, 20.0), pulses=4, seed=4)
+# Simulated seconds per second; chosen.
+TIME_SCALE = 50.0
+# Options of a scan: without processing, or with the metal plate's box, which so small an aperture does not find itself.
+NO_PROCESSING = ("--no-process",)
+METAL = ("--metal", "0,0,50,50")
+# A row has one data file (.bin) of each of the two receivers RH and RV.
+DATA_FILES = 2 * ROWS
+# Longest wait before a kill, s; chosen. Before the first row it includes the program's start, about a second.
+LONGEST_WAIT_S = 0.4
+LONGEST_WAIT_AT_START_S = 2.0
+# Kills that are drawn; chosen. Six are one of each kind, see `Kill.draw`.
+KILLS = 6
+KILLS_LONG = 50
+
+
+class Place(NamedTuple):
+    """The `nth` `operation` (of `os`) on a file or folder whose path ends in `suffix`, counted from 1.
+
+    A write (pwrite) is killed when half of it is written, any other operation before it is executed; see killed_at.py.
+    """
+
+    operation: str
+    suffix: str
+    nth: int
+
+
+def list_places(operation: str, suffix: str, last: int, first: int = 1) -> list[Place]:
+    """Return the places of the operations from the `first` to the `last`."""
+    return [Place(operation, suffix, nth) for nth in range(first, last + 1)]
+
+
+# How often a scan does an operation need not be known: a place that it does not reach kills nothing. A manifest has a
+# first line, one for each row, and a few others; the last numbers beyond ROWS are chosen.
 HOST_PLACES = [
-    *(("rename", ".bin", n) for n in range(1, FILES + 1)),  # rows durable, not named: before, and between two boards
-    *(("fsync", "raw/RV", n) for n in range(1, ROWS + 1)),  # named, not committed
-    *(("pwrite", "manifest.jsonl", n) for n in range(1, ROWS + 3)),  # half a line
-    *(("fsync", "manifest.jsonl", n) for n in range(2, ROWS + 5)),  # a line not synced
-    *(("pwrite", "events.msgpack", n) for n in range(1, ROWS + 3)),
+    # The data of a row is on the disk, and none of its two files, or only the first one, has its final name.
+    *list_places("rename", ".bin", last=DATA_FILES),
+    # Both files have their names. RV comes last: its folder is flushed, and the row is not in the manifest yet.
+    *list_places("fsync", "raw/RV", last=ROWS),
+    # Half a line is in the manifest.
+    *list_places("pwrite", "manifest.jsonl", last=ROWS + 2),
+    # A whole line is in the manifest, not yet flushed. The first line is left to the writes above.
+    *list_places("fsync", "manifest.jsonl", first=2, last=ROWS + 4),
+    # Half a record is in the file of events.
+    *list_places("pwrite", "events.msgpack", last=ROWS + 2),
 ]
+# A journal gets a record for the begin and end of the run and of each row, and for each position: 34 in this scan.
+# Several are written and flushed together; the last numbers are chosen.
 PI_PLACES = [
-    *(("pwrite", ".journal", n) for n in range(1, 30)),  # half a record
-    *(("fsync", ".journal", n) for n in range(1, 12)),
-    ("ftruncate", ".journal", 1),  # while the journal is opened
+    # Half of the records is in the journal.
+    *list_places("pwrite", ".journal", last=29),
+    *list_places("fsync", ".journal", last=11),
+    # The journal is being opened.
+    Place("ftruncate", ".journal", 1),
 ]
 RESUME_PLACES = [
-    ("ftruncate", "manifest.jsonl", 1),  # while the torn end is cut off
-    ("ftruncate", "events.msgpack", 1),
-    ("pwrite", "manifest.jsonl", 1),
-    ("pwrite", "events.msgpack", 1),
-    ("rename", ".bin", 1),
-    ("rename", ".bin", 2),
-    ("fsync", "manifest.jsonl", 3),
+    # The torn end of the file is being cut off.
+    Place("ftruncate", "manifest.jsonl", 1),
+    Place("ftruncate", "events.msgpack", 1),
+    Place("pwrite", "manifest.jsonl", 1),
+    Place("pwrite", "events.msgpack", 1),
+    Place("rename", ".bin", 1),
+    Place("rename", ".bin", 2),
+    Place("fsync", "manifest.jsonl", 3),
 ]
 
 
@@ -82,51 +122,66 @@ class Kill:
 
     @staticmethod
     def draw(number: int) -> Kill:
+        """Draw the kill with this number; six in succession are two of the host, two of the Pi, and two of both.
+
+        Of two kills of one program the first is at a place. Both programs are always killed after a time, because a
+        place is in one program only.
+        """
         rng = random.Random(number)
-        kind = number % 6
-        host, pi = [(True, False), (False, True), (True, True)][kind // 2]
+        pair, second_of_pair = divmod(number % 6, 2)
+        host = pair in (0, 2)
+        pi = pair in (1, 2)
         kill = Kill(number, host, pi)
-        if kind % 2 or (host and pi):
+        if second_of_pair or (host and pi):
             kill.rows = rng.randrange(-1, ROWS)
-            kill.wait_s = rng.uniform(0.0, 2.0 if kill.rows < 0 else 0.4)
+            longest_wait_s = LONGEST_WAIT_AT_START_S if kill.rows < 0 else LONGEST_WAIT_S
+            kill.wait_s = rng.uniform(0.0, longest_wait_s)
         else:
             kill.place = rng.choice(HOST_PLACES if host else PI_PLACES)
+        # Half of the scans whose host was killed are killed again, once or twice, while they resume; chosen.
         if host and rng.random() < 0.5:
             kill.resumes = rng.choices(RESUME_PLACES, k=rng.randint(1, 2))
         return kill
 
 
-class Killed:
-    """The rig, its undisturbed scan, and the check of each kill."""
+class KillableRig:
+    """A simulated rig whose programs can be killed, its undisturbed scan, and the check of each kill."""
 
     def __init__(self, rig: Any) -> None:
         self.rig = rig
-        # Kinds of places that programs reached, with the name of the program
-        self.met: Counter[str] = Counter()
-        self.armed = 0
+        # Kinds of places that programs reached, with the name of the program.
+        self.reached_kinds: Counter[str] = Counter()
+        # Number of commands started so far; it names their files of reached places.
+        self.commands_started = 0
+        # Files of reached places of the newest host command, and of the running Pi.
+        self.host_hits = Path()
+        self.pi_hits = Path()
+        undisturbed = rig.folder / "undisturbed"
         self.restart_pi(list_kinds(PI_PLACES))
-        assert self.scan(rig.folder / "undisturbed", list_kinds(HOST_PLACES)).wait().status == 0
-        self.note("host", self.hits)
-        self.note("Pi", self.pi_hits)
+        assert self.scan(undisturbed, list_kinds(HOST_PLACES)).wait().status == 0
+        self.add_reached_kinds("host", self.host_hits)
+        self.add_reached_kinds("Pi", self.pi_hits)
         self.restart_pi()
-        self.rows = compute_row_digests(rig.folder / "undisturbed")
-        self.image = image(rig.folder / "undisturbed")
+        self.true_digests = compute_row_digests(undisturbed)
+        self.true_image = form_image_bytes(undisturbed)
 
     def start(self, places: Sequence[Place], *command: str | Path) -> tuple[Any, Path]:
         """Start a command that kills itself at the first of these places; return it and its file of reached places."""
-        self.armed += 1
-        hits = self.rig.folder / f"hits-{self.armed}"
+        self.commands_started += 1
+        hits = self.rig.folder / f"hits-{self.commands_started}"
         hits.touch()
-        words = ",".join(f"{operation}:{suffix}:{nth}" for operation, suffix, nth in places)
-        return self.rig.start(*(["python", KILLED_AT, hits, words] if places else []), *command), hits
+        if places:
+            places_text = ",".join(f"{place.operation}:{place.suffix}:{place.nth}" for place in places)
+            command = ("python", KILLED_AT, hits, places_text, *command)
+        return self.rig.start(*command), hits
 
-    def scan(self, folder: Path, places: Sequence[Place] = (), *more: str) -> Any:
+    def scan(self, folder: Path, places: Sequence[Place] = (), options: Sequence[str] = NO_PROCESSING) -> Any:
         """Start a scan, or resume it if its manifest has a first line."""
         if has_begun(folder):
             command = ("resume", folder)
         else:
             command = ("scan", "--config", self.rig.config, "--out", folder)
-        program, self.hits = self.start(places, "polysight", *command, *(more or ["--no-process"]))
+        program, self.host_hits = self.start(places, "polysight", *command, *options)
         return program
 
     def restart_pi(self, places: Sequence[Place] = ()) -> None:
@@ -137,59 +192,77 @@ class Killed:
         self.rig.pi, self.pi_hits = self.start(places, *run)
         self.rig.pi.wait_ready()
 
-    def note(self, who: str, hits: Path) -> None:
+    def add_reached_kinds(self, program: str, hits: Path) -> None:
         """Remember the places that a program reached."""
-        self.met.update(f"{who} {kind}" for kind in hits.read_text().splitlines())
+        self.reached_kinds.update(f"{program} {kind}" for kind in hits.read_text().splitlines())
+
+    def list_kinds_not_reached(self, program: str, places: Sequence[Place]) -> list[Place]:
+        """Return the kinds of these places that the program reached in no scan so far."""
+        kinds = list_kinds(places)
+        return [kind for kind in kinds if not self.reached_kinds[f"{program} {kind.operation}:{kind.suffix}"]]
 
     @staticmethod
     def check_died(status: int | None, place: Place, hits: Path) -> None:
         """Check that a program died if it reached its place, and only then."""
-        operation, suffix, nth = place
-        matching_hits = hits.read_text().splitlines().count(f"{operation}:{suffix}")
-        assert (status == -signal.SIGKILL) == (matching_hits >= nth), (
-            f"{place}: {matching_hits} times there, exit status {status}"
+        operations_done = hits.read_text().splitlines().count(f"{place.operation}:{place.suffix}")
+        was_killed = status == -signal.SIGKILL
+        assert was_killed == (operations_done >= place.nth), (
+            f"{place}: {operations_done} times there, exit status {status}"
         )
 
-    def strike(self, kill: Kill, folder: Path) -> None:
+    def begin_and_kill(self, kill: Kill, folder: Path) -> None:
         """Begin a scan, kill its processes as given, and wait until none of them runs any more."""
         places = [kill.place] if kill.place else []
         if kill.pi and places:
             self.restart_pi(places)
         host = self.scan(folder, places if kill.host else ())
+
+        def has_rows_or_ended() -> bool:
+            return host.process.poll() is not None or len(list_committed(folder)) >= kill.rows
+
+        def pi_or_host_ended() -> bool:
+            return self.rig.pi.process.poll() is not None or host.process.poll() is not None
+
         if kill.place is None:
-            has_ended = lambda: host.process.poll() is not None or len(list_committed(folder)) >= kill.rows  # noqa: E731
-            self.rig.wait_for(has_ended, f"{kill.rows} rows")
+            self.rig.wait_for(has_rows_or_ended, f"{kill.rows} rows")
             time.sleep(kill.wait_s)
             if kill.host:
                 host.kill()
         elif kill.pi:
-            ended = lambda: self.rig.pi.process.poll() is not None or host.process.poll() is not None  # noqa: E731
-            self.rig.wait_for(ended, "the Pi at its place, or the scan's end")
+            self.rig.wait_for(pi_or_host_ended, "the Pi at its place, or the scan's end")
             self.check_died(self.rig.pi.process.poll(), kill.place, self.pi_hits)
         if kill.pi:
             self.restart_pi()
         ended = host.wait()
         if kill.place and kill.host:
-            self.check_died(ended.status, kill.place, self.hits)
-        assert ended.status in ((-signal.SIGKILL, 0) if kill.host else (0, 5, 6)), ended.err
+            self.check_died(ended.status, kill.place, self.host_hits)
+        if kill.host:
+            # Success: the scan ended before the kill.
+            assert ended.status in (-signal.SIGKILL, 0), ended.err
+        else:
+            # Without its Pi the host reports a lost device or an incomplete scan, unless all rows were complete.
+            assert ended.status in (0, DeviceError.exit_status, ScanError.exit_status), ended.err
 
     def check(self, kill: Kill) -> list[int]:
         """Kill, resume, compare. Returns the number of rows that each resume has retaken."""
         folder = self.rig.folder / f"scan-{kill.number}"
-        self.strike(kill, folder)
+        self.begin_and_kill(kill, folder)
         retaken_rows = []
+        # The last resume is not killed.
         for place in [*kill.resumes, None]:
-            safe_before = check_committed_rows(folder, self.rows)
-            ended = self.scan(folder, [place] if place else list_kinds(RESUME_PLACES)).wait()
-            assert ended.status == 0 or (place and ended.status == -signal.SIGKILL), f"{kill}\n{ended.err}"
+            digests_before = check_committed_rows(folder, self.true_digests)
+            resumed = self.scan(folder, [place] if place else list_kinds(RESUME_PLACES)).wait()
+            assert resumed.status == 0 or (place and resumed.status == -signal.SIGKILL), f"{kill}\n{resumed.err}"
             if place:
-                self.check_died(ended.status, place, self.hits)
-            self.note("resume", self.hits)
-            assert safe_before.items() <= check_committed_rows(folder, self.rows).items(), kill
+                self.check_died(resumed.status, place, self.host_hits)
+            self.add_reached_kinds("resume", self.host_hits)
+            digests_after = check_committed_rows(folder, self.true_digests)
+            assert digests_before.items() <= digests_after.items(), kill
             retaken_rows.append(len(list_retaken_rows(folder)))
         assert validate(folder) == [], kill
-        assert compute_row_digests(folder) == self.rows, kill
-        assert image(folder) == self.image, kill
+        assert compute_row_digests(folder) == self.true_digests, kill
+        assert form_image_bytes(folder) == self.true_image, kill
+        # Only the row that ran at the kill is lost.
         assert max(retaken_rows) <= 1, kill
         started = [e for e in read_events(folder / "events.msgpack").events if isinstance(e, RowStarted)]
         assert len({(e.row.index, e.take) for e in started}) == len(started), "a take was used twice"
@@ -198,12 +271,18 @@ class Killed:
 
 def list_kinds(places: Sequence[Place]) -> list[Place]:
     """Every kind of these places once, with number 0: it is counted, but never kills."""
-    return [(operation, suffix, 0) for operation, suffix in dict.fromkeys(place[:2] for place in places)]
+    kinds = dict.fromkeys((place.operation, place.suffix) for place in places)
+    return [Place(operation, suffix, 0) for operation, suffix in kinds]
 
 
 def has_begun(folder: Path) -> bool:
     path = folder / "manifest.jsonl"
     return path.exists() and manifest.read(path).length > 0
+
+
+def list_committed(folder: Path) -> list[int]:
+    """Committed rows of a scan; none if it is not begun."""
+    return list(ScanFolder.load(folder).committed_rows()) if has_begun(folder) else []
 
 
 def compute_row_digests(folder: Path) -> dict[str, str]:
@@ -212,30 +291,35 @@ def compute_row_digests(folder: Path) -> dict[str, str]:
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in files}
 
 
-def check_committed_rows(folder: Path, truth: dict[str, str]) -> dict[str, str]:
+def check_committed_rows(folder: Path, true_digests: dict[str, str]) -> dict[str, str]:
     """SHA-256 of the committed rows of an interrupted scan; all must be good. Empty if the scan is not begun."""
     if not has_begun(folder):
         return {}
     assert [f for f in validate(folder) if f.level == "error"] == []
-    row_states = compute_row_digests(folder)
-    assert row_states.items() <= truth.items()
-    return row_states
+    digests = compute_row_digests(folder)
+    assert digests.items() <= true_digests.items()
+    return digests
 
 
 def list_retaken_rows(folder: Path) -> set[int]:
-    """Rows that the last resume has retaken, by the manifest, without those that it rejected itself."""
+    """Rows that the last resume had to take again because they ran when the scan was killed.
+
+    In the manifest the first take of such a row after the resume has a number above 1. A row that this resume takes
+    twice, because it rejects its own first take, has number 1 first and does not count.
+    """
     if not has_begun(folder):
         return set()
     facts = load_facts(folder)
-    since = max((i for i, f in enumerate(facts) if f["fact"] == "scan_resumed"), default=len(facts))
+    resumes = [i for i, fact in enumerate(facts) if fact["fact"] == "scan_resumed"]
+    facts_since_resume = facts[resumes[-1] :] if resumes else []
     first_takes: dict[int, int] = {}
-    for fact in facts[since:]:
+    for fact in facts_since_resume:
         if fact["fact"] in ("row_committed", "row_rejected"):
             first_takes.setdefault(fact["row"], fact["take"])
     return {row for row, take in first_takes.items() if take > 1}
 
 
-def image(folder: Path) -> bytes:
+def form_image_bytes(folder: Path) -> bytes:
     """The final image's bytes, both channels and their mask."""
     pipeline = Pipeline(ScanFolder.load(folder))
     for row in pipeline.source.rows():
@@ -245,84 +329,89 @@ def image(folder: Path) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def killed_rig(running_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Killed]:
-    with running_rig(tmp_path_factory.mktemp("killed"), time_scale=50.0, scene=SCENE) as rig:
-        yield Killed(rig)
+def killable_rig(running_rig, tmp_path_factory: pytest.TempPathFactory) -> Iterator[KillableRig]:
+    with running_rig(tmp_path_factory.mktemp("killed"), time_scale=TIME_SCALE, scene=SCENE) as rig:
+        yield KillableRig(rig)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    count = 50 if metafunc.config.getoption("--long") else 6
+    """Give each test with an argument `number` the numbers of the kills."""
+    count = KILLS_LONG if metafunc.config.getoption("--long") else KILLS
     if "number" in metafunc.fixturenames:
         metafunc.parametrize("number", range(count))
 
 
-def test_killed(killed_rig: Killed, number: int, record_property):
+def test_a_killed_scan_resumes_to_the_undisturbed_image(killable_rig: KillableRig, number: int, record_property):
     kill = Kill.draw(number)
-    retaken_rows = killed_rig.check(kill)
+    retaken_rows = killable_rig.check(kill)
     record_property("kill", f"{kill}; rows retaken by each resume: {retaken_rows}")
     print(f"{kill}: rows retaken by each resume {retaken_rows}")  # noqa: T201 - shown with -s
 
 
-def test_every_kind_of_place_is_reached(killed_rig: Killed):
-    """Otherwise nothing is killed: a file has another name by now, or is written in another way."""
-
-    def never(program: str, places: Sequence[Place]) -> list[Place]:
-        return [place for place in list_kinds(places) if not killed_rig.met[f"{program} {place[0]}:{place[1]}"]]
-
-    for number, place in ((100, ("pwrite", "manifest.jsonl", 4)), (101, ("pwrite", "events.msgpack", 3))):
-        # Needed if this test runs alone, or the kills above left no torn manifest or torn events
-        if never("resume", RESUME_PLACES):
-            killed_rig.check(Kill(number, host=True, pi=False, place=place))
+def test_every_kind_of_place_is_reached(killable_rig: KillableRig):
+    """A kind that no program reaches kills nothing: its file was renamed, or is written by another operation."""
+    # Two more kills, which leave a torn manifest and torn events for the resume to cut off. They are needed if this
+    # test runs alone, or if the drawn kills left neither.
+    torn_manifest = Kill(number=100, host=True, pi=False, place=Place("pwrite", "manifest.jsonl", 4))
+    torn_events = Kill(number=101, host=True, pi=False, place=Place("pwrite", "events.msgpack", 3))
+    for kill in (torn_manifest, torn_events):
+        if killable_rig.list_kinds_not_reached("resume", RESUME_PLACES):
+            killable_rig.check(kill)
     for program, places in (("host", HOST_PLACES), ("Pi", PI_PLACES), ("resume", RESUME_PLACES)):
-        assert never(program, places) == [], f"{program}: {killed_rig.met}"
+        not_reached = killable_rig.list_kinds_not_reached(program, places)
+        assert not_reached == [], f"{program}: {killable_rig.reached_kinds}"
 
 
-def test_products_of_a_killed_scan(killed_rig: Killed):
-    """Products of processing during a scan that was killed and resumed are those of the undisturbed scan."""
-    folder = killed_rig.rig.folder / "live"
-    scan = killed_rig.scan(folder, [("rename", ".bin", 5)], *METAL)
+def test_products_of_a_killed_scan_are_those_of_the_undisturbed_scan(killable_rig: KillableRig):
+    """Rows are processed during a scan, which is killed and resumed; the other scan is processed after its end.
+
+    Both have no result: the only plate is the metal reference, so that no patch is left whose material could be named.
+    """
+    folder = killable_rig.rig.folder / "live"
+    # The data files of two rows have their names, and the first one of the third row gets its own.
+    scan = killable_rig.scan(folder, [Place("rename", ".bin", 5)], METAL)
     assert scan.wait().status == -signal.SIGKILL
-    resumed = killed_rig.scan(folder, (), *METAL).wait()
-    assert resumed.status == NO_RESULT, resumed.err  # one plate only: all rows are there, and no patch is named
-    out = killed_rig.rig.folder / "products"
+    resumed = killable_rig.scan(folder, options=METAL).wait()
+    assert resumed.status == NoResult.exit_status, resumed.err
+    out = killable_rig.rig.folder / "products"
+    undisturbed = killable_rig.rig.folder / "undisturbed"
     with skip_rendering():
-        processed = killed_rig.rig.run_here("process", killed_rig.rig.folder / "undisturbed", "--out", out, *METAL)
-    assert processed.status == NO_RESULT, processed.err
-    with np.load(folder / "products" / "image.npz") as live, np.load(out / "image.npz") as undisturbed:
-        assert live.files == undisturbed.files
-        for name in live.files:
-            np.testing.assert_array_equal(live[name], undisturbed[name])
-    documents = [json.loads((products / "materials.json").read_bytes()) for products in (folder / "products", out)]
-    assert documents[0].pop("scan_id") != documents[1].pop("scan_id")
-    assert documents[0] == documents[1]
+        processed = killable_rig.rig.run_here("process", undisturbed, "--out", out, *METAL)
+    assert processed.status == NoResult.exit_status, processed.err
+    with np.load(folder / "products" / "image.npz") as live_image, np.load(out / "image.npz") as true_image:
+        assert live_image.files == true_image.files
+        for name in live_image.files:
+            np.testing.assert_array_equal(live_image[name], true_image[name])
+    live_materials = json.loads((folder / "products" / "materials.json").read_bytes())
+    true_materials = json.loads((out / "materials.json").read_bytes())
+    assert live_materials.pop("scan_id") != true_materials.pop("scan_id")
+    assert live_materials == true_materials
 
 
-def test_pi_is_lost_with_its_journal(killed_rig: Killed):
+def test_a_scan_without_its_pi_fails_and_resumes_with_a_pi_whose_journal_is_lost(killable_rig: KillableRig):
     """Without a Pi the error says so; a Pi with an empty card continues after the host's last event, with a notice."""
-    folder = killed_rig.rig.folder / "lost"
-    # It kills itself: on a busy machine the scan might end before the test sees its rows and kills it.
-    killed_rig.restart_pi([("fsync", ".journal", 6)])
-    ended = killed_rig.scan(folder).wait()
-    assert ended.status == 5
+    folder = killable_rig.rig.folder / "lost"
+    # The Pi kills itself: on a busy machine the scan might end before the test sees its rows and kills it. The sixth
+    # flush is chosen: some of the rows are committed then, and not all.
+    killable_rig.restart_pi([Place("fsync", ".journal", 6)])
+    ended = killable_rig.scan(folder).wait()
+    assert ended.status == DeviceError.exit_status
     assert 0 < len(list_committed(folder)) < ROWS
     assert ended.message.startswith("polysight scan: the Pi at tcp://")
     assert "polysight-pi" in ended.message
-    safe_before = check_committed_rows(folder, killed_rig.rows)
-    refused = killed_rig.scan(folder).wait()
-    assert refused.status == 5
+    digests_before = check_committed_rows(folder, killable_rig.true_digests)
+    refused = killable_rig.scan(folder).wait()
+    assert refused.status == DeviceError.exit_status
     assert "the Pi at tcp://" in refused.message
     known_events = len(read_events(folder / "events.msgpack").events)
     scan_id = ScanFolder.load(folder).scan_id
-    (killed_rig.rig.folder / "rig" / "journal" / f"{scan_id}.journal").unlink()
-    killed_rig.restart_pi()
-    resumed = killed_rig.scan(folder).wait()
+    (killable_rig.rig.folder / "rig" / "journal" / f"{scan_id}.journal").unlink()
+    killable_rig.restart_pi()
+    resumed = killable_rig.scan(folder).wait()
     assert resumed.status == 0, resumed.err
     assert f"journal of this scan ends {known_events} events before" in " ".join(resumed.err.split())
-    assert safe_before.items() <= compute_row_digests(folder).items()
-    assert (validate(folder), compute_row_digests(folder)) == ([], killed_rig.rows)
+    digests_after = compute_row_digests(folder)
+    assert digests_before.items() <= digests_after.items()
+    assert validate(folder) == []
+    assert digests_after == killable_rig.true_digests
     assert len(list_retaken_rows(folder)) <= 1
-
-
-def list_committed(folder: Path) -> list[int]:
-    """Committed rows of a scan; none if it is not begun."""
-    return list(ScanFolder.load(folder).committed_rows()) if has_begun(folder) else []

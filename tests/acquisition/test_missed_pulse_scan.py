@@ -25,7 +25,7 @@ def timed_rig(make_instrument, monkeypatch, request):
     retakes = getattr(request, "param", 1)
     fake = FakeRig(make_instrument(columns=POINTS, rows=2, pulses=PULSES, row_retakes=retakes))
     fake.start()
-    fake.pi.timed = True
+    fake.pi.send_frame_by_frame = True
 
     def receive_in_time(event, _):
         # Events arrive a millisecond after the last pulse.

@@ -130,7 +130,7 @@ def test_plan_and_doctor_show_the_size_of_a_scan(make_instrument):
 @pytest.mark.parametrize("key", ["steps_per_mm", "centre_x_mm", "centre_y_mm", "backlash_mm", "accel_mm_s2"])
 def test_a_pi_with_other_stage_settings_is_refused_before_a_folder_is_made(rig, tmp_path, key):
     own_value = rig.instrument.stage.placement_settings[key]
-    rig.pi.stage = {**rig.pi.stage, key: own_value + 0.5}
+    rig.pi.placement_settings = {**rig.pi.placement_settings, key: own_value + 0.5}
     with expect_refusal(ErrorCode.STAGE_DIFFERS, key, f"{own_value:g}", f"{own_value + 0.5:g}"):
         run_scan(rig.instrument, tmp_path / "s")
     assert not (tmp_path / "s").exists()
@@ -140,20 +140,20 @@ def test_a_pi_with_other_stage_settings_is_refused_before_a_folder_is_made(rig, 
 
 def test_resuming_with_another_rig_file_on_the_pi_is_refused_until_it_has_the_old_one(rig, tmp_path):
     stop = StopRequest()
-    right = rig.pi.stage
+    right = rig.pi.placement_settings
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
     scan = ScanFolder.load(tmp_path / "s")
     assert load_facts(scan, "scan_started")[0]["pi"]["stage"] == right == rig.instrument.stage.placement_settings
     rows = list(scan.rows())
     facts = len(load_facts(scan))
     assert not scan.complete
-    rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
+    rig.pi.placement_settings = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     with expect_refusal(ErrorCode.STAGE_DIFFERS, "centre_x_mm", 400, 405):
         resume_scan(tmp_path / "s")
     scan.reload()
     # Nothing was written.
     assert (list(scan.rows()), len(load_facts(scan))) == (rows, facts)
-    rig.pi.stage = right
+    rig.pi.placement_settings = right
     assert resume_scan(tmp_path / "s").folder.complete
     scan.reload()
     assert load_facts(scan, "scan_resumed")[0]["pi"] == {
@@ -166,7 +166,7 @@ def test_resuming_with_another_rig_file_on_the_pi_is_refused_until_it_has_the_ol
 
 def test_a_pi_that_does_not_report_its_stage_is_a_warning(rig, tmp_path):
     """A Pi of an older release, with the same version of the protocol."""
-    rig.pi.stage = {}
+    rig.pi.placement_settings = {}
     result = run_scan(rig.instrument, tmp_path / "s")
     assert result.exit_status == "success"
     assert STAGE_NOT_REPORTED in result.warnings
@@ -181,15 +181,15 @@ def test_settings_that_do_not_place_rows_may_differ(rig):
 def test_a_scan_begun_without_comparison_resumes_with_a_warning(rig, tmp_path):
     """The earlier rows were placed with that Pi's settings; only the same settings continue them."""
     stop = StopRequest()
-    right = rig.pi.stage
-    rig.pi.stage = {}
+    right = rig.pi.placement_settings
+    rig.pi.placement_settings = {}
     run_scan(rig.instrument, tmp_path / "s", on_row=lambda _: stop.request(), stop=stop)
     next_request = StopRequest()
     assert (
         STAGE_NOT_REPORTED
         in resume_scan(tmp_path / "s", on_row=lambda _: next_request.request(), stop=next_request).warnings
     )
-    rig.pi.stage = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
+    rig.pi.placement_settings = {**right, "centre_x_mm": right["centre_x_mm"] + 5}
     result = resume_scan(tmp_path / "s")
     assert result.folder.complete
     assert any("not compared" in w and "centre_x_mm" in w for w in result.warnings)
@@ -206,7 +206,7 @@ def start_scan(rig, folder, **stage):
     ("lost_mm", "is_warned"), [((0.0, 0.0), False), ((0.03, -0.04), False), ((-0.05, 0.0), True), ((0.0, -1.2), True)]
 )
 def test_lost_steps_are_in_the_manifest_and_large_ones_are_a_warning(rig, tmp_path, lost_mm, is_warned):
-    rig.pi.lost_mm = lost_mm
+    rig.pi.lost_steps_mm = lost_mm
     result, ended = start_scan(rig, tmp_path / "s")
     assert (result.exit_status, rig.pi.homings) == ("success", 2)
     assert ended["lost_mm"] == list(lost_mm)
@@ -220,7 +220,7 @@ def test_a_stage_without_switches_is_not_homed_again(rig, tmp_path):
 
 
 def test_homing_that_fails_after_the_last_row_ends_no_scan(rig, tmp_path):
-    rig.pi.home_fails = {2}
+    rig.pi.failing_homings = {2}
     result, ended = start_scan(rig, tmp_path / "s")
     assert result.exit_status == ended["exit_status"] == "success"
     assert "lost_mm" not in ended

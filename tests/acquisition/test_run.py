@@ -136,7 +136,7 @@ def test_keep_incomplete_masks_exactly_what_was_lost(rig, payload, tmp_path):
 
 def test_an_incomplete_row_with_a_frame_too_few_is_masked_as_a_whole(rig, tmp_path):
     for take in (1, 2, 3):
-        rig.cards["RH"].short[1, take] = rig.instrument.frame_bytes
+        rig.cards["RH"].missing_end_bytes[1, take] = rig.instrument.frame_bytes
     run_scan(rig.instrument, tmp_path / "s", keep_incomplete=True)
     scan = ScanFolder.load(tmp_path / "s")
     assert scan.read_row("RH", 1).missing == [(0, rig.instrument.row_bytes)]
@@ -181,7 +181,7 @@ def test_a_scan_whose_host_was_killed_resumes_and_keeps_its_rows(rig, config, pa
         wait_for(lambda: rig.pi.hanging is not None, "row 2")
         host.kill()
     rig.pi.hang_at = set()
-    rig.pi.wanted_end = True
+    rig.pi.end_hanging_row = True
     wait_for(lambda: rig.pi.hanging is None, "the end of row 2")
     scan = ScanFolder.load(tmp_path / "s")
     digests_before = compute_digests(scan)

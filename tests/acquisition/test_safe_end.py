@@ -89,12 +89,12 @@ def test_a_scan_can_be_stopped_before_the_pi_is_asked_for_a_run(rig, tmp_path):
 def test_after_a_lasting_fault_nothing_is_homed_and_the_error_is_that_of_the_fault(rig, tmp_path, fault):
     """The Pi ends row 1 with this fault and stays in state `fault`, as after an emergency stop."""
     rig.pi.fail_rows[1, 1] = fault
-    rig.pi.latched = "stage alarm 14: the emergency stop is pressed"
+    rig.pi.latched_reason = "stage alarm 14: the emergency stop is pressed"
     phases = []
     with expect_refusal(ErrorCode.STAGE_NOT_READY, explain(fault).problem) as e:
         run_scan(rig.instrument, tmp_path / "s", progress=lambda p: phases.append(p.phase))
     assert "retake" not in phases
-    assert rig.pi.latched in e.value.what
+    assert rig.pi.latched_reason in e.value.what
     assert e.value.remedy.startswith(explain(fault).remedy)
     assert f"1 of 4 rows are safe; `polysight resume {tmp_path / 's'}`" in e.value.remedy
     # The stage was homed at the start only.
@@ -109,7 +109,7 @@ def test_at_its_start_a_scan_homes_after_any_fault_but_that_of_the_stage(rig, tm
     """An alarm of the stage may be its emergency stop, and a person has to look at it. `homes`: at start and end."""
     rig.pi.state = "fault"
     rig.pi.fault = fault
-    rig.pi.latched = "the reason"
+    rig.pi.latched_reason = "the reason"
     if homes:
         assert run_scan(rig.instrument, tmp_path / "s").exit_status == "success"
     else:

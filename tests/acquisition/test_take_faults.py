@@ -29,11 +29,11 @@ def lose_a_packet_on_the_way(rig) -> None:
 
 
 def send_no_data(rig) -> None:
-    rig.cards["RV"].short[0, 1] = rig.instrument.row_bytes
+    rig.cards["RV"].missing_end_bytes[0, 1] = rig.instrument.row_bytes
 
 
 def drop_frame(rig) -> None:
-    rig.cards["RV"].short[0, 1] = rig.instrument.frame_bytes
+    rig.cards["RV"].missing_end_bytes[0, 1] = rig.instrument.frame_bytes
 
 
 def hold_row(rig) -> None:
@@ -44,7 +44,7 @@ def hold_row(rig) -> None:
 def make_unlocated(rig) -> None:
     """The first packet is lost, and the record ends too early, within a packet."""
     rig.cards["RV"].drop[0, 1] = {0}
-    rig.cards["RV"].short[0, 1] = 5 * rig.instrument.frame_bytes // 2
+    rig.cards["RV"].missing_end_bytes[0, 1] = 5 * rig.instrument.frame_bytes // 2
 
 
 def lose_edge(rig) -> None:

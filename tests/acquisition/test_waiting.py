@@ -220,7 +220,7 @@ def test_a_row_that_is_held_has_no_time_limit(rig, tmp_path, monkeypatch):
             readings_s.append(60.0 * len(readings_s))
         elif answer:
             rig.pi.hang_at = set()
-            rig.pi.wanted_end = True
+            rig.pi.end_hanging_row = True
         return readings_s[-1] if readings_s else 0.0
 
     monkeypatch.setattr(row, "time", SimpleNamespace(monotonic=monotonic, monotonic_ns=time.monotonic_ns))

@@ -7,8 +7,16 @@ import threading
 
 import numpy as np
 
+from polysight.capture.dca1000 import Code, Status
 from polysight_shared.config import Board
 from tests.support.capture.records import FULL, encode_packet
+
+# Source port of the card's data, and the card's commands (docs/spec/dca1000.md).
+CARD_PORT = 1024
+HEADER = 0xA55A
+FOOTER = 0xEEAA
+# Version 2.4 of the card's FPGA: major in the low 7 bits, minor above.
+CARD_VERSION = 0x0402
 
 
 @functools.cache
@@ -28,7 +36,7 @@ class FakeCard:
         self.commands.bind((board.card_address, board.command_port))
         self.commands.settimeout(0.05)
         self.out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.out.bind((board.card_address, 1024))
+        self.out.bind((board.card_address, CARD_PORT))
         # Counters of the next packet: its number, and the bytes before it.
         self.sequence = 1
         self.count = 0
@@ -38,10 +46,10 @@ class FakeCard:
         self.silent_data = False
         # Codes of all commands.
         self.codes_received: list[int] = []
-        # Faults by (row, take): numbers of the packets that are lost, and bytes that the record lacks at its end, as if
-        # the radar had missed triggers.
+        # Faults by (row, take). Numbers (from 0) of the packets of the record that are lost.
         self.drop: dict[tuple[int, int], set[int]] = {}
-        self.short: dict[tuple[int, int], int] = {}
+        # Bytes that the record lacks at its end, as if the radar had missed triggers.
+        self.missing_end_bytes: dict[tuple[int, int], int] = {}
         # Pulses that the radar missed, for rows that are sent frame by frame.
         self.missed: dict[tuple[int, int], set[int]] = {}
         # Before this pulse the radar takes a spurious edge for a pulse: all later frames come one too early.
@@ -68,33 +76,43 @@ class FakeCard:
                 self._command(code, sender)
 
     def _command(self, code: int, sender: tuple[str, int]) -> None:
-        """Execute a command and reply (docs/spec/dca1000.md: 1 reset, 5 record start, 6 record stop, 0x0E version)."""
-        self.recording = {1: False, 5: True, 6: False}.get(code, self.recording)
-        if code == 5:
+        """Execute a command and reply with status 0, or with the version."""
+        if code in (Code.RESET_FPGA, Code.RECORD_STOP):
+            self.recording = False
+        if code == Code.RECORD_START:
+            self.recording = True
             self.arrivals_ns = {}
             self._record_bytes = 0
         # A reset begins the counters again.
-        if code == 1:
+        if code == Code.RESET_FPGA:
             self.sequence = 1
             self.count = 0
             self._rest = b""
-        self.out.sendto(struct.pack("<HHHH", 0xA55A, code, 0x0402 if code == 0x0E else 0, 0xEEAA), sender)
+        status = CARD_VERSION if code == Code.VERSION else 0
+        self.out.sendto(struct.pack("<HHHH", HEADER, code, status, FOOTER), sender)
 
-    def report_status(self, bits: int = 0x0100) -> None:
+    def report_status(self, bits: int = Status.RECORD_COMPLETED) -> None:
         """Send an asynchronous status, by default that the record is completed."""
-        status = struct.pack("<HHHH", 0xA55A, 0x0A, bits, 0xEEAA)
+        status = struct.pack("<HHHH", HEADER, Code.STATUS, bits, FOOTER)
         self.out.sendto(status, (self.board.host_address, self.board.command_port))
 
     def send_frame(self, row: int, take: int, slot: int, frame_bytes: int, arrival_ns: int) -> None:
-        """Send the frame of one pulse, unless the radar missed it; packets are sent when they are full."""
+        """Send the frame of one pulse, unless the radar missed it; packets are sent when they are full.
+
+        `slot` is the number of the pulse in the row. After a spurious edge the record is full before the last pulse,
+        which gets no frame.
+        """
         self._arrival_ns = arrival_ns
-        extra = self.extra.get((row, take))
-        last = slot == self.row_bytes // frame_bytes - 1
-        if slot == extra:
+        slot_of_extra = self.extra.get((row, take))
+        if slot == slot_of_extra:
             self._rest += bytes(frame_bytes)
-        if slot not in self.missed.get((row, take), ()) and not (last and extra is not None):
+        is_last = slot == self.row_bytes // frame_bytes - 1
+        is_crowded_out = is_last and slot_of_extra is not None
+        is_missed = slot in self.missed.get((row, take), ())
+        if not is_missed and not is_crowded_out:
             data = make_payload(self.board.name, row, self.row_bytes)
-            self._rest += data[slot * frame_bytes : (slot + 1) * frame_bytes]
+            start = slot * frame_bytes
+            self._rest += data[start : start + frame_bytes]
         while len(self._rest) >= FULL:
             self._send_packet(FULL)
 
@@ -120,7 +138,7 @@ class FakeCard:
         if not self.recording or self.silent_data:
             return
         data = make_payload(self.board.name, row, self.row_bytes)
-        data = data[: len(data) - self.short.get((row, take), 0)]
+        data = data[: len(data) - self.missing_end_bytes.get((row, take), 0)]
         destination = (self.board.host_address, self.board.data_port)
         for k, start in enumerate(range(0, len(data), FULL)):
             body = data[start : start + FULL]

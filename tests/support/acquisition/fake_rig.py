@@ -8,14 +8,28 @@ import zmq
 
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
+from polysight_shared.faults import PiFault
 from polysight_shared.raster import Row
 from polysight_simulators.loopback import move_to_free_subnet
 from tests.support.acquisition.fake_cards import FakeCard
 from tests.support.processes import HANG_S
 from tests.support.rigs import make_rig_with
 
-# The Pi's clock less the host's.
+# The Pi's clock less the host's; chosen.
 PI_AHEAD_NS = 77_000_000_000
+# Faults after which the Pi stays in state `fault` until the next homing. After the second two the stage is where it
+# was, so that it counts as homed.
+STAGE_FAULTS = (PiFault.STAGE_LOST, PiFault.STAGE_ALARM)
+FAULTS_AT_A_KNOWN_POSITION = (PiFault.TRIGGER_LINE_LOST, PiFault.JOURNAL_FULL)
+# Time between heartbeats; chosen.
+HEARTBEAT_MS = 50
+# Events in one reply to Replay; chosen. Like the Pi while a row runs it sends fewer than the host requests.
+MAX_REPLAYED_EVENTS = 3
+# Times of a row that is sent frame by frame, chosen: a burst at each position, the pulses in it, and the time from a
+# pulse until its frame arrives.
+BURST_PERIOD_NS = 60_000_000
+PULSE_PERIOD_NS = 1_500_000
+ARRIVAL_DELAY_NS = 100_000
 
 
 class FakePi:
@@ -24,35 +38,40 @@ class FakePi:
     def __init__(self, rig: Instrument, cards: list[FakeCard]) -> None:
         self.rig = rig
         self.cards = cards
-        # Events of every scan.
+        # Events of every scan, by its name.
         self.journal: dict[str, list[m.AnyEvent]] = {}
-        self.stage = rig.stage.placement_settings  # in the reply to Hello; {} as of older releases
+        # The stage's settings in the reply to Hello; older releases of the Pi send {}.
+        self.placement_settings = rig.stage.placement_settings
         self.homed = False
         self.run: m.BeginRun | None = None
         self.state: m.State = "idle"
+        # Homings so far, and the numbers (from 1) of those that fail.
         self.homings = 0
-        self.home_fails = set()
-        self.lost_mm = (0.0, 0.0)
+        self.failing_homings: set[int] = set()
+        # Steps that the motors lost since the last homing, as StatusReply reports them: x and y, mm.
+        self.lost_steps_mm = (0.0, 0.0)
         # Number of events that PUB is still to lose.
         self.lose_events = 0
         # Number of replies still to be lost, and of those lost so far.
         self.lose_replies = 0
         self.replies_lost = 0
-        # (row, take): fault number
+        # Fault with which a row ends, by (row, take).
         self.fail_rows: dict[tuple[int, int], int] = {}
-        # number and reason of the first fault
+        # The fault that StatusReply reports, 0: none, and its reason.
         self.fault = 0
-        self.latched = ""
-        # Rows that never end; half of their data is sent
+        self.latched_reason = ""
+        # Rows that hang: they send half of their data, and do not end.
         self.hang_at: set[int] = set()
-        # Frames are sent one by one, and the times of their pulses are those of a real row
-        self.timed = False
-        self.hang_after_captures = False  # such rows send their bursts before they hang
-        self.hang_held = False  # such rows are held
-        # Reason in RowFinished of a completed row
-        self.notes: dict[tuple[int, int], str] = {}
+        # A hanging row sends the events of its bursts first.
+        self.hang_after_captures = False
+        # The stage is held in a hanging row.
+        self.hang_held = False
         # Set by tests: the hanging row is to end.
-        self.wanted_end = False
+        self.end_hanging_row = False
+        # Frames are sent one by one, and the times of their pulses are those of a real row.
+        self.send_frame_by_frame = False
+        # Reason in RowFinished of a completed row, by (row, take).
+        self.notes: dict[tuple[int, int], str] = {}
         self.commands: list[m.AnyCommand] = []
         self.rows_run: list[tuple[int, int]] = []
         # Rows (row, take) that ran since the last BeginRun.
@@ -69,8 +88,8 @@ class FakePi:
         self._thread.start()
 
     def _serve(self) -> None:
-        """Answer commands, and send a heartbeat every 50 ms."""
-        last = 0.0
+        """Answer commands, and send a heartbeat every `HEARTBEAT_MS`."""
+        last_heartbeat_s = 0.0
         while not self._stop.is_set():
             if self.rep.poll(10):
                 *envelope, raw = self.rep.recv_multipart()
@@ -84,15 +103,14 @@ class FakePi:
                 else:
                     self.rep.send_multipart([*envelope, m.pack(reply)])
                 self._finish_command()
-            if self.wanted_end and self.hanging is not None:
-                self.wanted_end = False
+            if self.end_hanging_row and self.hanging is not None:
+                self.end_hanging_row = False
                 self._finish_hanging()
-            if time.monotonic() - last > 0.05:
-                last = time.monotonic()
+            if time.monotonic() - last_heartbeat_s > HEARTBEAT_MS / 1e3:
+                last_heartbeat_s = time.monotonic()
                 scan = self._scan_id()
-                beat = m.Heartbeat(
-                    scan_id=scan, seq=len(self.journal.get(scan, [])), t_mono_ns=1, state=self.state, period_ms=50
-                )
+                last_seq = len(self.journal.get(scan, []))
+                beat = m.Heartbeat(scan_id=scan, seq=last_seq, t_mono_ns=1, state=self.state, period_ms=HEARTBEAT_MS)
                 self.pub.send_multipart([b"event", m.pack(beat)])
         self.rep.close(linger=0)
         self.pub.close(linger=0)
@@ -122,16 +140,17 @@ class FakePi:
         if isinstance(c, m.Hello):
             return m.HelloReply(
                 pi_release="t", firmware="t", backend="fake", state=self.state, scan_id=scan, last_seq=last,
-                stage=self.stage,
+                stage=self.placement_settings,
             )  # fmt: skip
         if isinstance(c, m.Status):
             return m.StatusReply(
                 state=self.state, homed=self.homed, x_mm=0, y_mm=0, scan_id=scan, row_index=-1, take=0, points=0,
-                pulses=0, last_seq=last, fault=self.fault, reason=self.latched, lost_x_mm=self.lost_mm[0],
-                lost_y_mm=self.lost_mm[1],
+                pulses=0, last_seq=last, fault=self.fault, reason=self.latched_reason, lost_x_mm=self.lost_steps_mm[0],
+                lost_y_mm=self.lost_steps_mm[1],
             )  # fmt: skip
         if isinstance(c, m.EndRun) and (self.hanging is not None or self.run is None):
-            return m.Refused(number=111, problem="a row is running" if self.run else "no run is begun")
+            problem = "a row is running" if self.run else "no run is begun"
+            return m.Refused(number=PiFault.NOT_READY, problem=problem)
         if isinstance(c, m.BeginRun):
             self.run = c
             self._ran = set()
@@ -142,18 +161,19 @@ class FakePi:
             self.homed = True
             self.state = "ready"
             self.fault = 0
-            self.latched = ""
+            self.latched_reason = ""
             self.homings += 1
-            if self.homings in self.home_fails:
+            if self.homings in self.failing_homings:
                 self.homed = False
                 self.state = "fault"
-                self.fault = 102
-                self.latched = "the switch was not found"
+                self.fault = PiFault.STAGE_ALARM
+                self.latched_reason = "the switch was not found"
         elif isinstance(c, m.Replay):
             events = self.journal.get(c.scan_id, [])
-            # Never more than a few, as of a Pi whose row runs
-            few = events[c.from_seq - 1 :][: min(c.limit, 3)]
-            return m.ReplayReply(events=few, last_seq=len(events))
+            # Sequence numbers count from 1.
+            first = c.from_seq - 1
+            count = min(c.limit, MAX_REPLAYED_EVENTS)
+            return m.ReplayReply(events=events[first : first + count], last_seq=len(events))
         elif isinstance(c, m.RunRow):
             # A repeated request runs no row again.
             if (c.row_index, c.take) not in self._ran:
@@ -165,7 +185,7 @@ class FakePi:
             self.hanging = None
             self._emit(
                 m.RowFinished, row_index=row.index, take=take, status="aborted", points=0, edges=0, bursts=0, pulses=0,
-                fault=113, reason=c.reason,
+                fault=PiFault.ABORTED, reason=c.reason,
             )  # fmt: skip
         return m.Accepted(state=self.state)
 
@@ -181,30 +201,30 @@ class FakePi:
                 self.state = "held"
             self.hanging = (row, c.take)
             for card in self.cards:
-                card.short[row.index, c.take] = card.row_bytes // 2
+                card.missing_end_bytes[row.index, c.take] = card.row_bytes // 2
                 card.send_row(row.index, c.take)
             if self.hang_after_captures:
                 self._send_captures(row, c.take)
             return
-        if self.timed:
+        if self.send_frame_by_frame:
             self._send_frames(row, c.take)
         else:
             self._send_captures(row, c.take)
             for card in self.cards:
                 card.send_row(row.index, c.take)
         fault = self.fail_rows.get((c.row_index, c.take), 0)
-        n = row.points
-        # These faults last until the next homing.
-        if fault in (101, 102, 107, 109):
+        if fault in STAGE_FAULTS or fault in FAULTS_AT_A_KNOWN_POSITION:
             self.fault = fault
             self.state = "fault"
-            self.homed = fault in (107, 109)
+            self.homed = fault in FAULTS_AT_A_KNOWN_POSITION
+        n = row.points
         self._emit(
             m.RowFinished, row_index=row.index, take=c.take, status="fault" if fault else "done", points=n, edges=n,
             bursts=n, pulses=n * self.run.pulses, fault=fault, reason=self.notes.get((c.row_index, c.take), ""),
         )  # fmt: skip
 
     def _send_captures(self, row: Row, take: int) -> None:
+        """Send the events of all bursts of a row; times and widths in them are placeholders."""
         assert self.run is not None
         for i in range(row.points):
             self._emit(
@@ -215,16 +235,23 @@ class FakePi:
     def _send_frames(self, row: Row, take: int) -> None:
         """Send all frames together, with the times of a row that has run until now.
 
-        Bursts are 60 ms apart and pulses 1.5 ms, on the Pi's own clock; a frame arrives 0.1 ms after its pulse.
+        Capture events have the Pi's own clock.
         """
         assert self.run is not None
         n = self.run.pulses
-        begin = time.monotonic_ns() - row.points * 60_000_000
+        begin_ns = time.monotonic_ns() - row.points * BURST_PERIOD_NS
         for point in range(row.points):
-            pulses = [begin + point * 60_000_000 + k * 1_500_000 for k in range(n)]
+            burst_ns = begin_ns + point * BURST_PERIOD_NS
+            pulses = [burst_ns + k * PULSE_PERIOD_NS for k in range(n)]
             for k, pulse_ns in enumerate(pulses):
                 for card in self.cards:
-                    card.send_frame(row.index, take, point * n + k, self.rig.frame_bytes, pulse_ns + 100_000)
+                    card.send_frame(
+                        row=row.index,
+                        take=take,
+                        slot=point * n + k,
+                        frame_bytes=self.rig.frame_bytes,
+                        arrival_ns=pulse_ns + ARRIVAL_DELAY_NS,
+                    )
             first = pulses[0] + PI_AHEAD_NS
             self._emit(
                 m.Capture, row_index=row.index, take=take, point=point, column=row.column(point), edge_ns=first,
@@ -279,7 +306,8 @@ class FakeRig:
 def make_small_instrument(columns: int = 3, rows: int = 4, pulses: int = 3, **limits: float) -> Instrument:
     """The published rig with a small grid and few pulses, on a loopback subnet that is free.
 
-    Each of the three attempts of a command waits for its reply as long as `HANG_S`.
+    Each of the three attempts of a command waits for its reply as long as `HANG_S`. The other limits and the receive
+    buffer are chosen: short or small enough for a test, and independent of this machine's disk.
     """
     limits = {"end_of_record_s": 0.25, "command_timeout_s": 3 * HANG_S, "free_disk_bytes": 0, **limits}
     card = {"receive_buffer_bytes": 1 << 20}

@@ -77,7 +77,7 @@ def test_places_outside_the_image_are_refused(processed_scans):
 
 
 def test_without_a_result_no_material_is_reported(tmp_path):
-    write_judged_products(tmp_path, "none", careless=True)
+    write_judged_products(tmp_path, "none", keep_withheld=True)
     answer = probe(tmp_path, 0.0, 0.0)
     assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
     assert {p.name for p in read_result(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}

@@ -20,11 +20,17 @@ NUMBERS = ("2.9", "0.2", "3.0")
 
 def write_products_with_pixels(folder: Path) -> Path:
     """Add the patches.npz that `classify` needs: three patches of four pixels of the simulated library's PET."""
-    rows = [{"label": n, "centre_mm": [30.0 * n, 0.0], "truth": None, "pixels": 4} for n in (1, 2, 3)]
-    places = np.array([[30.0 * n + pixel, 0.0] for n in (1, 2, 3) for pixel in range(4)])
-    # |H|, |V|, and both parts of V / H
-    features = np.tile([0.5, 0.15, 0.3, 0.05], (12, 1))
-    meta = {"format": PATCHES_FORMAT, "angle_deg": 55.0, "simulated": True, "patches": rows}
+    labels = (1, 2, 3)
+    pixels_of_a_patch = 4
+    patches = [
+        {"label": label, "centre_mm": [30.0 * label, 0.0], "truth": None, "pixels": pixels_of_a_patch}
+        for label in labels
+    ]
+    # The pixels of a patch lie in a line, 1 mm apart.
+    places = np.array([[30.0 * label + pixel, 0.0] for label in labels for pixel in range(pixels_of_a_patch)])
+    # Features of a pixel: |H|, |V|, real and imaginary part of V / H. All pixels have the same.
+    features = np.tile([0.5, 0.15, 0.3, 0.05], (len(places), 1))
+    meta = {"format": PATCHES_FORMAT, "angle_deg": 55.0, "simulated": True, "patches": patches}
     out = io.BytesIO()
     np.savez_compressed(
         out,
@@ -39,7 +45,7 @@ def write_products_with_pixels(folder: Path) -> Path:
 @pytest.mark.parametrize("command", ["materials", "permittivity"])
 @pytest.mark.parametrize("level", LEVELS)
 def test_the_verdict_comes_first_and_decides_the_exit_status(tmp_path, capsys, command, level):
-    folder = str(write_judged_products(tmp_path, level, careless=True))
+    folder = str(write_judged_products(tmp_path, level, keep_withheld=True))
     status = main([command, folder])
     out = capsys.readouterr().out
     assert status == (NoResult.exit_status if level == "none" else 0)
@@ -60,7 +66,7 @@ def test_the_verdict_comes_first_and_decides_the_exit_status(tmp_path, capsys, c
 
 @pytest.mark.parametrize("command", ["materials", "permittivity"])
 def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
-    folder = str(write_judged_products(tmp_path, "none", careless=True))
+    folder = str(write_judged_products(tmp_path, "none", keep_withheld=True))
     assert main([command, folder, "--json"]) == NoResult.exit_status
     out = capsys.readouterr().out
     assert [word for word in NAMES if word in out] == []
@@ -78,7 +84,7 @@ def test_json_without_a_result_is_printed_with_nulls(tmp_path, capsys, command):
 
 
 def test_no_layer_is_fitted_without_a_result(tmp_path, capsys):
-    folder = write_judged_products(tmp_path, "none", careless=True)
+    folder = write_judged_products(tmp_path, "none", keep_withheld=True)
     status = main(["permittivity", str(folder), "--layer", "sheet,?,0.5"])
     answer = capsys.readouterr()
     assert status == NoResult.exit_status
@@ -121,11 +127,15 @@ def test_classify_names_nothing_without_a_result_and_no_refused_patch(tmp_path, 
 
 
 def test_products_of_earlier_releases_print_no_verdict(tmp_path, capsys):
-    folder = str(write_judged_products(tmp_path, None))
+    folder = str(write_judged_products(tmp_path, level=None))
     for command in ("materials", "permittivity"):
         assert main([command, folder]) == 0
         out = capsys.readouterr().out
         assert "verdict" not in out
         assert "2.90 - j0.20" in out
         assert "+- 0.20, 0.10" in out
+
+
+def test_the_numbers_looked_for_are_those_of_the_products():
+    """Without this, the tests above could look for numbers that no command would ever print."""
     assert PERMITTIVITY["real"] == 2.9

@@ -41,7 +41,7 @@ def test_every_export_holds_the_verdict_and_p_sigma(tmp_path, level):
 
 def test_without_a_result_no_export_names_anything(tmp_path):
     """Results are withheld even if the files contain names, as written by a faulty program."""
-    folder = write_judged_products(tmp_path / "one", "none", careless=True)
+    folder = write_judged_products(tmp_path / "one", "none", keep_withheld=True)
     out = tmp_path / "out"
     assert any(name in (folder / "materials.json").read_text(encoding="utf-8") for name in NAMES)
     assert main(["export", str(folder), "--mat", "--csv", "--out", str(out)]) == 0

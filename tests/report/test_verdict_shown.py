@@ -104,9 +104,9 @@ def test_reasons_of_less_weight_are_folded(tmp_path):
     assert "reason 20<" in folded_part
 
 
-@pytest.mark.parametrize("careless", [False, True])
-def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, careless):
-    folder = write_judged_products(tmp_path, "none", careless)
+@pytest.mark.parametrize("keep_withheld", [False, True])
+def test_without_a_result_page_and_figures_name_nothing_and_keep_the_images(tmp_path, keep_withheld):
+    folder = write_judged_products(tmp_path, "none", keep_withheld=keep_withheld)
     with skip_rendering():
         text = collect_texts(lambda: write_report(folder, write_products(folder)))
     text += collect_texts(lambda: open_scan(folder).plot())

@@ -62,10 +62,11 @@ def make_segments(level: str | None) -> list[dict[str, Any]]:
     return [metal, pet, noise]
 
 
-def write_judged_products(folder: Path, level: str | None, careless: bool = False, seed: int = 2) -> Path:
+def write_judged_products(folder: Path, level: str | None, keep_withheld: bool = False, seed: int = 2) -> Path:
     """Write the files; the images are noise of this seed.
 
-    With `careless`, names and permittivities are kept although the verdict withholds them.
+    With `keep_withheld`, names and permittivities stand in the files although the verdict withholds them, as of a
+    program that forgot to delete them: who shows the products must not show them.
     """
     rng = np.random.default_rng(seed)
     h, v = (rng.standard_normal((2, 20, 30)) + 1j * rng.standard_normal((2, 20, 30))).astype(np.complex64)
@@ -75,7 +76,7 @@ def write_judged_products(folder: Path, level: str | None, careless: bool = Fals
     content: dict[str, Any] = {
         "scan_id": "s",
         "simulated": True,
-        "segments": make_segments("good" if careless else level),
+        "segments": make_segments("good" if keep_withheld else level),
     }
     quality: dict[str, Any] = {}
     if level is not None:

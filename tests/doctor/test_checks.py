@@ -42,33 +42,37 @@ def test_a_bad_rig_file_is_the_first_and_only_error(tmp_path, broken, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("error       config")
     skipped = [line for line in lines if line.startswith("not checked")]
-    # All but the rig file and this machine's clock
+    # The checks of the rig file and of this machine's clock were run.
     assert len(skipped) == len(CHECKS) - 2
     assert all("config" in line for line in skipped)
     assert "config" in lines[-1]
 
 
-def test_a_burst_that_does_not_fit_between_two_points(tmp_path):
+def test_a_burst_that_does_not_fit_between_two_points_is_an_error(tmp_path):
+    # At 200 mm/s, ten times the published speed, the stage passes a point every 10 ms; a burst takes 24 ms.
+    rig = make_programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0})
     path = tmp_path / "rig.toml"
-    path.write_text(tomli_w.dumps(to_builtins(make_programmed_rig(stage={"speed_mm_s": 200.0, "accel_mm_s2": 2000.0}))))
+    path.write_text(tomli_w.dumps(to_builtins(rig)))
     with CheckContext(DoctorOptions(path), QUICK) as context:
         finding = next(run_checks(context))
     assert (finding.where, finding.level) == ("config", "error")
 
 
-def join_reasons(context, name):
-    return checks._run_check(next(c for c in CHECKS if c.name == name), context, None).level
+def run_check_by_name(context, name):
+    """Run the check with this name; return the level of its finding."""
+    check = next(c for c in CHECKS if c.name == name)
+    return checks._run_check(check, context, None).level
 
 
 def test_simulated_calibration_is_refused_on_a_real_rig(tmp_path):
-    context = make_context(make_programmed_rig(calibration={"hpf": str(write_calibration(filter_file(), tmp_path))}))
+    path = write_calibration(filter_file(), tmp_path)
+    context = make_context(make_programmed_rig(calibration={"hpf": str(path)}))
     hello = HelloReply(pi_release="", firmware="", backend=WIRES, state="homed", scan_id="", last_seq=0)
     assert check_calibration(dataclasses.replace(context, hello=hello)).level == "ok"
     real = msgspec.structs.replace(hello, backend=GPIOD)
-    assert join_reasons(dataclasses.replace(context, hello=real), "calibration") == "error"
-    assert (
-        join_reasons(make_context(make_programmed_rig(calibration={"hpf": "/nowhere.toml"})), "calibration") == "error"
-    )
+    assert run_check_by_name(dataclasses.replace(context, hello=real), "calibration") == "error"
+    rig_without_file = make_programmed_rig(calibration={"hpf": "/nowhere.toml"})
+    assert run_check_by_name(make_context(rig_without_file), "calibration") == "error"
 
 
 @pytest.mark.parametrize(
@@ -86,24 +90,32 @@ def test_a_lost_clock_is_an_error_and_an_unsynchronised_one_a_warning(system, ve
 @pytest.mark.parametrize(("mode", "verdict"), [(0o600, "ok"), (0o640, "warning"), (None, "error")])
 @pytest.mark.parametrize("public_mode", [0o600, 0o644])
 def test_the_secret_key_must_be_there_and_for_its_user_alone(tmp_path, public_mode, mode, verdict):
-    for name, its_mode in zip(HOST_KEYS, (public_mode, mode), strict=True) if mode else ():
-        (tmp_path / name).touch(its_mode)
-        (tmp_path / name).chmod(its_mode)
-    addresses = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602"}
-    assert check_keys(make_context(make_programmed_rig(pi=addresses | {"key_dir": str(tmp_path)}))).level == verdict
+    """`mode` is that of the secret key; None: there are no keys."""
+    if mode is not None:
+        for name, mode_of_key in zip(HOST_KEYS, (public_mode, mode), strict=True):
+            (tmp_path / name).touch(mode_of_key)
+            # The process's umask may have removed bits.
+            (tmp_path / name).chmod(mode_of_key)
+    # Keys are needed only for a Pi on another computer; 192.0.2.1 is reserved for documentation.
+    pi = {"command_address": "tcp://192.0.2.1:5601", "event_address": "tcp://192.0.2.1:5602", "key_dir": str(tmp_path)}
+    assert check_keys(make_context(make_programmed_rig(pi=pi))).level == verdict
 
 
 def test_the_kernel_reports_if_its_clock_is_synchronised():
     assert context.clock_is_synchronised() in (True, False, None)
 
 
-def test_a_full_disk_and_a_slow_one(tmp_path):
-    assert check_disk(make_context(make_programmed_rig(limits={"free_disk_bytes": 1 << 60}), tmp_path)).level == "error"
-    small = make_programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
-    rate = check_disk(make_context(small, tmp_path)).facts["scan_bytes_s"]
+def test_a_full_disk_is_an_error_and_a_slow_one_an_error_or_warning(tmp_path):
+    """A disk must be as fast as the scan's data, and should be twice as fast."""
+    # No disk has 2^60 bytes free.
+    rig_with_huge_reserve = make_programmed_rig(limits={"free_disk_bytes": 1 << 60})
+    assert check_disk(make_context(rig_with_huge_reserve, tmp_path)).level == "error"
+    small_rig = make_programmed_rig(limits={"free_disk_bytes": 0}, grid={"rows": 2})
+    scan_bytes_s = check_disk(make_context(small_rig, tmp_path)).facts["scan_bytes_s"]
+    folder_to_make = tmp_path / "not" / "yet"
     for factor, verdict in ((0.5, "error"), (1.5, "warning"), (3.0, "ok")):
-        system = System(write_speed=lambda _folder, speed=factor * rate: speed)
-        assert check_disk(make_context(small, tmp_path / "not" / "yet", system)).level == verdict
+        system = System(write_speed=lambda _folder, speed=factor * scan_bytes_s: speed)
+        assert check_disk(make_context(small_rig, folder_to_make, system)).level == verdict
 
 
 def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
@@ -114,18 +126,24 @@ def test_the_disk_probe_leaves_nothing_behind(tmp_path, monkeypatch):
 
 def test_the_published_scan_takes_two_hours(tmp_path):
     finding = check_time(make_context(RIG, tmp_path))
-    # 35 s a row, and its ends
+    # 200 rows of 350 points, 2 mm apart, at 20 mm/s: 35 s, and about 3 s to slow down, turn and start again.
     assert finding.facts["seconds"] == pytest.approx(200 * 38, rel=0.05)
+    # Two receivers, 70,000 positions, and 64 KiB of samples at each.
     assert finding.facts["bytes"] == 2 * 70_000 * 65_536
 
 
 def make_kernel_root(tmp_path, mtu=1500, speed=1000, lost=0):
-    """A file system with sysfs and procfs of one interface, with the subnet 192.168.33.0/24."""
+    """A file system with sysfs and procfs of one interface, with the subnet 192.168.33.0/24.
+
+    `mtu` is the largest packet, bytes; `speed` the link's, Mbit/s (-1: unknown); `lost` counts received packets that
+    were dropped.
+    """
     net = tmp_path / "sys/class/net/eth7"
     (net / "statistics").mkdir(parents=True)
     for name, value in (("mtu", mtu), ("speed", speed), ("statistics/rx_missed_errors", lost)):
         (net / name).write_text(f"{value}\n")
     (tmp_path / "proc/net").mkdir(parents=True)
+    # Addresses are hexadecimal with the last byte first: 0021A8C0 is 192.168.33.0.
     route = "Iface Destination Gateway Flags RefCnt Use Metric Mask MTU Window IRTT\n"
     route += "eth7 0021A8C0 00000000 0001 0 0 0 00FFFFFF 0 0 0\n"
     (tmp_path / "proc/net/route").write_text(route)
@@ -189,10 +207,17 @@ def test_only_checks_that_depend_on_a_failed_one_are_skipped(monkeypatch, failin
 
 @pytest.mark.parametrize(("lost", "verdict"), [((0, 0, 0), "ok"), ((0, 0, 50), "ok"), ((0, 5, 50), "warning")])
 def test_receivers_must_keep_up_with_the_configured_rate_of_the_cards(tmp_path, lost, verdict):
-    """Loss at a rate that only faster cards reach is shown, but is not a fault."""
+    """Loss at a rate that only faster cards reach is shown, but is not a fault.
+
+    `lost` are packets of 100 at each of the three rates that are measured; this rig's cards do not reach the third.
+    """
 
     def measure(_rig, rates):
-        return [LoadResult(r, r, 100, n) for r, n in zip(rates, lost, strict=True)], "nice -5"
+        results = [
+            LoadResult(wanted=rate, reached=rate, sent=100, lost=packets)
+            for rate, packets in zip(rates, lost, strict=True)
+        ]
+        return results, "nice -5"
 
     finding = check_receivers(make_context(make_programmed_rig(), tmp_path, System(measure_receivers=measure)))
     assert finding.level == verdict
@@ -204,7 +229,7 @@ def test_the_receivers_are_measured_with_packets_at_each_rate():
     assert scheduling
     assert [(r.wanted, r.sent) for r in results] == [(500.0, 200), (1000.0, 400)]
     assert all(r.reached > 0 for r in results)
-    # Packets of the second record are not taken for leftovers of the first
+    # If packets of the second record were taken for leftovers of the first, all of them would be lost.
     assert results[1].lost < results[0].sent
 
 

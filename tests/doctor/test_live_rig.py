@@ -10,7 +10,7 @@ import time
 import pytest
 from tests.support.calibration import filter_file, read_board_filter
 from tests.support.doctor.case import QUICK
-from tests.support.doctor.live_rig import answering
+from tests.support.doctor.live_rig import answer_as_pi
 from tests.support.processes import wait_for
 from tests.support.refusals import expect_refusal
 from tests.support.store.facts import load_facts
@@ -25,9 +25,15 @@ from polysight.store.validation import validate
 from polysight_shared import __version__
 from polysight_shared.config import load_instrument
 from polysight_shared.errors import ErrorCode
+from polysight_shared.faults import PiFault
 from polysight_shared.messages import WIRE_VERSION, BeginRun, HelloReply
 from polysight_shared.raster import plan_raster
 from polysight_simulators.builds import sketch_compiler
+
+# The published burst, as a scan by another host.
+PULSES = 16
+PERIOD_US = 1500
+WIDTH_US = 1
 
 
 def assert_failed(findings, *names):
@@ -47,21 +53,25 @@ def test_all_checks_of_a_healthy_rig_pass(live, capsys):
     assert [f for f in document["findings"] if f["verdict"] == "error"] == []
     assert (status, document["ok"], document["simulated"]) == (0, True, True)
     assert {n for n, f in findings.items() if f["verdict"] not in ("ok", "warning")} == set()
+    # The doctor moves the stage past 8 positions, and then sends 64 pulses.
     assert findings["trigger line"]["facts"]["edges"] == 8
-    assert findings["radar RH"]["facts"]["frames"] == findings["pulses"]["facts"]["pulses"] == 64
+    assert findings["pulses"]["facts"]["pulses"] == 64
+    assert findings["radar RH"]["facts"]["frames"] == 64
+    # Both programs have this machine's clock; a minute (chosen) is room for a busy machine.
     assert abs(findings["pi clock"]["facts"]["offset_s"]) < 60
+    # The mean of 64 chirps with trigger clocks of 5 ns has an error of 0.4 ns; 3 ns are chosen.
     assert abs(findings["trigger skew"]["facts"]["skew_ns"]) < 3
 
 
 def test_nothing_moves_and_no_pulse_is_sent_by_default(live):
-    def read_place():
+    def read_position_and_state():
         with live.connect_to_pi() as pi:
             status = pi.status()
             return status.x_mm, status.y_mm, status.state
 
-    place_before = read_place()
+    position_before = read_position_and_state()
     findings = live.run_doctor(pulse=False)
-    assert read_place() == place_before
+    assert read_position_and_state() == position_before
     assert_failed(findings)
     assert {n for n, f in findings.items() if f.level == "note"} == {
         "trigger line", "pulses", "radar RH", "radar RV", "level RH", "level RV", "direct path RH", "direct path RV",
@@ -69,13 +79,15 @@ def test_nothing_moves_and_no_pulse_is_sent_by_default(live):
     }  # fmt: skip
 
 
-def test_the_pis_clock_is_off(live):
-    findings = live.run_doctor(system=dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + 3_600_000_000_000))
+def test_a_pi_whose_clock_is_an_hour_slow_is_an_error(live):
+    hour_ns = 3_600_000_000_000
+    system = dataclasses.replace(QUICK, wall_ns=lambda: time.time_ns() + hour_ns)
+    findings = live.run_doctor(system=system)
     assert_failed(findings, "pi clock")
     assert findings["pi clock"].facts["offset_s"] == pytest.approx(-3600, abs=10)
 
 
-def test_a_pi_that_hangs(live):
+def test_a_pi_that_hangs_fails_alone_and_the_cards_are_still_checked(live):
     with live.stop_process("polysight-pi"):
         findings = live.run_doctor(pulse=True)
     assert_failed(findings, "pi")
@@ -86,43 +98,53 @@ def test_a_pi_that_hangs(live):
     assert findings["card RH"].level == "ok"
 
 
-def test_a_card_that_is_mute(live):
+def test_a_card_that_is_mute_fails_alone_and_the_other_is_still_checked(live):
     with live.stop_process("--boards RV"):
         findings = live.run_doctor(pulse=True)
     assert_failed(findings, "card RV")
     assert list_skipped(findings, "card RV") == ["buffer RV", "radar RV", "level RV", "direct path RV", "trigger skew"]
-    # The other board is checked to its end
+    # The last check of the other board was run.
     assert findings["direct path RH"].level == "ok"
 
 
-def test_a_receive_buffer_that_is_too_small(live):
-    findings = live.run_doctor(live.write_variant(lambda table: table["card"].update(receive_buffer_bytes=4096)))
+def test_a_receive_buffer_that_is_too_small_is_an_error(live):
+    # Room for two packets.
+    variant = live.write_variant(lambda table: table["card"].update(receive_buffer_bytes=4096))
+    findings = live.run_doctor(variant)
     assert_failed(findings, "buffer RH", "buffer RV")
 
 
-def test_a_sync_in_wire_that_is_cut(live):
+def test_a_sync_in_wire_that_is_cut_is_an_error_of_both_radars(live):
     with live.cut(live.instrument.pi.sync_out[0]):
         findings = live.run_doctor(pulse=True)
     assert_failed(findings, "radar RH", "radar RV")
-    # The Pi cannot detect it
+    # The Pi sends its pulses, and cannot detect that they do not arrive.
     assert findings["pulses"].level == "ok"
 
 
 def test_a_scan_in_progress_is_not_disturbed(live):
     rig = live.instrument
-    run = BeginRun(scan_id="another", plan=plan_raster(rig.grid), pulses=16, period_us=1500, width_us=1, speed_mm_s=20)
+    run = BeginRun(
+        scan_id="another",
+        plan=plan_raster(rig.grid),
+        pulses=PULSES,
+        period_us=PERIOD_US,
+        width_us=WIDTH_US,
+        speed_mm_s=20,
+    )
     with live.connect_to_pi() as pi:
         pi.begin_run(run)
         findings = live.run_doctor(pulse=True, move=True)
         with expect_refusal(ErrorCode.REFUSED_BY_PEER, "another"):
-            pi.pulse(16, 1500, 1)
+            pi.pulse(PULSES, PERIOD_US, WIDTH_US)
         pi.end_run("another", "abort", "test")
     assert_failed(findings, "rig is free")
     assert {"card RH", "card RV", "pulses", "trigger line"} <= set(list_skipped(findings, "rig is free"))
 
 
 def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
-    filters = filter_file(rv=read_board_filter(172.5, 347.0))
+    # RH has the corners of `filter_file`, 180.5 and 355.25 kHz.
+    filters = filter_file(rv=read_board_filter(first_khz=172.5, second_khz=347.0))
     path = write_calibration(filters, live.folder / "calibration")
 
     def shorten_scan(table):
@@ -143,24 +165,27 @@ def test_a_scan_keeps_the_calibration_it_was_taken_with(live):
     assert pipeline.synchroniser.setups["RV"].equaliser.model.corners_hz == (172.5e3, 347e3)
 
 
-def test_a_trigger_wire_that_is_cut(live):
+def test_a_trigger_wire_that_is_cut_is_an_error_without_edges(live):
     with live.cut(live.instrument.pi.trigger_in):
         findings = live.run_doctor(move=True)
     try:
         assert_failed(findings, "trigger line")
         assert findings["trigger line"].facts["edges"] == 0
     finally:
+        # The fault that the Pi reported lasts until the next homing.
         live.home()
 
 
-def test_a_stage_that_is_silent(live):
+def test_a_silent_stage_fails_alone_and_the_cards_are_still_checked(live):
+    # The stage is the compiled sketch, which alone has this option, or its Python stand-in.
+    word_in_command = "--trigger-line" if sketch_compiler() else "polysight_simulators.stage"
     try:
-        with live.stop_process("--trigger-line" if sketch_compiler() else "polysight_simulators.stage"):
+        with live.stop_process(word_in_command):
             with live.connect_to_pi() as pi:
                 wait_for(lambda: pi.status().state == "fault", "the fault")
             findings = live.run_doctor(move=True)
         assert_failed(findings, "stage")
-        assert findings["stage"].facts["fault"] == 101
+        assert findings["stage"].facts["fault"] == PiFault.STAGE_LOST
         assert list_skipped(findings, "stage") == ["trigger line"]
         assert findings["card RV"].level == "ok"
     finally:
@@ -170,15 +195,19 @@ def test_a_stage_that_is_silent(live):
 # --- a fake Pi at the real socket ---
 
 
-def reply(**changes):
+def make_hello_reply(**changes):
+    """The reply of a homed Pi of this release, with `changes`."""
     values = {"pi_release": __version__, "firmware": __version__, "backend": "gpiod", "state": "homed"}
     return HelloReply(**{**values, "scan_id": "", "last_seq": 0, "t_unix_ns": 0, **changes})
 
 
 def test_a_pi_of_this_release_is_ok(deaf_rig):
-    with answering(deaf_rig.instrument, reply()):
+    with answer_as_pi(deaf_rig.instrument, make_hello_reply()):
         findings = deaf_rig.run_doctor()
-    assert findings["pi"].level == findings["stage"].level == findings["rig is free"].level == "ok"
+    assert findings["pi"].level == "ok"
+    assert findings["stage"].level == "ok"
+    assert findings["rig is free"].level == "ok"
+    # Its reply has the time 0: such a Pi does not say what its clock shows.
     assert findings["pi clock"].level == "note"
     assert [n for n, f in findings.items() if f.level == "error"] == ["card RH", "card RV"]
 
@@ -187,6 +216,7 @@ def test_a_pi_of_this_release_is_ok(deaf_rig):
     ("changes", "version", "check", "skips"),
     [
         ({"pi_release": "0.0.9"}, WIRE_VERSION, "pi", "stage"),
+        # Any version of the wire but this release's.
         ({}, "2.0", "pi", "stage"),
         ({"firmware": "0.0.7"}, WIRE_VERSION, "stage", "trigger line"),
         ({"firmware": ""}, WIRE_VERSION, "stage", "trigger line"),
@@ -194,7 +224,7 @@ def test_a_pi_of_this_release_is_ok(deaf_rig):
     ids=["release", "wire version", "sketch", "no sketch"],
 )
 def test_a_pi_of_another_release_is_an_error(deaf_rig, changes, version, check, skips):
-    with answering(deaf_rig.instrument, reply(**changes), version):
+    with answer_as_pi(deaf_rig.instrument, make_hello_reply(**changes), version):
         findings = deaf_rig.run_doctor()
     assert findings[check].level == "error"
     assert all(value in findings[check].what for value in changes.values())

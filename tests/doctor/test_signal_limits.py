@@ -12,15 +12,28 @@ from polysight.doctor.signal_checks import check_level, judge_direct_path, judge
 
 RIG = make_programmed_rig()
 SLOPE = RIG.chirp.slope_hz_per_s
-# Middle of the samples 0 to 191, seconds after the first one
+# Middle of the samples that are used, 0 to 191; seconds after the first one.
 MIDDLE_S = 95.5 / RIG.chirp.sample_rate_hz
+# IF of the direct path, chosen: inside the band of 0 to 1935 kHz.
 EXPECTED_HZ = 900e3
+# Chirps of a signal; chosen.
+CHIRPS = 40
 
 
 def make_signal(
-    delay_ns: float = 0.0, ppm: float = 0.0, jitter_ns: float = 0.0, found: int = 40, chirps: int = 40, **changes: Any
+    delay_ns: float = 0.0,
+    ppm: float = 0.0,
+    jitter_ns: float = 0.0,
+    found: int = CHIRPS,
+    chirps: int = CHIRPS,
+    **changes: Any,
 ) -> DirectSignal:
-    """A direct path of a board that starts this much later, with a faster crystal, and jitter up and down."""
+    """A direct path, found in `found` of the chirps, of a board that starts `delay_ns` late with a crystal `ppm` fast.
+
+    The jitter of successive chirps is alternately `jitter_ns` and its negative. `changes` replace other fields.
+    """
+    # The IF is the difference of both boards' frequencies f0 + K t. With a crystal that is faster by p the frequency
+    # rises from f0 (1 + p), and by K (1 + p)^2 a second, because the clock that times the ramp is faster, too.
     offset_hz = ppm * 1e-6 * (RIG.chirp.first_sample_hz + 2 * SLOPE * MIDDLE_S)
     signs = np.where(np.arange(found) % 2, 1.0, -1.0)
     fields: dict[str, Any] = {
@@ -43,7 +56,8 @@ def test_delay_and_crystal_are_separated(ppm, delay_ns):
     assert signal.crystal_ppm(RIG) == pytest.approx(ppm)
     mean_s, error_s = signal.start_delay_s(RIG)
     assert mean_s * 1e9 == pytest.approx(delay_ns, abs=1e-3)
-    assert error_s * 1e9 == pytest.approx(2.0 / np.sqrt(39), rel=1e-3)
+    # The standard deviation of +-2 ns in 40 chirps is 2 ns x sqrt(40 / 39); the mean's error is that / sqrt(40).
+    assert error_s * 1e9 == pytest.approx(2.0 / np.sqrt(CHIRPS - 1), rel=1e-3)
     assert make_signal(found=1, chirps=1).start_delay_s(RIG)[1] == np.inf
 
 
@@ -68,6 +82,7 @@ def test_frequencies_on_both_sides_of_the_rate_lie_together():
     near = unwrap_if(given, RIG)
     assert np.ptp(near) == pytest.approx(0.05 * rate)
     np.testing.assert_allclose((near - given) / rate, np.round((near - given) / rate), atol=1e-9)
+    # Frequencies that lie together already are not changed.
     inside = np.array([0.4, 0.5, 0.6]) * rate
     np.testing.assert_allclose(unwrap_if(inside, RIG), inside)
 
@@ -81,7 +96,7 @@ def test_a_board_starts_within_10_ns_of_the_transmitter(delay_ns, level):
     assert finding.level == level
     if level == "warning":
         assert f"{-delay_ns:+.1f} ns away" in finding.what
-        # The start offset that the board would have then
+        # A late start looks like a lower start frequency: the remedy gives the offset that would explain it.
         offset_hz = board.start_offset_hz - delay_ns * 1e-9 * SLOPE
         assert f"start_offset_hz = {offset_hz:.0f} for {board.name}" in finding.do
 
@@ -89,7 +104,8 @@ def test_a_board_starts_within_10_ns_of_the_transmitter(delay_ns, level):
 @pytest.mark.parametrize(
     ("expected_hz", "found", "words"),
     [
-        # 194 kHz of jitter at either end of 0 to 1935 kHz, and nine tenths of the chirps
+        # A clock of 5 ns moves the IF by 194 kHz: the path must be so far from both ends of the band, 0 and 1935 kHz.
+        # It must be found in nine tenths of the 40 chirps.
         (195e3, 40, ""), (193e3, 40, "too near the edge"), (1740e3, 40, ""), (1742e3, 40, "too near the edge"),
         (900e3, 36, ""), (900e3, 35, "too near the edge"), (900e3, 20, "no direct path in 20 of 40"),
         (1936e3, 40, "outside 0..1935 kHz"), (-1e3, 40, "outside 0..1935 kHz"), (-1e3, 5, "no direct path in 35 of 40"),
@@ -102,29 +118,32 @@ def test_a_direct_path_has_room_for_jitter_in_the_band(expected_hz, found, words
     assert finding.level == ("error" if words else "ok")
     assert words in finding.what
     if "edge" in words or "outside" in words:
-        # Into the middle of the band
-        assert f"start_offset_hz = {board.start_offset_hz + 967.5e3 - expected_hz:.0f}" in finding.do
+        # The remedy moves the path into the middle of the band.
+        middle_hz = 967.5e3
+        assert f"start_offset_hz = {board.start_offset_hz + middle_hz - expected_hz:.0f}" in finding.do
 
 
 @pytest.mark.parametrize(
     ("skew_ns", "level"),
     [(9.9, "ok"), (10.1, "warning"), (-10.1, "warning"), (19.9, "warning"), (20.1, "error"), (-20.1, "error")],
 )
-def test_receivers_start_together(skew_ns, level):
-    finding = judge_skew(RIG, {"RH": make_signal(-30.0), "RV": make_signal(skew_ns - 30.0)})
+def test_receivers_start_within_10_ns_of_each_other(skew_ns, level):
+    """Both start 30 ns early, which would be too much of one: only their difference is judged here."""
+    rh_delay_ns = -30.0
+    finding = judge_skew(RIG, {"RH": make_signal(rh_delay_ns), "RV": make_signal(rh_delay_ns + skew_ns)})
     assert finding.level == level
     assert f"RV starts {skew_ns:+.2f} +- 0.00 ns after RH" in finding.what
-    assert finding.facts["later_ns"]["RH"] == pytest.approx(-30.0, abs=1e-3)
+    assert finding.facts["later_ns"]["RH"] == pytest.approx(rh_delay_ns, abs=1e-3)
 
 
 @pytest.mark.parametrize(("jitter_ns", "level"), [(3.9, "ok"), (4.1, "warning")])
-def test_starts_scatter_by_less_than_two_clocks(jitter_ns, level):
-    for signals in ((jitter_ns, 0.0), (0.0, jitter_ns)):
-        finding = judge_skew(
-            RIG, {name: make_signal(jitter_ns=j) for name, j in zip(("RH", "RV"), signals, strict=True)}
-        )
+def test_more_jitter_than_4_ns_of_one_receiver_is_a_warning(jitter_ns, level):
+    """4 ns are twice the standard deviation that two trigger clocks of 5 ns cause."""
+    for rh_jitter_ns, rv_jitter_ns in ((jitter_ns, 0.0), (0.0, jitter_ns)):
+        signals = {"RH": make_signal(jitter_ns=rh_jitter_ns), "RV": make_signal(jitter_ns=rv_jitter_ns)}
+        finding = judge_skew(RIG, signals)
         assert finding.level == level
-        assert finding.facts["standard_error_ns"] == pytest.approx(jitter_ns / 39**0.5, rel=1e-3)
+        assert finding.facts["standard_error_ns"] == pytest.approx(jitter_ns / (CHIRPS - 1) ** 0.5, rel=1e-3)
 
 
 def judge_words(words: np.ndarray) -> Any:
@@ -136,6 +155,7 @@ def judge_words(words: np.ndarray) -> Any:
 
 
 def make_words(level: int = 100) -> np.ndarray:
+    """Words of 200 complete chirps and one that is not, each of 16 samples; all have this value."""
     return np.full((201, 16, 2, 4), level, np.int16)
 
 
@@ -144,8 +164,9 @@ def make_words(level: int = 100) -> np.ndarray:
 def test_one_percent_of_clipped_chirps_is_a_warning(full, clipped, level):
     words = make_words()
     for chirp in range(clipped):
-        words[chirp, 3, chirp % 2, 1] = full
-    # What is not complete does not count, and almost full is not full.
+        i_or_q = chirp % 2
+        words[chirp, 3, i_or_q, 1] = full
+    # The incomplete chirp does not count, and one count below full scale is not clipped.
     words[-1] = full
     words[10, 0, 0, 0] = 32766
     finding = judge_words(words)
@@ -159,7 +180,7 @@ def test_one_percent_of_clipped_chirps_is_a_warning(full, clipped, level):
     [
         ((100, 100, 100, 100), ""), ((100, 8, 100, 100), ""), ((100, 100, 6, 100), "RX3"),
         ((0, 100, 0, 100), "RX1, RX3"),
-        # Noise of 4 counts, I and Q together
+        # The least rms of a signal is 4 counts, I and Q together: 3 x sqrt(2) is above it, 2 x sqrt(2) below.
         ((3, 3, 3, 3), ""), ((2, 2, 2, 2), "RX1, RX2, RX3, RX4"),
     ],
 )  # fmt: skip

@@ -15,7 +15,7 @@ from tests.support.capture.records import FULL, encode_packet
 CARD_PORT = 1024
 HEADER = 0xA55A
 FOOTER = 0xEEAA
-# Version 2.4 of the card's FPGA: major in the low 7 bits, minor above.
+# Version 2.8 of the card's FPGA: the major number in bits 0 to 6, the minor one in bits 7 to 13.
 CARD_VERSION = 0x0402
 
 

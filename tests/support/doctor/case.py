@@ -11,14 +11,18 @@ from polysight.sync import BoardSetup
 from polysight_simulators.scene import SimulatedRig, decode_scene
 from tests.support.rigs import make_programmed_rig
 
-# A computer whose disk and receivers count as fast enough, without a measurement.
-QUICK = System(
-    write_speed=lambda _folder: 200e6,
-    measure_receivers=lambda _rig, rates: ([LoadResult(r, r, 9, 0) for r in rates], "any core"),
-)
-# Frames of a board at rest.
+
+def report_no_loss(_rig, rates):
+    """Stands in for the measurement of the receivers: each rate is reached, and none of nine packets is lost."""
+    return [LoadResult(wanted=rate, reached=rate, sent=9, lost=0) for rate in rates], "any core"
+
+
+# A computer whose disk (200 MB/s, chosen) and receivers count as fast enough, without a measurement.
+QUICK = System(write_speed=lambda _folder: 200e6, measure_receivers=report_no_loss)
+# Frames of a board at rest; chosen.
 FRAMES = 32
 RIG = make_programmed_rig()
+# A scene of one point in front of the middle of a small grid.
 SMALL = {
     "name": "s",
     "grid": {"columns": 4, "rows": 2},
@@ -27,19 +31,24 @@ SMALL = {
 
 
 def simulate_frames(board, rig=RIG, **disturbances):
-    """Frames of a board at rest, int16 [frame, sample, 2, rx]; simulated."""
+    """Simulated frames of a board at rest, int16 [frame, sample, I or Q, RX]; `disturbances` as in a scene file."""
     scene = decode_scene({**SMALL, "disturbances": {"if_offset_hz": 0.0, **disturbances}}, "test")
     radar = SimulatedRig(rig, scene)
-    return radar.chirps(board, np.zeros(FRAMES), np.zeros(FRAMES)).reshape(FRAMES, -1, 2, 4)
+    x_mm = np.zeros(FRAMES)
+    y_mm = np.zeros(FRAMES)
+    return radar.chirps(board, x_mm, y_mm).reshape(FRAMES, -1, 2, 4)
 
 
-setup_of = functools.cache(lambda board: BoardSetup.from_rig(RIG, RIG.by_name(board)))  # no start frequency changes it
+@functools.cache
+def make_setup(board):
+    """The setup by which a board's direct path is found. It is the same for any start frequency: made once."""
+    return BoardSetup.from_rig(RIG, RIG.by_name(board))
 
 
 def make_direct_signal(board, rig=RIG, **disturbances):
-    """The doctor's finding on the direct path in simulated frames of a board."""
+    """The direct path that the doctor finds in simulated frames of a board."""
     words = simulate_frames(board, rig, **disturbances)
-    return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), setup_of(board))
+    return find_direct(rig, rig.by_name(board), words, np.ones(FRAMES, bool), make_setup(board))
 
 
 def make_context(rig=RIG, out=Path(), system=QUICK, **more):

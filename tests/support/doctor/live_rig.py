@@ -41,7 +41,7 @@ if_offset_hz = 0.0
 
 
 def make_impatient_rig() -> Instrument:
-    """A rig with the direct path mid-band and short timeouts."""
+    """A rig with the direct path mid-band and short timeouts (chosen), which needs hardly any free space."""
     return make_programmed_rig(limits={"command_timeout_s": 6.0, "end_of_record_s": 1.0, "free_disk_bytes": 1 << 20})
 
 
@@ -87,7 +87,7 @@ class LiveRig:
 
     @contextmanager
     def stop_process(self, word: str) -> Iterator[None]:
-        """Stop (SIGSTOP) the rig's process with this word in its command line, as if it hung."""
+        """Stop (SIGSTOP) the rig's only process with this word in its command line, as if it hung."""
         pid = self._pid(word)
         os.kill(pid, signal.SIGSTOP)
         try:
@@ -97,7 +97,7 @@ class LiveRig:
 
     @contextmanager
     def cut(self, line: int) -> Iterator[None]:
-        """Cut a GPIO wire."""
+        """Cut the wire of a GPIO line for a block: `X LINE 1` on the simulated wires, and `X LINE 0` joins it again."""
         with socket.socket(socket.AF_UNIX) as wires:
             wires.connect(str(self.folder / "rig" / "wires.sock"))
             wires.settimeout(HANG_S)
@@ -123,9 +123,12 @@ class LiveRig:
 
 
 @contextmanager
-def answering(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSION) -> Iterator[None]:
-    """Run a fake Pi that answers `hello`, and reports to every other request that it is at rest."""
-    rest = m.StatusReply(
+def answer_as_pi(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSION) -> Iterator[None]:
+    """Run a fake Pi that answers `hello`, and reports to every other request that it is at rest.
+
+    `version` is that of the wire protocol in its replies.
+    """
+    resting = m.StatusReply(
         state=hello.state, homed=True, x_mm=0, y_mm=0, scan_id="", row_index=-1, take=0, points=0, pulses=0,
         last_seq=0, fault=0, reason="",
     )  # fmt: skip
@@ -138,7 +141,7 @@ def answering(rig: Instrument, hello: m.HelloReply, version: str = m.WIRE_VERSIO
         while not stop.is_set():
             if replies.poll(20):
                 command = m.unpack_command(replies.recv())
-                reply = hello if isinstance(command, m.Hello) else rest
+                reply = hello if isinstance(command, m.Hello) else resting
                 replies.send(msgpack.packb({**msgspec.to_builtins(reply), "version": version}))
 
     thread = threading.Thread(target=serve)

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+# Code before that of a test: packages in `absent` cannot be imported, nor can their modules.
 BLOCK = """
 import sys
 class Absent:
@@ -23,6 +24,7 @@ HOST_ONLY = (
     "polysight",
     "polysight_simulators",
 )
+# Imports every module of the Pi's packages but those that run a program when they are imported.
 EVERYTHING = """
 import importlib, pkgutil
 import polysight_pi, polysight_shared
@@ -34,20 +36,21 @@ for package in (polysight_pi, polysight_shared):
 
 
 def run_alone(code: str, *absent: str) -> subprocess.CompletedProcess[str]:
+    """Run code in a new interpreter in which these packages are absent."""
     code = BLOCK.format(absent=set(absent)) + code
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
 
 
-def test_every_module_imports():
+def test_every_module_of_the_pi_imports_without_the_host_s_dependencies():
     ended = run_alone(EVERYTHING, *HOST_ONLY)
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_the_block_blocks():
+def test_an_absent_package_cannot_be_imported():
     assert "No module named 'numpy'" in run_alone("import numpy", *HOST_ONLY).stderr
 
 
-def test_gpio_without_gpiod_is_one_message():
+def test_gpio_without_gpiod_is_an_error_that_names_it():
     code = (
         "from polysight_pi.lines import load_gpiod\n"
         "from polysight_shared.errors import PolysightError\n"

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 import tomli_w
-from tests.support.rigs import load_rig_table
+from tests.support.rigs import MID_BAND_OFFSET_HZ, load_rig_table
 from tests.support.store.facts import load_facts
 
 from polysight.acquisition.progress import ScanResult
@@ -15,6 +15,9 @@ from polysight.acquisition.scan import run_scan
 from polysight.store.validation import validate
 from polysight_shared.config import load_instrument
 
+# First bytes of the command that starts frames, as hexadecimal words of two bytes, low byte first: its ID 0x0140, its
+# length of 8 bytes, the action 1 (start), and 0.
+START_FRAMES = "4001080001000000"
 COLUMNS = 8
 ROWS = 3
 CHIRPS = 4
@@ -29,21 +32,24 @@ def scan_three_rows(bench, radar: dict[str, Any], burst: dict[str, Any]) -> Scan
     table["limits"] |= {"end_of_record_s": 1.0, "row_retakes": 2, "command_timeout_s": 5.0}
     table["radar"] = radar
     for board in table["boards"]:
-        board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else 790e3
+        board["start_offset_hz"] = 0.0 if board["role"] == "transmit" else MID_BAND_OFFSET_HZ
     (bench.folder / "rig.toml").write_text(tomli_w.dumps(table))
     options = ("--config", "rig.toml", "--dir", bench.folder / "rig", "--pattern", "--time-scale", "40", "--with-pi")
     rig = bench.start("python", "-m", "polysight_simulators.rig", *options)
-    result = run_scan(load_instrument(bench.folder / rig.wait_ready()), bench.folder / "scan")
+    config = bench.folder / rig.wait_ready()
+    result = run_scan(load_instrument(config), bench.folder / "scan")
     rig.end()
     assert result.exit_status == "success"
     assert validate(bench.folder / "scan") == []
-    counts: dict[str, Any] = {}
+    # Each simulated card writes what its radar did at its end.
+    board_counts: dict[str, Any] = {}
     for path in (bench.folder / "rig").glob("cards-*.json"):
-        counts |= json.loads(path.read_text())["boards"]
-    for board in counts.values():
-        assert board["rearmed"] == ROWS + result.retakes
+        board_counts |= json.loads(path.read_text())["boards"]
+    for counts in board_counts.values():
+        assert counts["rearmed"] == ROWS + result.retakes
         if result.retakes == 0:
-            assert board.get("unarmed", 0) == 0
+            # No pulse came while the radar was not armed.
+            assert counts.get("unarmed", 0) == 0
     return result
 
 
@@ -60,21 +66,22 @@ def test_native_radars_make_a_frame_of_many_chirps_at_each_pulse(bench):
     assert {row.pulses for row in result.folder.committed_rows().values()} == {COLUMNS}
     data = result.folder.read_row("RH", 0)
     assert data.frames_expected == COLUMNS * CHIRPS
+    # The pattern counts on through every chirp; the upper four bits of its words are no part of the count.
     words = data.payload.view("<u4") & 0x0FFFFFFF
-    # The pattern counts on through every chirp
     assert (words == range(words[0], words[0] + words.size)).all()
     first, *rows = load_facts(result.folder, "radars")
     for answer in first["boards"].values():
         assert answer["state"] == "configured"
         assert answer["rf_firmware"] != ""
         assert answer["calibration"]["passed"]
-        assert answer["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}  # from RAM
-        # The flash was empty
+        # The simulated radar boots from RAM, in this time.
+        assert answer["boot"] == {"power_up_us": 1856.08, "boot_errors": 0, "tests_failed": 0, "cure": ""}
+        # Its flash was empty.
         assert any("no image header" in line for line in answer["events"])
     assert len({answer["die_id"] for answer in first["boards"].values()}) == 3
     assert "direct_if_hz" in first
     assert [r["row"] for r in rows if all(b["state"] == "done" for b in r["boards"].values())] == [0, 1, 2]
     for fact in rows:
-        # The start
-        assert all(any("4001080001000000" in sent for sent in b["sent"]) for b in fact["boards"].values())
-        assert all(b["temperatures_c"]["rx1"] for b in fact["boards"].values())
+        for board in fact["boards"].values():
+            assert any(START_FRAMES in sent for sent in board["sent"])
+            assert board["temperatures_c"]["rx1"]

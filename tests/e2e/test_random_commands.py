@@ -17,10 +17,12 @@ from tests.support.paths import RIG_FILE
 from tests.support.scenes import write_small_scene
 
 from polysight.cli.main import main
+from polysight_shared.errors import ConfigError, DataError, DeviceError, ScanError
 from polysight_simulators.__main__ import main as simulators
 
 # They serve, wait for a rig, or run for minutes; other tests give them wrong input.
 NOT_DRAWN = ("serve", "preview", "demo", "simulate", "reproduce", "scan", "resume", "doctor", "card", "radar", "ask")
+# Values that are mostly wrong: no number, too large, too small, or of another form than the option takes.
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e308", "5e-324", "9" * 20, "1_000", "0x10", "half", "1,2", "1,2,3,4,5")
 BOXES = ("0,0,nan,40", "1,2,3,4", "0,0,0,0", "-60,0,1e9,40", "a=1,2,3", "=b", "a=")
 LAYERS = ("glass,5.5,nan,3", "a,metal,3", "glass,1,2", "?", "glass,?,?", "glass,?,3-1")
@@ -29,8 +31,18 @@ FILES = (
     "scan", "scan/raw", "scan/products", "scan/manifest.jsonl", "scan/products/image.npz", "text.txt", "random.bin",
     "empty", "array.npz", "damaged.toml", "instrument.toml", "/dev/null", "no folder/no file",
 )  # fmt: skip
+# Command lines that are drawn; chosen. With --long this many for each command.
 CASES = 60
-CASES_LONG = 500  # for each command
+CASES_LONG = 500
+
+
+# Errors of the command line or of a file, a device, or a scan say what to do.
+STATUSES_WITH_A_REMEDY = (
+    ConfigError.exit_status,
+    DataError.exit_status,
+    DeviceError.exit_status,
+    ScanError.exit_status,
+)
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +71,10 @@ def list_command_parsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def draw_value(action: argparse.Action, draw: random.Random) -> str:
-    """A value of an option, which is sometimes right and mostly wrong."""
+    """A value of an option, which is sometimes right and mostly wrong; all shares here are chosen."""
     if action.choices and draw.random() < 0.6:
         return str(draw.choice(list(action.choices)))
+    # Files twice, as most arguments are files; the last values are right for many options.
     kind = draw.choice((FILES, FILES, NUMBERS, BOXES, LAYERS, WORDS, ("scan", "3", "out/x")))
     return draw.choice(kind)
 
@@ -86,14 +99,13 @@ def draw_words(parser: argparse.ArgumentParser, draw: random.Random) -> Iterator
 def list_number_commands(name: str, parser: argparse.ArgumentParser) -> Iterator[list[str]]:
     """Command lines of a command that give each number to each option with a value."""
     options = [action for action in parser._actions if action.option_strings and action.nargs != 0]
-    places = ["scan" for action in parser._actions if not action.option_strings]
+    # "scan" for each argument that is no option, "out/x" for each required option.
+    arguments = ["scan" for action in parser._actions if not action.option_strings]
     for option in options:
-        required = [
-            option_needed for option_needed in options if option_needed.required and option_needed is not option
-        ]
-        words_needed = [word for option_needed in required for word in (option_needed.option_strings[-1], "out/x")]
+        required = [other for other in options if other.required and other is not option]
+        required_words = [word for other in required for word in (other.option_strings[-1], "out/x")]
         for number in NUMBERS:
-            yield [name, *places, *words_needed, f"{option.option_strings[-1]}={number}"]
+            yield [name, *arguments, *required_words, f"{option.option_strings[-1]}={number}"]
 
 
 def check_end(words: list[str]) -> None:
@@ -103,7 +115,8 @@ def check_end(words: list[str]) -> None:
     try:
         with redirect_stdout(out), redirect_stderr(err):
             status = main(words)
-    except SystemExit as e:  # of argparse
+    except SystemExit as e:
+        # The parser of arguments raises it after an error, and after a help.
         status = e.code
     output = out.getvalue() + err.getvalue()
     assert isinstance(status, int), words
@@ -111,9 +124,11 @@ def check_end(words: list[str]) -> None:
     assert "Traceback" not in output, words
     # A note contains the text of the option; the last line of a list of scans names the folder as it was typed.
     computed_text = "" if words[0] == "note" else re.sub(r"scans under .*", "", out.getvalue())
-    numbers = {word.strip("(),;:+-").lower() for word in computed_text.split()}
-    assert status != 0 or not {"nan", "inf"} & numbers, (words, out.getvalue())
-    assert status not in (2, 3, 5, 6) or "usage:" in output or "\n  do: " in output, (words, output)
+    shown_words = {word.strip("(),;:+-").lower() for word in computed_text.split()}
+    if status == 0:
+        assert not {"nan", "inf"} & shown_words, (words, out.getvalue())
+    if status in STATUSES_WITH_A_REMEDY:
+        assert "usage:" in output or "\n  do: " in output, (words, output)
 
 
 def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
@@ -129,6 +144,7 @@ def test_random_command_lines_end_with_a_message(folder, monkeypatch, request):
 
 def test_each_option_takes_each_number_or_refuses_it(folder, monkeypatch, request):
     lines = [words for name, parser in list_command_parsers().items() for words in list_number_commands(name, parser)]
+    # Chosen: a third as many as there are drawn lines.
     if not request.config.getoption("--long"):
         lines = random.Random(2).sample(lines, CASES // 3)
     with chdir(folder):

@@ -103,8 +103,8 @@ def start(
                 rig = set_stage_port(rig, request.getfixturevalue("stage").port)
             program = Process(write_config(rig), *args, **environment)
             started.enter_context(program)
-            assert program.ready, program.popen.communicate()
-            host = HostSide(program.ready[1], program.events[1], rig)
+            assert program.ready_line, program.popen.communicate()
+            host = HostSide(program.ready_line[1], program.events_line[1], rig)
             started.callback(host.close)
             return program, host
 

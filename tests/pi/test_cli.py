@@ -52,7 +52,7 @@ def test_simulated_wires_need_neither_gpiod_nor_numpy(config, hub, stage, tmp_pa
         (tmp_path / "blocked" / f"{name}.py").write_text("raise ImportError('blocked')")
     path = os.pathsep.join(filter(None, [str(tmp_path / "blocked"), os.environ.get("PYTHONPATH")]))
     with Process(config, "--wires", hub, "--stage-port", stage.port, PYTHONPATH=path) as p:
-        assert p.ready[0] == "ready", p.popen.communicate()
+        assert p.ready_line[0] == "ready", p.popen.communicate()
         assert p.end()[0] == 0
 
 
@@ -73,7 +73,7 @@ def test_an_open_address_needs_keys(run_command, config, tmp_path, hub, stage):
     status, _, err = run_command("keys", "--config", config)
     assert (status, "--replace" in err) == (2, True)
     with Process(*args[1:]) as p:
-        assert p.ready[1].startswith("tcp://0.0.0.0:")
+        assert p.ready_line[1].startswith("tcp://0.0.0.0:")
 
 
 def test_check_names_every_hop(run_command, config, hub, stage):

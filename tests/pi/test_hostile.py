@@ -362,7 +362,10 @@ def test_a_client_without_end_is_cut_off(instrument, start, hub, attack):
     sent = 0
     # ZeroMQ itself ends some of these connections: the client comes back until the program had to act.
     while highest[0] < limit_bytes and not has_cut() and sent < ENOUGH_BYTES:
-        with connect_peer((program.ready[1], program.events[1])[endpoint], kind) as peer, suppress(ConnectionError):
+        with (
+            connect_peer((program.ready_line[1], program.events_line[1])[endpoint], kind) as peer,
+            suppress(ConnectionError),
+        ):
             # A connection that was cut may take nothing for a while before it is closed.
             peer.settimeout(0.1)
             remaining = b""

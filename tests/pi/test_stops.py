@@ -281,7 +281,7 @@ def test_subscribers_that_disconnect_together_delay_no_command(
     is_campaign = request.config.getoption("--long")
     program, host = start(instrument, "--wires", hub)
     host.must_accept(host.make_begin(owner=OWNER))
-    arguments = [program.events[1], "1000" if is_campaign else "100", "1"]
+    arguments = [program.events_line[1], "1000" if is_campaign else "100", "1"]
     longest_s = 0.0
     with subprocess.Popen([sys.executable, "-c", LEAVE, *arguments]) as leaving:
         left_s = math.inf

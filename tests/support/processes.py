@@ -1,4 +1,7 @@
-"""Commands of both halves, run as a user runs them: as processes, or in this one where the process does not matter."""
+"""Commands of the host and of the Pi, run as a user runs them.
+
+They run as processes, or in this one where the process does not matter.
+"""
 
 import io
 import os
@@ -45,9 +48,10 @@ class Ended:
         """The error message. Fails if there is a traceback, no message, or more than one."""
         assert "Traceback" not in self.err, self.err
         starts = ("polysight ", "error: ", "usage: ")
-        begun = [i for i, line in enumerate(self.err.splitlines()) if line.startswith(starts)]
-        assert len(begun) == 1, self.err
-        return "\n".join(self.err.splitlines()[begun[0] :])
+        lines = self.err.splitlines()
+        first_lines = [number for number, line in enumerate(lines) if line.startswith(starts)]
+        assert len(first_lines) == 1, self.err
+        return "\n".join(lines[first_lines[0] :])
 
 
 def wait_for(condition: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
@@ -136,10 +140,10 @@ class Program:
             self.process.wait()
 
     def end(self) -> None:
-        """Send SIGTERM, then SIGKILL if it does not end; fails in that case."""
+        """Send SIGTERM, then SIGKILL if it does not end within ten idle seconds (chosen); fails in that case."""
         if self.process.poll() is None:
             self.process.terminate()
-            self.wait(10.0)
+            self.wait(limit_s=10.0)
 
 
 class Bench:
@@ -167,12 +171,13 @@ class Bench:
         """Run a host command in this process, which saves a second for starting a program."""
         out = io.StringIO()
         err = io.StringIO()
+        # A command may set a handler of its own, which would outlive it in this process.
         handler_before = signal.getsignal(signal.SIGTERM)
         try:
             with chdir(self.folder), redirect_stdout(out), redirect_stderr(err):
                 status = main([str(word) for word in arguments])
         except SystemExit as e:
-            # The parser of arguments ends so.
+            # The parser of arguments raises it after an error, and after a help.
             status = e.code if isinstance(e.code, int) else 1
         finally:
             signal.signal(signal.SIGTERM, handler_before)

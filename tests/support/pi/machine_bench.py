@@ -11,7 +11,8 @@ from polysight_shared.raster import Row
 from polysight_shared.stage_line import Reply
 from tests.support.pi.fakes import FakeDriver, FakeLines
 
-SPEC = BurstSpec(2, 1_500_000, 1000)
+# Two pulses at each position; the times are those of the published rig.
+SPEC = BurstSpec(pulses=2, period_ns=1_500_000, width_ns=1000)
 ROW = Row(index=0, y_mm=0.0, x_start_mm=0.0, step_mm=2.0, points=3)
 # Time between two edges: 2 mm at 20 mm/s.
 INTERVAL_NS = 100_000_000
@@ -33,16 +34,20 @@ class Bench:
     """A machine with a fake stage and journal, and a trigger loop whose edges the test gives."""
 
     def __init__(self) -> None:
-        # The machine's clock, seconds.
+        # The machine's clock, seconds; its start is chosen.
         self.t = 100.0
         self.lines = FakeLines()
         self.stage = FakeDriver()
         self.journal = FakeJournal()
+        # What the machine and the trigger loop give to the executor: results of bursts, faults, and calls.
         self.posted: list[Any] = []
-        self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)  # not started: edges are given to it
+        # Its thread is not started: the test gives edges to it.
+        self.loop = TriggerLoop(self.lines, self.posted.append, lambda: None)
         parts: Any = (self.stage, self.loop, self.journal, self.posted.append, lambda: self.t)
         self.machine = Machine(*parts)
-        self.seqno = self.edge_ns = 0
+        # Number and time of the last edge.
+        self.seqno = 0
+        self.edge_ns = 0
         self.row = ROW
 
     def run_posted(self) -> None:
@@ -60,8 +65,12 @@ class Bench:
         """Advance the time in the executor's turns, until something is due or the time is over."""
         end = self.t + seconds
         while self.t < end:
-            seconds_left = self.machine.seconds_left()
-            self.t = min(end, self.t + (seconds if seconds_left is None else max(seconds_left, 1e-6)))
+            seconds_to_deadline = self.machine.seconds_left()
+            if seconds_to_deadline is None:
+                self.t = end
+            else:
+                # A deadline that is due now must not stop the clock.
+                self.t = min(end, self.t + max(seconds_to_deadline, 1e-6))
             self.machine.check_deadlines()
             self.run_posted()
 
@@ -76,8 +85,10 @@ class Bench:
         return self
 
     def start(self, row: Row = ROW, speed_mm_s: float = 20.0) -> None:
+        """Start the first take of a row, which the stage accepts."""
         self.row = row
-        self.machine.command("RunRow", row, 1, SPEC, speed_mm_s)
+        take = 1
+        self.machine.command("RunRow", row, take, SPEC, speed_mm_s)
         self.send_reply(Reply("ok", self.stage.number))
 
     def send_reply(self, reply: Reply) -> None:
@@ -110,6 +121,7 @@ class Bench:
 
     @property
     def armed(self) -> bool:
+        """True if the trigger loop answers edges with bursts."""
         return self.loop._job is not None
 
     def list_events(self, kind: type) -> list[Any]:

@@ -22,7 +22,11 @@ PROGRAM = (sys.executable, "-m", "polysight_pi")
 
 
 class Process:
-    """`polysight-pi run`, once it is ready; with further arguments and environment variables."""
+    """`polysight-pi run`, once it is ready; with further arguments and environment variables.
+
+    `ready_line` and `events_line` are the words of its first two lines: `ready` with the address for commands, and
+    `events` with that of the events.
+    """
 
     def __init__(
         self, config: Path, *args: object, preexec_fn: Callable[[], None] | None = None, **environment: str
@@ -37,14 +41,14 @@ class Process:
             preexec_fn=preexec_fn,
         )
         assert self.popen.stdout is not None
-        self.ready = self.popen.stdout.readline().split()
-        self.events = self.popen.stdout.readline().split()
+        self.ready_line = self.popen.stdout.readline().split()
+        self.events_line = self.popen.stdout.readline().split()
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Wait for the end; return exit status, stdout and stderr."""
+        """Send a signal and wait for the end; return exit status, stdout and stderr."""
         self.popen.send_signal(number)
-        out = self.popen.communicate(timeout=HANG_S)
-        return self.popen.returncode, *out
+        out, err = self.popen.communicate(timeout=HANG_S)
+        return self.popen.returncode, out, err
 
     def __enter__(self) -> Process:
         return self
@@ -63,8 +67,10 @@ def require_stand_in_chip() -> None:
 
 
 def read_resident_bytes(pid: int | str = "self") -> int:
-    """Return the resident memory of a process; the kernel counts pages of 4096 bytes."""
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
+    """Return the resident memory of a process."""
+    # The second number of proc_pid_statm(5): resident pages.
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -81,10 +87,10 @@ def run(*args: object, **environment: str) -> subprocess.CompletedProcess[str]:
 
 
 class WiresLog:
-    """Records every edge on the given lines of a hub."""
+    """Records every edge on the given GPIO lines of the simulated wires, whose socket is `wires_socket`."""
 
-    def __init__(self, hub: Path, *lines: int) -> None:
-        self._client = WireClient(hub, listen=lines)
+    def __init__(self, wires_socket: Path, *lines: int) -> None:
+        self._client = WireClient(wires_socket, listen=lines)
         self.edges: list[WireEdge] = []
         self._closed = False
         self._thread = threading.Thread(target=self._read)
@@ -100,6 +106,7 @@ class WiresLog:
                 self.edges.append(message)
 
     def list_rises(self, line: int) -> list[int]:
+        """Return the times of a line's rising edges, ns."""
         return [e.t_ns for e in self.edges if e.line == line and e.value]
 
     def read_level(self, line: int) -> int:
@@ -107,6 +114,7 @@ class WiresLog:
         return next((e.value for e in reversed(self.edges) if e.line == line), 0)
 
     def drive(self, *edges: WireEdge) -> None:
+        """Put edges on the wires."""
         self._client.send(*edges)
 
     def wait_until(self, condition: Callable[[], bool]) -> None:

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import tomli_w
 from tests.support.paths import RIG_FILE
@@ -21,32 +22,38 @@ def test_the_published_rig_survives_toml(rig: Instrument, tmp_path: Path):
     assert load_instrument(path) == rig
 
 
-def test_paths_are_relative_to_the_rig_file_and_no_path_stays_empty(rig: Instrument, tmp_path: Path):
+def test_paths_are_relative_to_the_rig_file_and_an_empty_path_stays_empty(rig: Instrument, tmp_path: Path):
     table = to_builtins(rig)
     table["pi"]["key_dir"] = ""
     table["radar"] |= {"firmware": "", "trace_dir": "traces"}
     path = tmp_path / "rig.toml"
     path.write_text(tomli_w.dumps(table))
     loaded = load_instrument(path)
-    assert (loaded.pi.key_dir, loaded.radar.firmware) == (str(tmp_path), "")
+    # For a folder, "" is the folder of the rig file; for a file, it is no file.
+    assert loaded.pi.key_dir == str(tmp_path)
+    assert loaded.radar.firmware == ""
     assert loaded.radar.trace_dir == str(tmp_path / "traces")
 
 
 def test_no_section_of_the_rig_can_be_changed(rig: Instrument):
-    sections = [getattr(rig, name) for name in rig.__struct_fields__]
-    for section in (rig, *(s for s in sections if isinstance(s, Section))):
+    values = [getattr(rig, name) for name in rig.__struct_fields__]
+    sections = [value for value in values if isinstance(value, Section)]
+    for section in (rig, *sections):
         for name in section.__struct_fields__:
             with pytest.raises(AttributeError):
                 setattr(section, name, getattr(section, name))
 
 
-def test_published_chirp(rig: Instrument):
+def test_the_rig_file_has_the_published_chirp_and_burst(rig: Instrument):
+    # The paper rounds to these digits.
     assert rig.chirp.swept_hz == pytest.approx(4.622e9, rel=1e-4)
     assert rig.chirp.first_sample_hz == pytest.approx(76.282e9, rel=1e-5)
+    # A burst of 16 frames of 4 KiB.
     assert rig.frame_bytes * rig.burst.pulses == 65536
 
 
 def test_mounts_reproduce_the_published_antenna_positions(rig: Instrument):
+    """The limits are half of the last digit that is published, and a little."""
     h, v = rig.receivers
     assert geometry.tx_position_m(rig) == pytest.approx((-0.7055, 0.0974, 0.0130), abs=6e-5)
     assert geometry.rx_positions_m(rig, h)[0] == pytest.approx((0.6843, 0.1035, 0.0094), abs=6e-5)
@@ -74,14 +81,20 @@ def test_a_mount_step_is_a_whole_shift_or_a_whole_turn(step):
 
 @pytest.mark.parametrize(("axis", "first", "second"), [("x", 1, 2), ("y", 2, 0), ("z", 0, 1)])
 def test_a_mount_turns_right_handed_about_each_axis(axis: str, first: int, second: int):
+    """By 30 degrees, the first axis after the one of the turn moves towards the second, and the second away from it."""
     mount = (MountStep(turn_deg=30.0, about=axis),)
-    images = [geometry.transform_to_rig(tuple(1000.0 * (i == k) for i in range(3)), mount) for k in range(3)]
-    expected = [[float(i == k) for i in range(3)] for k in range(3)]
-    for k, cosine_at, sine_at, sign in ((first, first, second, 1.0), (second, second, first, -1.0)):
-        expected[k][cosine_at] = math.cos(math.pi / 6)
-        expected[k][sine_at] = sign * 0.5
-    for image, row in zip(images, expected, strict=True):
-        assert image == pytest.approx(row)
+    # Points 1 m along each axis; positions on a board are in mm, those in the rig in m.
+    points_mm = 1000.0 * np.eye(3)
+    images_m = [geometry.transform_to_rig(tuple(point_mm), mount) for point_mm in points_mm]
+    cosine = math.cos(math.radians(30.0))
+    sine = 0.5
+    expected_m = np.eye(3)
+    expected_m[first, first] = cosine
+    expected_m[first, second] = sine
+    expected_m[second, second] = cosine
+    expected_m[second, first] = -sine
+    for image_m, row_m in zip(images_m, expected_m, strict=True):
+        assert image_m == pytest.approx(row_m)
 
 
 def test_an_image_has_at_most_four_million_pixels():
@@ -92,14 +105,16 @@ def test_an_image_has_at_most_four_million_pixels():
 
 def test_angles_of_incidence_and_reflection_are_equal_at_the_midpoint(rig: Instrument):
     for board in rig.receivers:
-        rx = geometry.rx_positions_m(rig, board)[0]
-        mid = geometry.specular_midpoint_m(rig, board)
-        out = math.degrees(math.atan2(math.hypot(mid[0] - rx[0], mid[1] - rx[1]), mid[2] - rx[2]))
-        assert out == pytest.approx(geometry.incidence_deg(rig, board), abs=1e-9)
+        rx_x, rx_y, rx_z = geometry.rx_positions_m(rig, board)[0]
+        middle_x, middle_y, middle_z = geometry.specular_midpoint_m(rig, board)
+        across_m = math.hypot(middle_x - rx_x, middle_y - rx_y)
+        reflection_deg = math.degrees(math.atan2(across_m, middle_z - rx_z))
+        assert reflection_deg == pytest.approx(geometry.incidence_deg(rig, board), abs=1e-9)
 
 
 @pytest.mark.parametrize(
     ("table", "key", "value", "code", "named"),
+    # `named`: words of the error, the keys that do not fit together and limits.
     [
         ("chirp", "start_hertz", 1.0, ErrorCode.KEY_UNKNOWN, ["start_hertz"]),
         ("chirp", "start_hz", "fast", ErrorCode.TYPE_WRONG, ["chirp.start_hz", "'fast'"]),
@@ -137,15 +152,16 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
 
 @pytest.mark.parametrize(
     ("table", "within", "beyond"),
+    # Limits of the radar, of a Pi and of its lines, and chosen ones; polysight_shared/config.py has their reasons.
     [
         ("chirp", {"linear_samples": [0, 12]}, {"linear_samples": [0, 11]}),
         ("chirp", {"linear_samples": [244, 256]}, {"linear_samples": [245, 257]}),
         ("chirp", {"linear_samples": [0, 12]}, {"linear_samples": [-1, 12]}),
         ("chirp", {"start_hz": 76e9}, {"start_hz": 75.999e9}),
-        # 100 us of 41 MHz/us
+        # 100 us of 41 MHz/us are 4.1 GHz: the ramp ends at 81.1 GHz.
         ("chirp", {"start_hz": 77e9, "samples": 192, "ramp_end_us": 100.0, "slope_hz_per_s": 41e12},
          {"start_hz": 77.001e9}),
-        # 200 samples at 2 MHz
+        # 200 samples at 2 MHz take 100 us: with the start of 7 us they end with the ramp.
         ("chirp", {"adc_start_us": 7.0, "samples": 200, "sample_rate_hz": 2e6, "ramp_end_us": 107.0},
          {"adc_start_us": 7.001}),
         ("chirp", {"hpf1_khz": 0.0, "hpf2_khz": 0.0}, {"hpf2_khz": 175.0}),
@@ -153,7 +169,7 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
         ("burst", {"period_us": 300.0}, {"period_us": 299.9}),
         ("burst", {"width_us": 0.025}, {"width_us": 0.024}),
         ("burst", {"width_us": 4.0}, {"width_us": 4.001}),
-        # Two chirps and the pause of 300 us
+        # Two chirps of 100 us and the pause of 300 us between two frames.
         ("burst", {"chirps": 2, "chirp_us": 100.0, "period_us": 500.0}, {"period_us": 499.9}),
         ("burst", {"chirps": 1, "chirp_us": 0.0}, {"chirps": 2}),
         ("burst", {"pulses": 1}, {"pulses": 0}),
@@ -188,6 +204,7 @@ def test_a_broken_rule_names_the_file_and_every_key(table: str, key: str, value:
     ],
 )  # fmt: skip
 def test_a_value_at_its_limit_is_taken_and_one_beyond_is_refused(table: str, within: dict, beyond: dict):
+    """`beyond` changes one key of those that are set `within`."""
     raw = read_toml(RIG_FILE)
     raw.setdefault(table, {}).update(within)
     decode(raw, Instrument, "my.toml")
@@ -197,7 +214,8 @@ def test_a_value_at_its_limit_is_taken_and_one_beyond_is_refused(table: str, wit
 
 
 @pytest.mark.parametrize(("width_us", "is_taken"), [(0.4, False), (0.5, True), (2.0, True), (2.1, False)])
-def test_a_pulse_by_spi_is_a_bit_of_the_controller(width_us: float, is_taken: bool):
+def test_a_pulse_by_spi_is_as_wide_as_the_controller_can_send_a_bit(width_us: float, is_taken: bool):
+    """From 0.5 to 2 us; a pulse by a GPIO line may have any of these widths."""
     raw = read_toml(RIG_FILE)
     raw["burst"]["width_us"] = width_us
     decode(raw, Instrument, "my.toml")
@@ -210,18 +228,23 @@ def test_a_pulse_by_spi_is_a_bit_of_the_controller(width_us: float, is_taken: bo
 
 
 @pytest.mark.parametrize(
-    "changes",
+    "refused_names",
     [
-        # Names: length, first character, characters, and two alike
-        ["x" * 65, "RV"], ["", "RV"], [" RH", "RV"], ["-RH", "RV"], ["R/H", "RV"], ["RV", "RV"], ["RH\n", "RV"],
+        # A name that is too long, or empty.
+        ["x" * 65, "RV"], ["", "RV"],
+        # One with a first character, or another one, that it may not have.
+        [" RH", "RV"], ["-RH", "RV"], ["R/H", "RV"], ["RH\n", "RV"],
+        # Two boards of one name.
+        ["RV", "RV"],
     ],
 )  # fmt: skip
-def test_boards_have_names_of_folders(changes: list[str]):
+def test_the_name_of_a_board_can_be_the_name_of_its_folder(refused_names: list[str]):
     raw = read_toml(RIG_FILE)
-    for board, name in zip(raw["boards"][1:], ["x" * 64, "R.1-b c_"], strict=True):
+    receivers = raw["boards"][1:]
+    for board, name in zip(receivers, ["x" * 64, "R.1-b c_"], strict=True):
         board["name"] = name
     decode(raw, Instrument, "my.toml")
-    for board, name in zip(raw["boards"][1:], changes, strict=True):
+    for board, name in zip(receivers, refused_names, strict=True):
         board["name"] = name
     with expect_refusal(ErrorCode.VALUE_INVALID, "name"):
         decode(raw, Instrument, "my.toml")
@@ -250,6 +273,7 @@ def test_boards_may_share_an_address_or_a_port_and_not_both():
     ],
 )
 def test_each_board_at_usb_has_one_place_of_its_own(tables: list[dict[str, str]], places: list[str] | None):
+    """A place is a serial number or a path of the bus; `places` is None where the tables are refused."""
     raw = {"native": dict(zip("ab", tables, strict=False))}
     if places is not None:
         assert [board.place for board in decode(raw, Radar, "my.toml").native.values()] == places
@@ -267,7 +291,7 @@ def test_each_board_at_usb_has_one_place_of_its_own(tables: list[dict[str, str]]
         ({"wiring": "spi", "one_shot": True, "sync_out": (10,)}, ["SPI controller", "by its clock"]),
     ],
 )
-def test_the_source_of_pulses_is_said(keys: dict[str, Any], words: list[str]):
+def test_the_words_for_the_source_of_pulses_say_how_they_are_made_and_seen(keys: dict[str, Any], words: list[str]):
     text = Pi(**keys).pulse_source
     assert all(word in text for word in words)
 
@@ -278,11 +302,13 @@ def test_pulses_need_a_line():
 
 
 def test_data_of_a_scan_are_counted(rig: Instrument):
-    """16 bits each of I and Q, 256 samples, four receivers; 350 columns of 16 pulses, two boards, 200 rows."""
+    # 2 bytes each of I and Q, 256 samples, four receivers.
     assert rig.frame_bytes == 2 * 2 * 256 * 4
+    # 350 columns of 16 pulses; two boards; 200 rows.
     assert rig.row_bytes == 350 * 16 * 4096
     assert rig.recorded_row_bytes == 2 * rig.row_bytes
     assert rig.scan_bytes == 200 * 2 * rig.row_bytes
+    # Data bytes of a full packet (docs/spec/dca1000.md).
     assert rig.card.payload_bytes == 1456
 
 
@@ -294,7 +320,7 @@ def test_data_of_a_scan_are_counted(rig: Instrument):
         ({"shift_mm": [1e4, 0.0, -1e4]}, {"shift_mm": [0.0, 0.0, 1e300]}),
     ],
 )
-def test_a_board_is_mounted_in_the_room(step: dict[str, Any], beyond: dict[str, Any]):
+def test_a_mount_turns_at_most_once_around_and_shifts_at_most_ten_metres(step: dict[str, Any], beyond: dict[str, Any]):
     decode(step, MountStep, "my.toml")
     with expect_refusal(ErrorCode.VALUE_INVALID):
         decode(beyond, MountStep, "my.toml")
@@ -307,6 +333,7 @@ def test_a_board_has_the_name_asked_for(rig: Instrument):
 
 
 def test_antennas_of_a_board_are_those_of_the_table():
+    """The table has three transmit antennas, counted from 0, and four receive antennas, counted from 1."""
     raw = read_toml(RIG_FILE)
     transmitter = next(board for board in raw["boards"] if board["role"] == "transmit")
     for tx_antenna in (0, 2):
@@ -347,7 +374,7 @@ def test_a_text_with_a_character_that_a_terminal_obeys_is_refused(tmp_path: Path
 
 
 @pytest.mark.parametrize("debounce_us", [2_000, 4_000])
-def test_a_trigger_outlasts_the_debounce_by_its_clocks_steps(debounce_us: int):
+def test_a_trigger_is_longer_than_the_debounce_by_the_steps_of_the_debounces_clock(debounce_us: int):
     raw = read_toml(RIG_FILE)
     raw["pi"]["trigger_debounce_us"] = debounce_us
     raw["stage"]["trigger_width_us"] = debounce_us + DEBOUNCE_TICKS_US
@@ -393,7 +420,7 @@ def test_a_file_in_another_encoding_is_reported_with_its_line(tmp_path: Path):
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_files_of_editors_of_windows_are_read(tmp_path: Path, encoding: str, end: str):
+def test_a_byte_order_mark_and_line_ends_of_windows_are_read(tmp_path: Path, encoding: str, end: str):
     path = tmp_path / "rig.toml"
     path.write_bytes(f"a = 1{end}b = 'ü'{end}".encode(encoding))
     assert read_toml(path) == {"a": 1, "b": "ü"}

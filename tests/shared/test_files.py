@@ -10,14 +10,15 @@ import pytest
 from polysight_shared.files import name_in_errors, read_json, write_atomically
 
 
-@pytest.mark.parametrize(("known_path", "shown_path"), [(None, "mine"), ("theirs", "theirs")])
-def test_an_error_without_a_path_gets_one_and_keeps_its_own(tmp_path, known_path, shown_path):
-    with pytest.raises(OSError, match="No space left") as caught, name_in_errors(tmp_path / "mine"):
-        raise OSError(errno.ENOSPC, "No space left on device", known_path and str(tmp_path / known_path))
+@pytest.mark.parametrize(("path_of_error", "shown_path"), [(None, "ours"), ("theirs", "theirs")])
+def test_an_error_without_a_path_gets_one_and_one_with_a_path_keeps_it(tmp_path, path_of_error, shown_path):
+    path = None if path_of_error is None else str(tmp_path / path_of_error)
+    with pytest.raises(OSError, match="No space left") as caught, name_in_errors(tmp_path / "ours"):
+        raise OSError(errno.ENOSPC, "No space left on device", path)
     assert caught.value.filename == str(tmp_path / shown_path)
 
 
-def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
+def test_an_error_names_the_file_that_stands_where_a_folder_is_needed(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=re.escape(str(tmp_path / "file"))):
         write_atomically(tmp_path / "file" / "new", b"")
@@ -25,8 +26,8 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("place", [".", "..", "/", "folder", "link"])
-def test_a_folder_in_the_place_of_a_file_is_named(tmp_path, monkeypatch, place):
-    """`.` and `/` have no name that a file beside them could have."""
+def test_an_error_names_the_folder_that_stands_where_a_file_is_written(tmp_path, monkeypatch, place):
+    """A file is first written under a temporary name next to the path. `.` and `/` have no name to make one from."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "link").symlink_to("folder")
     monkeypatch.chdir(tmp_path)
@@ -37,7 +38,7 @@ def test_a_folder_in_the_place_of_a_file_is_named(tmp_path, monkeypatch, place):
 
 
 def test_a_pipe_is_not_replaced_by_a_file(tmp_path):
-    """Nor is /dev/null, by a user who may."""
+    """The same check protects /dev/null from a user who has the right to replace it."""
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(OSError, match="a device or a pipe"):
         write_atomically(tmp_path / "pipe", b"new")
@@ -55,6 +56,7 @@ def test_errors_name_the_file_and_not_its_temporary_copy(tmp_path, monkeypatch):
     assert (caught.value.filename, caught.value.filename2) == (str(tmp_path / "mine"), None)
 
 
-def test_json_of_an_editor_that_marks_the_order_of_bytes_is_read(tmp_path):
+def test_json_that_begins_with_a_byte_order_mark_is_read(tmp_path):
+    """Editors of Windows write one; Python's name of the encoding is utf-8-sig."""
     (tmp_path / "labels.json").write_text('{"a": 1}', encoding="utf-8-sig")
     assert read_json(tmp_path / "labels.json") == {"a": 1}

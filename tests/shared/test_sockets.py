@@ -25,6 +25,7 @@ from polysight_shared.sockets import create_replier, host_name
 def test_an_address_that_cannot_be_bound_is_refused_with_its_cause(
     tmp_path: Path, number: int, cause: str, remedy: str, code: ErrorCode
 ) -> None:
+    """`number` is the error number of the operating system or of libzmq."""
     context = Mock()
     socket = context.socket.return_value
     socket.bind.side_effect = zmq.ZMQError(number)
@@ -39,7 +40,7 @@ def test_an_address_that_cannot_be_bound_is_refused_with_its_cause(
 
 @pytest.mark.parametrize("port", ["65536", "99999", "²", "9" * 5000, "-1", ""])
 def test_a_port_that_does_not_exist_is_refused(port: str) -> None:
-    """libzmq would bind port 34463 for 99999."""
+    """libzmq keeps the last 16 bits of a number: it would bind port 34463 for 99999."""
     with pytest.raises(ConfigError) as caught:
         host_name(f"tcp://127.0.0.1:{port}")
     assert caught.value.code == ErrorCode.VALUE_INVALID

@@ -27,7 +27,9 @@ replies = st.one_of(
 
 @pytest.mark.parametrize("messages", [commands, replies], ids=["commands", "replies"])
 @given(data=st.data())
-def test_round_trip(messages: st.SearchStrategy[Command | Reply], data: st.DataObject):
+def test_an_encoded_line_is_decoded_to_the_same_message(
+    messages: st.SearchStrategy[Command | Reply], data: st.DataObject
+):
     message = data.draw(messages)
     assert type(message).decode(message.encode()) == message
 
@@ -40,26 +42,37 @@ def test_every_single_bit_flip_is_refused(messages: st.SearchStrategy[Command | 
     for bit in range(len(line) * 8):
         flipped = bytearray(line)
         flipped[bit // 8] ^= 1 << bit % 8
-        # A command is read line by line, and a bit may make a line's end.
-        parts = bytes(flipped).splitlines(keepends=True) if isinstance(message, Command) else [bytes(flipped)]
-        for part in parts:
+        # The stage reads commands line by line, and a flipped bit may make a character the end of a line.
+        if isinstance(message, Command):
+            lines = bytes(flipped).splitlines(keepends=True)
+        else:
+            lines = [bytes(flipped)]
+        for part in lines:
             with pytest.raises(ProtocolError):
                 type(message).decode(part)
 
 
-def test_immediate_bytes_differ_from_all_others_in_two_bits_and_resume_in_three():
+def test_no_flipped_bit_makes_an_immediate_byte_of_another_and_no_two_make_resume():
+    """RESUME moves a stage that was held: it differs from the bytes of lines and of other commands in three bits.
+
+    The others differ in two bits, also from printable characters that no line has.
+    """
     used_in_lines = set(b"0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZ-* \n")
+    printable = set(range(0x20, 0x7F))
     for byte in Immediate:
         if byte == Immediate.RESUME:
             other_bytes = used_in_lines
+            least_bits = 3
         else:
-            other_bytes = used_in_lines | set(range(0x20, 0x7F))
-        nearest = min((byte ^ other_byte).bit_count() for other_byte in other_bytes | set(Immediate) - {byte})
-        assert nearest >= (3 if byte == Immediate.RESUME else 2)
+            other_bytes = used_in_lines | printable
+            least_bits = 2
+        other_bytes = other_bytes | set(Immediate) - {byte}
+        fewest_bits = min((byte ^ other_byte).bit_count() for other_byte in other_bytes)
+        assert fewest_bits >= least_bits
 
 
 @given(st.binary(max_size=100))
-def test_random_bytes_are_refused_or_sealed(raw: bytes):
+def test_bytes_that_are_not_refused_are_those_of_a_sealed_line(raw: bytes):
     try:
         body = unseal(raw)
     except ProtocolError:
@@ -67,45 +80,50 @@ def test_random_bytes_are_refused_or_sealed(raw: bytes):
     assert seal(body) == raw
 
 
-def test_crc_is_xmodem():
-    # Check value of CRC-16/XMODEM
+def test_the_checksum_is_crc_16_xmodem():
+    # The check value that catalogues of CRCs give for XMODEM: the checksum of these nine digits.
     assert crc16(b"123456789") == 0x31C3
 
 
-@pytest.mark.parametrize("bad", [Command(70000, "HOME"), Command(1, "home"), Command(1, "MOVE", (2**31,))])
-def test_out_of_range_is_refused(bad: Command):
+@pytest.mark.parametrize(
+    "command",
+    # A sequence number of more than 16 bits, small letters, and an argument of more than 32 bits.
+    [Command(70000, "HOME"), Command(1, "home"), Command(1, "MOVE", (2**31,))],
+)
+def test_a_command_outside_the_protocols_ranges_is_not_sent(command: Command):
     with pytest.raises(ProtocolError):
-        bad.encode()
+        command.encode()
 
 
 def test_a_line_has_at_most_96_bytes():
-    """A star, four digits of the checksum and the end of the line are six of them."""
+    """Six of them are the star, the four digits of the checksum and the end of the line."""
     longest = "x" * (96 - 6)
     assert unseal(seal(longest)) == longest
     with pytest.raises(ProtocolError, match="longer"):
         seal(longest + "x")
-    raw = (longest + "x").encode()
+    too_long = (longest + "x").encode()
     with pytest.raises(ProtocolError, match="longer"):
-        unseal(raw + b"*%04X\n" % crc16(raw))
+        unseal(too_long + b"*%04X\n" % crc16(too_long))
 
 
 @pytest.mark.parametrize(
     ("code", "is_taken"), [(0x1F, False), (0x20, True), (0x7E, True), (0x7F, False), (0x80, False)]
 )
 def test_a_line_is_printable_ascii(code, is_taken):
-    raw = b"ab" + bytes([code])
-    line = raw + b"*%04X\n" % crc16(raw)
+    body = b"ab" + bytes([code])
+    line = body + b"*%04X\n" % crc16(body)
     if is_taken:
-        assert unseal(line) == raw.decode()
+        assert unseal(line) == body.decode()
         return
     with pytest.raises(ProtocolError):
         unseal(line)
 
 
-def test_a_line_may_be_empty_and_is_not_shorter():
+def test_a_line_may_have_an_empty_body_but_not_less_than_its_checksum():
     assert unseal(seal("")) == ""
+    without_star = seal("")[1:]
     with pytest.raises(ProtocolError, match="not a stage line"):
-        unseal(seal("")[1:])
+        unseal(without_star)
 
 
 @pytest.mark.parametrize(
@@ -131,7 +149,7 @@ def test_a_command_has_16_bits_of_sequence_and_32_of_each_argument(body, is_take
         "done x=1", "status x", "status x=1 x=2", "other N5",
     ],
 )  # fmt: skip
-def test_a_reply_has_its_number_sequence_and_fields(body):
+def test_a_reply_without_its_number_sequence_or_fields_is_refused(body):
     with pytest.raises(ProtocolError):
         Reply.decode(seal(body))
 

@@ -1,4 +1,8 @@
-"""Fixtures: `stage` is a stage in virtual time with simulated wires, `talker` any kind of stage."""
+"""Fixtures: `stage` is a stage in virtual time with simulated wires, `talker` any kind of stage.
+
+Kinds of stage: the sketch compiled for this machine ("pc"), the same with sanitizers, its Python stand-in, its machine
+code on an emulated Arduino UNO, and any stage at a serial port.
+"""
 
 import os
 import subprocess
@@ -20,7 +24,10 @@ from polysight_simulators.uno import (
     list_missing_packages,
 )
 
+# Findings of the sanitizers end the program; optimisation is that which their manuals advise.
 _SANITIZE = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1")
+# These packages are for the emulator only.
+_EMULATOR_PACKAGES = ("libsimavr-dev", "libelf-dev")
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +41,7 @@ def firmware_program() -> Path:
 
 @pytest.fixture(scope="session")
 def sanitized_program() -> Path:
-    """The same with address and undefined-behaviour sanitizers, whose findings end the program."""
+    """The sketch compiled for this machine with address and undefined-behaviour sanitizers."""
     gxx = sketch_compiler()
     if gxx is None:
         pytest.skip("no C++ compiler: `apt-get install g++` runs these tests too")
@@ -51,8 +58,9 @@ def sanitized_program() -> Path:
 @pytest.fixture(scope="session")
 def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """Output folder and stdout of `make firmware`."""
-    if lacking := [p for p in list_missing_packages() if p not in ("libsimavr-dev", "libelf-dev")]:
-        pytest.skip(f"no firmware without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
+    missing_packages = [package for package in list_missing_packages() if package not in _EMULATOR_PACKAGES]
+    if missing_packages:
+        pytest.skip(f"no firmware without {' '.join(missing_packages)}: `{ENABLING_COMMAND}` runs these tests too")
     folder = tmp_path_factory.mktemp("firmware")
     command = ["make", "-C", str(SKETCH_DIR), "firmware", f"AVR_B={folder}"]
     compilation = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -62,9 +70,10 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @pytest.fixture(scope="session")
 def uno_programs() -> tuple[Path, Path]:
-    """The emulator and the machine code."""
-    if lacking := list_missing_packages():
-        pytest.skip(f"no emulated UNO without {' '.join(lacking)}: `{ENABLING_COMMAND}` runs these tests too")
+    """Paths of the emulator and of the sketch's machine code."""
+    missing_packages = list_missing_packages()
+    if missing_packages:
+        pytest.skip(f"no emulated UNO without {' '.join(missing_packages)}: `{ENABLING_COMMAND}` runs these tests too")
     return compile_emulator(), compile_firmware()
 
 
@@ -100,13 +109,17 @@ def talker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Driver]:
     elif kind == "uno":
         driver = UnoDriver(*request.getfixturevalue("uno_programs"), tmp_path)
     else:
-        real = request.config.getoption("--stage-port")
-        dialogue = request.node.callspec.params.get("path")
-        if real:
-            driver = PortDriver(real)
-        elif request.config.getoption("--long") or (dialogue is not None and dialogue.stem in ("hold", "sequence")):
-            # Three times real time, but the heartbeat counts wall time, however fast the motion runs.
-            speed = 1.0 if dialogue is not None and dialogue.stem == "heartbeat" else 3.0
+        port_of_real_stage = request.config.getoption("--stage-port")
+        path = request.node.callspec.params.get("path")
+        dialogue = None if path is None else path.stem
+        # Two dialogues are so short that they are always held at a port, too.
+        is_short = dialogue in ("hold", "sequence")
+        if port_of_real_stage:
+            driver = PortDriver(port_of_real_stage)
+        elif request.config.getoption("--long") or is_short:
+            # Three times real time, which a busy machine can simulate (chosen). The heartbeat counts wall time,
+            # however fast the motion runs.
+            speed = 1.0 if dialogue == "heartbeat" else 3.0
             process = closed.enter_context(closing(StageProcess(tmp_path, "pc", speed)))
             driver = PortDriver(str(process.link), speed)
         else:
@@ -129,7 +142,7 @@ def stage(request: pytest.FixtureRequest) -> Iterator[Driver]:
 
 @pytest.fixture
 def both(firmware_program: Path) -> Iterator[Callable[..., tuple[Driver, Driver]]]:
-    """Makes the firmware and the stand-in side by side, with these steps per millimetre."""
+    """Makes two stages with these steps per millimetre: the firmware, and its stand-in in Python."""
     drivers: list[Driver] = []
 
     def make(steps_per_mm: float = 200.0) -> tuple[Driver, Driver]:

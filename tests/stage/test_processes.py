@@ -16,10 +16,15 @@ from tests.support.stage.conversation import play
 from tests.support.stage.drivers import PortDriver
 from tests.support.stage.processes import COMMANDS, StageProcess, outlives_its_parent
 
+from polysight_shared.faults import StageError
 from polysight_shared.wires import WireMotion
 
-# x, y in um at the triggers of dialogues/row.txt
-ROW_POINTS = [(5 * x, 5000) for x in range(20_000, 22_000, 400)] + [(5 * x, 7000) for x in range(21_600, 19_600, -400)]
+# A step is 5 um.
+UM = 5
+# x and y in um at the triggers of the two rows in dialogues/row.txt: 5 points 400 steps apart, at y of 1000 and 1400
+# steps, towards larger and towards smaller x.
+FIRST_ROW = [(UM * x, UM * 1000) for x in range(20_000, 22_000, 400)]
+SECOND_ROW = [(UM * x, UM * 1400) for x in range(21_600, 19_600, -400)]
 Start = Callable[..., StageProcess]
 
 
@@ -46,7 +51,7 @@ def start(kind: str, tmp_path: Path) -> Iterator[Start]:
         yield lambda time_scale=1.0: started.enter_context(closing(StageProcess(tmp_path, kind, time_scale)))
 
 
-def test_rows_over_the_port(start: Start, speed: float):
+def test_each_trigger_of_rows_over_the_port_has_its_time_position_and_speed(start: Start, speed: float):
     """Every trigger reaches the wires, and just before it, with the same time, the stage's position and speed."""
     stage = start(speed)
     with closing(PortDriver(str(stage.link), speed)) as driver:
@@ -54,23 +59,32 @@ def test_rows_over_the_port(start: Start, speed: float):
     messages = stage.end()
     times = [m.t_ns for m in messages]
     assert times == sorted(times)
+    # The Pi's line of the trigger.
     assert {e.line for e in stage.rising} == {26}
-    spacing = [b.t_ns - a.t_ns for a, b in itertools.pairwise(stage.rising[:5])]
-    # 400 steps at 4000 steps/s
-    assert all(abs(s - 100_000_000) <= 16_000 for s in spacing)
+    first_row = stage.rising[: len(FIRST_ROW)]
+    spacing_ns = [after.t_ns - before.t_ns for before, after in itertools.pairwise(first_row)]
+    # 400 steps at 4000 steps/s are 100 ms. 16 us are the most by which a step may wait for an interrupt.
+    assert all(abs(spacing - 100_000_000) <= 16_000 for spacing in spacing_ns)
+
     messages_before = [messages[messages.index(e) - 1] for e in stage.rising]
     motions = [m for m in messages_before if isinstance(m, WireMotion)]
     assert [m.t_ns for m in motions] == [e.t_ns for e in stage.rising]
-    assert [(m.x_um, m.y_um) for m in motions] == ROW_POINTS
+    assert [(m.x_um, m.y_um) for m in motions] == FIRST_ROW + SECOND_ROW
+    # 4000 steps/s of 5 um; the limit, 0.2 per cent, is chosen.
     assert all(abs(abs(m.vx_um_s) - 20_000) <= 40 for m in motions)
     assert stage.motions[-1].vx_um_s == 0
-    # The x that each line predicts for the next one is right, to a step.
-    row = [m for m in stage.motions if motions[0].t_ns <= m.t_ns <= motions[4].t_ns]
-    for a, b in itertools.pairwise(row):
-        assert abs(a.x_um + a.vx_um_s * (b.t_ns - a.t_ns) * 1e-9 - b.x_um) <= 5
+
+    # From each message's position and speed, the position of the next one can be predicted within a step.
+    first_trigger_ns = motions[0].t_ns
+    last_trigger_ns = motions[len(FIRST_ROW) - 1].t_ns
+    row = [m for m in stage.motions if first_trigger_ns <= m.t_ns <= last_trigger_ns]
+    for before, after in itertools.pairwise(row):
+        predicted_um = before.x_um + before.vx_um_s * (after.t_ns - before.t_ns) * 1e-9
+        assert abs(predicted_um - after.x_um) <= UM
 
 
-def test_opening_resets(start: Start, speed: float):
+def test_opening_the_port_resets_the_stage(start: Start, speed: float):
+    """As it does an Arduino: after it a greeting is needed, and homing."""
     stage = start(speed)
     with closing(PortDriver(str(stage.link), speed)) as driver:
         assert driver.received.startswith(b"polysight-stage")
@@ -78,14 +92,14 @@ def test_opening_resets(start: Start, speed: float):
         assert driver.send_command("HELLO").kind == "ok"
     with closing(PortDriver(str(stage.link), speed)) as driver:
         driver.read_replies()
-        assert driver.send_command("ENABLE", 1).number == 18
+        assert driver.send_command("ENABLE", 1).number == StageError.SEQUENCE
         assert driver.ask_status().integer("homed") == 0
     stage.end()
     assert stage.rising == []
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signals_end_it_cleanly(start: Start, number: signal.Signals):
+def test_signals_end_a_simulated_stage_cleanly(start: Start, number: signal.Signals):
     stage = start()
     assert stage.link.is_symlink()
     stage.end(number)
@@ -101,15 +115,18 @@ def test_the_stage_ends_when_its_wires_are_closed(start: Start, speed: float):
         stage.process.wait(HANG_S)
 
 
-def test_dies_with_its_parent(kind: str, tmp_path: Path):
+def test_a_simulated_stage_ends_with_its_parent(kind: str, tmp_path: Path):
     module, *options = COMMANDS[kind]
     command = [sys.executable, "-m", f"polysight_simulators.{module}", "--config", RIG_FILE, *options]
     assert not outlives_its_parent([*command, "--link", tmp_path / "tty"])
 
 
-def test_an_emulator_in_lockstep_dies_with_its_parent(uno_programs: tuple[Path, Path]):
+def test_an_emulator_in_lockstep_ends_with_its_parent(uno_programs: tuple[Path, Path]):
     """A killed test run leaves no emulator running, even if the parent ended before the emulator checked."""
     program, image = uno_programs
+    # So many cycles take years.
     assert not outlives_its_parent(uno_programs, "rest 1000000000000000\nrun 1000000000000000\n")
-    with subprocess.Popen([program, "--parent", str(os.getppid()), image], stdin=subprocess.PIPE) as uno:
+    # This process's own parent is not the emulator's: for the emulator its parent has ended.
+    not_its_parent = str(os.getppid())
+    with subprocess.Popen([program, "--parent", not_its_parent, image], stdin=subprocess.PIPE) as uno:
         assert uno.wait(HANG_S) == 0

@@ -1,6 +1,9 @@
 """Laws of a row: one trigger at each exact step count, evenly spaced in time, in both directions, and no step lost.
 
 They hold for firmware and Python stand-in, which send the same bytes and edges at the same ticks.
+
+Arguments of ROW are x of the first point, pitch, number of points, y and rate; those of MOVE are x, y and rate. Lengths
+are in steps, rates in steps/s.
 """
 
 import itertools
@@ -9,18 +12,34 @@ import random
 import pytest
 from tests.support.stage.drivers import list_edges, list_motions
 
-from polysight_shared.stage_line import Command, Immediate
+from polysight_shared.stage_line import Command, Immediate, Parameter
 
-# Steps
-UM = 5  # per step
+# Micrometres per step.
+UM = 5
+# Acceleration of a stage after power-on, steps/s^2.
 ACCEL = 40_000
+# A tick of the stage's timer.
+TICK_NS = 500
 
 
-def check_row(wires, x0: int, pitch: int, points: int, y: int, width_us: int):
-    """The laws that hold for every row, held or not, except the even spacing."""
+def compute_ramp_steps(rate: int) -> int:
+    """Steps from rest to this rate: v^2 / (2 a) and at most one more."""
+    return rate * rate // (2 * ACCEL) + 1
+
+
+def list_rising(wires) -> list:
+    """The beginnings of all triggers."""
+    return [edge for edge in list_edges(wires) if edge.value]
+
+
+def check_row(wires, *, x0: int, pitch: int, points: int, y: int, width_us: int):
+    """Check the laws that hold for every row, held or not, which are all but the even spacing.
+
+    Returns the rising edges of the triggers.
+    """
     times = [w.t_ns for w in wires]
     assert times == sorted(times)
-    rising = [e for e in list_edges(wires) if e.value]
+    rising = list_rising(wires)
     falling = [e for e in list_edges(wires) if not e.value]
     assert len(rising) == len(falling) == points
     assert [f.t_ns - r.t_ns for r, f in zip(rising, falling, strict=True)] == [width_us * 1000] * points
@@ -32,32 +51,37 @@ def check_row(wires, x0: int, pitch: int, points: int, y: int, width_us: int):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_rows(stage, seed: int):
+def test_random_rows_have_a_trigger_at_each_point_evenly_in_time(stage, seed: int):
     rng = random.Random(seed)
     stage.prepare()
     for _ in range(4):
+        # Rates from the lowest to the highest, some of which divide the timer's 2 MHz and some of which do not.
         if rng.random() < 0.5:
             rate = rng.choice([31, 100, 640, 3999, 4000, 7001, 20_000])
         else:
             rate = rng.randint(500, 20_000)
-        pitch = rng.choice([-1, 1]) * rng.randint(40, 1200 if rate >= 500 else 150)
-        points = rng.randint(1, 40 if rate >= 500 else 4)
+        # Slow rows are short, so that the test is not long.
+        is_slow = rate < 500
+        pitch = rng.choice([-1, 1]) * rng.randint(40, 150 if is_slow else 1200)
+        points = rng.randint(1, 4 if is_slow else 40)
         width_us = rng.randint(1, 40)
-        reach = abs(pitch) * points + rate * rate // (2 * ACCEL) + 1
+        # The row and its ramps lie within the travel.
+        reach = abs(pitch) * points + compute_ramp_steps(rate)
         x0 = rng.randint(reach, 160_000 - reach)
         y = rng.randint(0, 100_000)
-        assert stage.send_command("SET", 2, width_us).kind == "ok"
+        assert stage.send_command("SET", Parameter.TRIGGER, width_us).kind == "ok"
         done, wires = stage.run_motion("ROW", x0, pitch, points, y, rate)
         assert (done.kind, done.integer("points"), done.integer("pulses")) == ("done", points, points)
         assert done.integer("held") == 0
-        rising = check_row(wires, x0, pitch, points, y, width_us)
+        rising = check_row(wires, x0=x0, pitch=pitch, points=points, y=y, width_us=width_us)
         # Even spacing: each edge within one timer tick of its ideal time, errors never add up.
         first = rising[0].t_ns
         spacing_ns = abs(pitch) / rate * 1e9
-        assert all(abs(e.t_ns - first - i * spacing_ns) <= 500 for i, e in enumerate(rising))
-        # Constant speed from one pitch before the first point to one pitch after the last.
-        latest = {m.t_ns: m for m in list_motions(wires)}  # of several at one time, the last counts
-        cruise = [m for t, m in latest.items() if first - spacing_ns - 500 <= t <= rising[-1].t_ns]
+        assert all(abs(e.t_ns - first - i * spacing_ns) <= TICK_NS for i, e in enumerate(rising))
+        # Constant speed from one pitch before the first point to one pitch after the last. Of several motions that are
+        # reported at one time, the last counts.
+        motion_at = {m.t_ns: m for m in list_motions(wires)}
+        cruise = [m for t, m in motion_at.items() if first - spacing_ns - TICK_NS <= t <= rising[-1].t_ns]
         sign = 1 if pitch > 0 else -1
         assert all(m.vx_um_s == sign * rate * UM for m in cruise)
         assert cruise[0].x_um == (x0 - pitch) * UM
@@ -69,7 +93,7 @@ def test_random_rows(stage, seed: int):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_hold_resumes_on_the_exact_grid(stage, seed: int):
+def test_after_a_hold_a_row_continues_on_its_exact_grid(stage, seed: int):
     rng = random.Random(seed)
     stage.prepare()
     x0 = 40_000
@@ -81,6 +105,8 @@ def test_hold_resumes_on_the_exact_grid(stage, seed: int):
     stage.wires.clear()
     assert stage.send_command("ROW", x0, pitch, points, y, rate).kind == "ok"
     hold_count = 0
+    # The row takes 30 x 300 steps / 5000 steps/s = 1.8 s. Three holds fall into it, and after 600 ms the stage is at
+    # rest: its ramp takes 125 ms.
     for _ in range(3):
         stage.run_ms(rng.uniform(350, 650))
         stage.send(bytes([Immediate.HOLD]))
@@ -92,46 +118,60 @@ def test_hold_resumes_on_the_exact_grid(stage, seed: int):
     (done,) = stage.read_replies()
     assert hold_count == 3
     assert (done.integer("points"), done.integer("pulses"), done.integer("held")) == (points, points, 1)
-    check_row(stage.wires, x0, pitch, points, y, 20)
-    assert done.integer("x") == x0 + pitch * points + (pitch // 300) * (rate * rate // (2 * ACCEL) + 1)
+    # A trigger is 20 us wide unless it is set.
+    check_row(stage.wires, x0=x0, pitch=pitch, points=points, y=y, width_us=20)
+    # The row ends one pitch after its last point, and the stage slows down from there.
+    direction = 1 if pitch > 0 else -1
+    assert done.integer("x") == x0 + pitch * points + direction * compute_ramp_steps(rate)
 
 
 @pytest.mark.parametrize("accel", [2_000, 40_000, 400_000])
 def test_ramps_keep_to_the_acceleration(stage, accel: int):
+    rate = 6000
+    distance = 60_000
     stage.prepare()
-    assert stage.send_command("SET", 0, accel).kind == "ok"
+    assert stage.send_command("SET", Parameter.ACCEL, accel).kind == "ok"
     stage.wires.clear()
-    _, wires = stage.run_motion("MOVE", 60_000, 20_000, 6000)
+    _, wires = stage.run_motion("MOVE", distance, 20_000, rate)
     speeds = {m.t_ns: m.vx_um_s / UM for m in list_motions(wires) if m.vx_um_s > 0}
     for (t0, v0), (t1, v1) in itertools.pairwise(speeds.items()):
+        # Chosen: 10 per cent and 5 steps/s more, as the speed changes by whole timer ticks.
         assert abs(v1 - v0) <= 1.1 * accel * (t1 - t0) * 1e-9 + 5
-    assert max(speeds.values()) == 6000
-    # The whole move takes the time of a trapezium: cruise time plus one ramp.
-    took_s = (wires[-1].t_ns - wires[0].t_ns) * 1e-9
-    assert took_s == pytest.approx(60_000 / 6000 + 6000 / accel, rel=0.02)
+    assert max(speeds.values()) == rate
+    # The speed over time is a trapezium: the distance at full speed takes its time, and the two ramps that of one more.
+    duration_s = (wires[-1].t_ns - wires[0].t_ns) * 1e-9
+    assert duration_s == pytest.approx(distance / rate + rate / accel, rel=0.02)
 
 
 def test_stop_ends_the_triggers_and_keeps_the_position(stage):
     stage.prepare()
     stage.wires.clear()
     assert stage.send_command("ROW", 20_000, 400, 50, 0, 4000).kind == "ok"
+    # The way to the row takes some 5 s, and the row as long.
     stage.run_ms(5_500)
-    rising_edges = len([e for e in list_edges(stage.wires) if e.value])
-    assert 0 < rising_edges < 50
+    triggers_before_stop = len(list_rising(stage.wires))
+    assert 0 < triggers_before_stop < 50
     stage.send(bytes([Immediate.STOP]))
     stage.run_until_rest()
     assert [r.kind for r in stage.read_replies()] == ["alarm"]
     status = stage.ask_status()
-    rising = [e for e in list_edges(stage.wires) if e.value]
-    assert rising_edges <= len(rising) <= rising_edges + 1
-    assert status.integer("points") == status.integer("pulses") == len(rising)
+    triggers = len(list_rising(stage.wires))
+    # One more may have begun before the byte was read.
+    assert triggers_before_stop <= triggers <= triggers_before_stop + 1
+    assert status.integer("points") == status.integer("pulses") == triggers
     assert list_motions(stage.wires)[-1].x_um == status.integer("x") * UM
     stage.run_ms(5_000)
-    assert len([e for e in list_edges(stage.wires) if e.value]) == len(rising)
+    assert len(list_rising(stage.wires)) == triggers
 
 
 def _draw_action(rng: random.Random, sequence: int) -> tuple[str, object]:
-    kind = rng.choices(["command", "byte", "run", "rest", "press", "slip", "reset"], [40, 15, 30, 10, 2, 2, 1])[0]
+    """Draw something to do with a stage: the name of a driver's method, and its arguments.
+
+    How often each is drawn, and its ranges, are chosen. Some commands are drawn twice, so that the stage is homed and
+    enabled for much of the time; some arguments are outside of the travel.
+    """
+    weights = {"command": 40, "byte": 15, "run": 30, "rest": 10, "press": 2, "slip": 2, "reset": 1}
+    (kind,) = rng.choices(list(weights), list(weights.values()))
     if kind == "command":
         x = rng.randint(-500, 20_000)
         y = rng.randint(-200, 9_000)
@@ -153,11 +193,13 @@ def _draw_action(rng: random.Random, sequence: int) -> tuple[str, object]:
         return "send", Command(sequence, verb, args).encode()
     if kind == "byte":
         return "send", bytes([rng.choice(list(Immediate))])
+    # Ticks of the timer, 2 a microsecond: up to 1.5 s, and to rest within 20 s.
     if kind == "run":
         return "run", rng.randint(1, 3_000_000)
     if kind == "rest":
         return "run_until_rest", 40_000_000
     if kind == "press":
+        # Bits of the switches: of x, of y, and the emergency stop; 0 releases them.
         return "press", rng.choice([0, 0, 0, 1, 2, 4])
     if kind == "slip":
         return "slip", (rng.randint(-50, 50), rng.randint(-50, 50))
@@ -165,16 +207,20 @@ def _draw_action(rng: random.Random, sequence: int) -> tuple[str, object]:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_same_words_and_same_wires(both, seed: int):
+def test_firmware_and_stand_in_have_the_same_replies_wires_and_clock(both, seed: int):
     firmware, python = drivers = both()
     rng = random.Random(seed)
-    greetings = [
-        ("send", Command(n, v, a).encode()) for n, v, a in ((0, "HELLO", ()), (1, "ENABLE", (1,)), (2, "HOME", ()))
+    script = [
+        ("send", Command(0, "HELLO", ()).encode()),
+        ("send", Command(1, "ENABLE", (1,)).encode()),
+        ("send", Command(2, "HOME", ()).encode()),
+        ("run_until_rest", 40_000_000),
     ]
-    script = [*greetings, ("run_until_rest", 40_000_000)]
     sequence = 2
     for _ in range(120):
-        sequence += rng.random() < 0.9
+        # One action in ten repeats the sequence number of the previous one.
+        if rng.random() < 0.9:
+            sequence += 1
         script.append(_draw_action(rng, sequence))
     for i, (name, argument) in enumerate(script):
         if isinstance(argument, tuple):
@@ -195,7 +241,8 @@ def test_same_words_and_same_wires(both, seed: int):
 
 
 @pytest.mark.parametrize("steps_per_mm", [80.0, 157.48])
-def test_same_positions_with_other_screws(both, steps_per_mm: float):
+def test_firmware_and_stand_in_have_the_same_wires_with_other_screws(both, steps_per_mm: float):
+    """157.48 steps/mm are those of a screw of inches: a step is no whole number of micrometres."""
     firmware, python = both(steps_per_mm)
     for driver in (firmware, python):
         driver.prepare()

@@ -598,9 +598,12 @@ def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> 
     numbers = [arrays[f"evidence_{name}"] for name in ("theta_rad", "ratio", "covariance", "share")]
     columns = zip(*numbers, brightness, map(_unpack_dispersion, dispersions), map(_unpack_cases, cases), strict=True)
     rows = [
-        RatioEvidence(float(angle), complex(ratio), covariance, float(share), float(off), float(std), change, both)
-        for angle, ratio, covariance, share, (off, std), change, both in columns
-    ]
+        RatioEvidence(
+            theta_rad=float(angle), inverse_ratio=complex(ratio), covariance=covariance, library_share=float(share),
+            brightness_off=float(off), brightness_std=float(std), dispersion=dispersion, cases=both_cases,
+        )
+        for angle, ratio, covariance, share, (off, std), dispersion, both_cases in columns
+    ]  # fmt: skip
     if any(row.covariance.shape != (2, 2) for row in rows):
         raise ValueError("covariances are not [patch, 2, 2]")
     return dict(zip(map(int, judged), rows, strict=True))

@@ -12,7 +12,7 @@ from tests.support.refusals import expect_refusal
 from polysight.cli.main import main
 from polysight.materials import UNKNOWN, Classifier, Library, TrainingScan, fit_library
 from polysight.materials.classify import DISCRIMINANT_MODEL, MODELS, PAPER_MODEL, describe_classifier
-from polysight.materials.result import PATCHES_FILE, match_patches, pack_patches, read_patches
+from polysight.materials.patch_files import PATCHES_FILE, match_patches, pack_patches, read_patches
 from polysight.materials.train import make_entries
 from polysight_papers.sensys2026.patches import Errors, draw, groups
 from polysight_shared.errors import ErrorCode

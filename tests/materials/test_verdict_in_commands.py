@@ -10,7 +10,7 @@ from tests.support.products import NAMES, PERMITTIVITY, REASON, write_judged_pro
 
 from polysight.cli.main import main
 from polysight.materials import PATCHES_FILE
-from polysight.materials.result import PATCHES_FORMAT
+from polysight.materials.patch_files import PATCHES_FORMAT
 from polysight.results import NoResult
 from polysight.results.verdict import LEVELS
 

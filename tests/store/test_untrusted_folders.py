@@ -21,7 +21,7 @@ from polysight.capture.row_files import PACKETS_SUFFIX, RUN, write_durably
 from polysight.cli.main import main
 from polysight.materials.labels import read_labels, read_truth
 from polysight.materials.library import Library
-from polysight.materials.result import read_patches
+from polysight.materials.patch_files import read_patches
 from polysight.materials.train import read_material
 from polysight.products import ProcessedScan
 from polysight.products.exports import read_netcdf

@@ -93,19 +93,21 @@ from polysight.materials.names import (
     PatchName as PatchName,
     format_permittivity as format_permittivity,
 )
-from polysight.materials.result import (
+from polysight.materials.patch_files import (
     PATCHES_FILE as PATCHES_FILE,
-    SMEAR as SMEAR,
-    STEEP_FINDING as STEEP_FINDING,
     MatchedPatch as MatchedPatch,
-    MaterialsResult as MaterialsResult,
     ScanPatches as ScanPatches,
-    make_labels as make_labels,
     match_patches as match_patches,
     pack_patches as pack_patches,
+    read_patches as read_patches,
+)
+from polysight.materials.result import (
+    SMEAR as SMEAR,
+    STEEP_FINDING as STEEP_FINDING,
+    MaterialsResult as MaterialsResult,
+    make_labels as make_labels,
     pixel_accuracy as pixel_accuracy,
     predict_pixel_accuracy as predict_pixel_accuracy,
-    read_patches as read_patches,
 )
 from polysight.materials.segment import (
     Box as Box,

@@ -1,19 +1,10 @@
-"""Result of `analyse`: patches with permittivities and names, their rows for materials.json, and `patches.npz`.
-
-`patches.npz` holds the features of the pixels of all patches; `match_patches` finds the same patches in several scans,
-to name them together.
-"""
+"""Result of `analyse`: patches with permittivities and names, and their rows for materials.json."""
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,16 +14,14 @@ from msgspec import UNSET, structs
 from polysight.imaging import MAX_RISE, Illumination, Image, Images, Rise
 from polysight.materials.common_change import CommonChange
 from polysight.materials.inversion import Inversion, RigPrior
-from polysight.materials.kinds import PatchDispersion, RatioCase, RatioEvidence, find_permittivity_slope, split_complex
+from polysight.materials.kinds import RatioEvidence, find_permittivity_slope
 from polysight.materials.labels import Labels
 from polysight.materials.library import Real, make_features
 from polysight.materials.measure import Permittivity, measure_background, ratio_sigma
 from polysight.materials.metal import MetalReference
 from polysight.materials.names import UNKNOWN, NamedPatch, PatchName
-from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate, axis_mm
+from polysight.materials.segment import Box, Patch, Segmentation, TruthPlate
 from polysight.results import BandFigures, ComplexNumber, PatchFigures, PermittivityFigures, TruthFigures
-from polysight.store import open_npz
-from polysight_shared.errors import DataError, ErrorCode
 from polysight_shared.findings import Finding
 
 MAX_BEND = 3.5
@@ -413,63 +402,6 @@ def _describe_truth(truth: TruthPlate, library: tuple[str, ...]) -> TruthFigures
     )
 
 
-PATCHES_FILE = "patches.npz"
-PATCHES_FORMAT = "polysight-patches-1"
-"""Name of the file in a scan's products, and of its format: a file of another one is refused."""
-SAME_PATCH_MM = 20.0
-"""Largest distance between the centres of one patch in two scans. Chosen: less than half of a plate and its gap."""
-NEAR_MM = 4.0
-"""Largest distance between pixels of two scans that show the same spot: about the resolution."""
-
-
-@dataclass(frozen=True)
-class ScanPatch:
-    """A patch in one scan: its centre (mm from the image centre), the positions and features of its pixels.
-
-    `places_mm` float64 [n, 2] from the image centre, `features` float64 [n, 4] of its interior, after the Gaussian
-    filter (`pixel_features`). `truth` is the true material, if known.
-    """
-
-    label: int
-    centre_mm: tuple[float, float]
-    truth: str | None
-    places_mm: Real
-    features: Real
-
-
-@dataclass(frozen=True)
-class ScanPatches:
-    """The patches of one scan; `evidence`: patch number to what its name rests on (earlier releases wrote none).
-
-    `angle_deg` is the mean incidence angle over the image; `simulated` is true if the scan was.
-    """
-
-    angle_deg: float
-    simulated: bool
-    patches: tuple[ScanPatch, ...]
-    evidence: Mapping[int, RatioEvidence] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class MatchedPatch:
-    """A patch that several scans show.
-
-    Attributes
-    ----------
-    label, truth
-        Number in the first scan, and true material, if known.
-    features
-        float64 [n, 4 * scans] of the spots that all of them show.
-    evidence
-        What each scan says of it; None if one of them does not say.
-    """
-
-    label: int
-    truth: str | None
-    features: Real
-    evidence: tuple[RatioEvidence, ...] | None = None
-
-
 def pixel_features(h: npt.ArrayLike, v: npt.ArrayLike, p: npt.ArrayLike) -> Real:
     """Return features [n, 4] of pixels (`library.make_features`); not finite for unusable pixels."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -496,170 +428,6 @@ def make_labels(result: MaterialsResult, description: str = "") -> Labels:
         key = name if name not in boxes else f"{name} ({patch_result.patch.label})"
         boxes[key] = (float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1))
     return Labels(boxes, description=description)
-
-
-def pack_patches(result: MaterialsResult, x_m: npt.ArrayLike, y_m: npt.ArrayLike, simulated: bool) -> bytes:
-    """Return the content of `patches.npz`; `x_m`, `y_m` are the image's axes."""
-    x = axis_mm(x_m)
-    y = axis_mm(y_m)
-    rows = []
-    places = [np.zeros((0, 2))]
-    features = [np.zeros((0, 4))]
-    for patch_result in result.patches:
-        pixels = patch_result.patch.interior
-        iy, ix = np.nonzero(pixels)
-        places.append(np.stack([x[ix], y[iy]], axis=1))
-        features.append(pixel_features(result.h[pixels], result.v[pixels], result.p[pixels]))
-        truth = patch_result.truth.name if patch_result.truth else None
-        rows.append(
-            {
-                "label": patch_result.patch.label,
-                "centre_mm": patch_result.patch.centre_mm,
-                "truth": truth,
-                "pixels": int(ix.size),
-            }
-        )
-    angle = float(np.degrees(np.mean(result.theta_rad)))
-    judged = list(result.evidence)
-    meta = {"format": PATCHES_FORMAT, "angle_deg": angle, "simulated": simulated, "patches": rows, "judged": judged}
-    evidence = result.evidence.values()
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        meta=np.frombuffer(json.dumps(meta).encode("utf-8"), np.uint8),
-        places_mm=np.concatenate(places).astype(np.float32),
-        features=np.concatenate(features).astype(np.float32),
-        evidence_theta_rad=np.array([e.theta_rad for e in evidence], np.float64),
-        evidence_ratio=np.array([e.inverse_ratio for e in evidence], np.complex128),
-        evidence_covariance=np.array([e.covariance for e in evidence], np.float64).reshape(-1, 2, 2),
-        evidence_share=np.array([e.library_share for e in evidence], np.float64),
-        evidence_brightness=np.reshape([[e.brightness_off, e.brightness_std] for e in evidence], (-1, 2)),
-        evidence_dispersion=np.reshape([_pack_dispersion(e.dispersion) for e in evidence], (-1, 8)),
-        evidence_cases=np.reshape([_pack_cases(e.cases) for e in evidence], (-1, 2, 7)),
-    )
-    return buffer.getvalue()
-
-
-def _pack_dispersion(dispersion: PatchDispersion | None) -> Real:
-    """Return change, standard deviations, and the band in Hz, float64 [8]; NaN if they are not known."""
-    if dispersion is None:
-        return np.full(8, np.nan)
-    return np.concatenate([dispersion.change, dispersion.std, dispersion.band_hz])
-
-
-def _unpack_dispersion(row: Real) -> PatchDispersion | None:
-    """Return what :func:`_pack_dispersion` packed; None if it is not known."""
-    if not np.isfinite(row).all():
-        return None
-    return PatchDispersion(row[:3], row[3:6], (float(row[6]), float(row[7])))
-
-
-def _pack_cases(cases: Sequence[RatioCase]) -> Real:
-    """Return probability, t and covariance of both cases, float64 [2, 7]; NaN if there is one."""
-    rows = [[case.probability, *split_complex(case.inverse_ratio), *case.covariance.flat] for case in cases]
-    return np.array(rows) if rows else np.full((2, 7), np.nan)
-
-
-def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
-    """Return what :func:`_pack_cases` packed."""
-    return tuple(RatioCase(row[0], complex(*row[1:3]), row[3:].reshape(2, 2)) for row in rows[np.isfinite(rows[:, 0])])
-
-
-def read_patches(path: Path) -> ScanPatches:
-    """Read `patches.npz` (no pickle). Raises DataError."""
-    try:
-        with open_npz(path) as z:
-            meta = json.loads(z["meta"].tobytes().decode("utf-8"))
-            places = z["places_mm"].astype(np.float64)
-            features = z["features"].astype(np.float64)
-            evidence = _read_evidence(z, meta["judged"]) if "evidence_ratio" in z else {}
-        if meta["format"] != PATCHES_FORMAT:
-            raise ValueError(f"its format is {meta['format']!r}, this program reads {PATCHES_FORMAT!r}")
-        ends = np.cumsum([0, *(int(r["pixels"]) for r in meta["patches"])])
-        if features.shape != (ends[-1], 4) or places.shape != (ends[-1], 2):
-            raise ValueError(f"arrays {places.shape}, {features.shape} for {ends[-1]} pixels")
-        patches = tuple(
-            _read_patch(r, places[a:b], features[a:b]) for r, a, b in zip(meta["patches"], ends, ends[1:], strict=False)
-        )
-        return ScanPatches(float(meta["angle_deg"]), bool(meta["simulated"]), patches, evidence)
-    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as e:
-        raise DataError(
-            f"{path}: the patches cannot be read: {type(e).__name__}: {e}",
-            "it is damaged, or of another version", "process the scan again", code=ErrorCode.FILE_UNREADABLE,
-        ) from None  # fmt: skip
-
-
-def _read_evidence(arrays: Mapping[str, npt.NDArray], judged: Sequence[int]) -> dict[int, RatioEvidence]:
-    """Return what the names of the judged patches rest on. Raises ValueError if the arrays do not fit."""
-    # Products of earlier states hold neither brightness nor dispersion nor cases.
-    brightness = arrays.get("evidence_brightness", np.full((len(judged), 2), np.nan))
-    dispersions = arrays.get("evidence_dispersion", np.full((len(judged), 8), np.nan))
-    cases = arrays.get("evidence_cases", np.full((len(judged), 2, 7), np.nan))
-    numbers = [arrays[f"evidence_{name}"] for name in ("theta_rad", "ratio", "covariance", "share")]
-    columns = zip(*numbers, brightness, map(_unpack_dispersion, dispersions), map(_unpack_cases, cases), strict=True)
-    rows = [
-        RatioEvidence(
-            theta_rad=float(angle), inverse_ratio=complex(ratio), covariance=covariance, library_share=float(share),
-            brightness_off=float(off), brightness_std=float(std), dispersion=dispersion, cases=both_cases,
-        )
-        for angle, ratio, covariance, share, (off, std), dispersion, both_cases in columns
-    ]  # fmt: skip
-    if any(row.covariance.shape != (2, 2) for row in rows):
-        raise ValueError("covariances are not [patch, 2, 2]")
-    return dict(zip(map(int, judged), rows, strict=True))
-
-
-def _read_patch(row: Mapping[str, Any], places: Real, features: Real) -> ScanPatch:
-    x, y = row["centre_mm"]
-    return ScanPatch(int(str(row["label"])), (float(x), float(y)), row["truth"], places, features)
-
-
-def match_patches(scans: Sequence[ScanPatches]) -> list[MatchedPatch]:
-    """Return the patches that all scans show at the same place, pixel by pixel.
-
-    Two patches match if their centres are each other's nearest and at most `SAME_PATCH_MM` apart. Pixels match by their
-    position in the patch, so that the scans' image centres may differ by up to half a patch.
-    """
-    matched = []
-    for patch in scans[0].patches:
-        partners = [p for other_scan in scans[1:] if (p := _find_partner(patch, scans[0], other_scan)) is not None]
-        if len(partners) < len(scans) - 1:
-            continue
-        pairs = zip(scans, (patch, *partners), strict=True)
-        evidence = tuple(scan.evidence[p.label] for scan, p in pairs if p.label in scan.evidence)
-        places = patch.places_mm - patch.centre_mm
-        columns = [patch.features]
-        near_enough = np.ones(len(places), bool)
-        for partner in partners:
-            partner_places = partner.places_mm - partner.centre_mm
-            if not len(partner_places):
-                near_enough[:] = False
-                columns.append(columns[0])
-                continue
-            distance_mm, nearest_index = scipy.spatial.KDTree(partner_places).query(places)
-            near_enough &= distance_mm <= NEAR_MM
-            columns.append(partner.features[np.minimum(nearest_index, len(partner_places) - 1)])
-        complete = evidence if len(evidence) == len(scans) else None
-        matched.append(MatchedPatch(patch.label, patch.truth, np.hstack(columns)[near_enough], complete))
-    return matched
-
-
-def _find_partner(patch: ScanPatch, own_scan: ScanPatches, other_scan: ScanPatches) -> ScanPatch | None:
-    """Return the other scan's patch nearest to this one, if this one is also the nearest to it."""
-
-    def nearest(patch: ScanPatch, among: ScanPatches) -> ScanPatch | None:
-        def distance_mm(candidate: ScanPatch) -> float:
-            return float(
-                np.hypot(candidate.centre_mm[0] - patch.centre_mm[0], candidate.centre_mm[1] - patch.centre_mm[1])
-            )
-
-        best = min(among.patches, key=distance_mm, default=None)
-        return best if best is not None and distance_mm(best) <= SAME_PATCH_MM else None
-
-    partner = nearest(patch, other_scan)
-    if partner is not None and nearest(partner, own_scan) is patch:
-        return partner
-    return None
 
 
 def pixel_accuracy(result: MaterialsResult) -> float | None:

@@ -97,6 +97,34 @@ def test_a_file_of_an_earlier_release_without_errors_of_its_patches_is_read(
         assert name == match.truth or name not in library.names
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        # Probabilities that are not positive or whose sum is not 1, and rows that lack a number
+        (lambda cases: cases * [-1, 1, 1, 1, 1, 1, 1], "probabilities"),
+        (lambda cases: cases * [2, 1, 1, 1, 1, 1, 1], "probabilities"),
+        (lambda cases: cases[:, :, :-1], "reshape"),
+        (lambda cases: cases[:, 0, 0], "reshape"),
+    ],
+)
+def test_a_file_whose_cases_of_paint_are_damaged_is_refused(synthetic, analyse_placement, tmp_path, change, reason):
+    scene = synthetic(seed=3)
+    path = tmp_path / "patches.npz"
+    path.write_bytes(pack_patches(analyse_placement(1000), scene.x_m, scene.y_m, simulated=True))
+    with np.load(path) as z:
+        arrays = {k: z[k] for k in z}
+    # Each patch: probability, t and covariance with paint, and without.
+    case = np.array([0.5, 1.5, 0.1, 0.01, 0.0, 0.0, 0.01])
+    cases = np.tile(case, (len(arrays["evidence_cases"]), 2, 1))
+    with path.open("wb") as file:
+        np.savez(file, **{**arrays, "evidence_cases": cases})
+    assert all(len(evidence.cases) == 2 for evidence in read_patches(path).evidence.values())
+    with path.open("wb") as file:
+        np.savez(file, **{**arrays, "evidence_cases": change(cases)})
+    with expect_refusal(ErrorCode.FILE_UNREADABLE, reason):
+        read_patches(path)
+
+
 def test_a_file_whose_errors_are_of_fewer_patches_is_refused(synthetic, analyse_placement, tmp_path):
     scene = synthetic(seed=3)
     path = tmp_path / "patches.npz"

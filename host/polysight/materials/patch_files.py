@@ -145,8 +145,11 @@ def _pack_cases(cases: Sequence[RatioCase]) -> Real:
 
 
 def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
-    """Return what :func:`_pack_cases` packed."""
-    return tuple(RatioCase(row[0], complex(*row[1:3]), row[3:].reshape(2, 2)) for row in rows[np.isfinite(rows[:, 0])])
+    """Return what :func:`_pack_cases` packed. Raises ValueError for rows of another shape or without probabilities."""
+    known_rows = [row for row in rows.reshape(2, 7) if np.isfinite(row).all()]
+    if known_rows and not (np.isclose(sum(row[0] for row in known_rows), 1) and min(row[0] for row in known_rows) > 0):
+        raise ValueError("the probabilities of the cases of a patch are not positive, or their sum is not 1")
+    return tuple(RatioCase(float(row[0]), complex(*row[1:3]), row[3:].reshape(2, 2)) for row in known_rows)
 
 
 def read_patches(path: Path) -> ScanPatches:

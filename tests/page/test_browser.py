@@ -17,8 +17,10 @@ def list_running_in_group(group: int) -> set[int]:
         if not folder.name.isdigit():
             continue
         with suppress(OSError):
-            # proc_pid_stat(5), after the name: state, parent, group
-            state, _, process_group = (folder / "stat").read_text(errors="replace").rpartition(") ")[2].split()[:3]
+            # proc_pid_stat(5): after the name, which ends in a bracket, come the state, the parent and the group.
+            fields_after_name = (folder / "stat").read_text(errors="replace").rpartition(") ")[2].split()
+            state, _, process_group = fields_after_name[:3]
+            # Z and X: the process has ended.
             if int(process_group) == group and state not in "ZX":
                 running.add(int(folder.name))
     return running

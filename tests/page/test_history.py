@@ -9,8 +9,10 @@ from polysight.page.history import parse_seconds
 from polysight.page.status import estimate_time_left
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, ScanFolder
+from polysight_shared.faults import PiFault
 from polysight_shared.messages import Capture, Fault
 
+# A time of the scan, to be filled with minute and second.
 UTC = "2026-05-01T02:{:02d}:{:02d}.000+00:00"
 
 
@@ -23,7 +25,7 @@ def make_history(facts):
 
 @pytest.fixture
 def begun(finished_scan):
-    """A history whose scan began at 02:00 and has committed rows 0 and 1 at 02:01 and 02:02."""
+    """A history whose scan began at 02:00 and has committed rows 0 and 1 at 02:01 and 02:02; and its last row."""
     facts = load_facts(finished_scan)
     rows = [f for f in facts if f["fact"] == "row_committed"]
     history = begin_history(facts[0] | {"started_utc": UTC.format(0, 0), "simulated": False})
@@ -47,13 +49,12 @@ def test_counts_are_those_of_the_scan_folder(finished_scan):
 def test_lost_shares_are_percent_of_the_bytes_of_each_row(finished_scan):
     history = make_history(load_facts(finished_scan))
     row = history.content.rows[1]
-    boards = {
-        name: structs.replace(part, missing_bytes=part.bytes // 8) if name == "RV" else part
-        for name, part in row.boards.items()
-    }
-    history.content.rows[1] = structs.replace(row, boards=boards)
-    rows = sorted(history.content.rows)
-    assert history.lost_shares == {"RH": dict.fromkeys(rows, 0.0), "RV": dict.fromkeys(rows, 0.0) | {1: 12.5}}
+    # RV lacks an eighth of its bytes in row 1.
+    rv = row.boards["RV"]
+    rv_with_loss = structs.replace(rv, missing_bytes=rv.bytes // 8)
+    history.content.rows[1] = structs.replace(row, boards={**row.boards, "RV": rv_with_loss})
+    no_losses = dict.fromkeys(sorted(history.content.rows), 0.0)
+    assert history.lost_shares == {"RH": no_losses, "RV": no_losses | {1: 12.5}}
 
 
 def test_trigger_health_is_the_worst_of_all_bursts(finished_scan):
@@ -67,15 +68,16 @@ def test_trigger_health_is_the_worst_of_all_bursts(finished_scan):
 
 def test_a_fault_reported_twice_is_shown_once(finished_scan):
     history = make_history(load_facts(finished_scan))
-    fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=103, problem="a trigger edge was lost")
+    fault = Fault(scan_id="s", seq=9, t_mono_ns=1, number=PiFault.EDGE_LOST, problem="a trigger edge was lost")
     history.add_events([fault])
     history.add_events([fault])
     assert [n.level for n in history.notices] == ["warning"]
-    assert "103" in history.notices[0].what
+    assert str(int(PiFault.EDGE_LOST)) in history.notices[0].what
     assert history.notices[0].do
 
 
 def test_time_left_is_what_rows_took(begun):
+    """A row takes 60 s. The third one began at 02:02, and 20 s later it has 40 s left."""
     history, last = begun
     now = parse_seconds(UTC.format(2, 20))
     assert estimate_time_left(history, now) == (40, "measured")
@@ -104,18 +106,19 @@ def test_time_left_after_one_row_is_what_that_row_took(finished_scan):
     assert history.row_seconds == (60.0, "measured")
 
 
-def test_time_left_before_the_first_row_is_the_plan_s(finished_scan):
+def test_before_the_first_row_a_real_scan_s_time_is_planned_and_a_simulated_one_s_unknown(finished_scan):
     started = load_facts(finished_scan)[0]
     real = begin_history(started | {"simulated": False})
     simulated = begin_history(started | {"simulated": True})
-    row_s = real.row_seconds
-    assert row_s is not None
-    assert row_s[1] == "plan"
-    assert row_s[0] > 2 * real.plan.step_x_mm / real.instrument.stage.speed_mm_s
+    assert real.row_seconds is not None
+    seconds, source = real.row_seconds
+    assert source == "plan"
+    # Two steps between the three positions of a row at full speed; the stage also speeds up and slows down.
+    assert seconds > 2 * real.plan.step_x_mm / real.instrument.stage.speed_mm_s
     assert simulated.row_seconds is None
 
 
-def test_rejected_then_committed_leaves_a_warning(begun):
+def test_a_row_that_was_rejected_and_then_committed_leaves_a_warning(begun):
     history, last = begun
     add_fact(history, {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {},
          "faults": [{"kind": "no_data", "board": "RV"}], "rejected_utc": UTC.format(2, 30)})  # fmt: skip
@@ -130,17 +133,19 @@ def test_rejected_then_committed_leaves_a_warning(begun):
 def test_rejections_of_earlier_releases_are_shown_without_a_cause(begun):
     history, _ = begun
     add_fact(history, {"fact": "row_rejected", "row": 2, "take": 1, "reasons": ["RV: no data"], "boards": {}})
-    assert (history.marks[2], history.notices[-1].facts["detail"]) == ("rejected", "RV: no data")
-    assert (history.notices[-1].why, [b.retaken for b in history.boards if b.name == "RV"]) == ("", [1])
+    notice = history.notices[-1]
+    assert history.marks[2] == "rejected"
+    assert (notice.facts["detail"], notice.why) == ("RV: no data", "")
+    assert [board.retaken for board in history.boards if board.name == "RV"] == [1]
 
 
-def test_withdrawn_is_missing_until_taken_again(begun):
+def test_a_withdrawn_row_is_missing_until_it_is_taken_again(begun):
     history, _ = begun
     add_fact(history, {"fact": "row_withdrawn", "row": 1, "take": 1, "reasons": ["short"]})
     assert (set(history.takes), 1 in history.marks) == ({0}, False)
 
 
-def test_resumed_is_not_ended(finished_scan):
+def test_a_scan_that_was_resumed_has_not_ended(finished_scan):
     history = make_history(load_facts(finished_scan))
     add_fact(history, {"fact": "scan_resumed", "resumed_utc": UTC.format(5, 0), "rows_missing": 0})
     assert history.ended is None

@@ -14,18 +14,20 @@ from polysight.page.watch import compute_range_profile_db
 from polysight.sync import SyncedRow
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
+# Pixels of the images; chosen, different in both directions.
 NY = 8
 NX = 11
 
 
 def decode_pixels(png: bytes) -> np.ndarray:
+    """Pixels of a picture, float [row from the top, column, red green blue opacity], 0 to 1."""
     return imread(io.BytesIO(png), format="png")
 
 
 @pytest.fixture
 def images() -> Images:
+    """Dim images (-40 dB) with one bright pixel, at the smallest y and the largest x."""
     h = np.full((NY, NX), 0.01, np.complex64)
-    # Smallest y, largest x
     h[0, -1] = 1.0
     axes = (np.arange(NX, dtype=float), np.arange(NY, dtype=float))
     return Images(h, h.copy(), *axes, np.ones((NY, NX), bool))
@@ -35,30 +37,36 @@ def test_smallest_y_is_at_the_bottom(images):
     picture = decode_pixels(draw(images)["h_amplitude"].png)
     assert picture.shape == (NY, NX, 4)
     brightness = picture[..., :3].sum(axis=-1)
-    assert np.unravel_index(brightness.argmax(), brightness.shape) == (NY - 1, NX - 1)
+    brightest_pixel = np.unravel_index(brightness.argmax(), brightness.shape)
+    assert brightest_pixel == (NY - 1, NX - 1)
 
 
 def test_what_no_row_has_lit_is_transparent(images):
     is_lit = np.ones((NY, NX), bool)
+    # The three rows of smallest y, which are the last ones of a picture.
     is_lit[:3] = False
-    for picture in draw(replace(images, valid=is_lit)).values():
-        assert (decode_pixels(picture.png)[-3:, :, 3] == 0).all()
-    assert (decode_pixels(draw(replace(images, valid=is_lit))["h_amplitude"].png)[:-3, :, 3] == 1).all()
+    pictures = draw(replace(images, valid=is_lit))
+    for picture in pictures.values():
+        opacity = decode_pixels(picture.png)[..., 3]
+        assert (opacity[-3:] == 0).all()
+    opacity_of_amplitude = decode_pixels(pictures["h_amplitude"].png)[..., 3]
+    assert (opacity_of_amplitude[:-3] == 1).all()
 
 
-def test_nothing_lit_is_drawn_all_the_same(images):
+def test_pictures_of_images_with_nothing_lit_are_transparent(images):
     nothing_lit = replace(images, valid=np.zeros((NY, NX), bool))
     assert all((decode_pixels(p.png)[..., 3] == 0).all() for p in draw(nothing_lit).values())
 
 
-def test_phase_is_cyclic_and_comes_round(images):
+def test_the_colours_of_phases_meet_at_180_degrees(images):
+    """Colours of -180 and +180 degrees are one, and unlike that of 0; both limits are chosen."""
     angles = np.linspace(-np.pi, np.pi, NX, dtype=np.float32)
     rotated = np.tile(np.exp(1j * angles).astype(np.complex64), (NY, 1))
-    row = decode_pixels(draw(replace(images, h=rotated))["h_phase"].png)[0, :, :3]
-    assert np.abs(row[0] - row[-1]).max() < 0.02
-    assert np.abs(row[0] - row[NX // 2]).max() > 0.3
-    ends = decode_pixels(colour_bar(PHASE_COLOURS))[0]
-    assert np.abs(ends[0] - ends[-1]).max() < 0.02
+    colours = decode_pixels(draw(replace(images, h=rotated))["h_phase"].png)[0, :, :3]
+    assert np.abs(colours[0] - colours[-1]).max() < 0.02
+    assert np.abs(colours[0] - colours[NX // 2]).max() > 0.3
+    bar = decode_pixels(colour_bar(PHASE_COLOURS))[0]
+    assert np.abs(bar[0] - bar[-1]).max() < 0.02
 
 
 @pytest.mark.parametrize("picture", ["h_phase", "p_phase"])
@@ -66,28 +74,38 @@ def test_phase_is_cyclic_and_comes_round(images):
     ("level_db", "opacity"), [(-30, 0.0), (-26, 0.0), (-24, 0.25), (-22, 0.5), (-18, 1.0), (-9, 1.0)]
 )
 def test_phases_fade_with_the_level_below_the_brightest_pixels(images, picture, level_db, opacity):
+    """Opacity falls from 1 at -18 dB to 0 at -26 dB, in proportion to the decibels."""
     h = np.ones((NY, NX), np.complex64)
-    # The picture's first row
-    h[-1, 3] = 10 ** (level_db / 20)
-    drawn = decode_pixels(draw(replace(images, h=h, v=np.ones_like(h)))[picture].png)
-    assert drawn[0, 3, 3] == pytest.approx(opacity, abs=0.01)
-    assert (np.delete(drawn[..., 3].ravel(), 3) == 1).all()
+    # One pixel is dim. The largest y is the first row of a picture.
+    column = 3
+    h[-1, column] = 10 ** (level_db / 20)
+    pixels = decode_pixels(draw(replace(images, h=h, v=np.ones_like(h)))[picture].png)
+    opacities = pixels[..., 3]
+    # 0.01: opacities have 8 bits.
+    assert opacities[0, column] == pytest.approx(opacity, abs=0.01)
+    other_opacities = np.delete(opacities.ravel(), column)
+    assert (other_opacities == 1).all()
 
 
-def test_phase_of_p_is_the_difference(images):
+def test_the_phase_of_p_is_that_of_h_less_that_of_v(images):
+    """Phases of 1 and 0.25 rad (chosen) give the picture that 0.75 and 0 rad give."""
     h = images.h * np.exp(1j).astype(np.complex64)
     v = images.v * np.exp(0.25j).astype(np.complex64)
-    p = draw(replace(images, h=h, v=v))["p_phase"].png
-    same = draw(replace(images, h=images.h * np.exp(0.75j).astype(np.complex64)))["p_phase"].png
-    assert np.allclose(decode_pixels(p), decode_pixels(same), atol=0.01)
+    picture_of_both = draw(replace(images, h=h, v=v))["p_phase"].png
+    h_alone = images.h * np.exp(0.75j).astype(np.complex64)
+    picture_of_h_alone = draw(replace(images, h=h_alone))["p_phase"].png
+    assert np.allclose(decode_pixels(picture_of_both), decode_pixels(picture_of_h_alone), atol=0.01)
 
 
 @pytest.mark.parametrize("path_m", [0.3, 0.45, 0.8])
 def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
+    """The direct path, of amplitude 1, is at 0 m, and an echo of 0.3 (chosen) at its longer path."""
     chirp = load_published_rig().chirp
     sweep_hz = chirp.first_sample_hz + chirp.hz_per_sample * np.arange(chirp.samples)
-    echo = 1 + 0.3 * np.exp(2j * np.pi * sweep_hz * path_m / SPEED_OF_LIGHT_M_S)
-    samples = np.tile(echo.astype(np.complex64), (4, 5, 1))
+    echo_amplitude = 0.3
+    direct_and_echo = 1 + echo_amplitude * np.exp(2j * np.pi * sweep_hz * path_m / SPEED_OF_LIGHT_M_S)
+    # Four RX and five positions.
+    samples = np.tile(direct_and_echo.astype(np.complex64), (4, 5, 1))
     zeros = np.zeros(5)
     row = SyncedRow(
         samples=samples,
@@ -98,11 +116,14 @@ def test_an_echo_stands_at_its_path_in_the_range_profile(path_m):
         direct_amplitude=zeros,
     )
     distances_m = np.linspace(-0.2, 1.0, 601)
-    level = compute_range_profile_db(row, chirp, distances_m)
-    assert abs(distances_m[level.argmax()]) < 0.01
-    assert level.max() == pytest.approx(0.0, abs=0.05)
-    level_without_direct_path = np.where(np.abs(distances_m) < 0.2, -200.0, level)
-    assert distances_m[level_without_direct_path.argmax()] == pytest.approx(path_m, abs=0.01)
-    assert level_without_direct_path.max() == pytest.approx(20 * np.log10(0.3), abs=0.5)
+    level_db = compute_range_profile_db(row, chirp, distances_m)
+    # 1 cm: chosen, five steps of the distances.
+    assert abs(distances_m[level_db.argmax()]) < 0.01
+    assert level_db.max() == pytest.approx(0.0, abs=0.05)
+    # -200 dB stand for nothing.
+    level_of_echo_db = np.where(np.abs(distances_m) < 0.2, -200.0, level_db)
+    assert distances_m[level_of_echo_db.argmax()] == pytest.approx(path_m, abs=0.01)
+    # 0.5 dB: chosen, for side lobes of the direct path.
+    assert level_of_echo_db.max() == pytest.approx(20 * np.log10(echo_amplitude), abs=0.5)
     without_positions = replace(row, valid=np.zeros(5, bool))
     assert np.ptp(compute_range_profile_db(without_positions, chirp, distances_m)) == 0

@@ -23,8 +23,12 @@ from polysight.store import manifest
 from polysight.store.logs import read_events
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
 
+# Time after which a program without a sign of life counts as ended; chosen so long that no test reaches it.
+NEVER_LAPSES_S = 1e6
+
 
 def read_state(watch: Watch) -> dict:
+    """The newest snapshot, as a viewer gets it."""
     return json.loads(watch.state.data)
 
 
@@ -55,6 +59,7 @@ def test_a_finished_folder_is_shown_unchanged(finished_scan, truth, watching):
     watch = watching(finished_scan)
     watch.wait_for(has_rows(scan.plan.rows))
     state = read_state(watch)
+    # One letter for each row: c is committed.
     assert (state["status"]["level"], state["scan"]["marks"]) == ("done", "ccc")
     assert (state["scan"]["rows"], state["scan"]["committed"]) == (3, 3)
     assert state["scan"]["simulated"] is True
@@ -63,7 +68,8 @@ def test_a_finished_folder_is_shown_unchanged(finished_scan, truth, watching):
         assert board["frames_received"] == summary.frames_received
         assert board["masked"] == summary.positions_masked
     assert {name: p.png for name, p in watch.shown.pictures.items()} == {n: p.png for n, p in pictures.items()}
-    assert set(state["pictures"]["scales"]) == {f"{c}_{k}" for c in "hvp" for k in ("amplitude", "phase")}
+    picture_names = {f"{channel}_{part}" for channel in "hvp" for part in ("amplitude", "phase")}
+    assert set(state["pictures"]["scales"]) == picture_names
     assert state["profile"]["row"] == 2
     for board in state["sync"].values():
         assert list(board) == ["0", "1", "2"]
@@ -71,7 +77,7 @@ def test_a_finished_folder_is_shown_unchanged(finished_scan, truth, watching):
 
 
 def test_rows_grow_as_they_are_committed(growing: GrowingScan, watching):
-    watch = watching(growing.path, lapse_s=1e6)
+    watch = watching(growing.path, lapse_s=NEVER_LAPSES_S)
     assert read_state(watch)["scan"] is None
     growing.touch_alive()
     growing.grow_until("scan_started")
@@ -102,13 +108,13 @@ def test_a_scan_that_becomes_silent_is_reported_as_ended(growing, watching):
         state = read_state(watch)
         return state["status"]["level"] == "good" and state["running"]
 
-    wait_for(is_alive, "that it lives")
+    wait_for(is_alive, "that the scan is shown as running")
     watch.wait_for(lambda s: s["status"]["key"] in ("frozen", "killed"))
     state = read_state(watch)
     assert not state["running"]
     assert "polysight resume" in state["status"]["do"]
     wait_for(lambda: json.loads(watch.motion.data)["left_s"] is None, "that no time is left")
-    wait_for(is_alive, "that it lives again")
+    wait_for(is_alive, "that the scan is shown as running again")
 
 
 def test_a_killed_program_is_reported_immediately_however_long_its_timeout_is(growing, watching):
@@ -117,7 +123,7 @@ def test_a_killed_program_is_reported_immediately_however_long_its_timeout_is(gr
     life = SignOfLife(program.pid, read_start_ticks(program.pid) or 0, socket.gethostname())
     growing.touch_alive()
     (growing.path / CONTROL_FOLDER / ALIVE_FILE).write_bytes(msgspec.json.encode(life))
-    watch = watching(growing.path, lapse_s=1e6)
+    watch = watching(growing.path, lapse_s=NEVER_LAPSES_S)
     watch.wait_for(lambda s: s["running"])
     program.kill()
     program.wait()
@@ -133,7 +139,9 @@ def test_an_unfinished_folder_without_a_program_is_reported_immediately(growing,
 
 def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
     raw = next((growing.path / "raw" / "RV").glob("0001.bin"))
-    raw.write_bytes(raw.read_bytes()[:-1] + b"\x55")
+    content = raw.read_bytes()
+    raw.write_bytes(content[:-1] + b"\x55")
+    # All facts are written.
     while growing.grow():
         pass
     watch = watching(growing.path)
@@ -144,7 +152,7 @@ def test_a_damaged_row_is_named_and_the_others_are_shown(growing, watching):
 
 def test_another_scan_in_the_same_place_begins_afresh(growing, finished_scan, watching):
     growing.grow_until("row_committed")
-    watch = watching(growing.path, lapse_s=1e6)
+    watch = watching(growing.path, lapse_s=NEVER_LAPSES_S)
     watch.wait_for(has_rows(1))
     shutil.rmtree(growing.path)
     shutil.copytree(finished_scan, growing.path)
@@ -154,7 +162,7 @@ def test_another_scan_in_the_same_place_begins_afresh(growing, finished_scan, wa
 
 def test_a_new_scan_of_an_old_name_has_nothing_of_the_old_one(growing, watching):
     growing.grow_until("row_committed")
-    watch = watching(growing.path, lapse_s=1e6)
+    watch = watching(growing.path, lapse_s=NEVER_LAPSES_S)
     watch.wait_for(has_rows(1))
     shutil.rmtree(growing.path)
     watch.wait_for(lambda s: s["status"]["key"] == "folder_gone")
@@ -188,32 +196,35 @@ def test_a_manifest_of_another_release_is_not_taken_for_none(growing, watching):
 
 # --- files as they grow ---
 
+# Where a file is cut, as shares of its length.
 CUTS = st.lists(st.floats(0, 1), max_size=12)
 
 
 @pytest.mark.parametrize(("name", "tail"), [(MANIFEST, ManifestTail), (EVENTS, EventTail)])
-def test_any_pieces_give_the_whole(finished_scan, tmp_path_factory, name, tail):
+def test_a_file_that_grows_in_any_pieces_gives_all_its_facts(finished_scan, tmp_path_factory, name, tail):
     raw = (finished_scan / name).read_bytes()
     if name == MANIFEST:
         all_facts = manifest.parse(raw).facts
     else:
         all_facts = read_events(finished_scan / name).events
+    # There is something to cut.
     assert len(all_facts) > 4
 
     @settings(max_examples=20)
     @given(CUTS)
     def check_pieces(cuts: list[float]) -> None:
         path = tmp_path_factory.mktemp("pieces") / name
-        tailing = tail(path)
+        reader = tail(path)
         collected = []
-        ends = sorted({int(c * len(raw)) for c in cuts} | {len(raw)})
-        for start, end in zip([0, *ends], ends, strict=False):
+        ends = sorted({int(share * len(raw)) for share in cuts} | {len(raw)})
+        starts = [0, *ends[:-1]]
+        for start, end in zip(starts, ends, strict=True):
             with path.open("ab") as f:
                 f.write(raw[start:end])
-            collected += tailing.look()
+            collected += reader.look()
             assert collected == all_facts[: len(collected)]
         assert collected == all_facts
-        assert tailing.look() == []
+        assert reader.look() == []
 
     check_pieces()
 
@@ -252,6 +263,7 @@ def test_another_and_longer_file_is_found_after_a_single_look(finished_scan, tmp
 
 def test_the_verdict_follows_the_products(tmp_path):
     tail = ProductsTail(tmp_path)
+    # `look` is given the time when the scan was begun; "" is before all products.
     assert tail.look("") is None
     for level in ("care", "none", None, "good"):
         shutil.rmtree(tmp_path / "products", ignore_errors=True)
@@ -273,14 +285,15 @@ def test_images_before_materials_and_earlier_products_are_not_a_result(tmp_path)
     assert tail.look("") is None
 
 
-def test_it_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
+def test_a_verdict_is_shown_when_the_scan_has_ended(growing: GrowingScan, watching):
     growing.grow_until("row_committed")
     write_judged_products(growing.path / "products", "care")
     watch = watching(growing.path)
     watch.wait_for(lambda s: s["scan"] is not None)
-    assert json.loads(watch.state.data)["verdict"] is None  # of an earlier run of the scan
+    # The products are those of an earlier run of the scan.
+    assert read_state(watch)["verdict"] is None
     growing.grow_until("scan_ended")
     watch.wait_for(lambda s: s["verdict"] is not None)
-    verdict = json.loads(watch.state.data)["verdict"]
+    verdict = read_state(watch)["verdict"]
     assert verdict["level"] == "care"
     assert [{key: r[key] for key in REASON} for r in verdict["reasons"]] == [REASON]

@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from tests.support.paths import REPO
 from tests.support.processes import HANG_S, LIMIT_S, read_idle_s, wait_for
 
-# Sizes of a window: width, height, and whether it is a phone.
+# Sizes of a window: width and height in CSS pixels, and whether it is a phone; chosen, the phone's as a common one has.
 DESK = (1400, 900, False)
 PHONE = (390, 844, True)
 
@@ -33,8 +33,11 @@ def find_chromium() -> str | None:
 
     The headless shell comes first: it draws no windows, and a page takes a third of the processor time.
     """
-    programs = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
-    return next(filter(None, map(shutil.which, programs)), None)
+    for program in ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome"):
+        path = shutil.which(program)
+        if path is not None:
+            return path
+    return None
 
 
 def find_axe() -> Path | None:
@@ -65,18 +68,20 @@ class Browser:
         command = [
             program,
             "--headless=new",
+            # A container lets no program make a sandbox, and has little shared memory.
             "--no-sandbox",
-            "--disable-gpu",
             "--disable-dev-shm-usage",
+            "--disable-gpu",
             "--no-first-run",
         ]
+        # With port 0 the browser chooses one, and writes it into the file DevToolsActivePort of its profile.
         command += ["--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"]
         command += [f"--user-data-dir={profile}", "about:blank"]
         self._log = (folder / "chromium.log").open("wb")
         # In a process group of its own: Debian's headless shell is started by a script, which would end without it.
         self._process = subprocess.Popen(command, stdout=self._log, stderr=self._log, start_new_session=True)
         try:
-            address = self._page(profile / "DevToolsActivePort")
+            address = self._wait_for_page(profile / "DevToolsActivePort")
             self._stack = ExitStack()
             self._socket = self._stack.enter_context(
                 connect(address, max_size=None, open_timeout=HANG_S, ping_interval=None)
@@ -84,7 +89,9 @@ class Browser:
         except BaseException:
             self._end()
             raise
+        # Number of the last request to the browser.
         self._count = 0
+        # Errors that the page reported, and addresses that it requested.
         self.errors: list[str] = []
         self.requests: list[str] = []
         for domain in ("Page", "Runtime", "Network", "Log"):
@@ -95,15 +102,15 @@ class Browser:
             features=[{"name": "prefers-color-scheme", "value": "light"}],
         )
 
-    def _page(self, answer: Path) -> str:
-        """Address of the first page's DevTools socket."""
+    def _wait_for_page(self, port_file: Path) -> str:
+        """Wait until the browser has a page; return the address of its DevTools socket."""
 
         def is_ready() -> bool:
             assert self._process.poll() is None, "Chromium ended; see chromium.log"
-            return answer.exists() and "\n" in answer.read_text()
+            return port_file.exists() and "\n" in port_file.read_text()
 
         wait_for(is_ready, "that Chromium starts")
-        port = answer.read_text().split()[0]
+        port = port_file.read_text().split()[0]
         pages: list[str] = []
 
         def has_page() -> bool:
@@ -126,15 +133,18 @@ class Browser:
                     raise NavigatedError(method)
                 assert "error" not in answer, (method, answer["error"])
                 return answer["result"]
-            self._note(answer.get("method", ""), answer.get("params", {}))
+            self._add_event(answer.get("method", ""), answer.get("params", {}))
 
-    def _note(self, event: str, what: dict[str, Any]) -> None:
+    def _add_event(self, event: str, parameters: dict[str, Any]) -> None:
+        """Keep the errors and requests among the browser's events."""
         if event == "Runtime.exceptionThrown":
-            self.errors.append(str(what["exceptionDetails"].get("exception", {}).get("description")))
-        elif event == "Log.entryAdded" and what["entry"]["level"] == "error":
-            self.errors.append(f"{what['entry']['text']} {what['entry'].get('url', '')}")
+            exception = parameters["exceptionDetails"].get("exception", {})
+            self.errors.append(str(exception.get("description")))
+        elif event == "Log.entryAdded" and parameters["entry"]["level"] == "error":
+            entry = parameters["entry"]
+            self.errors.append(f"{entry['text']} {entry.get('url', '')}")
         elif event == "Network.requestWillBeSent":
-            self.requests.append(what["request"]["url"])
+            self.requests.append(parameters["request"]["url"])
 
     def set_size(self, width: int, height: int, phone: bool) -> None:
         """The window's size in CSS pixels."""
@@ -153,7 +163,7 @@ class Browser:
     def visit(self, url: str, size: tuple[int, int, bool] = DESK) -> None:
         """Go to a page, and forget errors and requests of the previous one."""
         self.set_size(*size)
-        # A page that differs by its fragment only is not loaded again
+        # The browser does not load a page again whose address differs in the fragment (after #) only.
         self.open("about:blank")
         self.wait("location.href == 'about:blank'", "an empty page")
         self.errors.clear()
@@ -211,11 +221,12 @@ class Browser:
     def wait(self, expression: str, what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until an expression is true in the page."""
         deadline = read_idle_s() + limit_s
-        while not self._true(expression):
+        while not self._is_true(expression):
             assert read_idle_s() < deadline, f"not within {limit_s:g} s: {what}; it says {self.read_text('status')!r}"
             time.sleep(0.05)
 
-    def _true(self, expression: str) -> bool:
+    def _is_true(self, expression: str) -> bool:
+        """True if an expression is true; False also while the page is replaced by another."""
         try:
             return bool(self.evaluate(f"Boolean({expression})"))
         except NavigatedError:
@@ -236,6 +247,7 @@ class Browser:
         try:
             with suppress(ProcessLookupError):
                 os.killpg(self.process_group, signal.SIGTERM)
+            # Ten seconds, chosen; then it is killed.
             self._process.wait(10)
         except subprocess.TimeoutExpired:
             pass

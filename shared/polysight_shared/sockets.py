@@ -49,7 +49,7 @@ def host_name(address: str) -> str:
     """Return the host of `tcp://host:port` (port `*`: any free one). Raises ConfigError for another form."""
     scheme, _, host_and_port = address.partition("://")
     host, _, port = host_and_port.rpartition(":")
-    # libzmq takes a larger number without the bits above the 16th: another port.
+    # Of a larger number libzmq takes the lower 16 bits, and so another port.
     port_is_valid = port == "*" or (re.fullmatch("[0-9]{1,5}", port) and int(port) <= MAX_PORT)
     if scheme != "tcp" or not host or not port_is_valid:
         raise ConfigError(
@@ -99,6 +99,7 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
     else:
         files = HOST_KEYS
         remedy = f"copy the Pi's {' and '.join(HOST_KEYS)} here (docs/how-to/install.md); pi.key_dir is {key_dir}"
+    # The last of the files is this side's own key, with its secret part.
     secret_file = key_dir / files[-1]
     try:
         from zmq.auth import load_certificate
@@ -131,6 +132,7 @@ def _make(
 
     Raises ConfigError for a wrong address or without usable keys, DeviceError if ZeroMQ cannot bind or connect it.
     """
+    # Raises ConfigError for a wrong address.
     host_name(address)
     socket: Socket = context.socket(kind)
     socket.setsockopt(zmq.LINGER, 0)
@@ -203,7 +205,8 @@ def create_observer(context: zmq.Context[Any], address: str, key_dir: Path) -> S
     """Create the SUB socket of a program that only displays events: a short queue, and a heartbeat of ZeroMQ.
 
     The Pi has a queue for each subscriber; without the heartbeat it would keep the queue of one that was
-    stopped, or whose machine has failed. The host's own `create_subscriber` is rather kept: it must lose no events.
+    stopped, or whose machine has failed. The host that runs a scan uses `create_subscriber`: it must lose no events, so
+    that the Pi has to keep its queue.
     """
     # Times in ms: a heartbeat each second; after five seconds without one the Pi drops this subscriber. Chosen.
     options: dict[int, int | bytes] = {zmq.RCVHWM: 1000, zmq.SUBSCRIBE: EVENT_TOPIC}
@@ -232,7 +235,8 @@ class HandshakeMonitor:
         self._monitor = socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
         self._refused = False
         self.lacks_curve = False
-        # A refusal before this monitor would not be repeated: the socket connects again.
+        # The server may have refused the key before this monitor saw it, and reports that once for each connection. So
+        # the socket connects again.
         if endpoint := socket.getsockopt_string(zmq.LAST_ENDPOINT):
             socket.disconnect(endpoint)
             socket.connect(endpoint)

@@ -19,7 +19,7 @@ from polysight_shared.files import read_bounded
 
 # Chosen: far above any table written by hand.
 _MAX_BYTES = 64 << 20
-_RIG_KEYS = "instrument.toml in the repository and shared/polysight_shared/config.py explain every key"
+_WHERE_KEYS_ARE_EXPLAINED = "instrument.toml in the repository and shared/polysight_shared/config.py explain every key"
 T = TypeVar("T")
 # The upper limits only refuse infinities and typing errors.
 Positive = Annotated[float, msgspec.Meta(gt=0, le=1e15)]
@@ -105,6 +105,7 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as e:
+        # msgspec writes: Expected `int`, got `str` - at `$.grid.columns`. At the top there is no place.
         message, _, path = str(e).partition(" - at `")
         path = path.rstrip("`") or "$"
         key = path.removeprefix("$").lstrip(".")
@@ -117,7 +118,7 @@ def decode(raw: dict[str, Any], kind: type[T], source: str, keys: str = "") -> T
         raise ConfigError(
             f"{source}: {rule}",
             "the file breaks a rule of its format",
-            f"correct {key or 'that'} in {source}; {keys or _RIG_KEYS}",
+            f"correct {key or 'that'} in {source}; {keys or _WHERE_KEYS_ARE_EXPLAINED}",
             code=code,
         ) from None
 
@@ -137,7 +138,8 @@ def _rewrite_rule(rule: str, kind: Any) -> tuple[str, ErrorCode]:
         return f"the key {match[1]!r} is missing", ErrorCode.KEY_MISSING
     if match := re.fullmatch(r"Invalid enum value (.*)", rule):
         return f"{match[1]} is not an allowed value", ErrorCode.VALUE_INVALID
-    # Such as: Expected `int | null`, got `str`; Expected `float` > 0.0.
+    # Such as: Expected `int | null`, got `str`; Expected `float` > 0.0. The groups are the type, the limit behind it,
+    # and what was found instead, of which the latter two may be missing.
     match = re.fullmatch(r"Expected `(.+?)`( .+?)?(?:, got `?(.+?)`?)?", rule)
     if match is None:
         return rule, ErrorCode.VALUE_INVALID

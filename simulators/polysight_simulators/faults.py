@@ -23,9 +23,9 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     The card: `overflow` (half a frame is lost before packetising: no sequence gap, status bit 9), `mute` (no replies),
     `boot_s` (ignores requests for so many seconds after a power cycle).
     The radar: `missed_pulse`, `miss_pulses` (these SYNC_IN pulses start no frame), `spurious_edges` (pairs: pulse
-    number, and ms after that pulse at which a spurious edge comes). Its control server:
-    `retrigger_fails` (these lines have no effect), `retrigger_resets` (the connection is reset at these lines). Under
-    native control: `radar_fault_pulses` (the RF core faults at these pulses).
+    number, and ms after that pulse at which a spurious edge comes). Its control server: `retrigger_fails` (these lines
+    `Retrigger`, which arm the radar, have no effect), `retrigger_resets` (the connection is reset at these lines).
+    Under native control: `radar_fault_pulses` (the RF core faults at these pulses).
     """
 
     loss: Probability = 0.0
@@ -51,8 +51,8 @@ class Faults(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return any((self.loss, self.duplicate, self.reorder, self.truncate, self.corrupt))
 
 
-# Faults that need this value of `radar.control` in the rig file.
-CONTROL_OF_FAULT = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
+# Value of `radar.control` in the rig file, and the faults that can only be made with it.
+FAULTS_OF_CONTROL = {"line_server": ("retrigger_fails", "retrigger_resets"), "native": ("radar_fault_pulses",)}
 
 
 def read_faults(
@@ -106,7 +106,7 @@ def read_faults(
         raise ConfigError(f"faults for unknown boards {unknown}", f"the boards are {list(boards)}", "correct the name")
     faults = {name: decode({**common, **board_tables.get(name, {})}, Faults, f"faults of {name}") for name in boards}
     for name, board_faults in faults.items():
-        for required, keys in CONTROL_OF_FAULT.items():
+        for required, keys in FAULTS_OF_CONTROL.items():
             keys_without_effect = [key for key in keys if getattr(board_faults, key)]
             if keys_without_effect and control not in (None, required):
                 raise ConfigError(

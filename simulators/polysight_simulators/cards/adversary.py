@@ -114,19 +114,20 @@ class Adversary:
         payload_bytes: int = 1456,
     ) -> None:
         self._rng = rng
-        self._frame = frame_bytes
-        self._payload = payload_bytes
+        self._frame_bytes = frame_bytes
+        self._payload_bytes = payload_bytes
         self._card = Packetiser(payload_bytes, sequence, byte_count)
         self._now_ns = 1_000_000_000
         self._number = 0
         self._twin = Packetiser(payload_bytes, rng.randrange(1 << 32), rng.randrange(1 << 48))
         # Packets that arrive in a later record.
         self._late: list[Arrival] = []
-        # Data of the record that is being made, numbers of its bytes that are not in a packet yet, and number of the
-        # last data byte in each packet.
+        # Data of the record that is being made.
         self._bytes = np.zeros(0, np.uint8)
+        # Numbers of its bytes that are not in a packet yet.
         self._waiting = np.zeros(0, np.int64)
-        self._made: list[int] = []
+        # Number of the last data byte in each packet that was made.
+        self._last_bytes: list[int] = []
         self.resets = 0
 
     def take_late(self, share: float) -> list[Arrival]:
@@ -149,7 +150,8 @@ class Adversary:
         """
         rng = self._rng
         byte_generator = np.random.default_rng(rng.getrandbits(32))
-        frames = byte_generator.integers(1, 256, (pulses_ns.size, self._frame), np.uint8)
+        # Without zeros: those stand for bytes that are missing.
+        frames = byte_generator.integers(1, 256, (pulses_ns.size, self._frame_bytes), np.uint8)
         edges = [(int(t), frames[k]) for k, t in enumerate(pulses_ns)]
         if "missed" in troubles:
             for _ in range(rng.randint(1, min(3, len(edges) - 1))):
@@ -157,13 +159,13 @@ class Adversary:
         if "near" in troubles:
             t, _ = edges.pop(rng.randrange(len(edges)))
             edge_near_pulse = t + rng.choice([-1, 1]) * rng.randint(NEAREST_EDGE_NS, 5 * _FRAME_NS)
-            edges.append((edge_near_pulse, byte_generator.integers(1, 256, self._frame, np.uint8)))
+            edges.append((edge_near_pulse, byte_generator.integers(1, 256, self._frame_bytes, np.uint8)))
         if "spurious" in troubles:
             for _ in range(rng.randint(1, 2)):
                 t = rng.randint(int(pulses_ns[0]), int(pulses_ns[-1]))
                 # An edge during a frame or just after it starts none; one near a missed pulse counts as that pulse.
                 if np.abs(np.append(pulses_ns, [e for e, _ in edges]) - t).min() > 5 * _FRAME_NS:
-                    edges.append((t, byte_generator.integers(1, 256, self._frame, np.uint8)))
+                    edges.append((t, byte_generator.integers(1, 256, self._frame_bytes, np.uint8)))
         edges.sort(key=lambda edge: edge[0])
         if "endless" not in troubles:
             edges = edges[: pulses_ns.size]
@@ -185,7 +187,7 @@ class Adversary:
         self._number += 1
         if not data:
             byte_generator = np.random.default_rng(rng.getrandbits(32))
-            data = byte_generator.integers(1, 256, frames * self._frame, np.uint8).tobytes()
+            data = byte_generator.integers(1, 256, frames * self._frame_bytes, np.uint8).tobytes()
         begin_ns = self._now_ns + 1_000_000
         if edges_ns is not None:
             begin_ns = edges_ns[0] - 1_000_000
@@ -225,20 +227,20 @@ class Adversary:
         """Return the packets of one record as the card sends them, and the number of the last data byte in each."""
         self._bytes = np.frombuffer(data, dtype=np.uint8)
         self._waiting = np.zeros(0, np.int64)
-        self._made = []
+        self._last_bytes = []
         out = self._send_record(sent, np.arange(len(data)))
-        return out, self._made
+        return out, self._last_bytes
 
-    def _send_record(self, sent: SentRecord, data: NDArray[np.int64]) -> list[bytes]:
-        """Send bytes of the data, by their numbers."""
+    def _send_record(self, sent: SentRecord, byte_numbers: NDArray[np.int64]) -> list[bytes]:
+        """Send bytes of the data, which are given by their numbers."""
         troubles = sent.troubles
         rng = self._rng
-        frame = self._frame
-        frames = len(data) // frame
+        frame = self._frame_bytes
+        frames = len(byte_numbers) // frame
         if "miss_frames" in troubles and frames > 1:
             sent.is_complete = False
             for missed_frame in sorted(rng.sample(range(frames), rng.randint(1, min(3, frames - 1))), reverse=True):
-                data = np.delete(data, slice(missed_frame * frame, (missed_frame + 1) * frame))
+                byte_numbers = np.delete(byte_numbers, slice(missed_frame * frame, (missed_frame + 1) * frame))
         if "drop_inside" in troubles or "drop_frames" in troubles:
             sent.is_complete = False
             if "drop_frames" in troubles:
@@ -246,15 +248,15 @@ class Adversary:
             else:
                 # Blocks of 16 bytes; chosen.
                 dropped_bytes = 16 * rng.randint(1, 200)
-            cut = rng.randrange(max(1, len(data) - dropped_bytes))
-            data = np.delete(data, slice(cut, cut + dropped_bytes))
+            cut = rng.randrange(max(1, len(byte_numbers) - dropped_bytes))
+            byte_numbers = np.delete(byte_numbers, slice(cut, cut + dropped_bytes))
         if "two_drops" in troubles:
             sent.is_complete = False
             dropped_bytes = frame * rng.randint(1, 2)
             first_part = 16 * rng.randint(1, dropped_bytes // 16 - 1)
             for size in (first_part, dropped_bytes - first_part):
-                cut = rng.randrange(max(1, len(data) - size))
-                data = np.delete(data, slice(cut, cut + size))
+                cut = rng.randrange(max(1, len(byte_numbers) - size))
+                byte_numbers = np.delete(byte_numbers, slice(cut, cut + size))
         if "reset_between" in troubles:
             self._reset()
         out: list[bytes] = []
@@ -262,18 +264,18 @@ class Adversary:
             sent.is_complete = False
             cut = rng.randint(1, frames - 2) * frame
             lost_bytes = rng.randint(0, 1) * frame
-            out += self._make_stream(data[:cut]) + self._end()
-            data = data[cut + lost_bytes :]
+            out += self._make_stream(byte_numbers[:cut]) + self._end()
+            byte_numbers = byte_numbers[cut + lost_bytes :]
         if "reset" in troubles or "reset_early" in troubles:
             sent.is_complete = False
-            cut = rng.randrange(len(data) + 1)
+            cut = rng.randrange(len(byte_numbers) + 1)
             if "reset_early" in troubles:
-                cut = min(cut, 3 * self._payload)
-            out += self._make_stream(data[:cut])
+                cut = min(cut, 3 * self._payload_bytes)
+            out += self._make_stream(byte_numbers[:cut])
             lost_bytes = rng.choice([0, 0, rng.randint(1, 4000)])
             self._reset()
-            data = data[cut + lost_bytes :]
-        return out + self._make_stream(data) + self._end()
+            byte_numbers = byte_numbers[cut + lost_bytes :]
+        return out + self._make_stream(byte_numbers) + self._end()
 
     def forget_late(self) -> None:
         """Drop delayed packets: the host's program was restarted."""
@@ -281,7 +283,7 @@ class Adversary:
 
     def _reset(self) -> None:
         """Reset the card: counters start again, and bytes waiting for a full packet are lost."""
-        self._card = Packetiser(self._payload)
+        self._card = Packetiser(self._payload_bytes)
         self.resets += 1
         self._waiting = np.zeros(0, np.int64)
 
@@ -295,19 +297,21 @@ class Adversary:
         return self._note_last_bytes(self._card.flush())
 
     def _note_last_bytes(self, rows: NDArray[np.uint8]) -> list[bytes]:
-        """Note the number of the last data byte in each packet (`_made`); return the packets as bytes."""
+        """Note the number of the last data byte in each packet (`_last_bytes`); return the packets as bytes."""
         for row in rows:
             size = len(row) - DATA_HEADER_BYTES
             last_byte = 0
+            # The last packet of a record may be filled up beyond its data.
             if self._waiting.size:
                 last_byte = int(self._waiting[min(size, self._waiting.size) - 1])
-            self._made.append(last_byte)
+            self._last_bytes.append(last_byte)
             self._waiting = self._waiting[size:]
         return [bytes(row) for row in rows]
 
     def _find_time_made_ns(self, byte: int, edges_ns: list[int]) -> int:
         """Time at which the card sends a byte of the data: 0.1 ms (chosen) after it leaves the radar."""
-        return edges_ns[byte // self._frame] + _FRAME_NS * (byte % self._frame) // self._frame + 100_000
+        frame, byte_in_frame = divmod(byte, self._frame_bytes)
+        return edges_ns[frame] + _FRAME_NS * byte_in_frame // self._frame_bytes + 100_000
 
     def _transmit(self, packets: list[bytes], made_ns: list[int], sent: SentRecord) -> list[Arrival]:
         """Return the packets that arrive in time, in the order of arrival; keep the delayed ones.
@@ -345,12 +349,17 @@ class Adversary:
             if rng.random() < 0.5 and n:
                 self._late.append(Arrival(0, packets[-1], sent.number))
         if "reorder" in troubles:
-            coming = [(t_ns + rng.randint(0, 120_000) * (rng.random() < 0.2), k, p) for t_ns, k, p in coming]
+            # A fifth of the packets is late by up to 0.12 ms. Both numbers are drawn for each, so that a seed stays
+            # valid.
+            delays_ns = [rng.randint(0, 120_000) * (rng.random() < 0.2) for _ in coming]
+            coming = [(t_ns + delay_ns, k, p) for delay_ns, (t_ns, k, p) in zip(delays_ns, coming, strict=True)]
         if "flows" in troubles:
             coming = [(t_ns + 100_000 * (k % 3), k, p) for t_ns, k, p in coming]
         if "held" in troubles:
-            # Two of three packets wait for the fifth or the tenth after them.
-            coming = [(made_ns[min(k + 5 * (k % 3), n - 1)] + k % 3, k, p) for _, k, p in coming]
+            # Of three packets one comes at once, one with the fifth packet behind it, one with the tenth, and 1 or 2 ns
+            # later than that.
+            held_until = [min(k + 5 * (k % 3), n - 1) for _, k, _ in coming]
+            coming = [(made_ns[last] + k % 3, k, p) for last, (_, k, p) in zip(held_until, coming, strict=True)]
         return [Arrival(t_ns, p, sent.number) for t_ns, _, p in sorted(coming, key=lambda c: c[0])]
 
     def _damage(self, packet: bytes, troubles: tuple[str, ...]) -> bytes:

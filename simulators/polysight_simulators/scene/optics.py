@@ -108,7 +108,8 @@ def reflect_layers(
 def strips(psi_rad: float, theta_rad: NDArray[np.floating] | float) -> tuple[Complex, Complex]:
     """Return the reflection of a screen that conducts in one direction only, at `psi_rad` from y towards x.
 
-    The wave has equal s and p, whose sum the strips see: the coefficients hold for such a wave alone.
+    Strips turn the polarisation: what they return depends on s and p together. The coefficients are those of a wave
+    whose s and p are equal, as the transmitter sends it, and hold for no other.
     The current J along the strips u = (sin psi, cos psi) in (x, y) makes the total field along u zero. It radiates with
     the wave impedances of the polarisations, 1 / (2 cos) for s and cos / 2 for p in units of free space.
 
@@ -177,6 +178,8 @@ class Antennas:
         r2 = np.sqrt(bx**2 + by**2 + bz**2)
         theta = 0.5 * np.arccos(np.clip((ax * bx + ay * by + az * bz) / (r1 * r2), -1.0, 1.0))
         if any(slope):
+            # The component along the normal (-slope_x, -slope_y, 1). Its length is not made 1: it is the ratio of the
+            # surface's area to dx dy.
             az = az - slope[0] * ax - slope[1] * ay
             bz = bz - slope[0] * bx - slope[1] * by
         return r1, r2, theta, 0.5 * (az / r1 + bz / r2)
@@ -186,6 +189,7 @@ def antennas(rig: Instrument, board: Board) -> Antennas:
     """Return the antenna positions of the transmitter and a receiving board."""
     tx = np.array(tx_position_m(rig))
     rx = np.array(rx_positions_m(rig, board))
+    # The image has one centre for both boards: that of H.
     centre = np.array(specular_midpoint_m(rig, rig.by_role("receive_h")))
     return Antennas(tx, rx, rig.geometry.object_distance_mm / 1e3, centre)
 
@@ -218,10 +222,11 @@ def board_reflectivity(board: Board, scene: Scene) -> Reflectivity:
 def turn_reflection(plate: Plate, frequency_hz: float, theta: Real) -> tuple[Complex, Complex]:
     """Return the reflection of a plate in the polarisations of H and V for a wave with equal s and p there.
 
-    A plate that rises by w across the plane of incidence (its height grows along y) turns this plane about x, and both
-    waves meet its s axis at d = w sin(theta). To first order the incident wave has 1 - d of s and 1 + d of p, and
-    turning back mixes the reflected ones: H receives (1 - d) r_s - d r_p and V (1 + d) r_p + d r_s. A mirror, which has
-    an image of TX with polarisation 2 (n e) n - e, gives the same.
+    A plate whose height grows along y by w turns the plane of incidence about x. Its s axis then differs by the angle
+    d = w sin(theta) from that of a level plate, for the incident and for the reflected wave. To first order the
+    incident wave, which has 1 of s and 1 of p, has 1 - d and 1 + d about the turned axis; turning the reflected wave
+    back gives (1 - d) r_s - d r_p in H and (1 + d) r_p + d r_s in V. For metal this is the field of TX's mirror image,
+    whose polarisation is 2 (n . e) n - e for a polarisation e of TX and the normal n.
     """
     r_s, r_p = plate_reflection(plate, frequency_hz, theta)
     d = slopes(plate)[1] * np.sin(theta)
@@ -245,7 +250,10 @@ def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
 
 
 def point_scale(ant: Antennas) -> float:
-    """Return the factor of a point's 1 / (r1 r2): amplitude 1 at the specular midpoint equals the direct path."""
+    """Return the factor of 1 / (r1 r2) with which a point of amplitude 1 at the specular midpoint is as strong as TX.
+
+    That is, as the direct path.
+    """
     r1, r2, _, _ = ant.legs(ant.centre_m[0], ant.centre_m[1], 0)
     return float(r1 * r2)
 
@@ -297,17 +305,21 @@ def field_exact(
         px, py = ant.centre_m[:2] + np.array(point.position_mm) / 1e3
         z = ant.plane_z_m + point.height_mm / 1e3
         r1, r2, _, _ = ant.legs(px - offsets_m[:, 0], py - offsets_m[:, 1], rx, z)
-        spread = conjugate(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
+        # A point returns s and p alike, as they come by the direct path, so that leakage has the same effect on both.
+        amplitude = conjugate(complex(*point.amplitude)) * point_scale(ant) * direct_factor(board, scene) / (r1 * r2)
         phase = np.exp(2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(r1 + r2, frequencies_hz))
-        out += spread[:, None] * phase
+        out += amplitude[:, None] * phase
     return out
 
 
 def _place_quadrature(size_m: tuple[float, float], top_hz: float) -> tuple[Real, Real, Real]:
     """Return quadrature points x, y relative to the centre of a rectangle, and their areas; each [y, x]."""
-    # The phase changes at most by 2 k per metre. Gauss-Legendre with n points is exact up to the degree 2 n - 1, so a
-    # quarter of a point per radian suffices. Taken are 0.3 (0.6 k per metre), and 16 points more.
-    wave = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
-    (nx, ax), (ny, ay) = (np.polynomial.legendre.leggauss(int(wave * s * 0.6) + 16) for s in size_m)
-    x, y = np.meshgrid(nx * size_m[0] / 2, ny * size_m[1] / 2)
-    return x, y, np.outer(ay * size_m[1] / 2, ax * size_m[0] / 2)
+    # Over a side of length L the phase changes by 2 k L at most: exp(j k L u) for u = -1 to 1, whose series converges
+    # from the degree k L on. Gauss-Legendre with n points is exact up to the degree 2 n - 1, so that n = k L / 2
+    # suffices. Taken are 0.6 k L, and 16 points more.
+    wavenumber = 2 * np.pi * top_hz / SPEED_OF_LIGHT_M_S
+    width, height = size_m
+    nodes_x, weights_x = np.polynomial.legendre.leggauss(int(wavenumber * width * 0.6) + 16)
+    nodes_y, weights_y = np.polynomial.legendre.leggauss(int(wavenumber * height * 0.6) + 16)
+    x, y = np.meshgrid(nodes_x * width / 2, nodes_y * height / 2)
+    return x, y, np.outer(weights_y * height / 2, weights_x * width / 2)

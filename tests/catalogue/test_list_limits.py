@@ -83,7 +83,8 @@ def test_a_scan_to_be_made_need_not_be_there(tmp_path):
     ("ages_s", "is_kept"), [((10.0, 10.0), True), ((2.5, 10.0), True), ((10.0, 1.5), False), ((-100.0, 10.0), False)]
 )
 def test_an_index_keeps_what_was_written_more_than_two_seconds_ago(tmp_path, monkeypatch, ages_s, is_kept):
-    """A scan has two files here. One that is younger, or of the future, may still change without another time."""
+    """A scan has two files here. One that is younger, or of the future, may still change and keep its time."""
+    # Any time of this century.
     now_ns = 1_800_000_000_000_000_000
     monkeypatch.setattr(scans_module, "time", SimpleNamespace(time=lambda: now_ns / 1e9))
     stamp = tuple((now_ns - int(age_s * 1e9), 1) for age_s in ages_s)
@@ -136,6 +137,7 @@ def test_a_long_error_is_cut():
     log = f"polysight process: {'a' * 400}\n  why: {'b' * 600}\n  do: {'c' * 600}"
     finding = explain_failure(make_program(log))
     assert finding is not None
+    # Lengths that a page shows in a few lines (chosen).
     assert (len(finding.what), len(finding.why), len(finding.do)) == (300, 500, 500)
     finding = explain_failure(make_program("d" * 400))
     assert finding is not None
@@ -151,7 +153,8 @@ def test_only_a_program_that_ended_with_an_error_has_failed(status, running, fai
     assert explain_failure(None) is None
 
 
-def test_of_a_log_the_end_since_the_last_start_is_read(tmp_path):
+def test_of_a_log_the_last_16_kib_since_the_last_start_are_read(tmp_path):
+    """Colours of a terminal, other control characters and line ends of Windows are left out."""
     log = tmp_path / "scan.log"
     log.write_bytes(b"old\n--- started 1\nolder\n--- started 2\nfirst\r\n\x1b[1;31mred\x1b[0m\x07\n\tindented\n")
     assert read_log_tail(log) == "first\nred\n\tindented"
@@ -172,7 +175,7 @@ def test_a_scan_that_has_ended_needs_no_sign_of_life(tmp_path, state):
 def test_a_scan_that_began_and_whose_program_failed_says_why(tmp_path):
     folder = make_scan(tmp_path, "a")
     assert add_signs_of_life(folder, Summary("a", "begun")).state == "begun"
-    # No process has a number above the largest one of Linux.
+    # Linux numbers processes up to 2^22 - 1: no process has this number.
     record = {"pid": 1 << 22, "ticks": 1, "words": ["x", "-m", "polysight", "scan"], "started_utc": "2026-01-01"}
     (folder / "program" / "scan.json").write_bytes(msgspec.json.encode(record))
     (folder / "program" / "scan.status").write_text("1\n")
@@ -200,12 +203,13 @@ def test_notes_and_tags_have_a_length_that_a_list_can_show(tmp_path, notes, is_t
     assert not (tmp_path / NOTES_FILE).exists()
 
 
-def test_a_file_of_notes_that_was_not_written_here_is_ignored(tmp_path):
-    """The longest notes take 44 kB; the limit is 128 KiB."""
+def test_a_file_of_notes_that_is_too_long_to_be_ours_is_ignored(tmp_path):
+    """The longest notes that are accepted take 44 kB; the limit is 128 KiB."""
+    limit_bytes = 128 * 1024
     text = '{"notes": "a"}'
-    (tmp_path / NOTES_FILE).write_text(text.ljust(131_072))
+    (tmp_path / NOTES_FILE).write_text(text.ljust(limit_bytes))
     assert read_notes(tmp_path).notes == "a"
-    (tmp_path / NOTES_FILE).write_text(text.ljust(131_073))
+    (tmp_path / NOTES_FILE).write_text(text.ljust(limit_bytes + 1))
     assert read_notes(tmp_path) == Notes()
 
 

@@ -1,10 +1,13 @@
 """One place of a scan, and two scans compared: the values are those of the images."""
 
+import io
 import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from tests.support.products import write_judged_products
 from tests.support.refusals import expect_refusal
 from tests.support.scenes import COPPER, PET
@@ -12,9 +15,10 @@ from tests.support.scenes import COPPER, PET
 from polysight.catalogue import Pixels, compare, draw_comparison, draw_products, probe, read_result, thumbnail
 from polysight.catalogue.pictures import MAPS
 from polysight.catalogue.results import SIGNIFICANT_STDS, measure_scatter
-from polysight.products import map_permittivity, read_products
+from polysight.products import map_permittivity, read_products, write_image
 from polysight_shared.errors import DataError, ErrorCode
 
+# Middle of the plate of PET, mm.
 CENTRE = tuple(PET["centre_mm"])
 
 
@@ -23,6 +27,7 @@ def test_a_place_shows_its_own_pixel(processed_scans):
     row, column = pixels.nearest(*CENTRE)
     answer = probe(processed_scans / "one", *CENTRE)
     p = complex(pixels.p[row, column])
+    # Answers are rounded to four digits after the point, places to a hundredth of a mm.
     assert answer.p.value == pytest.approx(p, abs=1e-4)
     map_of_scan = map_permittivity(read_products(processed_scans / "one"))
     assert answer.permittivity.value == pytest.approx(complex(map_of_scan.value[row, column]), abs=1e-4)
@@ -60,7 +65,9 @@ def test_the_range_profile_has_its_peak_at_the_plate(processed_scans):
     for plate in (COPPER, PET):
         answer = probe(processed_scans / "one", *plate["centre_mm"]).profile
         for levels in answer.boards.values():
-            assert abs(answer.path_m[int(np.argmax(levels))]) < 0.03
+            peak_m = answer.path_m[int(np.argmax(levels))]
+            # Paths are relative to that of the place. Chosen: less than half of a range cell.
+            assert abs(peak_m) < 0.03
 
 
 def test_metal_has_no_permittivity_and_the_reason_is_given(processed_scans):
@@ -80,7 +87,9 @@ def test_without_a_result_no_material_is_reported(tmp_path):
     write_judged_products(tmp_path, "none", keep_withheld=True)
     answer = probe(tmp_path, 0.0, 0.0)
     assert (answer.permittivity, answer.patch, answer.nearest) == (None, None, [])
-    assert {p.name for p in read_result(tmp_path).pictures} <= {n for n in MAPS if n[0] in "hvp" and n != "p_sigma"}
+    # The images of H, V and P alone may be shown; "p_sigma" is an error of a result.
+    maps_of_images = {name for name in MAPS if name[0] in "hvp" and name != "p_sigma"}
+    assert {picture.name for picture in read_result(tmp_path).pictures} <= maps_of_images
 
 
 def test_a_scan_does_not_differ_from_itself(processed_scans):
@@ -92,10 +101,11 @@ def test_a_scan_does_not_differ_from_itself(processed_scans):
 
 def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed_scans):
     comparison = compare(processed_scans / "one", processed_scans / "two")
-    answer = [pair.sigmas for pair in comparison.figures.patches if pair.sigmas is not None]
-    assert answer
-    assert max(answer) < 3
-    # Few pixels that are independent of each other
+    sigmas_of_patches = [pair.sigmas for pair in comparison.figures.patches if pair.sigmas is not None]
+    assert sigmas_of_patches
+    # Chosen: with so few patches none is three standard deviations apart by chance.
+    assert max(sigmas_of_patches) < 3
+    # Chosen: neighbouring pixels share their noise, so that a whole spot may differ by chance.
     assert (comparison.sigmas > 5).mean() < 0.05
     back = compare(processed_scans / "two", processed_scans / "one")
     finite_in_both = np.isfinite(comparison.p) & np.isfinite(back.p)
@@ -103,41 +113,46 @@ def test_the_same_scene_with_other_noise_differs_by_noise_alone(processed_scans)
 
 
 def test_a_changed_plate_is_found_where_it_lies(processed_scans, tmp_path):
-    """The V channel of the PET's pixels is made 30 % stronger in a copy."""
-    import shutil
-    from dataclasses import replace
-
-    from polysight.products import write_image
-
+    """In a copy, V of the pixels of PET is made 30 per cent stronger."""
     shutil.copytree(processed_scans / "one" / "products", tmp_path / "changed")
-    saved = pixels = Pixels(processed_scans / "one" / "products")
+    saved = Pixels(processed_scans / "one" / "products")
     v = saved.v.copy()
     x, y = CENTRE
-    inside = np.ix_(abs(pixels.y_mm - y) < 15, abs(pixels.x_mm - x) < 15)
+    inside = np.ix_(abs(saved.y_mm - y) < 15, abs(saved.x_mm - x) < 15)
     v[inside] *= 1.3
     with np.errstate(invalid="ignore", divide="ignore"):
         p = saved.h / v
     write_image(tmp_path / "changed" / "image.npz", replace(saved.images, v=v, p=p))
     comparison = compare(processed_scans / "one", tmp_path / "changed")
-    answer = np.nan_to_num(comparison.sigmas)
-    # A copy, which shares its errors
-    assert comparison.figures.scatter == 0.1
-    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.images.p_sigma) / 0.1
-    assert np.allclose(answer[inside], expected[inside], rtol=1e-4)
-    assert answer[inside].min() > 0.5
-    answer[inside] = 0
-    assert answer.max() == 0
+    sigmas = np.nan_to_num(comparison.sigmas)
+    # A copy shares all its errors: unchanged pixels do not scatter. Errors are then taken as a tenth of what is stated,
+    # which is the least.
+    least_scatter = 0.1
+    assert comparison.figures.scatter == least_scatter
+    expected = np.abs(saved.p - p) / (np.sqrt(2) * saved.images.p_sigma) / least_scatter
+    assert np.allclose(sigmas[inside], expected[inside], rtol=1e-4)
+    assert sigmas[inside].min() > 0.5
+    sigmas[inside] = 0
+    assert sigmas.max() == 0
 
 
 def test_errors_that_both_scans_share_do_not_hide_a_change():
-    """Stated errors are three times the scatter of unchanged pixels: of these 5 % lie beyond their 95 % region."""
+    """Stated errors are three times as large as the scatter of unchanged pixels; a fifth of the pixels has changed."""
     rng = np.random.default_rng(3)
+    # Differences in units of their stated errors.
     stated = np.abs(rng.standard_normal(20_000) + 1j * rng.standard_normal(20_000)) / 3
-    stated[:4000] += 5 / 3
+    changed = slice(None, 4000)
+    unchanged = slice(4000, None)
+    # The change is five standard deviations of the true scatter.
+    stated[changed] += 5 / 3
     sigmas = stated / measure_scatter(stated)
-    assert measure_scatter(stated[4000:]) == pytest.approx(1 / 3, rel=0.03)
-    assert (sigmas[4000:] > 2.448).mean() == pytest.approx(0.03, abs=0.025)
-    assert (sigmas[:4000] > SIGNIFICANT_STDS).mean() > 0.95
+    # The scatter of 16,000 values is known to better than 3 per cent.
+    assert measure_scatter(stated[unchanged]) == pytest.approx(1 / 3, rel=0.03)
+    # 5 per cent of a Rayleigh distribution lie beyond sqrt(-2 ln 0.05) = 2.448. They are fewer here, as the changed
+    # pixels widen the scatter a little.
+    assert (sigmas[unchanged] > 2.448).mean() == pytest.approx(0.03, abs=0.025)
+    assert (sigmas[changed] > SIGNIFICANT_STDS).mean() > 0.95
+    # Scatter that is larger than stated is left as it is, and none is known without numbers.
     assert measure_scatter(3 * stated) == 1.0
     assert np.isnan(measure_scatter(np.array([np.nan])))
 
@@ -149,10 +164,6 @@ def test_scans_that_cannot_be_compared_say_so(processed_scans, tmp_path):
 
 
 def test_every_map_is_drawn_in_the_size_of_the_image(processed_scans):
-    import io
-
-    from matplotlib.image import imread
-
     pixels = Pixels(processed_scans / "one" / "products")
     for name in MAPS:
         picture = draw_products(pixels, name)
@@ -177,6 +188,7 @@ def test_colours_of_differences_in_standard_deviations_reach_twice_the_significa
         assert (picture.low, picture.high) == (0.0, pytest.approx(high))
 
 
+# What is done to the arrays of an image; those of one dimension are its axes.
 DAMAGED = {
     "smaller": lambda image: image | {"h": image["h"][:3, :3]},
     "of words": lambda image: image | {"h": image["h"].astype(str)},

@@ -80,7 +80,7 @@ def test_a_scan_that_has_not_ended_runs_or_pauses_while_its_program_lives(root):
 
 
 def test_rows_are_counted_as_the_scan_folder_counts_them(root):
-    """Taken again, withdrawn, torn and damaged lines included."""
+    """The manifest has a row taken again, a withdrawn row, a damaged line, and a last line without its end."""
     path = root / "done" / MANIFEST
     facts = load_facts(path)
     facts_of_retake = [
@@ -159,8 +159,11 @@ def test_a_list_cut_off_by_its_time_limit_continues_at_the_next_request(root):
 
 
 @pytest.mark.parametrize(("stuck", "threads"), [("", 1), ("out", 2), ("done", 1)])
-def test_another_thread_reads_on_only_when_one_makes_no_progress(root, monkeypatch, stuck, threads):
-    """`done` is the last folder that is read: after it no other one waits."""
+def test_another_thread_continues_only_where_one_makes_no_progress(root, monkeypatch, stuck, threads):
+    """A drive that does not answer stops one thread; a second one reads the folders that are left.
+
+    `done` is the last folder that is read: after it no other one waits, and no second thread is begun.
+    """
     all_names = {s.name for s in Scans(root).list()}
     begun = []
 

@@ -32,22 +32,19 @@ def read_pins(text: str) -> dict[str, int]:
     return {k: int(v) for k, v in re.findall(r"\b(?:PIN_)?([A-Z_]+) = (\d+)", text)}
 
 
-def test_pinout():
-    """Pins are those of the published rig and additional ones; the emulated board has the same."""
+def test_pins_of_sketch_and_emulated_board_are_those_of_the_published_rig_and_further_ones():
     published = {"TRIGGER": 2, "LEFT_PUL": 3, "LEFT_DIR": 8, "RIGHT_PUL": 4, "RIGHT_DIR": 9, "X_PUL": 5, "X_DIR": 10}
     board = read_pins("\n".join(re.findall(r"PIN_.*", (SKETCH / "board.h").read_text(encoding="ascii"))))
     assert published.items() <= board.items()
     assert len(set(board.values())) == len(board)
-    emulated = read_pins(
-        re.findall(
-            r"enum (\{ TRIGGER.*?\});", (REPO / "simulators/polysight_simulators/uno/rig.c").read_text(), re.DOTALL
-        )[0]
-    )
-    names = {"DRIVERS_OFF": "ENABLE", "EMERGENCY_STOP": "EMERGENCY"}
-    assert {names.get(k, k): v for k, v in emulated.items()} == board
+    emulator = (REPO / "simulators/polysight_simulators/uno/rig.c").read_text()
+    emulated = read_pins(re.findall(r"enum (\{ TRIGGER.*?\});", emulator, re.DOTALL)[0])
+    # Two pins have other names in the emulator than in the sketch.
+    names_in_sketch = {"DRIVERS_OFF": "ENABLE", "EMERGENCY_STOP": "EMERGENCY"}
+    assert {names_in_sketch.get(name, name): pin for name, pin in emulated.items()} == board
 
 
-def test_parameters_and_bytes():
+def test_numbers_of_parameters_and_immediate_bytes_are_those_of_the_sketch():
     text = (SKETCH / "stage.h").read_text(encoding="ascii")
     assert dict(re.findall(r"PARAMETER_([A-Z_]+) = (\d+)", text)) == {p.name: str(int(p)) for p in Parameter}
     assert dict(re.findall(r"immediate_([a-z]+) = (0x\w+)", text.lower())) == {
@@ -55,7 +52,7 @@ def test_parameters_and_bytes():
     }
 
 
-def test_limits():
+def test_limits_of_the_stand_in_and_the_protocol_are_those_of_the_sketch():
     protocol = read_constants("protocol.h")
     board = read_constants("board.h")
     assert protocol["MAX_LINE_BYTES"] == stage_line.MAX_LINE_BYTES
@@ -80,29 +77,31 @@ def test_limits():
 def test_defaults_are_those_of_the_rig_file():
     board = read_constants("board.h")
     stage = Stage(port="")
-    k = stage.steps_per_mm
-    assert board["STEPS_PER_MM"] == k
-    assert board["DEFAULT_ACCEL"] == stage.accel_mm_s2 * k
+    steps_per_mm = stage.steps_per_mm
+    assert board["STEPS_PER_MM"] == steps_per_mm
+    assert board["DEFAULT_ACCEL"] == stage.accel_mm_s2 * steps_per_mm
     assert board["DEFAULT_HEARTBEAT_MS"] == stage.heartbeat_ms
     assert board["DEFAULT_TRIGGER_US"] == stage.trigger_width_us
-    assert (board["DEFAULT_TRAVEL_X"], board["DEFAULT_TRAVEL_Y"]) == (stage.travel_x_mm * k, stage.travel_y_mm * k)
-    assert board["DEFAULT_TRAVEL_RATE"] == stage.travel_speed_mm_s * k
+    assert board["DEFAULT_TRAVEL_X"] == stage.travel_x_mm * steps_per_mm
+    assert board["DEFAULT_TRAVEL_Y"] == stage.travel_y_mm * steps_per_mm
+    assert board["DEFAULT_TRAVEL_RATE"] == stage.travel_speed_mm_s * steps_per_mm
 
 
-def test_longest_status_fits_a_line():
+def test_the_longest_status_fits_a_line():
+    """Each value has as many characters as it may have; a line that is too long is not encoded."""
     fields = {"state": "alarm", "x": "-1099999", "y": "-1099999", "points": "9999", "pulses": "9999"}
     Reply("status", fields={**fields, "alarm": "15", "limits": "7", "homed": "1"}).encode()
 
 
-def test_page_lists_every_error():
+def test_the_page_lists_every_error():
     page = " ".join(PAGE.partition("## Errors and alarms")[2].split())
     for error in StageError:
-        e = EXPLANATIONS[error]
-        assert f"* **{int(error)}**: {e.problem} ({e.cause}): {e.remedy}" in page
+        explanation = EXPLANATIONS[error]
+        assert f"* **{int(error)}**: {explanation.problem} ({explanation.cause}): {explanation.remedy}" in page
     assert set(re.findall(r"\* \*\*(\d+)\*\*", page)) == {str(int(e)) for e in StageError}
 
 
-def test_page_lists_parameters_bytes_and_verbs():
+def test_the_page_lists_parameters_bytes_and_verbs():
     for parameter in Parameter:
         assert re.search(rf"^\| {int(parameter)} +\| `{parameter.name}` ", PAGE, re.MULTILINE), parameter
     for byte in Immediate:
@@ -113,6 +112,7 @@ def test_page_lists_parameters_bytes_and_verbs():
 
 def test_examples_of_the_page_are_valid_lines():
     examples = re.findall(r"^(?:->|<-) (\S.*\*[0-9A-F]{4})$", PAGE, re.MULTILINE)
+    # The examples were found; the page has six.
     assert len(examples) >= 6
     for example in examples:
         stage_line.unseal(example.encode("ascii") + b"\n")
@@ -120,17 +120,17 @@ def test_examples_of_the_page_are_valid_lines():
 
 def test_sketch_fits_an_uno(built: tuple[Path, str]):
     sizes = dict(re.findall(r"^(Program|Data): +(\d+) bytes", built[1], re.MULTILINE))
-    # Flash without the boot loader
+    # The flash has 32 KiB, of which the boot loader takes 512 bytes.
     assert int(sizes["Program"]) < 32_256
-    # A quarter of the memory is left for the stack
+    # Of the 2 KiB of memory a quarter is left for the stack (chosen).
     assert int(sizes["Data"]) < 1_536
 
 
-def test_no_floating_point_anywhere(built: tuple[Path, str]):
-    """No routine of the compiler's soft floating point is linked."""
+def test_the_sketch_has_no_floating_point(built: tuple[Path, str]):
+    """No routine of the compiler's soft floating point is linked: it would be too slow between two steps."""
     elf = str(built[0] / "arduino_stage.elf")
     symbols = subprocess.run(["avr-nm", elf], capture_output=True, text=True, check=True).stdout
-    # The step interrupt: these are the right symbols
+    # The list of symbols has the interrupt of the steps: it is the right one.
     assert " __vector_11" in symbols
     assert not re.findall(r"\b__\w*(?:sf|fp|float)\w*", symbols)
 
@@ -158,8 +158,9 @@ def test_sketch_folder_is_what_the_arduino_ide_wants():
             assert (SKETCH / included).is_file(), f"{source.name} includes {included}"
 
 
-# ATmega328P
+# Signature of the ATmega328P, by its data sheet.
 SIGNATURE = bytes([0x1E, 0x95, 0x0F])
+# Bytes of STK500 (Atmel AVR061): a reply begins with IN_SYNC and ends with OK; a command ends with END.
 IN_SYNC = b"\x14"
 OK = b"\x10"
 END = b"\x20"
@@ -226,9 +227,12 @@ class BootLoader:
 
 
 def read_hex(path: Path) -> bytes:
-    """The bytes of an Intel hex file without gaps."""
+    """The bytes of an Intel hex file without gaps.
+
+    A record has its length, two bytes of address, its kind (0: data), the data, and a checksum.
+    """
     records = [bytes.fromhex(line[1:]) for line in path.read_text(encoding="ascii").split()]
-    return b"".join(r[4:-1] for r in records if r[3] == 0)
+    return b"".join(record[4:-1] for record in records if record[3] == 0)
 
 
 def flash(folder: Path, port: str) -> subprocess.CompletedProcess[str]:
@@ -236,7 +240,7 @@ def flash(folder: Path, port: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_flash(built: tuple[Path, str]):
+def test_make_flash_writes_the_image_to_the_board_and_verifies_it(built: tuple[Path, str]):
     if shutil.which("avrdude") is None:
         pytest.skip("no avrdude: `sudo apt-get install avrdude` runs this too")
     board = BootLoader()
@@ -250,7 +254,7 @@ def test_flash(built: tuple[Path, str]):
     assert "verified" in process.stderr
 
 
-def test_flash_asks_for_a_port(built: tuple[Path, str]):
+def test_make_flash_without_a_port_asks_for_one(built: tuple[Path, str]):
     process = flash(built[0], "")
     assert process.returncode != 0
     assert "make flash PORT=/dev/ttyACM0" in process.stdout

@@ -1,23 +1,28 @@
-"""Laws of the compiled sketch on an emulated UNO, in lockstep: counts and times are exact on any machine."""
+"""Laws of the compiled sketch on an emulated UNO, in lockstep: counts and times are exact on any machine.
+
+Arguments of ROW are x of the first point, pitch, number of points, y and rate; those of MOVE are x, y and rate. Lengths
+are in steps, rates in steps/s. Times of the emulator are cycles of its processor.
+"""
 
 import itertools
 import random
 
 import pytest
 
+from polysight_shared.faults import StageError
 from polysight_shared.stage_line import Command, Immediate, Parameter
 from polysight_simulators.stage import count_steps_to_zero
 from polysight_simulators.uno import HZ
 
 US = HZ // 1_000_000
 MS = HZ // 1000
-# the left motor steps just before the right one
+# Pins of the UNO: the trigger, and the steps of two motors. Of those in y the left one steps just before the right one.
 TRIGGER = 2
 X_PUL = 5
 RIGHT_PUL = 4
-# Rows
+# Rows of a test of random rows; chosen.
 BATCH = 20
-# Steps/s
+# Highest rate of the stage, steps/s.
 TOP_RATE = 20_000
 
 
@@ -26,8 +31,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("batch", range(500 if metafunc.config.getoption("--long") else 4))
 
 
-def test_random_rows(host, batch: int):
-    """Pulses = points, each at its exact step count, both ways, held or not; evenly in time unless held; no step lost.
+def test_random_rows_have_a_trigger_at_each_point_and_lose_no_step(host, batch: int):
+    """Each trigger is at its exact step count, in both directions. Triggers are evenly in time unless a row was held.
 
     A quarter of the rows is held and resumed once or twice at random moments: in travel, in a ramp, between triggers.
     """
@@ -71,13 +76,14 @@ def test_random_rows(host, batch: int):
         assert [e.value for e in host.uno.edges] == [1, 0] * points
         assert [host.find_position(e) for e in rising] == [(x0 + i * pitch, y) for i in range(points)]
         steps_to_trigger |= {e.cycle - e.step_cycle for e in rising}
-        # A step waits at most for another interrupt to end, and lateness never adds up.
+        # A step waits at most for another interrupt to end, which is less than 16 us, and lateness never adds up.
         spacing = abs(pitch) * HZ / rate
         late = [e.cycle - i * spacing for i, e in enumerate(rising)]
         assert hold_count or max(late) - min(late) <= 16 * US
         widths = [f.cycle - r.cycle for r, f in zip(rising, falling, strict=True)]
         assert all(-2 * US <= w - width_us * US <= 60 * US for w in widths)
         assert host.uno.motors == (host.zero[0] + x, host.zero[1] + y, host.zero[1] + y)
+    # Chosen: a trigger follows its step within 4 us, in which the stage moves 0.4 um at the highest rate.
     assert max(steps_to_trigger) - min(steps_to_trigger) <= 4 * US
     assert max(steps_to_trigger) <= 4 * US
     host.run_motion("MOVE", 0, 0, TOP_RATE)
@@ -86,8 +92,7 @@ def test_random_rows(host, batch: int):
 
 
 @pytest.mark.parametrize("accel", [400, 40_000, 400_000])
-def test_homing_finds_the_same_zero(host, accel: int):
-    """From any position, and at the zero of the simulated rig."""
+def test_homing_from_any_position_finds_the_zero_of_the_simulated_rig(host, accel: int):
     host.set(Parameter.ACCEL, accel)
     for x, y in ((900, 700), (377, 1111)):
         host.run_motion("MOVE", x, y, 2000)
@@ -95,7 +100,8 @@ def test_homing_finds_the_same_zero(host, accel: int):
         assert host.uno.motors == (count_steps_to_zero(),) * 3
 
 
-def test_backlash_comes_from_below_and_runs_up(host):
+def test_a_row_is_approached_from_below_in_y_and_from_behind_in_x_by_the_backlash(host):
+    """The play of the screws is then always on the same side. Here it is 700 steps."""
     host.set(Parameter.BACKLASH, 700)
     host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
     host.uno.watch(TRIGGER, RIGHT_PUL, X_PUL)
@@ -103,12 +109,13 @@ def test_backlash_comes_from_below_and_runs_up(host):
         host.run_motion("ROW", 9000, pitch, 5, y, 4000)
         ys = [host.find_position(e)[1] for e in host.uno.edges if e.pin == RIGHT_PUL and e.value]
         assert len(ys) >= 700
-        # The last of y's steps go upwards
+        # The last 700 steps in y go upwards.
         assert ys[-700:] == list(range(y - 699, y + 1))
+        # The last 700 steps in x before the first point all go in the row's direction.
         xs = [host.find_position(e)[0] for e in host.uno.edges if e.pin == X_PUL and e.value]
         first = xs.index(9000) if pitch > 0 else len(xs) - 1 - xs[::-1].index(9000)
         x_before = xs[first - 700 : first]
-        assert len({b - a for a, b in itertools.pairwise(x_before)}) == 1  # so do those of x in the row's direction
+        assert len({after - before for before, after in itertools.pairwise(x_before)}) == 1
 
 
 def test_a_short_hold_is_reported_and_costs_no_step(host):
@@ -128,11 +135,14 @@ def test_a_short_hold_is_reported_and_costs_no_step(host):
 
 @pytest.mark.parametrize("chatty", [False, True])
 def test_no_command_is_lost_silently(host, chatty: bool):
-    """A host that does not wait for answers: every line is answered, or a loss is reported."""
-    lines = [
-        host.encode_command("MOVE", 10 + i, 0, 4000) if i % 7 == 0 else host.encode_command("CLEAR") for i in range(100)
-    ]
-    # Six times as many bytes of answers, so that the board is busy writing
+    """To a host that does not wait for answers, every line is answered, or a loss is reported."""
+    lines = []
+    for i in range(100):
+        if i % 7 == 0:
+            lines.append(host.encode_command("MOVE", 10 + i, 0, 4000))
+        else:
+            lines.append(host.encode_command("CLEAR"))
+    # Short lines that are no commands have answers six times as long: the board is busy writing, and loses lines.
     gap = b"?\n" * 12 if chatty else b""
     host.uno.feed(b"".join(gap + line for line in lines))
     host.uno.settle()
@@ -143,8 +153,9 @@ def test_no_command_is_lost_silently(host, chatty: bool):
     unread = [r for r in replies if r.kind == "error" and r.sequence is None]
     expected_sequence = set(range(host.sequence - 99, host.sequence + 1))
     assert answered <= expected_sequence
-    assert answered == expected_sequence or any(r.number == 3 for r in unread)
-    # Packets were lost, as this test needs
+    # A loss is reported as a line that is too long.
+    assert answered == expected_sequence or any(r.number == StageError.LINE_TOO_LONG for r in unread)
+    # Only in the second case lines were lost, as the test needs.
     assert (answered == expected_sequence) != chatty
     # The conversation continues: greet, then any number may follow.
     host.uno.feed(b"\n")
@@ -161,11 +172,15 @@ def test_a_second_command_on_its_way_is_answered(host):
     )
     host.uno.run_until_rest()
     kinds = [(r.kind, r.number) for r in host.read_replies()]
-    assert kinds == [("ok", 0), ("error", 7), ("error", 7), ("done", 0)]
+    assert kinds == [("ok", 0), ("error", StageError.BUSY), ("error", StageError.BUSY), ("done", 0)]
     assert host.ask_status().integer("x") == 400
 
 
-@pytest.mark.parametrize(("mask", "number"), [(1, 12), (2, 12), (4, 14)])
+@pytest.mark.parametrize(
+    ("mask", "number"),
+    # Bits of the switches of x and y, and of the emergency stop.
+    [(1, StageError.LIMIT_SWITCH), (2, StageError.LIMIT_SWITCH), (4, StageError.EMERGENCY_STOP)],
+)
 def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest, mask: int, number: int):
     """A switch that closes at any time during a motion is an alarm, never `done`."""
     rng = random.Random(mask)
@@ -182,19 +197,21 @@ def test_a_switch_at_any_moment_is_an_alarm(host, request: pytest.FixtureRequest
         host.uno.run_ms(8)
         host.must_obey("CLEAR")
         # The emergency stop has switched the motors off as well.
-        assert host.send_command("MOVE", 0, 0, 4000).number == (19 if number == 14 else 8)
+        refusal = StageError.DISABLED if number == StageError.EMERGENCY_STOP else StageError.NOT_HOMED
+        assert host.send_command("MOVE", 0, 0, 4000).number == refusal
         host.must_obey("ENABLE", 1)
         host.run_motion("HOME")
 
 
 def test_damaged_lines_do_not_disturb_a_row(host):
-    """Every single flipped bit of a line, one after another, while a row is under way."""
+    """The lines of a command with each of its bits flipped arrive one after another during a row."""
     line = Command(host.sequence + 2, "MOVE", (0, 0, 4000)).encode()
     host.uno.edges.clear()
     host.must_obey("ROW", 4000, 200, 60, 500, 4000)
     for bit in range(8 * len(line)):
         damaged = bytearray(line)
         damaged[bit // 8] ^= 1 << bit % 8
+        # An immediate byte is obeyed within a line, too.
         if any(byte in list(Immediate) for byte in damaged):
             continue
         host.uno.feed(bytes(damaged) + b"\n")

@@ -12,24 +12,27 @@ from tests.support.processes import Bench
 from tests.support.rigs import load_published_rig
 
 from polysight.store.scan_folder import ScanFolder
+from polysight_shared.errors import ConfigError
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import load_scene, simulate
 
+# Time after which the scan counts as hung; chosen, many times what it takes.
 LIMIT_S = 200
 SIMULATED_RIG = ("python", "-m", "polysight_simulators.rig")
 SCENE = 'name = "a plate"\n[[plates]]\nname = "m"\ncentre_mm = [0, 0]\nsize_mm = [60.0, 60.0]\nmetal = true\n'
 
 
 @pytest.mark.usefixtures("uno_programs")
-def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
-    """Every row is committed, and the radars measured the plate from the planned positions, also between triggers."""
+def test_echoes_of_a_scan_are_those_of_the_planned_positions(tmp_path: Path):
+    """The simulated radars compute echoes where the emulated stage is. A scan without a stage has the same ones."""
     rig = load_published_rig()
     replace = msgspec.structs.replace
     rig = replace(
         rig,
         grid=replace(rig.grid, columns=6, rows=2),
         burst=replace(rig.burst, pulses=4),
-        # The travel there is short, and a busy machine must not count as a silent host.
+        # A small area near the home corner, which the stage reaches soon. The heartbeat is long, as a busy machine must
+        # not count as a silent host.
         stage=replace(rig.stage, centre_x_mm=15.0, centre_y_mm=4.0, heartbeat_ms=5000),
     )
     config = tmp_path / "rig.toml"
@@ -42,7 +45,7 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         options = ("--out", tmp_path / "scan", "--no-process")
         ended = bench.run_polysight("scan", "--config", simulated.wait_ready(), *options, limit_s=LIMIT_S)
         assert ended.status == 0, ended.err
-    # The same scan without a stage, at the plan's positions
+    # The same scan without a stage, at the plan's positions.
     simulate(rig, load_scene(scene), tmp_path / "ideal")
     scan = ScanFolder.load(tmp_path / "scan")
     ideal = ScanFolder.load(tmp_path / "ideal")
@@ -51,13 +54,15 @@ def test_a_scan_sees_what_the_stage_truly_did(tmp_path: Path):
         for row in (0, 1):
             samples = np.fromfile(scan.row_path(board, row), "<i2").astype(float)
             expected = np.fromfile(ideal.row_path(board, row), "<i2").astype(float)
+            # There is a signal, in steps of the converter.
             assert expected.std() > 100
-            assert np.abs(samples - expected).max() <= 2  # of the converter's steps: positions are exact to 1 um
+            # Positions are exact to 1 um, which changes no sample by more than two steps of the converter.
+            assert np.abs(samples - expected).max() <= 2
 
 
-def test_a_time_scale_its_heartbeat_cannot_follow_is_refused(tmp_path: Path):
+def test_a_time_scale_is_refused_at_which_the_heartbeat_would_be_lost(tmp_path: Path):
     with closing(Bench(tmp_path)) as bench:
         options = ("--config", RIG_FILE, "--dir", "rig", "--pattern", "--uno", "--time-scale", "5")
         process = bench.run(*SIMULATED_RIG, *options)
-    assert process.status == 2
+    assert process.status == ConfigError.exit_status
     assert "--time-scale 5" in process.err

@@ -17,11 +17,12 @@ MS = HZ // 1000
 TRIGGER = 2
 X_PUL = 5
 DRIVERS_OFF = 7
-# The watchdog's oscillator is accurate to 10 %.
+# Time of the watchdog; its oscillator is accurate to 10 per cent.
 WATCHDOG_MS = 250 * 1.1
 # Highest rate of the stage, steps per second.
 TOP_RATE = 20_000
-# By kind: bytes within a millisecond, more than the line carries at 115,200 baud.
+# Traffic that is no heartbeat, by kind: a function that makes the bytes of a millisecond. At 115,200 baud the line
+# carries 11.5 bytes in that time.
 CHATTER = {
     "silence": lambda _: b"",
     "yes": lambda _: b"y\n" * 6,
@@ -51,7 +52,7 @@ def test_other_traffic_is_not_a_heartbeat(host, kind: str):
         host.uno.run_ms(1)
     steps = [e.cycle for e in host.uno.edges if e.value]
 
-    # The heartbeat is 500 ms, to within 100 ms; the ramp from 4000 steps/s takes 100 ms.
+    # The heartbeat is 500 ms, to within 100 ms; the ramp from 4000 steps/s takes 100 ms, and 10 ms are to spare.
     assert silent_from + 400 * MS < steps[-1] <= silent_from + (600 + 100 + 10) * MS
 
     host.uno.settle()
@@ -119,6 +120,7 @@ def test_a_program_that_works_is_never_reset(host):
     assert host.uno.troubles == []
 
 
+# Bits of the switches: of x (1), of y (2), the emergency stop (4), and all of them.
 @pytest.mark.parametrize("mask", [1, 2, 4, 7])
 def test_a_glitch_is_not_a_switch(host, request: pytest.FixtureRequest, mask: int):
     """A switch that closes for up to 100 us at any moment of a row at 100 mm/s does not change the row."""
@@ -146,7 +148,7 @@ def test_a_glitch_is_not_a_switch(host, request: pytest.FixtureRequest, mask: in
 @pytest.mark.parametrize("rate", [500, 4000, TOP_RATE])
 @pytest.mark.parametrize(("mask", "number"), [(1, StageError.LIMIT_SWITCH), (4, StageError.EMERGENCY_STOP)])
 def test_a_real_switch_stops_immediately(host, rate: int, mask: int, number: int):
-    """A switch stays closed for 15 ms at least: the stage stops within six steps."""
+    """A switch that is really hit stays closed for 15 ms at least. The stage stops within six steps (30 um)."""
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
     host.must_obey("MOVE", 40_000, 0, rate)

@@ -8,16 +8,18 @@ import pytest
 from tests.support.paths import REPO
 from tests.support.stage.drivers import Host
 
+from polysight_shared.faults import StageError
 from polysight_shared.stage_line import Immediate, Parameter
 from polysight_simulators.uno import HZ, compile_firmware
 
 SKETCH = REPO / "arduino_stage"
 US = HZ // 1_000_000
 MS = HZ // 1000
-TRIGGER = 2
+# Pin of the UNO for the steps in x.
 X_PUL = 5
+# Number of the step timer's interrupt (timer 1, compare A).
 STEP_VECTOR = 11
-# Steps/s
+# Highest rate of the stage, steps/s.
 TOP_RATE = 20_000
 # Cycles of a step's time at TOP_RATE that have to stay free, whichever compiler made the image; chosen.
 MARGIN_CYCLES = 16
@@ -38,7 +40,10 @@ def read_documented_cycles() -> int:
 
 
 def measure_busiest_step(host: Host) -> int:
-    """The longest step interrupt of ramps, rows and slants at the highest rate, with bytes coming in; cycles."""
+    """Cycles of the longest step interrupt of ramps, rows and moves in x and y together, at the highest rate.
+
+    Bytes arrive all the time.
+    """
     host.set(Parameter.TRAVEL_SPEED, TOP_RATE)
     host.set(Parameter.TRIGGER, 1)
     most = 0
@@ -67,24 +72,21 @@ def measure_busiest_step(host: Host) -> int:
     return most
 
 
-def test_interrupt_cost(host):
-    """The step interrupt fits between two steps at the highest rate and takes as long as its comment says."""
+def test_the_step_interrupt_fits_between_two_steps_and_takes_as_long_as_its_comment_says(host):
     most = measure_busiest_step(host)
     # The documented figure is a bound, and not more than 60 cycles too high (chosen).
     assert read_documented_cycles() - 60 <= most <= read_documented_cycles() <= HZ // TOP_RATE - MARGIN_CYCLES
 
 
 @pytest.mark.parametrize("folder", list_other_compilers() or [None])
-def test_interrupt_cost_with_another_compiler(make_uno, folder: Path | None):
-    """The same for the image that another avr-gcc makes."""
+def test_the_step_interrupt_of_another_compiler_fits_between_two_steps(make_uno, folder: Path | None):
     if folder is None:
         pytest.skip("no other avr-gcc: the Arduino IDE's is looked for in ~/.arduino15, others in POLYSIGHT_AVR_GCC")
     host = Host(make_uno(start=(300, 250), image=compile_firmware(folder))).prepare()
     assert measure_busiest_step(host) <= HZ // TOP_RATE - MARGIN_CYCLES
 
 
-def test_top_rate_is_kept(host):
-    """20,000 steps/s over thousands of steps, while the host asks for the status all the time."""
+def test_the_highest_rate_is_kept_over_thousands_of_steps_while_the_host_asks_for_the_status(host):
     host.set(Parameter.ACCEL, 400_000)
     host.uno.watch(X_PUL)
     host.uno.edges.clear()
@@ -95,9 +97,10 @@ def test_top_rate_is_kept(host):
     host.uno.run_until_rest()
     times = [e.cycle for e in host.uno.edges if e.value]
     assert len(times) == 20_000
-    # Between the ramps, which take v^2 / 2 a = 500 steps
+    # The ramps take v^2 / (2 a) = 500 steps; these steps lie well between them.
     cruise = times[2000:18_000]
     deviations = [t - i * HZ / TOP_RATE for i, t in enumerate(cruise)]
+    # Chosen: more than half of the 50 us between two steps would be felt by the motor.
     assert max(deviations) - min(deviations) <= 30 * US
     assert host.read_replies()[-1].kind == "done"
 
@@ -114,20 +117,21 @@ def test_hold_and_stop_begin_within_20_ms(host, byte: Immediate, rate: int):
     sent = host.uno.cycle
     host.uno.run_until_rest()
     times = [e.cycle for e in host.uno.edges if e.value]
-    # Steps in which the stage slows down
+    # Steps in which the stage slows down: v^2 / (2 a), rounded up.
     ramp = -(-rate * rate // (2 * accel))
     begins = times[-ramp - 1]
     assert sent <= begins <= sent + 20 * MS
-    # Seen from outside: 20 ms after the byte the steps come slower, and they stop after the time of the ramp.
+    # The steps themselves show it, too: 20 ms after the byte they are slower by a per cent at least, over any 20 of
+    # them. They end after the time of the ramp, of which 10 per cent more are allowed (chosen).
     late_edges = [t for t in times if t >= sent + 20 * MS]
-    paces = [(b - a) / 20 for a, b in zip(late_edges, late_edges[20:], strict=False)]
-    assert not paces or min(paces) > 1.01 * HZ / rate
+    mean_intervals = [(after - before) / 20 for before, after in zip(late_edges, late_edges[20:], strict=False)]
+    assert not mean_intervals or min(mean_intervals) > 1.01 * HZ / rate
     assert times[-1] <= sent + 20 * MS + 1.1 * HZ * rate / accel
-    assert [r.number for r in host.read_replies()] == ([15] if byte == Immediate.STOP else [])
+    expected_alarms = [StageError.STOPPED] if byte == Immediate.STOP else []
+    assert [r.number for r in host.read_replies()] == expected_alarms
 
 
-def test_half_a_second_of_silence_is_the_default(host):
-    """A board after reset, without SET HEARTBEAT, that is homed."""
+def test_without_set_heartbeat_a_moving_stage_stops_after_half_a_second_of_silence(host):
     host.run_motion("MOVE", 20_000, 0, 8000)
     host.uno.reset()
     host.uno.run_ms(5)
@@ -138,7 +142,7 @@ def test_half_a_second_of_silence_is_the_default(host):
     silent_from = host.uno.cycle
     host.must_obey("HOME")
     host.uno.run_until_rest()
-    assert [(r.kind, r.number) for r in host.read_replies()] == [("alarm", 11)]
+    assert [(r.kind, r.number) for r in host.read_replies()] == [("alarm", StageError.HEARTBEAT_LOST)]
     steps = [e.cycle for e in host.uno.edges if e.value]
-    # Behind the 500 ms: up to 100 ms for slowing down, and 15 ms for the command itself
+    # After the 500 ms the stage takes up to 100 ms to slow down. The command itself takes up to 15 ms before them.
     assert silent_from + 500 * MS < steps[-1] <= silent_from + (500 + 100 + 15) * MS

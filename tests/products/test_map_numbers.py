@@ -20,8 +20,9 @@ def test_numbers_are_written_as_ranges(numbers, text):
 
 def test_levels_are_decibels_of_amplitudes():
     levels = level_db(np.array([1.0, 10.0j, -0.1, 2.0, 0.0, np.nan, np.inf]))
+    # 20 log10(2) = 6.0206.
     np.testing.assert_allclose(levels[:4], [0.0, 20.0, -20.0, 6.0206], atol=1e-4)
-    # What has no level is as dark as can be.
+    # Zero and values that are no numbers are all as dark as can be: far below any level of an image.
     assert len(set(levels[4:].tolist())) == 1
     assert levels[4] < -100
 
@@ -31,13 +32,15 @@ def test_a_percentile_is_of_the_pixels_of_a_mask():
     mask = np.array([[True, True], [True, False]])
     assert percentile(values, mask, 50) == 10.0
     assert percentile(values, mask, 100) == 20.0
-    assert percentile(values, ~mask & mask, 50, default=-3.0) == -3.0
+    # Without any pixel it is the default.
+    no_pixel = np.zeros((2, 2), bool)
+    assert percentile(values, no_pixel, 50, default=-3.0) == -3.0
 
 
 @pytest.mark.parametrize(
     ("patches_db", "limits"),
     [
-        # A decibel to spare, in whole ones, from below 0 dB on
+        # A decibel more on either side, rounded outwards to whole decibels; the range always begins below 0 dB.
         ([0.5, 6.2], (-1.0, 8.0)), ([-2.5, 6.0], (-4.0, 7.0)), ([3.0, 9.0], (-1.0, 10.0)),
     ],
 )  # fmt: skip
@@ -48,16 +51,23 @@ def test_ratios_have_the_range_of_the_patches(patches_db, limits):
 
 
 def test_without_patches_ratios_have_the_range_of_the_opaque_pixels():
+    # Opaque pixels from -5 to 14 dB, and transparent ones of 90 dB.
     level = np.linspace(-5.0, 15.0, 2001)
     level[1900:] = 90.0
     opaque = np.arange(2001) < 1900
     low, high = _find_ratio_limits_db(level, opaque, [])
+    # Percentiles near the ends: the limits of this test leave a decibel or two (chosen).
     assert -6.0 <= low <= -4.0
     assert 12.0 <= high <= 15.0
-    nothing = _find_ratio_limits_db(level, np.zeros(2001, bool), [])
-    assert nothing[0] < nothing[1]
-    # All values far below: the range is not narrower than a few decibels.
-    low, high = _find_ratio_limits_db(level, opaque, [-40.0, -39.5])
+
+
+def test_without_opaque_pixels_ratios_have_some_range():
+    low, high = _find_ratio_limits_db(np.full(10, 5.0), np.zeros(10, bool), [])
+    assert low < high
+
+
+def test_patches_of_nearly_one_ratio_have_a_range_of_a_few_decibels():
+    low, high = _find_ratio_limits_db(np.linspace(-5.0, 15.0, 10), np.ones(10, bool), [-40.0, -39.5])
     assert low == -41.0
     assert -37.0 <= high < 0.0
 

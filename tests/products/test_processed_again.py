@@ -16,6 +16,7 @@ from polysight.materials import Library
 from polysight.materials.library import SIMULATED_LIBRARY
 from polysight.store import manifest
 from polysight.store.scan_folder import MANIFEST, ScanFolder
+from polysight_shared.errors import ConfigError, DataError, DeviceError
 from polysight_shared.tables import to_builtins
 from polysight_simulators.scene import decode_scene, simulate
 
@@ -27,8 +28,10 @@ SCENE = make_scene(
     step_mm=(14.0, 12.0),
     image={"columns": 40, "rows": 30, "pixel_mm": 4.0},
 )
-# The leading minus does not make it an option
+# The box on the copper plate: its middle and its size, mm. The leading minus does not make it an option.
 METAL = ["--metal", "-36,0,30,40"]
+# A box where nothing is.
+NO_METAL = ["--metal", "900,900,10,10"]
 
 
 @pytest.fixture(scope="module")
@@ -81,17 +84,18 @@ def test_labels_among_the_products_that_they_replace(made_folder):
 def test_an_invalid_input_changes_nothing(made_folder, option, path, value, capsys):
     write_boxes(made_folder, {"far": [4000, 0, 4010, 10]})
     contents_before = read_contents(made_folder)
-    assert process(made_folder, option, made_folder / path) == 3
+    assert process(made_folder, option, made_folder / path) == DataError.exit_status
     assert value in capsys.readouterr().err
     assert read_contents(made_folder) == contents_before
 
 
 def test_a_report_is_not_replaced_by_images_without_one(made_folder, capsys):
     contents_before = read_contents(made_folder / "out")
-    assert process(made_folder, "--metal", "900,900,10,10") == 3
+    assert process(made_folder, *NO_METAL) == DataError.exit_status
     assert read_contents(made_folder / "out") == contents_before
+    # Without older products the images are kept, and the message names them.
     shutil.rmtree(made_folder / "out")
-    assert process(made_folder, "--metal", "900,900,10,10") == 3
+    assert process(made_folder, *NO_METAL) == DataError.exit_status
     assert str(made_folder / "out" / "image.npz") in capsys.readouterr().err.splitlines()[-1]
     assert (made_folder / "out" / "image.npz").exists()
 
@@ -103,7 +107,7 @@ def test_products_whose_raw_rows_were_dropped_stay(made_folder, capsys):
         load_published_rig(), decode_scene({**SCENE, "name": "another"}, "test"), made_folder / "other"
     )
     for command in ("process", "image"):
-        assert main([command, str(other_scan), "--out", str(made_folder / "out")]) == 2
+        assert main([command, str(other_scan), "--out", str(made_folder / "out")]) == ConfigError.exit_status
         assert ScanFolder.load(made_folder / "scan").scan_id in capsys.readouterr().err
     assert read_contents(made_folder / "out") == contents_before
 
@@ -126,9 +130,10 @@ def test_at_another_angle_than_the_librarys_nothing_is_named(made_folder, other_
     assert materials["model"] is None
     other_patch = next(s for s in materials["segments"] if not s["metal_reference"])
     assert other_patch["name"] is None
-    assert (other_patch["permittivity"] is None) == (
-        other_patch["refused"] is not None
-    )  # such a coarse scan may give no result
+    # Such a coarse scan may give no result: then the reason is there instead.
+    has_permittivity = other_patch["permittivity"] is not None
+    is_refused = other_patch["refused"] is not None
+    assert has_permittivity != is_refused
     assert "other.npz" in (made_folder / "out" / "report.html").read_text()
 
 
@@ -144,19 +149,23 @@ def no_pi(made_folder) -> Path:
 
 def test_a_library_of_another_angle_is_reported_before_the_rig_is_used(made_folder, other_angle, no_pi, capsys):
     scan = ["scan", "--config", str(no_pi), "--out", str(made_folder / "new")]
-    assert main([*scan, "--library", str(other_angle)]) == 5
+    assert main([*scan, "--library", str(other_angle)]) == DeviceError.exit_status
     message = capsys.readouterr().err
     assert 0 < message.index("other.npz") < message.index("127.0.0.1:1")
     far_box = write_boxes(made_folder, {"far": [4000, 0, 4010, 10]})
     for option in (["--labels", made_folder / "no.json"], ["--labels", far_box],
                    ["--library", made_folder / "no.npz"], ["--truth", no_pi]):  # fmt: skip
-        assert main([*scan, *map(str, option)]) == 3
+        assert main([*scan, *map(str, option)]) == DataError.exit_status
         assert "127.0.0.1" not in capsys.readouterr().err
     assert not (made_folder / "new").exists()
 
 
 def test_retaken_and_incomplete_rows_of_every_run_are_counted(made_folder):
-    """They come from the manifest, however often the scan was resumed."""
+    """They come from the manifest, however often the scan was resumed.
+
+    Here takes 1 and 2 of row 2 and take 1 of row 5 were rejected: three retakes. Row 2 is incomplete; of row 7 the
+    incomplete take was withdrawn and another one has replaced it.
+    """
     scan = ScanFolder.load(made_folder / "scan")
     rows = {f["row"]: f for f in load_facts(scan, "row_committed")}
     with scan.writer() as writer:

@@ -1,5 +1,6 @@
 """Files of products are written completely or not at all, and read back unchanged."""
 
+import errno
 import json
 from dataclasses import replace
 
@@ -25,15 +26,17 @@ def test_image_product_round_trips(tmp_path):
     path = tmp_path / "products" / "image.npz"
     images = Images(h, v, x, y, valid, p)
     write_image(path, images)
-    z = read_image(path)
-    assert {k: a.dtype for k, a in vars(z).items() if isinstance(a, np.ndarray)} == {
+    read_back = read_image(path)
+    assert {name: array.dtype for name, array in vars(read_back).items() if isinstance(array, np.ndarray)} == {
         **dict.fromkeys(("h", "v", "p"), np.dtype(np.complex64)),
         **dict.fromkeys(("x_m", "y_m"), np.dtype(np.float64)),
         "valid": np.dtype(np.bool_),
     }
-    np.testing.assert_array_equal(z.h, h)
-    np.testing.assert_array_equal(z.y_m, y)
-    assert [p.name for p in path.parent.iterdir()] == ["image.npz"]
+    np.testing.assert_array_equal(read_back.h, h)
+    np.testing.assert_array_equal(read_back.y_m, y)
+    # No temporary file is left.
+    assert [file.name for file in path.parent.iterdir()] == ["image.npz"]
+    # Arrays of different shapes are not written, and a file that was cut off is not read.
     with pytest.raises(DataError):
         write_image(path, replace(images, h=h[1:]))
     path.write_bytes(path.read_bytes()[:100])
@@ -41,7 +44,7 @@ def test_image_product_round_trips(tmp_path):
         read_image(path)
 
 
-def test_json_products_are_strict(tmp_path):
+def test_json_products_have_null_for_what_is_not_finite_and_parts_of_complex_numbers(tmp_path):
     content = {"a": np.float32(1.5), "b": [np.inf, float("nan"), 2 - 1j], "c": np.array([1, 2]), "d": (True, None, "ε")}
     write_json(tmp_path / "q.json", content)
     assert json.loads((tmp_path / "q.json").read_text(encoding="utf-8")) == {
@@ -57,11 +60,11 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "x.json"
     write_atomically(path, b"old")
 
-    def full(_fd):
-        raise OSError(28, "No space left on device")
+    def fail_as_a_full_disk_does(_fd):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(OSError):  # noqa: PT011
+    monkeypatch.setattr("os.fsync", fail_as_a_full_disk_does)
+    with pytest.raises(OSError, match="No space left"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
 

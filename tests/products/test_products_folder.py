@@ -1,5 +1,6 @@
 """A folder of products is replaced atomically: after any failure it holds the old products or the new ones."""
 
+import errno
 import fcntl
 import os
 import shutil
@@ -55,7 +56,9 @@ def test_new_products_replace_all_old_files(out):
     assert read(out.parent / "deeper" / "two") == NEW
 
 
-@pytest.mark.parametrize("error", [DataError("x"), OSError(28, "No space left on device"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    "error", [DataError("x"), OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+)
 def test_an_error_leaves_the_old_products(out, error):
     def fail(new: Path) -> None:
         write(new, NEW)
@@ -71,14 +74,17 @@ class Killed(BaseException):
     """Raised in place of the program's end."""
 
 
+# An exchange has fewer than 20 steps: in the last cases nothing is killed.
 @pytest.mark.parametrize("step", range(20))
 def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, exchange, step, monkeypatch):
     """With an atomic swap this holds at every moment; otherwise from the start of the next run."""
-    done = iter(range(step, -1, -1))
+    steps_left = iter(range(step, -1, -1))
 
-    def die_after(call):
+    def die_at_step(call):
+        """The call, which ends the program instead if the step is reached; then all further calls do, too."""
+
         def dying(*args, **kwargs):
-            if next(done, 0) == 0:
+            if next(steps_left, 0) == 0:
                 raise Killed
             return call(*args, **kwargs)
 
@@ -89,15 +95,16 @@ def test_after_a_kill_at_any_step_the_next_run_finds_old_or_new_products(out, ex
             (Path, "mkdir"), (Path, "rename"), (Path, "write_bytes"), (Path, "unlink"), (shutil, "rmtree"),
             (products_folder, "_exchange"), (products_folder, "sync_folder"), (fcntl, "flock"),
         ):  # fmt: skip
-            patched.setattr(owner, name, die_after(getattr(owner, name)))
+            patched.setattr(owner, name, die_at_step(getattr(owner, name)))
         replace(out)
     if exchange == "one step":
         assert read(out) in (OLD, NEW)
-    collected = {}
+    # A run that fails after it has begun leaves what it found.
+    found_by_next_run = {}
     with suppress(DataError), replace_products(out, "s"):
-        collected = read(out)
+        found_by_next_run = read(out)
         raise DataError("nothing")
-    assert collected in (OLD, NEW)
+    assert found_by_next_run in (OLD, NEW)
     replace(out)
     assert read(out) == NEW
     assert list(out.parent.iterdir()) == [out]
@@ -148,18 +155,19 @@ def test_the_only_products_of_a_scan_are_not_replaced_by_those_of_another(out):
     with expect_refusal(ErrorCode.NAME_TAKEN, "first", "2026-01-02"), replace_products(out, "second"):
         pytest.fail("it began")
     assert read(out) == contents_before
-    with replace_products(out, "first") as new:  # from a copy that has its raw rows
+    # The same scan, processed from a copy that has its raw rows, may replace them.
+    with replace_products(out, "first") as new:
         write(new, NEW)
     assert read(out) == NEW
 
 
 def test_products_that_cannot_replace_the_old_ones_are_kept_and_named(out, monkeypatch):
-    def busy(*_):
-        raise OSError(16, os.strerror(16))
+    def fail_as_busy(*_):
+        raise OSError(errno.EBUSY, os.strerror(errno.EBUSY))
 
-    monkeypatch.setattr(products_folder, "_exchange", busy)
-    with pytest.raises(DeviceError) as e:
+    monkeypatch.setattr(products_folder, "_exchange", fail_as_busy)
+    with pytest.raises(DeviceError) as caught:
         replace(out)
     unfinished_folder = out.with_name(".one.new")
-    assert str(unfinished_folder) in e.value.remedy
+    assert str(unfinished_folder) in caught.value.remedy
     assert (read(unfinished_folder), read(out)) == (NEW, OLD)

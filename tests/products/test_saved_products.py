@@ -23,18 +23,24 @@ from polysight_shared.errors import DataError, ErrorCode, convert_os_error
 from polysight_shared.files import write_atomically
 from polysight_shared.tables import to_builtins
 
-# Rig file in the current folder
+# The rig of the rig file in the current folder.
 HERE = load_published_rig()
-# Rig of the scan: another slope, another window
+# The rig of the scan: another slope, and another window of the samples.
 USED = msgspec.structs.replace(
     HERE, chirp=msgspec.structs.replace(HERE.chirp, slope_hz_per_s=HERE.chirp.slope_hz_per_s * 0.4, adc_start_us=9.0)
 )
+# About that of water at these frequencies.
 WATER = 9.4 - 18j
+# Layers as the command takes them: name, real part, loss and thickness in mm of glass; the permittivity of water is
+# to be found.
 STACK = ["glass,5.5,0.05,3", "water,?"]
 ANGLE_DEG = 55.0
+# The fit ends within this of the truth, as products have no noise here; chosen.
+FIT_ERROR = 1e-2
 
 
 def make_ratio_entry(inverse: complex) -> dict:
+    """The ratio P = H / V in materials.json, from its inverse, and the error of the inverse."""
     ratio = 1 / inverse
     return {"ratio": {"real": ratio.real, "imag": ratio.imag}, "inverse_ratio_std": 0.005}
 
@@ -58,7 +64,8 @@ def folder(tmp_path, monkeypatch):
     return made_folder
 
 
-def read_fit(capsys, *arguments: object) -> complex:
+def fit_water(capsys, *arguments: object) -> complex:
+    """The permittivity of water that the command finds with these arguments."""
     layers = [word for layer in STACK for word in ("--layer", layer)]
     assert main(["permittivity", *map(str, arguments), *layers, "--json"]) == 0
     real, loss = json.loads(capsys.readouterr().out)[0]["layer"]["permittivity"]
@@ -67,23 +74,23 @@ def read_fit(capsys, *arguments: object) -> complex:
 
 @pytest.mark.parametrize("bands", [1, 3])
 def test_permittivity_is_computed_with_the_chirp_of_the_products(folder, capsys, bands):
-    assert abs(read_fit(capsys, folder, "--bands", bands) - WATER) < 1e-2
+    assert abs(fit_water(capsys, folder, "--bands", bands) - WATER) < FIT_ERROR
 
 
 def test_a_rig_file_may_replace_the_chirp_unless_sub_bands_contradict_it(folder, capsys):
     Path("used.toml").write_text(tomli_w.dumps(to_builtins(USED)))
-    assert abs(read_fit(capsys, folder, "--config", "used.toml") - WATER) < 1e-2
+    assert abs(fit_water(capsys, folder, "--config", "used.toml") - WATER) < FIT_ERROR
     arguments = ["permittivity", str(folder), "--config", "instrument.toml", "--layer", "water,?"]
     for bands in ("1", "3"):
         assert main([*arguments, "--bands", bands]) == DataError.exit_status
         message = capsys.readouterr().err
         assert "patch 3" in message
         assert "instrument.toml" in message
+    # Without sub-bands nothing contradicts the wrong chirp, and the permittivity found with it is wrong.
     materials = json.loads((folder / MATERIALS).read_text())
-    # Nothing contradicts the given chirp
     del materials["segments"][0]["bands"]
     write_json(folder / MATERIALS, materials)
-    assert abs(read_fit(capsys, folder, "--config", "instrument.toml") - WATER) > 1
+    assert abs(fit_water(capsys, folder, "--config", "instrument.toml") - WATER) > 1
 
 
 def test_a_missing_chirp_is_not_guessed(folder, capsys):
@@ -91,14 +98,14 @@ def test_a_missing_chirp_is_not_guessed(folder, capsys):
     arguments = ["permittivity", str(folder)]
     assert main([*arguments, "--layer", "water,?"]) == DataError.exit_status
     assert "--config" in capsys.readouterr().err
-    assert main(arguments) == 0, "one interface needs no chirp"
+    assert main(arguments) == 0, "a single interface needs no chirp: it reflects all frequencies alike"
 
 
 def test_a_scan_folder_may_be_given_for_its_products(folder, tmp_path, capsys):
     scan = tmp_path / "scan"
     scan.mkdir()
     folder.rename(scan / "products")
-    assert abs(read_fit(capsys, scan) - WATER) < 1e-2
+    assert abs(fit_water(capsys, scan) - WATER) < FIT_ERROR
 
 
 @pytest.mark.parametrize("name", ["materials.json", "scan.json"])
@@ -117,24 +124,25 @@ def test_missing_products_are_named(tmp_path):
 
 
 def test_a_full_disk_is_reported_with_the_path(tmp_path, monkeypatch):
-    def full(_fd: int) -> None:
+    def fail_as_a_full_disk_does(_fd: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError) as e:  # noqa: PT011
+    monkeypatch.setattr(os, "fsync", fail_as_a_full_disk_does)
+    with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)) as caught:
         write_atomically(tmp_path / "image.npz", b"1")
-    assert e.value.errno == errno.ENOSPC
-    assert str(tmp_path) in str(convert_os_error(e.value))
+    assert caught.value.errno == errno.ENOSPC
+    assert str(tmp_path) in str(convert_os_error(caught.value))
 
 
 def test_gains_are_relative_to_each_boards_first_rx():
-    none = np.zeros((1, 1), np.complex64)
+    """In decibels and degrees, from complex gains."""
+    dark_pixel = np.zeros((1, 1), np.complex64)
     axis = np.zeros(1)
     gains = {
         "RH": np.array([2.0, 20.0, 2.0j, -0.2], np.complex128),
         "RV": np.array([5j, 5j], np.complex128),
     }
-    images = Images(none, none, axis, axis, np.ones((1, 1), bool), rx_gains=gains)
+    images = Images(h=dark_pixel, v=dark_pixel, x_m=axis, y_m=axis, valid=np.ones((1, 1), bool), rx_gains=gains)
     gains_read = {name: [(g.gain_db, g.phase_deg) for g in board] for name, board in rx_gains(images).items()}
     assert gains_read["RH"] == [pytest.approx(g) for g in ((0.0, 0.0), (20.0, 0.0), (0.0, 90.0), (-20.0, 180.0))]
     assert gains_read["RV"] == [pytest.approx((0.0, 0.0))] * 2

@@ -70,11 +70,15 @@ def test_withholding_keeps_positions_and_does_not_change_usable_results(tmp_path
 
 
 def test_loss_is_minus_imag_in_the_covariance_too(tmp_path):
-    spread = PermittivityFigures(real=3, imag=-1, covariance=[[0.04, -0.01], [-0.01, 0.09]]).spread
+    covariance = [[0.04, -0.01], [-0.01, 0.09]]
+    spread = PermittivityFigures(real=3, imag=-1, covariance=covariance).spread
     assert spread is not None
     assert (spread.real_std, spread.loss_std, spread.covariance) == pytest.approx((0.2, 0.3, 0.01))
-    draws = np.random.default_rng(1).multivariate_normal([3, -1], [[0.04, -0.01], [-0.01, 0.09]], 200_000)
-    np.testing.assert_allclose(np.cov(draws[:, 0], -draws[:, 1]), spread.matrix, rtol=0.03)
+    # The same from draws: a covariance of 200,000 is known to some per cent.
+    draws = np.random.default_rng(1).multivariate_normal([3, -1], covariance, 200_000)
+    real = draws[:, 0]
+    loss = -draws[:, 1]
+    np.testing.assert_allclose(np.cov(real, loss), spread.matrix, rtol=0.03)
     scan = open_scan(write_judged_products(tmp_path / "one", "good"))
     pet = scan.materials().sel(patch=2)
     given_covariance = read_products(scan.folder).segments[1].permittivity.covariance
@@ -93,11 +97,14 @@ def test_products_of_earlier_releases_are_read_as_before(tmp_path):
     assert "p_sigma" not in scan.image()
     assert "verdict" not in scan.image().attrs
     assert str(scan.materials()["name"].values[1]) == "PET"
-    stds = PermittivityFigures(real=1, imag=0, real_std=0.1, imag_std=0.2)
-    assert stds.spread is not None
-    np.testing.assert_allclose(stds.spread.matrix, [[0.01, 0], [0, 0.04]])
-    assert PermittivityFigures(real=1, imag=0).spread is None
-    assert PermittivityFigures(real=1, imag=0, covariance=[[None, None], [None, None]]).spread is None
+    # Files of earlier releases have standard deviations and no covariance.
+    with_stds = PermittivityFigures(real=1, imag=0, real_std=0.1, imag_std=0.2)
+    assert with_stds.spread is not None
+    np.testing.assert_allclose(with_stds.spread.matrix, [[0.01, 0], [0, 0.04]])
+    without_errors = PermittivityFigures(real=1, imag=0)
+    assert without_errors.spread is None
+    with_unknown_covariance = PermittivityFigures(real=1, imag=0, covariance=[[None, None], [None, None]])
+    assert with_unknown_covariance.spread is None
     assert main(["export", str(folder), "--csv", "--out", str(tmp_path / "out")]) == 0
     assert "verdict" not in (tmp_path / "out" / "materials.csv").read_text(encoding="utf-8")
 

@@ -23,5 +23,5 @@ def test_sub_bands_of_all_patches_are_exported():
 
 
 @pytest.mark.parametrize("patches", [[], [make_patch(1, [])], [make_patch(1, BANDS), make_patch(2, [])]])
-def test_without_those_of_each_patch_there_are_none(patches):
+def test_an_export_has_no_sub_bands_unless_each_patch_has_them(patches):
     assert _make_band_variables(patches) == {}

@@ -11,6 +11,7 @@ PLANE = "Plane of the plates, relative to the rig file"
 
 
 def list_cells(**parts) -> list[list[str]]:
+    """The cells of each line of the table of a budget with these parts."""
     table = make_budget_table(ErrorBudget(**parts))
     return [] if table is None else [row["cells"] for row in table["rows"]]
 
@@ -44,6 +45,7 @@ def test_leakages_are_complex_numbers_with_their_errors():
         [LEAKAGE_OF_H, "+0.012 − 0.046i ± 0.001"],
         [LEAKAGE_OF_V, "−0.020 + 0.000i"],
     ]
+    # A number of which a part is not known is left out: the line of the source is left.
     leakage = LeakageError(h=(None, 0.1), v=(0.1, None), source="scene")
     assert len(list_cells(leakage=leakage)) == 1
     leakage = LeakageError(v=(0.1, 0.2), std=(0.5, 0.25), source="scene")
@@ -81,7 +83,7 @@ def test_a_plane_is_written_with_what_is_known_of_it(plane, cells):
     assert list_cells(plane=plane) == cells
 
 
-def test_evidence_for_metal_is_a_score():
+def test_evidence_for_metal_is_a_score_and_the_ratio_of_the_channels():
     assert list_cells(metal=MetalScore(others=3)) == []
     text = "Evidence that the reference is metal"
     assert list_cells(metal=MetalScore(score=-2.04, others=3)) == [[text, "score −2.0 from 3 other patches"]]

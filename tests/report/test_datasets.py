@@ -10,7 +10,7 @@ import xarray
 from polysight.cli.main import main
 from polysight.products import exports
 from polysight.products.exports import join_complex, read_netcdf, split_complex
-from polysight_shared.errors import DataError
+from polysight_shared.errors import ConfigError, DataError
 
 
 def export_folder(folder: Path) -> xarray.Dataset:
@@ -38,6 +38,7 @@ def test_the_file_holds_the_products(folder):
 
 def test_the_table_is_that_of_the_materials(folder):
     dataset = export_folder(folder)
+    # PATCH and METAL in conftest.py, by their labels.
     pet = dataset.sel(patch=4)
     metal = dataset.sel(patch=5)
     assert (pet["name"], pet["runner_up"], metal["name"]) == ("PET", "glass", "")
@@ -107,7 +108,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(folder, mo
 
     monkeypatch.setattr(exports, "import_module", raise_import_error)
     out = folder.parent / "out"
-    assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == 2
+    assert main(["export", str(folder), "--netcdf", "--out", str(out)]) == ConfigError.exit_status
     message = capsys.readouterr().err
     assert "pip install h5netcdf" in message
     assert not list(out.iterdir())

@@ -14,12 +14,13 @@ from polysight.results import to_plain
 
 
 def assert_same_arrays(read_array, products):
+    """Check that `read_array` of a name has the values and the kind of numbers of the products' array."""
     for name in ("h", "v", "p", "valid"):
         assert (np.asarray(read_array(name)) == getattr(products, name)).all()
         assert np.asarray(read_array(name)).dtype.kind == getattr(products, name).dtype.kind
 
 
-def test_matlab_round_trip(folder, tmp_path):
+def test_a_matlab_file_has_the_arrays_settings_and_materials_of_the_products(folder, tmp_path):
     products = read_products(folder)
     (tmp_path / "image.mat").write_bytes(pack_mat(products))
     content = scipy.io.loadmat(tmp_path / "image.mat", simplify_cells=True)
@@ -28,6 +29,7 @@ def test_matlab_round_trip(folder, tmp_path):
     assert np.array_equal(content["y_m"], products.y_m)
     config = content["config"]
     assert config["chirp"]["start_hz"] == products.facts.instrument["chirp"]["start_hz"]
+    # First step of the mount of the second board in instrument.toml.
     assert list(config["boards"][1]["mount"][0]["shift_mm"]) == [15.837, -3.35, 0.0]
     assert content["versions"]["polysight"] == "0.1.0"
     assert json.loads(content["materials_json"]) == to_plain(products.materials)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from polysight.report import figures
 from polysight.results import PatchFigures, PermittivityFigures
 
+# Pixels of the made-up images; chosen.
 STEP_MM = 2.0
 
 
@@ -20,7 +21,10 @@ def make_patch(x_mm: float, **changes: Any) -> PatchFigures:
 
 
 def make_scan(phases_deg: dict[float, Any], segments: list[PatchFigures] | None = None) -> Any:
-    """P of 1 at 90 degrees, but for plates of 12 mm at places along x with phases of their own."""
+    """A scan whose P is 1 at 90 degrees, and 3 on plates of 12 mm along x: `phases_deg` has the phase at each x.
+
+    Without `segments`, there is a patch of 20 mm about each plate.
+    """
     x_mm = np.arange(-60.0, 61.0, STEP_MM)
     y_mm = np.arange(-20.0, 21.0, STEP_MM)
     p = np.full((y_mm.size, x_mm.size), 1j)
@@ -34,7 +38,7 @@ def make_scan(phases_deg: dict[float, Any], segments: list[PatchFigures] | None 
     ("phases_deg", "limits"),
     [
         ({0.0: 40.0}, (30.0, 50.0)),
-        # From 20 to 60 degrees, and 15 % of these 40 on either side, up to a multiple of 5
+        # From 20 to 60 degrees, and 15 per cent of these 40 on either side, rounded outwards to multiples of 5.
         ({-30.0: 20.0, 30.0: 60.0}, (10.0, 70.0)),
         # Either side of 180 degrees lies together.
         ({-30.0: 170.0, 30.0: -170.0}, (165.0, 195.0)),
@@ -49,7 +53,7 @@ def test_phases_around_the_circle_have_no_range():
     circle = np.linspace(-180, 180, 49).reshape(7, 7)
     assert figures.find_phase_limits_deg(make_scan({0.0: circle})) is None
     more_than_half = np.linspace(-100, 100, 49).reshape(7, 7)
-    # The middle 90 % of them, -90 to 90, and 15 % of these 180 on either side, up to a multiple of 5
+    # The middle 90 per cent of them, -90 to 90, and 15 per cent of these 180 on either side, rounded to multiples of 5.
     assert figures.find_phase_limits_deg(make_scan({0.0: more_than_half})) == (-120.0, 120.0)
     beside_the_image = make_patch(0.0, box_mm=(90.0, 0.0, 95.0, 1.0))
     assert figures.find_phase_limits_deg(make_scan({0.0: 40.0}, [beside_the_image])) is None
@@ -101,10 +105,11 @@ def test_decibels_say_what_zero_is(referenced, judged, unit):
 @pytest.mark.parametrize(
     ("boxes", "limits"),
     [
-        # Room of 20 mm on either side, 12 below and 24 above, made square
+        # Room of 20 mm on either side, 12 mm below and 24 mm above for the name. The shorter side is made as long as
+        # the longer one.
         ([(-10.0, -10.0, 10.0, 10.0)], (-30.0, 30.0, -24.0, 36.0)),
         ([(-40.0, -10.0, -20.0, 10.0), (20.0, 0.0, 40.0, 10.0)], (-60.0, 60.0, -54.0, 66.0)),
-        # No further than the image
+        # Where the image ends, the map ends.
         ([(90.0, 90.0, 100.0, 100.0)], (70.0, 100.0, 76.0, 100.0)),
         ([], (-100.0, 100.0, -100.0, 100.0)),
     ],
@@ -124,6 +129,7 @@ def test_a_map_shows_the_plates_with_room_for_their_names(boxes, limits):
     ("values", "limits"), [([], (0.5, 1.5)), ([3.0], (2.5, 3.5)), ([3.0, 3.8], (2.9, 3.9)), ([2.0, 6.0], (1.8, 6.2))]
 )
 def test_colours_of_a_surface_span_its_permittivities(values, limits):
+    """The span is 1 at least; a larger one is widened by 5 per cent on either side."""
     segments = [SimpleNamespace(permittivity=complex(value)) for value in values]
     surface: Any = SimpleNamespace(segments=[*segments, SimpleNamespace(permittivity=None)])
     assert figures.colour_range(surface) == pytest.approx(limits)
@@ -152,6 +158,7 @@ def test_a_relative_error_is_that_of_both_parts(monkeypatch):
     drawn.clear()
     figures.draw_permittivity_map(scan)
     values, _, (_, low, high, _) = drawn[0]
+    # A tenth of the difference of 5 on either side.
     assert (low, high) == pytest.approx((3.0 - 0.5, 8.0 + 0.5))
     assert set(values) == {1, 2}, "the patch without a permittivity is not filled"
     scan.segments = [make_patch(0.0)]
@@ -160,12 +167,12 @@ def test_a_relative_error_is_that_of_both_parts(monkeypatch):
 
 @pytest.mark.parametrize("count", [1, 59, 60, 119, 120, 500])
 def test_a_surface_has_up_to_120_needles_along_its_normals(monkeypatch, count):
-    """Points are drawn from the far ones to the near ones, as seen from the rig, from the side and from above.
+    """Three views: from the rig, from the side and from above. Far points are drawn first, so that near ones hide them.
 
     Needles are 12 mm long. So that they can be told apart, only each n-th point has one.
     """
-    seen: list[Figure] = []
-    monkeypatch.setattr(figures.style, "encode_png", seen.append)
+    drawn_figures: list[Figure] = []
+    monkeypatch.setattr(figures.style, "encode_png", drawn_figures.append)
     rng = np.random.default_rng(count)
     normals = rng.standard_normal((count, 3))
     surface: Any = SimpleNamespace(
@@ -176,15 +183,15 @@ def test_a_surface_has_up_to_120_needles_along_its_normals(monkeypatch, count):
         figures.surface_figure(surface)
     points_mm = 1e3 * surface.points_m
     x, y, z = points_mm.T
-    # Coordinates to the right and upwards, and the distance from the eye
+    # For each view: the indices of the coordinates to the right and upwards, and the distance from the eye.
     views = (((0, 1), z), ((2, 1), -x), ((0, 2), -y))
-    for ax, ((across, up), depth) in zip(seen[0].axes, views, strict=True):
+    for ax, ((across, up), depth) in zip(drawn_figures[0].axes, views, strict=True):
         (dots,) = ax.collections
         order = np.argsort(-depth)
         assert np.allclose(dots.get_offsets(), points_mm[order][:, [across, up]])
         needles = ax.lines
         assert min(count, 60) <= len(needles) <= 120
-        # Rounded up
+        # Points per needle, rounded up.
         stride = -(-count // len(needles))
         for needle, start, normal in zip(needles, points_mm[::stride], surface.normals[::stride], strict=True):
             ends = np.array([start, start + 12 * normal])

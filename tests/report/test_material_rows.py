@@ -26,6 +26,7 @@ METAL = {
     "ratio": None, "inverse_ratio_std": None, "permittivity": None, "truth": None, "box": "copper foil",
     "refused": {"what": "noise", "why": "nothing reflects", "do": "look at the image"},
 }  # fmt: skip
+# Columns of the table of both patches.
 EXPECTED = {
     "patch": [4, 5],
     "name": ['PET, "0.5 mm"', None],
@@ -43,7 +44,8 @@ EXPECTED = {
     "permittivity_real_standard_error": [0.0625, None],
     "permittivity_loss": [0.25, None],
     "permittivity_loss_standard_error": [0.125, None],
-    "permittivity_real_loss_covariance": [0.002, None],  # loss is -imag
+    # The loss is minus the imaginary part: the covariance changes its sign.
+    "permittivity_real_loss_covariance": [0.002, None],
     "permittivity_real_half_width_68": [0.05, None],
     "permittivity_loss_half_width_68": [0.09375, None],
     "dominated_by": ["leakage", None],
@@ -75,7 +77,9 @@ def exported_folder(tmp_path):
 def test_csv_keeps_every_digit(exported_folder):
     with (exported_folder / "materials.csv").open(newline="", encoding="utf-8") as f:
         header, *rows = csv.reader(f)
-    assert dict(zip(header, map(list, zip(*rows, strict=True)), strict=True)) == {
+    columns = [list(column) for column in zip(*rows, strict=True)]
+    written = dict(zip(header, columns, strict=True))
+    assert written == {
         name: ["" if value is None else str(value) for value in values] for name, values in EXPECTED.items()
     }
 
@@ -87,7 +91,7 @@ def are_same(values, expected) -> bool:
     return np.array_equal(np.asarray(values, float), [np.nan if e is None else e for e in expected], equal_nan=True)
 
 
-def test_matlab(exported_folder):
+def test_a_matlab_file_has_the_same_columns(exported_folder):
     content = scipy.io.loadmat(exported_folder / "image.mat", simplify_cells=True)["materials"]
     assert set(content) == set(EXPECTED)
     for name, expected in EXPECTED.items():

@@ -40,7 +40,7 @@ def make_result_of_names(names: list[str]) -> ProcessedScan:
 
 
 @pytest.fixture(autouse=True)
-def strict():
+def make_warnings_errors():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -55,11 +55,12 @@ def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
             assert f"patch {number}: {figure_label(name, 'x').removeprefix('x: ')}" in html
 
 
-def test_the_page_lists_the_name_of_each_label():
-    odd = "\U0010fffd木"
-    html = render(make_result_of_names([odd, "PET"]), {})
-    assert f"patch 1: ?? is {odd}" in html
-    assert f"plate 1: ?? is {odd}" in html
+def test_the_page_lists_names_whose_characters_no_font_has():
+    # A character that is for private use, and a Chinese one.
+    without_font = "\U0010fffd木"
+    html = render(make_result_of_names([without_font, "PET"]), {})
+    assert f"patch 1: ?? is {without_font}" in html
+    assert f"plate 1: ?? is {without_font}" in html
     assert "is PET" not in html
     assert "fonts do not have" not in render(make_result_of_names(["PET"]), {})
 

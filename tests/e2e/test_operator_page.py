@@ -20,6 +20,7 @@ from polysight.store import ScanFolder, validate
 from polysight_shared.messages import BeginRun
 from polysight_shared.raster import plan_raster
 
+# Rows of a scan; chosen, so many that a scan is stopped before its end on a slow machine, too.
 ROWS = 40
 SCENE = write_small_scene(10, ROWS, step_mm=(10.0, 5.0))
 pytestmark = pytest.mark.slow
@@ -125,19 +126,19 @@ def test_a_scan_pauses_continues_stops_and_is_resumed(lab):
     lab.wait_rows(folder, 1)
     lab.click("pause")
     lab.wait_headline("Paused")
-    rows = len(ScanFolder.load(folder).committed_rows())
+    rows_at_pause = len(ScanFolder.load(folder).committed_rows())
     lab.click("continue")
-    lab.wait_rows(folder, rows + 1)
+    lab.wait_rows(folder, rows_at_pause + 1)
     lab.click("pause")
     lab.wait_headline("Paused")
-    # While the stage rests: rows remain, even on a slow machine
+    # Stopped while the stage rests: rows remain, even on a slow machine.
     lab.click("stop")
     lab.wait_headline("Stopped on request")
     lab.wait_end(folder)
-    stopped = len(ScanFolder.load(folder).committed_rows())
-    assert rows < stopped < ROWS
+    rows_at_stop = len(ScanFolder.load(folder).committed_rows())
+    assert rows_at_pause < rows_at_stop < ROWS
     lab.click("resume")
-    lab.wait_rows(folder, stopped + 1)
+    lab.wait_rows(folder, rows_at_stop + 1)
     lab.click("abort")
     lab.browser.evaluate("document.querySelector('#confirm button[value=yes]').click()")
     lab.wait_headline("Aborted on request")
@@ -150,25 +151,26 @@ def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
     lab.wait_rows(folder, 1)
     program_before = json.loads((folder / PROGRAM_FOLDER / "scan.json").read_text())
     pid = program_before["pid"]
-    # The priority of a program in a terminal, not that of the reading process
+    # The scan has the priority of the server, which is that of a program in a terminal. The server's own process for
+    # reading scans has a lower one, and is the first to be killed for want of memory.
     assert os.getpriority(os.PRIO_PROCESS, lab.server.process.pid) == os.getpriority(os.PRIO_PROCESS, pid)
-    assert (
-        Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == Path("/proc/self/oom_score_adj").read_text().strip()
-    )
+    assert Path(f"/proc/{pid}/oom_score_adj").read_text() == Path("/proc/self/oom_score_adj").read_text()
     lab.open("/new")
     lab.browser.wait("document.querySelector('.time')", "the plan")
     lab.fill(name="fourth")
     lab.click("start")
     lab.browser.wait("document.getElementById('told').innerText.includes('third is being scanned')", "the refusal")
     assert not (lab.scans / "fourth").exists()
-    # The refused request
+    # The browser counts the refused request as an error.
     lab.browser.errors.clear()
     lab.open("/watch?scan=third")
     lab.wait_headline("All is well")
     lab.server.kill()
     lab.browser.wait("document.body.classList.contains('lost')", "that the page says so")
-    rows = len(ScanFolder.load(folder).committed_rows())
-    lab.rig.wait_for(lambda: len(ScanFolder.load(folder).committed_rows()) > rows, "rows without a server")
+    rows_without_server = len(ScanFolder.load(folder).committed_rows())
+    lab.rig.wait_for(
+        lambda: len(ScanFolder.load(folder).committed_rows()) > rows_without_server, "rows without a server"
+    )
     lab.serve()
     lab.open("/watch?scan=third", PHONE)
     lab.wait_headline("All is well")
@@ -181,8 +183,11 @@ def test_the_rig_makes_one_scan_and_it_outlives_its_server(lab):
     lab.wait_end(folder)
 
 
-def test_the_doctor_is_shown_as_it_looks(lab):
-    """Beside another's scan: otherwise it would load all cores to measure the receivers, which tests/doctor covers."""
+def test_findings_of_the_doctor_are_shown_while_it_runs(lab):
+    """Another host's scan runs: without it the doctor would load all cores to measure the receivers.
+
+    That measurement is tested in tests/doctor.
+    """
     plan = plan_raster(lab.rig.instrument.grid)
     run = BeginRun(scan_id="another", plan=plan, pulses=16, period_us=1500, width_us=1, speed_mm_s=20)
     with zmq.Context() as context, PiClient(context, lab.rig.instrument) as pi:

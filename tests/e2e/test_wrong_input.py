@@ -1,7 +1,7 @@
 """For any wrong input the exit status is not 0, and one message says what, why and what to do.
 
 Commands of the host run in this process. The tests that show that a program's exit status and stderr are those of its
-`main` are `test_rig_file`, which starts both programs, and those of interrupted commands.
+`main` are that of a wrong rig file, which starts both programs, and those of interrupted commands.
 """
 
 import os
@@ -19,6 +19,7 @@ from tests.support.paths import RIG_FILE
 from tests.support.processes import HANG_S
 from tests.support.scenes import write_small_scene
 
+from polysight_shared.errors import ConfigError, DataError, DeviceError
 from polysight_shared.tables import to_builtins
 
 SCENE = write_small_scene(12, 4, pixels=30, pixel_mm=5.0, metal=False, seed=1)
@@ -40,28 +41,34 @@ def check_refusal(ended, *words: str, status: int | None = None) -> None:
 
 
 @pytest.mark.parametrize("program", ["polysight", "polysight-pi"])
-def test_rig_file(bench, program):
-    """Which contents are refused, and in which words, is shown in tests/shared."""
+def test_a_rig_file_with_an_unknown_key_is_refused_with_that_key(bench, program):
+    """All other contents that are refused, and the words, are in tests/shared."""
     path = bench.folder / "wrong.toml"
     path.write_text(RIG_FILE.read_text().replace("baud = 115200", "baud = 115200\nbaude = 9600"))
     command = ["scan", "--out", "s"] if program == "polysight" else ["run"]
-    check_refusal(bench.run(program, *command, "--config", path), path.name, "stage", "baude", status=2)
+    check_refusal(
+        bench.run(program, *command, "--config", path), path.name, "stage", "baude", status=ConfigError.exit_status
+    )
     assert not (bench.folder / "s").exists()
 
 
-def test_files_that_are_not_there(bench):
-    check_refusal(bench.run_here("scan", "--out", "s"), "instrument.toml: no such file", status=2)
-    check_refusal(bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=2)
+def test_files_that_are_missing_or_of_another_kind_are_named(bench):
+    check_refusal(bench.run_here("scan", "--out", "s"), "instrument.toml: no such file", status=ConfigError.exit_status)
+    check_refusal(
+        bench.run("polysight-pi", "run", "--config", "no.toml"), "no.toml: no such file", status=ConfigError.exit_status
+    )
     check_refusal(
         bench.run_polysight("simulate", "no.toml", "--config", RIG_FILE, "--out", "d"),
         "no.toml: no such file",
-        status=2,
+        status=ConfigError.exit_status,
     )
     reproduce = ("reproduce", "--config", "no.toml", "--out", "r", "table1")
-    check_refusal(bench.run_here(*reproduce), "no.toml: no such file", status=2)
-    check_refusal(bench.run_here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=2)
-    check_refusal(bench.run_here("inspect", "no.bin"), "no.bin", status=3)
-    check_refusal(bench.run_here("inspect", "no.pcap"), "no.pcap", status=3)
+    check_refusal(bench.run_here(*reproduce), "no.toml: no such file", status=ConfigError.exit_status)
+    check_refusal(
+        bench.run_here("preview", RIG_FILE, "--port", "0"), "instrument.toml is a file", status=ConfigError.exit_status
+    )
+    check_refusal(bench.run_here("inspect", "no.bin"), "no.bin", status=DataError.exit_status)
+    check_refusal(bench.run_here("inspect", "no.pcap"), "no.pcap", status=DataError.exit_status)
 
 
 @pytest.mark.parametrize(
@@ -72,32 +79,51 @@ def test_files_that_are_not_there(bench):
         ("", "", ("scene.toml: no such file",)),
     ],
 )
-def test_scene_file(bench, old, new, words):
-    """The error comes before anything else: an existing demo folder is kept, and no rig was started."""
+def test_a_wrong_scene_file_is_refused_before_anything_is_changed(bench, old, new, words):
+    """An existing demo folder is kept, and no rig was started. Without `old` there is no scene file."""
     scenes = bench.folder / "scenes"
     scenes.mkdir()
     (scenes / "a.toml").write_text(SCENE)
     if old:
         (scenes / "scene.toml").write_text(SCENE.replace(old, new, 1))
-    last = bench.folder / "d"
-    last.mkdir()
-    (last / ".polysight-demo").touch()
-    (last / "report.html").touch()
+    earlier_demo = bench.folder / "d"
+    earlier_demo.mkdir()
+    # A folder with this file is a demo's, which another demo may overwrite.
+    (earlier_demo / ".polysight-demo").touch()
+    (earlier_demo / "report.html").touch()
     rig = ("--config", RIG_FILE)
-    check_refusal(bench.run_here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"), *words, status=2)
-    assert (last / "report.html").exists()
-    check_refusal(bench.run_polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=2)
+    check_refusal(
+        bench.run_here("demo", "--scene", "scenes/scene.toml", *rig, "--out", "d"),
+        *words,
+        status=ConfigError.exit_status,
+    )
+    assert (earlier_demo / "report.html").exists()
+    check_refusal(
+        bench.run_polysight("simulate", "scenes/scene.toml", *rig, "--out", "s"), *words, status=ConfigError.exit_status
+    )
     if old:
-        check_refusal(bench.run_here("train", "--simulate", "scenes", *rig, "--out", "l.npz"), *words, status=2)
+        check_refusal(
+            bench.run_here("train", "--simulate", "scenes", *rig, "--out", "l.npz"),
+            *words,
+            status=ConfigError.exit_status,
+        )
     assert {p.name for p in bench.folder.iterdir() if p.is_dir()} == {"scenes", "d"}
 
 
-def test_rig_file_of_a_training(bench):
+def test_a_training_without_its_rig_file_or_output_folder_is_refused(bench):
     (bench.folder / "scenes").mkdir()
     (bench.folder / "scenes" / "a.toml").write_text(SCENE)
     train = ("train", "--simulate", "scenes")
-    check_refusal(bench.run_here(*train, "--config", "no.toml", "--out", "l.npz"), "no.toml: no such file", status=2)
-    check_refusal(bench.run_here(*train, "--config", RIG_FILE, "--out", "no/l.npz"), "no such folder no", status=2)
+    check_refusal(
+        bench.run_here(*train, "--config", "no.toml", "--out", "l.npz"),
+        "no.toml: no such file",
+        status=ConfigError.exit_status,
+    )
+    check_refusal(
+        bench.run_here(*train, "--config", RIG_FILE, "--out", "no/l.npz"),
+        "no such folder no",
+        status=ConfigError.exit_status,
+    )
 
 
 # --- recorded data ----------------------------------------------------------------------------------------------------
@@ -125,36 +151,53 @@ def test_a_folder_that_is_not_a_scan_is_refused(bench, command):
     (bench.folder / "empty").mkdir()
     (bench.folder / "other").mkdir()
     (bench.folder / "other" / "notes.txt").write_text("not a scan")
-    folders = ("missing", "empty", "other", "other/notes.txt")
-    for name in folders if command == "validate" else ("missing", "other"):
-        check_refusal(bench.run_here(command, name, *out), name, status=3)
+    if command == "validate":
+        names = ("missing", "empty", "other", "other/notes.txt")
+    else:
+        names = ("missing", "other")
+    for name in names:
+        check_refusal(bench.run_here(command, name, *out), name, status=DataError.exit_status)
     assert not (bench.folder / "out").exists()
 
 
-def test_scan_without_a_row(bench, scan):
+def test_a_scan_without_a_row_is_not_processed_but_can_be_resumed(bench, scan):
     path = scan / "manifest.jsonl"
-    path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
-    check_refusal(bench.run_here("process", scan, "--out", "out"), f"polysight resume {scan}", status=3)
+    first_line = path.read_bytes().splitlines(keepends=True)[0]
+    path.write_bytes(first_line)
+    check_refusal(
+        bench.run_here("process", scan, "--out", "out"), f"polysight resume {scan}", status=DataError.exit_status
+    )
 
 
-def test_library(bench, scan):
+def test_a_library_that_cannot_be_read_is_refused_before_processing(bench, scan):
     process = ("process", scan, "--out", "out", "--library")
     (bench.folder / "junk.npz").write_text("no library")
     for name in ("no.npz", "junk.npz", "scan"):
-        check_refusal(bench.run_here(*process, name), name, "polysight train", status=3)
-    assert not (bench.folder / "out").exists(), "found out before anything is processed"
+        check_refusal(bench.run_here(*process, name), name, "polysight train", status=DataError.exit_status)
+    assert not (bench.folder / "out").exists(), "something was processed"
     check_refusal(bench.run_here("train", "--config", RIG_FILE, "--out", "l.npz"), "--simulate")
 
 
-def test_out_is_taken(bench, scan):
+def test_an_output_folder_with_other_files_is_refused_and_kept(bench, scan):
     own_folder = bench.folder / "mine"
     own_folder.mkdir()
     (own_folder / "thesis.tex").write_text("precious")
     for command in (["image", scan], ["demo", "--config", RIG_FILE], ["scan", "--config", RIG_FILE]):
-        check_refusal(bench.run_here(*command, "--out", own_folder), str(own_folder), "--out", status=2)
+        check_refusal(
+            bench.run_here(*command, "--out", own_folder), str(own_folder), "--out", status=ConfigError.exit_status
+        )
     for command in (["image", scan], ["demo", "--config", RIG_FILE]):
-        check_refusal(bench.run_here(*command, "--out", own_folder / "thesis.tex"), "thesis.tex", "--out", status=2)
-    check_refusal(bench.run_here("scan", "--config", RIG_FILE, "--out", scan), f"polysight resume {scan}", status=2)
+        check_refusal(
+            bench.run_here(*command, "--out", own_folder / "thesis.tex"),
+            "thesis.tex",
+            "--out",
+            status=ConfigError.exit_status,
+        )
+    check_refusal(
+        bench.run_here("scan", "--config", RIG_FILE, "--out", scan),
+        f"polysight resume {scan}",
+        status=ConfigError.exit_status,
+    )
     assert (own_folder / "thesis.tex").read_text() == "precious"
     assert list(own_folder.iterdir()) == [own_folder / "thesis.tex"]
     assert bench.run_here("image", scan, "--out", "out").status == 0
@@ -187,13 +230,25 @@ def listen_on(address: str) -> socket.socket:
     return server
 
 
-def test_no_stage(bench, lonely, lonely_instrument, wires, silent_pty):
+def test_a_stage_or_wires_that_do_not_answer_are_named(bench, lonely, lonely_instrument, wires, silent_pty):
     run = ("polysight-pi", "run", "--config", lonely, "--wires", wires)
-    check_refusal(bench.run(*run), lonely_instrument.stage.port, "No such file", "stage.port", status=5)
-    check_refusal(bench.run(*run, "--stage-port", silent_pty), silent_pty, "does not answer", "make flash", status=5)
+    check_refusal(
+        bench.run(*run), lonely_instrument.stage.port, "No such file", "stage.port", status=DeviceError.exit_status
+    )
+    check_refusal(
+        bench.run(*run, "--stage-port", silent_pty),
+        silent_pty,
+        "does not answer",
+        "make flash",
+        status=DeviceError.exit_status,
+    )
     (bench.folder / "file").touch()
-    check_refusal(bench.run(*run, "--stage-port", bench.folder / "file"), "file", status=5)
-    check_refusal(bench.run("polysight-pi", "run", "--config", lonely, "--wires", "no.sock"), "no.sock", status=5)
+    check_refusal(bench.run(*run, "--stage-port", bench.folder / "file"), "file", status=DeviceError.exit_status)
+    check_refusal(
+        bench.run("polysight-pi", "run", "--config", lonely, "--wires", "no.sock"),
+        "no.sock",
+        status=DeviceError.exit_status,
+    )
 
 
 @pytest.fixture
@@ -208,8 +263,8 @@ def silent_pty():
 # --- the host and what it talks to ------------------------------------------------------------------------------------
 
 
-def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
-    """The Pi's port accepts the connection and never answers: Ctrl-C ends the wait."""
+def test_ctrl_c_ends_a_scan_that_waits_for_the_pi(bench, lonely, lonely_instrument):
+    """The Pi's port accepts the connection and never answers."""
     table = to_builtins(lonely_instrument)
     table["limits"]["command_timeout_s"] = HANG_S
     lonely.write_text(tomli_w.dumps(table))
@@ -217,7 +272,8 @@ def test_interrupted_while_connecting(bench, lonely, lonely_instrument):
         scan = bench.start("polysight", "scan", "--config", lonely, "--out", "s")
         bench.wait_for(lambda: "connect" in scan.err, "the scan says that it connects")
         scan.interrupt()
-        ended = scan.wait(10)
+        # Ten idle seconds; chosen.
+        ended = scan.wait(limit_s=10)
     assert ended.status == 128 + signal.SIGINT
     assert ended.message == "polysight scan: stopped"
     assert not (bench.folder / "s").exists()

@@ -23,17 +23,20 @@ from polysight_shared import messages as m
 from polysight_shared.config import load_instrument
 from polysight_shared.wires import WireEdge, parse
 
+# GPIO lines of a Raspberry Pi's header.
 LINES = 28
+# Longest time of a row or of a program's end, and attempts to home on a busy machine; both chosen.
 LIMIT_S = 600.0
 HOMINGS = 5
 WIRES = Path("/run/wires")
 PORT = Path("/run/ttySTAGE")
+# Request that sets the flags of a network interface, and its flag "up" (netdevice(7)).
 SIOCSIFFLAGS = 0x8914
 IFF_UP = 1
 
 
 def raise_loopback() -> None:
-    """What `ip link set lo up` does."""
+    """Switch the loopback interface on, as `ip link set lo up` does."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as s:
         fcntl.ioctl(s, SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", IFF_UP))
 
@@ -97,7 +100,7 @@ def run_one_row(config: Path, chip: SimChip) -> dict[str, Any]:
     host = HostSide(rig.pi.command_address, rig.pi.event_address, rig)
     host.must_accept(host.make_begin())
     homings = home(host)
-    # Earlier events are not part of the row
+    # Changes of the lines until now are read and dropped: they are not part of the row.
     list(chip.changes())
     host.must_accept(m.RunRow(scan_id="scan", row_index=0, take=1))
     finished = host.wait_for_event(m.RowFinished, limit_s=LIMIT_S)

@@ -12,6 +12,13 @@ CONFIG = Path("/sys/kernel/config/gpio-sim/chip")
 DEVICES = Path("/sys/devices/platform")
 TRACING = Path("/sys/kernel/tracing")
 PAGE_BYTES = 4096
+# Kinds of entries in the kernel's ring buffer (Linux, include/linux/ring_buffer.h). Smaller numbers than these are the
+# length of an event's payload in words of 4 bytes; 0: the length follows.
+PADDING = 29
+TIME_EXTEND = 30
+TIME_STAMP = 31
+# Bits of the time in an entry's first word.
+TIME_BITS = 27
 
 
 class Change(NamedTuple):
@@ -78,22 +85,25 @@ def _parse_events(page: bytes) -> Iterator[tuple[int, bytes]]:
     while position < end:
         head, word = struct.unpack_from("<II", page, position)
         kind = head & 31
-        delta = head >> 5
+        low_bits_ns = head >> 5
         position += 4
-        # Padding
-        if kind == 29:
+        if kind == PADDING:
             return
-        # Absolute time
-        if kind == 31:
-            t_ns = delta | word << 27
+        if kind == TIME_STAMP:
+            t_ns = low_bits_ns | word << TIME_BITS
             position += 4
             continue
-        t_ns += delta | (word << 27 if kind == 30 else 0)
-        # More than 2^27 ns since the last event
-        if kind == 30:
+        if kind == TIME_EXTEND:
+            # More than 2^27 ns have passed since the last event: the next word has the upper bits.
+            t_ns += low_bits_ns | word << TIME_BITS
             position += 4
             continue
-        length = 4 * kind if kind else word - 4
-        position += 0 if kind else 4
+        t_ns += low_bits_ns
+        if kind:
+            length = 4 * kind
+        else:
+            # The second word is the length of the payload and of itself.
+            length = word - 4
+            position += 4
         yield t_ns, page[position : position + length]
         position += length

@@ -13,12 +13,13 @@ import pytest
 from polysight_pi.edges import TOLERANCE
 from polysight_shared.faults import PiFault
 
-# of instrument.toml
+# Of instrument.toml: pulses of a burst, their period, and the GPIO line of SYNC_IN.
 PULSES = 16
 PERIOD_NS = 1_500_000
 SYNC_OUT = 22
-# 2 mm at 20 mm/s
+# Time between two positions: 2 mm at 20 mm/s.
 SPACING_NS = 100_000_000
+# Takes of a row in real time; chosen. Each is half as fast as the one before.
 TAKES = 6
 # By which reading the clock advances virtual time (Linux, arch/um/kernel/time.c, TIMER_MULTIPLIER).
 CLOCK_READING_NS = 256
@@ -51,7 +52,7 @@ def read_bursts(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
     changes = result["changes"]
     assert {line for _, line, _ in changes} == {SYNC_OUT}
     rises = [i for i, (_, _, value) in enumerate(changes) if value]
-    # Each goes low again before the next
+    # Each pulse ends before the next one begins.
     assert all(changes[i + 1][2] == 0 for i in rises)
     pulses = iter([Pulse(changes[i][0], changes[i + 1][0]) for i in rises])
     bursts = []
@@ -62,16 +63,18 @@ def read_bursts(result: dict[str, Any]) -> list[tuple[Capture, list[Pulse]]]:
         assert burst[-2].rise_ns < capture.last_ns <= burst[-1].rise_ns
         assert max(p.fall_ns - p.rise_ns for p in burst) <= capture.width_max_ns
         bursts.append((capture, burst))
-    assert list(pulses) == []  # no pulse without an event
+    # No pulse is left that no event reports.
+    assert list(pulses) == []
     assert [c.point for c, _ in bursts] == list(range(len(bursts)))
     assert (result["pi_status"], result["left_high"]) == (0, 0)
     return bursts
 
 
-def complete(result: dict[str, Any], points: int) -> bool:
-    """Whether the row ended without a fault, with a full burst at every point."""
-    pulses = [c[2] for c in result["captures"]]
-    return result["finished"] == [points, 0, ""] and pulses == [PULSES] * points
+def is_complete(result: dict[str, Any], points: int) -> bool:
+    """True if the row ended without a fault, with a full burst at every point."""
+    pulses = [Capture(*values).pulses for values in result["captures"]]
+    no_fault, no_reason = 0, ""
+    return result["finished"] == [points, no_fault, no_reason] and pulses == [PULSES] * points
 
 
 def compute_period_errors_ns(bursts: list[tuple[Capture, list[Pulse]]]) -> list[int]:
@@ -100,13 +103,14 @@ def print_figures(what: str, bursts: list[tuple[Capture, list[Pulse]]]) -> None:
 def test_a_published_row_in_virtual_time(run_row):
     """350 positions, 5600 pulses, nothing lost, and every period within 2 us of nominal."""
     result = run_row(350, "time-travel=inf-cpu")
-    assert complete(result, 350), result["finished"]
+    assert is_complete(result, 350), result["finished"]
     assert result["homings"] == 1
     bursts = read_bursts(result)
     print_figures("virtual time", bursts)
     assert sum(len(burst) for _, burst in bursts) == 5600
     assert max(map(abs, compute_period_errors_ns(bursts))) <= 2_000
     edges = [capture.edge_ns for capture, _ in bursts]
+    # 0.5 ms are 10 um of the stage's way; chosen.
     assert all(abs(b - a - SPACING_NS) <= 500_000 for a, b in itertools.pairwise(edges))
 
 
@@ -143,12 +147,14 @@ def test_a_row_in_real_time(run_row):
         bursts = read_bursts(result)
         if result["homings"] > 1:
             print_figure(f"homed at the {result['homings']}th attempt: the Pi's program was late")
-        if complete(result, 20):
+        if is_complete(result, 20):
             print_figures(f"real time at {speed_mm_s:g} mm/s", bursts)
             return
         fault = result["finished"][1]
         print_figure(f"a take at {speed_mm_s:g} mm/s ended with {result['finished']}, {result['late_ns']} ns late")
-        wire_was_late = result["late_ns"] > 0.9 * TOLERANCE * SPACING_NS * 20.0 / speed_mm_s
+        # The Pi accepts edges within a share `TOLERANCE` of the interval; a tenth (chosen) is for its own delay.
+        interval_ns = SPACING_NS * 20.0 / speed_mm_s
+        wire_was_late = result["late_ns"] > 0.9 * TOLERANCE * interval_ns
         assert fault in FAULTS_OF_A_LATE_PROGRAM or (fault == PiFault.EDGE_TIME and wire_was_late), result["finished"]
         speed_mm_s /= 2
     pytest.skip(f"this machine is too busy for a row in real time: each of {TAKES} takes said so")

@@ -18,28 +18,32 @@ from polysight_shared.errors import ErrorCode
 
 from .conftest import PET
 
+# A plate with a known permittivity of 2.05 - 0.01j, and its place in the image; chosen, as PTFE.
 PLATE = CheckPlate(name="PTFE", permittivity=(2.05, 0.01), std=(0.02, 0.01), place_mm=(30.0, 0.0))
 
 
-def patch(real: float, loss: float, covariance: list[list[float | None]] | None = None) -> PatchFigures:
+def make_patch(real: float, loss: float, covariance: list[list[float | None]] | None = None) -> PatchFigures:
+    """A patch around the plate's place, measured with errors of 0.1 unless a covariance is given."""
     covariance = covariance or [[0.01, 0.0], [0.0, 0.01]]
     value = PermittivityFigures(real=real, imag=-loss, covariance=covariance)
     return PatchFigures(label=1, box_mm=(10.0, -20.0, 50.0, 20.0), permittivity=value)
 
 
 @pytest.mark.parametrize(
-    ("off", "level"), [(2.44, "good"), (2.46, "warning"), (3.40, "warning"), (3.42, "action"), (-3.42, "action")]
+    ("sigmas_off", "level"), [(2.44, "good"), (2.46, "warning"), (3.40, "warning"), (3.42, "action"), (-3.42, "action")]
 )
-def test_a_distance_is_in_standard_deviations_of_the_scan_and_of_the_plate(off, level):
-    """Errors of 0.03 and 0.04 are 0.05 together."""
+def test_a_distance_is_in_standard_deviations_of_the_scan_and_of_the_plate(sigmas_off, level):
+    """An error of 0.03 of the scan and one of 0.04 of the plate are 0.05 together."""
     plate = replace(PLATE, std=(0.04, 0.04))
-    for real_off, loss_off in ((off, 0.0), (0.0, off)):
-        value = patch(2.05 + 0.05 * real_off, 0.01 + 0.05 * loss_off, [[0.0009, 0.0], [0.0, 0.0009]])
-        result = check_plate(plate, [value])
+    covariance: list[list[float | None]] = [[0.03**2, 0.0], [0.0, 0.03**2]]
+    for real_sigmas, loss_sigmas in ((sigmas_off, 0.0), (0.0, sigmas_off)):
+        real = 2.05 + 0.05 * real_sigmas
+        loss = 0.01 + 0.05 * loss_sigmas
+        result = check_plate(plate, [make_patch(real, loss, covariance)])
         assert result is not None
         assert result.level == level
-        assert result.sigmas == pytest.approx(abs(off), abs=1e-3)
-        assert result.measured == pytest.approx((2.05 + 0.05 * real_off, 0.01 + 0.05 * loss_off))
+        assert result.sigmas == pytest.approx(abs(sigmas_off), abs=1e-3)
+        assert result.measured == pytest.approx((real, loss))
         assert result.measured_std == pytest.approx((0.03, 0.03))
 
 
@@ -51,7 +55,7 @@ def test_a_distance_is_in_standard_deviations_of_the_scan_and_of_the_plate(off, 
     ],
 )  # fmt: skip
 def test_a_check_plate_lies_where_a_patch_does(place_mm, is_on_it):
-    result = check_plate(replace(PLATE, place_mm=place_mm), [patch(2.05, 0.01)])
+    result = check_plate(replace(PLATE, place_mm=place_mm), [make_patch(2.05, 0.01)])
     assert result is not None
     assert (result.level == "good") == is_on_it
 
@@ -66,8 +70,8 @@ def test_a_patch_without_an_error_is_not_judged():
 @pytest.mark.parametrize(
     ("real", "level", "reasons"), [(2.1, "good", 0), (2.34, "warning", 0), (2.5, "action", 1), (1.6, "action", 1)]
 )
-def test_limits_are_those_of_good_scans(real, level, reasons):
-    result = check_plate(PLATE, [patch(real, 0.01)])
+def test_only_a_plate_beyond_the_action_limit_is_a_reason_against_a_scan(real, level, reasons):
+    result = check_plate(PLATE, [make_patch(real, 0.01)])
     assert result is not None
     assert result.level == level
     assert len(check_reasons(result)) == reasons
@@ -76,8 +80,8 @@ def test_limits_are_those_of_good_scans(real, level, reasons):
 def test_the_error_of_both_parts_and_their_correlation_count():
     """An error along the axis of the covariance is likelier than one across it; the loss is -imag."""
     covariance: list[list[float | None]] = [[0.01, -0.0095], [-0.0095, 0.01]]
-    along = check_plate(PLATE, [patch(2.25, 0.21, covariance)])
-    across = check_plate(PLATE, [patch(2.25, -0.19, covariance)])
+    along = check_plate(PLATE, [make_patch(2.25, 0.21, covariance)])
+    across = check_plate(PLATE, [make_patch(2.25, -0.19, covariance)])
     assert along is not None
     assert along.sigmas is not None
     assert along.sigmas < 2.1
@@ -87,16 +91,18 @@ def test_the_error_of_both_parts_and_their_correlation_count():
 
 
 def test_good_scans_are_within_the_limits():
+    """Limits are those of 95 % and 99.7 % of good scans; 2000 draws are chosen."""
     rng = np.random.default_rng(1)
+    draws = 2000
     covariance = np.array([[0.04, -0.01], [-0.01, 0.02]])
     levels = []
-    for _ in range(2000):
+    for _ in range(draws):
         real, imag = rng.multivariate_normal([2.05, -0.01], covariance + np.diag([0.02**2, 0.01**2]))
-        result = check_plate(PLATE, [patch(real, -imag, covariance.tolist())])
+        result = check_plate(PLATE, [make_patch(real, -imag, covariance.tolist())])
         assert result is not None
         levels.append(result.level)
-    assert levels.count("good") / 2000 == pytest.approx(0.95, abs=0.02)
-    assert levels.count("action") / 2000 < 0.01
+    assert levels.count("good") / draws == pytest.approx(0.95, abs=0.02)
+    assert levels.count("action") / draws < 0.01
 
 
 @pytest.mark.parametrize("patches", [[], [PatchFigures(label=1, box_mm=(10.0, -20.0, 50.0, 20.0))]])

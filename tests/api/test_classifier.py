@@ -36,7 +36,7 @@ def test_the_paper_s_classifier_passes_scikit_learn_s_checks(measure):
     assert {result["check_name"] for result in results if result["status"] != "passed"} == NOT_CHECKED
 
 
-def test_its_metric_is_the_distance_that_it_votes_with(library):
+def test_the_paper_s_metric_is_the_distance_by_which_neighbours_are_chosen(library):
     X, y, _ = library.columns()
     knn = PaperKNeighborsClassifier(3, weight_h=0.5, weight_v=2.0).fit(X[::7], y[::7])
     distance, nearest = knn.kneighbors(X[1:5])
@@ -45,14 +45,14 @@ def test_its_metric_is_the_distance_that_it_votes_with(library):
         assert (np.diff(distance[row]) >= 0).all()
 
 
-def test_it_names_as_the_model_of_libraries(library):
+def test_the_paper_s_classifier_names_as_the_model_of_libraries(library):
     X, _, _ = library.columns()
     samples = Samples.from_library(library)
     model = PaperKnn(weights=Weights(0.7, 1.3, 1.0, "inverse", 5)).fit(samples)
     knn = PaperKNeighborsClassifier(5, weight_h=0.7, weight_v=1.3, measure="inverse")
     knn.fit(invert_ratios(samples.x), samples.names)
     ours = model.by_pixel(invert_ratios(X[::29]))[0]
-    # Ties
+    # Both may break a tie in another way: up to 1 % of the pixels, chosen.
     assert (knn.predict(X[::29]) == ours).mean() > 0.99
 
 
@@ -72,14 +72,14 @@ def test_a_classifier_is_an_estimator(library, model):
 
 
 @pytest.mark.parametrize(
-    ("model", "others"),
+    ("model", "expected_failures"),
     [
         ("knn", set()),
-        # Its clouds of points are anywhere in X, and do not look like reflections of materials.
+        # This check's clouds of points are anywhere in X, and do not look like reflections of materials.
         ("discriminant", {"check_classifiers_train"}),
     ],
 )
-def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, others):
+def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, expected_failures):
     """The checks have 1 to 10 columns; the discriminant gets additional columns, so that all angles are complete."""
 
     def fill_angle(X):
@@ -89,7 +89,7 @@ def test_both_models_pass_scikit_learn_s_checks(monkeypatch, model, others):
     results = check_estimator(Classifier(model), on_skip=None, on_fail=None)
     failed = {result["check_name"] for result in results if result["status"] == "failed"}
     skipped = {result["check_name"] for result in results if result["status"] == "skipped"}
-    assert failed == others
+    assert failed == expected_failures
     assert skipped <= NOT_CHECKED
 
 

@@ -9,6 +9,8 @@ from tests.support.scenes import COPPER, PET, make_scene
 
 from polysight_simulators.scene import decode_scene, simulate
 
+# Code before that of a test: POSIX modules and functions are missing, and `asked` notes which other things the program
+# tried that Windows has not: /proc, compiled loops, and an exchange of two names (renameat2).
 HIDDEN = """
 import builtins, ctypes, io, os, subprocess, sys, types  # subprocess takes a msvcrt for Windows' own
 for name in ("fcntl", "resource", "termios", "tty", "pty", "grp", "pwd", "syslog"):
@@ -69,12 +71,14 @@ def test_a_scan_is_processed_read_and_exported_without_posix(tmp_path):
     scan, out = sys.argv[1:]
     assert main(["image", scan, "--out", out]) == 0
     assert main(["process", scan, "--out", out]) == 0
+    # A file was locked: LK_NBLCK, one byte.
     assert (2, 1) in locked
     assert {"renameat2", "kernels"} <= asked
     import polysight
     print(polysight.open_scan(out).materials().sizes["patch"])
     assert main(["export", out, "--csv", "--mat", "--out", out + "-export"]) == 0
     """
+    # It prints the number of patches.
     assert "\n2\n" in run_hidden(program, scan, tmp_path / "products")
     assert {path.name for path in (tmp_path / "products-export").iterdir()} == {"image.mat", "materials.csv"}
     assert not list(tmp_path.glob(".products*"))

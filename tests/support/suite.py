@@ -116,8 +116,11 @@ def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     return folder
 
 
+# Lines of each table of costs; chosen.
 _SHOWN = 60
+# Name under which a worker's report has the costs.
 _NAME = "costs"
+# Unit of the times in /proc.
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -129,13 +132,14 @@ class ProcessTimes:
     """
 
     def __init__(self) -> None:
-        # Process number and time of start (numbers are reused), with the parent's number and ticks until now
+        # The parent's number and the ticks until now, by process number and time of start: numbers are reused.
         self._followed: dict[tuple[int, str], tuple[int, int]] = {}
         self._orphans_ticks = 0
 
     def read_s(self) -> float:
         """Seconds until now."""
-        # Field numbers of proc_pid_stat(5), less the three before: 4 ppid, 14 to 17 times, 22 time of start.
+        # Fields of proc_pid_stat(5) after the name; the third field has index 0. Used are 4 (parent, index 1), 14 to 17
+        # (times, 11 to 14) and 22 (time of start, 19).
         table = {}
         for folder in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208
             with suppress(OSError):
@@ -145,18 +149,19 @@ class ProcessTimes:
         children: dict[int, list[int]] = {}
         for pid, fields in table.items():
             children.setdefault(int(fields[1]), []).append(pid)
-        waiting = [os.getpid(), *our_pids]
-        while waiting:
-            new = set(children.get(waiting.pop(), ())) - our_pids
-            our_pids |= new
-            waiting.extend(new)
+        # Add the children of all our processes, their children, and so on.
+        parents_to_visit = [os.getpid(), *our_pids]
+        while parents_to_visit:
+            new_pids = set(children.get(parents_to_visit.pop(), ())) - our_pids
+            our_pids |= new_pids
+            parents_to_visit.extend(new_pids)
         self._orphans_ticks += self._count_lost({os.getpid(), *our_pids})
         self._followed = {
             (pid, table[pid][19]): (int(table[pid][1]), sum(map(int, table[pid][11:15]))) for pid in our_pids
         }
         ticks = self._orphans_ticks + sum(used for _, used in self._followed.values())
-        used = [resource.getrusage(process_kind) for process_kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-        return ticks / _TICKS_PER_S + sum(u.ru_utime + u.ru_stime for u in used)
+        usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+        return ticks / _TICKS_PER_S + sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
     def _count_lost(self, running: set[int]) -> int:
         """Ticks of the processes that have ended since the last call without a parent of ours."""

@@ -9,7 +9,7 @@ import pytest
 from polysight_shared.errors import ProtocolError
 from polysight_shared.stage_line import Command, Immediate, crc16, unseal
 
-# Bits of the switches by their letter in a conversation.
+# Bits of the limit switches in x and y and of the emergency stop, by their letter in a conversation.
 PRESSED = {"X": 1, "Y": 2, "E": 4, "nothing": 0}
 
 
@@ -18,11 +18,12 @@ class Conversation:
 
     def __init__(self, stage) -> None:
         self.stage = stage
-        # Number of the last line.
+        # Number of the last line that was sent.
         self.sequence = 0
         # Number of the last line with each verb.
-        self.by_verb: dict[str, int] = {}
-        self.last = b""
+        self.sequence_by_verb: dict[str, int] = {}
+        # Bytes of the last line, for `again`.
+        self.last_line = b""
 
     def send(self, texts: list[str]) -> None:
         """Send the bytes of these texts in one piece."""
@@ -45,9 +46,9 @@ class Conversation:
                 self.sequence = self.sequence + 1
             verb = words[0]
             args = tuple(map(int, words[1:]))
-            self.by_verb[verb] = self.sequence
-            self.last = Command(self.sequence, verb, args).encode()
-        return self.last
+            self.sequence_by_verb[verb] = self.sequence
+            self.last_line = Command(self.sequence, verb, args).encode()
+        return self.last_line
 
     def expect(self, text: str) -> None:
         """Wait for a line and compare it: `#` is the last line's number, `#VERB` that verb's, `?` any value."""
@@ -57,7 +58,7 @@ class Conversation:
             return
         self.stage.wait_until(lambda: b"\n" in self.stage.received)
         line, newline, self.stage.received = self.stage.received.partition(b"\n")
-        text = re.sub(r"#([A-Z]+)", lambda m: str(self.by_verb[m[1]]), text).replace("#", str(self.sequence))
+        text = re.sub(r"#([A-Z]+)", lambda m: str(self.sequence_by_verb[m[1]]), text).replace("#", str(self.sequence))
         assert re.fullmatch(re.escape(text).replace(r"\?", r"[-+.:A-Za-z0-9]+"), unseal(line + newline)), (
             f"expected {text!r}, got {line!r}"
         )
@@ -81,15 +82,15 @@ class Conversation:
 
 def play(stage, path: Path) -> None:
     """Play every line of the file; fail at the first one that does not match."""
-    talk = Conversation(stage)
+    conversation = Conversation(stage)
     for number, sign, texts in _steps(path):
         try:
             if sign == "->":
-                talk.send(texts)
+                conversation.send(texts)
             elif sign == "<-":
-                talk.expect(texts[0])
+                conversation.expect(texts[0])
             else:
-                talk.act(texts[0])
+                conversation.act(texts[0])
         except (AssertionError, ProtocolError) as e:
             pytest.fail(f"{path.name}:{number}: {sign} {texts[-1]}: {e}")
     stage.collect_late_bytes()

@@ -17,7 +17,7 @@ from polysight_simulators.stage import NS_PER_TICK, TICK_HZ, PythonStage, Rig
 from polysight_simulators.uno import HZ, EmulatedUno, PinEdge
 from tests.support.processes import HANG_S, LIMIT_S, read_idle_s
 
-# Longest time until a stage comes to rest: 10 minutes.
+# Longest time until a stage comes to rest: 10 minutes; chosen.
 LIMIT_TICKS = 600 * TICK_HZ
 TICKS_PER_MS = TICK_HZ // 1000
 
@@ -46,18 +46,18 @@ class Driver:
     def close(self) -> None:
         return
 
-    def wait_until(self, there: Callable[[], bool]) -> None:
+    def wait_until(self, is_met: Callable[[], bool]) -> None:
         """Wait until a condition holds for the received bytes. In virtual time no further bytes can come."""
-        assert there(), f"received {self.received!r}"
+        assert is_met(), f"received {self.received!r}"
 
     def collect_late_bytes(self) -> None:
         """Wait for bytes still under way. In virtual time there are none."""
 
     def has_stood_still(self) -> bool:
         """True if nothing has moved and no trigger was sent since the last call."""
-        quiet = not self.wires
+        has_stood_still = not self.wires
         self.wires.clear()
-        return quiet
+        return has_stood_still
 
     def run_ms(self, ms: float) -> None:
         self.run(round(ms * TICKS_PER_MS))
@@ -108,11 +108,11 @@ class Driver:
         *_, self.received = self.received.partition(answer)[2].partition(b"\n")
 
     def prepare(self, heartbeat_ms: int = 60_000) -> Driver:
-        """Greeted, switched on and homed."""
+        """Greet the stage, set its heartbeat (by default a minute: none is sent), switch it on and home it."""
         self.read_replies()
         answers = [
             self.send_command("HELLO"),
-            self.send_command("SET", 1, heartbeat_ms),
+            self.send_command("SET", int(Parameter.HEARTBEAT), heartbeat_ms),
             self.send_command("ENABLE", 1),
         ]
         assert [r.kind for r in answers] == ["ok"] * 3
@@ -229,8 +229,11 @@ class UnoDriver(Driver):
         link = folder / "ttyUNO"
         self.uno = EmulatedUno(program, image, pty=link)
         self._port = serial.Serial(str(link), 115200, timeout=HANG_S)
-        self._written = self._read = 0
-        self._stood = self.uno.motors
+        # Bytes to and from the port so far.
+        self._written = 0
+        self._read = 0
+        # Position of the motors at the last call of `has_stood_still`.
+        self._last_motors = self.uno.motors
         self._collect()
 
     def _collect(self) -> None:
@@ -240,6 +243,7 @@ class UnoDriver(Driver):
         assert self._read == self.uno.sent, "bytes got lost in the pseudo terminal"
         assert not [t for t in self.uno.troubles if t != "reset"], self.uno.troubles
         self.received += data
+        # A cycle of the 16 MHz clock takes 62.5 ns.
         self.t_ns = self.uno.cycle * 125 // 2
 
     def send(self, data: bytes) -> None:
@@ -266,10 +270,10 @@ class UnoDriver(Driver):
         self._collect()
 
     def has_stood_still(self) -> bool:
-        quiet = not self.uno.edges and self.uno.motors == self._stood
+        has_stood_still = not self.uno.edges and self.uno.motors == self._last_motors
         self.uno.edges.clear()
-        self._stood = self.uno.motors
-        return quiet
+        self._last_motors = self.uno.motors
+        return has_stood_still
 
     def close(self) -> None:
         self._port.close()
@@ -305,9 +309,9 @@ class PortDriver(Driver):
         self.wait_until(lambda: b"polysight-stage" in self.received)
         self.received = self.received[self.received.index(b"polysight-stage") :]
 
-    def wait_until(self, there: Callable[[], bool]) -> None:
+    def wait_until(self, is_met: Callable[[], bool]) -> None:
         limit = read_idle_s() + LIMIT_S
-        while not there():
+        while not is_met():
             if read_idle_s() > limit:
                 raise ProtocolError(f"not within {LIMIT_S:g} s; received {self.received!r}")
             self._listen()
@@ -380,6 +384,7 @@ class Host(Driver):
         return last
 
     def must_obey(self, verb: str, *args: int) -> None:
+        """Send a command, which the stage must accept."""
         assert self.send_command(verb, *args).kind == "ok"
 
     def set(self, parameter: Parameter, value: int) -> None:

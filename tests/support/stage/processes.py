@@ -73,6 +73,8 @@ class StageProcess:
             self._listener.join(HANG_S)
 
 
+# A process that starts the command of its further arguments, gives it its first argument as input, prints its number,
+# and waits to be killed.
 PARENT = """
 import subprocess, sys, time
 child = subprocess.Popen(sys.argv[2:], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -91,9 +93,9 @@ def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "")
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         parent.kill()
-    limit = read_idle_s() + LIMIT_S
+    deadline = read_idle_s() + LIMIT_S
     while runs(child):
-        if read_idle_s() > limit:
+        if read_idle_s() > deadline:
             return True
         time.sleep(0.02)
     return False
@@ -102,6 +104,8 @@ def outlives_its_parent(command: Sequence[str | Path], standard_input: str = "")
 def runs(pid: int) -> bool:
     """True if there is such a process and it has not ended."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+        # proc_pid_stat(5): the state comes after the name in brackets; Z is a process that has ended.
+        fields_after_name = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+        return fields_after_name[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False

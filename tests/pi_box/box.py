@@ -13,11 +13,13 @@ from typing import Any, NamedTuple
 
 from polysight_shared.program import die_with_parent
 
+# Event of QEMU's trace: a program writes to the memory of a device.
 MEMORY_WRITE = "memory_region_ops_write"
+# Address of a Raspberry Pi 3B's GPIO block.
 GPIO_BASE = 0x3F200000
-# Vendor of the stage's USB serial chip
+# USB vendor of the stage's serial chip.
 FTDI = "0403"
-# offsets of registers, BCM2835 ARM Peripherals, 6.1
+# Offsets of registers (BCM2835 ARM Peripherals, 6.1): functions of the lines, lines to set and to clear, levels.
 SELECT = 0x00
 SET = 0x1C
 CLEAR = 0x28
@@ -34,7 +36,7 @@ class Write(NamedTuple):
 
     t_s: float
     high: bool
-    # Bit n: line n
+    # Bit n stands for line n.
     lines: int
 
 
@@ -94,7 +96,7 @@ class Box:
         forwards = "".join(f",hostfwd=tcp:127.0.0.1:{outer}-:{inner}" for inner, outer in forward.items())
         command = ["qemu-system-aarch64", "-M", "raspi3b", "-display", "none", "-msg", "timestamp=on"]
         command += ["-kernel", str(image / "vmlinuz"), "-initrd", str(image / "initrd"), "-dtb", str(image / "pi.dtb")]
-        # A Pi has no battery for its clock either, but it has the network
+        # Neither a Pi nor this box has a battery for its clock: a Pi asks the network, the box is told the time.
         clock = f"systemd.clock_usec={time.time_ns() // 1000}"
         command += ["-append", f"{KERNEL_LINE} {clock}", "-serial", f"file:{self.console}", "-D", str(self._trace)]
         command += ["-drive", f"if=sd,format=raw,snapshot=on,file={image / 'root.img'}"]
@@ -181,12 +183,14 @@ class Box:
         return int(answer.split(":")[1], 16)
 
     def function(self, line: int) -> int:
-        """Function of a line: 0 input, 1 output."""
-        return self.register(SELECT + 4 * (line // 10)) >> 3 * (line % 10) & 7
+        """Function of a line: 0 input, 1 output. A register has three bits for each of ten lines."""
+        register = self.register(SELECT + 4 * (line // 10))
+        return register >> 3 * (line % 10) & 7
 
     def level(self, line: int) -> int:
-        """The level of a line."""
-        return self.register(LEVEL + 4 * (line // 32)) >> line % 32 & 1
+        """The level of a line. A register has one bit for each of 32 lines."""
+        register = self.register(LEVEL + 4 * (line // 32))
+        return register >> line % 32 & 1
 
     def writes_during(self, action: Callable[[], Any]) -> list[Write]:
         """Record the writes to the registers that set and clear lines during the block."""

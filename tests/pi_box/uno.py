@@ -11,6 +11,7 @@ from tests.support.paths import REPO
 
 from polysight_shared.wires import WireMotion, parse
 
+# Time without a change of the motion after which the stage counts as resting; chosen.
 REST_S = 1.0
 
 
@@ -28,7 +29,7 @@ class Uno:
     def __init__(self, config: Path, work: Path) -> None:
         self.port = work / "ttyUNO"
         wires = work / "wires"
-        # Time of its last change
+        # The last change of the motion, and when it was received.
         self.motion: WireMotion | None = None
         self._heard_s = time.monotonic()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -46,6 +47,7 @@ class Uno:
         peer, _ = self._listener.accept()
         with peer, peer.makefile("r", encoding="ascii") as lines:
             for line in lines:
+                # Only these lines can be a change of the motion.
                 message = parse(line) if line.startswith(("M", "S")) else None
                 if isinstance(message, WireMotion):
                     self._heard_s = time.monotonic()

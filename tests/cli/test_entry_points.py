@@ -24,20 +24,23 @@ PROGRAMS = [
         for name in ("cards", "radars", "rig", "stage", "uno", "wires")
     ),
 ]
-# The arguments after `env` are the same, and `env` is not a program of ours.
+# Tests fork commands that begin with one of our programs. One that begins with `env` is really started.
 REAL = ("env",)
 
 
 @pytest.mark.parametrize("command", PROGRAMS, ids=lambda command: " ".join(map(str, command[1:])))
-def test_a_fork_is_as_the_program_started_for_real(tmp_path: Path, command: tuple[str | Path, ...]):
+def test_a_forked_program_has_the_output_and_the_status_of_one_that_is_started(
+    tmp_path: Path, command: tuple[str | Path, ...]
+):
+    """Other tests fork programs from a process that has loaded them, which takes less time."""
     forked = subprocess.run(command, cwd=tmp_path, input="", capture_output=True, text=True, check=False)
     real = subprocess.run([*REAL, *command], cwd=tmp_path, input="", capture_output=True, text=True, check=False)
     assert (forked.returncode, forked.stdout) == (real.returncode, real.stdout)
-    # Of a traceback the last line: the fork's has more.
+    # Tracebacks differ, but for their last line: the fork's has more.
     assert forked.stderr.splitlines()[-1:] == real.stderr.splitlines()[-1:]
 
 
-def test_a_fork_has_its_own_words_parent_session_and_end(tmp_path: Path):
+def test_a_forked_program_has_the_command_line_parent_session_and_end_of_a_started_one(tmp_path: Path):
     command = [*MODULE, "polysight_simulators.wires", "--socket", tmp_path / "wires"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as program:
         assert program.stdout is not None

@@ -19,6 +19,7 @@ from polysight_simulators.scene import load_scene, simulate
 
 NUMBERS = {"numpy"}
 SCIPY = {"scipy"}
+# Packages, and parts of scipy, that take long to load.
 HEAVY = {
     "distributed", "h5py", "jinja2", "matplotlib", "numba", "pandas", "sklearn", "skimage.measure", "xarray", "zmq",
     "scipy.fft", "scipy.interpolate", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.signal", "scipy.sparse",
@@ -46,7 +47,7 @@ def list_loaded_modules(*words: str | Path) -> set[str]:
     return set(modules)
 
 
-def test_help_needs_no_numbers():
+def test_help_and_version_need_no_numbers():
     for words in (["--help"], ["--version"]):
         assert list_loaded_modules(*words) & (NUMBERS | SCIPY | HEAVY) == set(), words
 
@@ -81,7 +82,7 @@ def test_a_plan_is_made_without_scipys_parts():
     assert list_loaded_modules("plan", "--config", RIG_FILE) & HEAVY == set()
 
 
-def test_jobs_load_what_they_compute_with_when_they_compute():
+def test_modules_of_jobs_load_heavy_packages_only_when_they_compute():
     jobs = {f.stem for f in (RIG_FILE.parent / "host" / "polysight" / "jobs").glob("[a-z]*.py")}
     modules = [
         *(f"jobs.{job}" for job in sorted(jobs)),
@@ -102,5 +103,6 @@ def test_jobs_load_what_they_compute_with_when_they_compute():
 @pytest.mark.parametrize("window", ["hann", *TAPERS.values()])
 def test_windows_without_scipy_are_those_of_scipy(window):
     for n in (1, 2, 7, 64):
+        # Ours have no zeros at their ends.
         expected = scipy.signal.get_window(window, n + 2, fftbins=False)[1:-1]
         assert_allclose(make_window(window, n), expected, rtol=0, atol=1e-15)

@@ -11,7 +11,11 @@ from tests.support.paths import BIN, RIG_FILE
 from tests.support.processes import wait_for
 from tests.support.products import write_judged_products
 
+from polysight_shared.errors import DeviceError
+
 POLYSIGHT = str(BIN / "polysight")
+# The exit status that shells give to a program that Ctrl-C ended.
+INTERRUPTED = 128 + signal.SIGINT
 
 
 @pytest.fixture
@@ -45,7 +49,7 @@ def test_a_file_never_takes_the_place_of_a_closed_stream(products):
 @pytest.mark.parametrize("command", ["materials products", "--help"])
 def test_output_that_cannot_be_written_is_an_error(products, command):
     status, messages = run_in_shell(f"$P {command} >/dev/full", products.parent)
-    assert status == 5
+    assert status == DeviceError.exit_status
     assert "No space left" in messages
     assert "Traceback" not in messages
     assert "Exception ignored" not in messages
@@ -84,7 +88,8 @@ def test_an_interrupt_waits_for_the_module_that_is_loading(tmp_path, number):
     wait_for(lambda: "loading" in messages.read_text(), "the module loads")
     program.send_signal(number)
     (tmp_path / "go").touch()
-    assert program.wait(60) == 128 + signal.SIGINT
+    # It counts as hanging after a minute (chosen).
+    assert program.wait(60) == INTERRUPTED
     assert messages.read_text() == "loading, loaded, polysight materials: stopped\n"
 
 
@@ -104,6 +109,7 @@ def test_an_interrupt_at_any_moment_ends_in_one_line_at_most():
 
     Before its first modules are loaded, the signal ends it without a word, as it ends other programs.
     """
+    # Exit status and stderr of each run.
     ends = []
     for cpu_ms in range(2, 5000, 60):
         command = [sys.executable, "-c", INTERRUPT_AFTER, f"{cpu_ms / 1e3}", "plan", "--config", str(RIG_FILE)]
@@ -111,9 +117,10 @@ def test_an_interrupt_at_any_moment_ends_in_one_line_at_most():
         ends.append((process.returncode, process.stderr))
         if process.returncode == 0:
             break
-    stopped = (128 + signal.SIGINT, "polysight plan: stopped\n")
+    stopped = (INTERRUPTED, "polysight plan: stopped\n")
+    ended_by_signal = (-signal.SIGINT, "")
     assert stopped in ends
-    assert set(ends[:-1]) <= {stopped, (-signal.SIGINT, "")}
+    assert set(ends[:-1]) <= {stopped, ended_by_signal}
 
 
 INTERRUPT_THE_PI = """
@@ -128,7 +135,7 @@ sys.exit(cli.main([]))
 def test_an_early_interrupt_on_the_pi_prints_no_traceback():
     """Its modules take a second to load on a Pi: they are loaded where Ctrl-C is handled."""
     process = subprocess.run([sys.executable, "-c", INTERRUPT_THE_PI], capture_output=True, text=True, check=False)
-    assert (process.returncode, process.stderr) == (128 + signal.SIGINT, "")
+    assert (process.returncode, process.stderr) == (INTERRUPTED, "")
 
 
 def test_characters_that_the_terminal_lacks_cause_no_traceback(products):
@@ -160,5 +167,6 @@ sys.exit(main(["plan", "--help"]))
 def test_an_interrupt_while_the_first_modules_load_prints_no_traceback(module):
     command = [sys.executable, "-c", INTERRUPT_AN_IMPORT, module]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode in (128 + signal.SIGINT, -signal.SIGINT)
+    # Before our handler is installed, the signal itself ends the program.
+    assert done.returncode in (INTERRUPTED, -signal.SIGINT)
     assert done.stderr.removeprefix("interrupted") in ("", "polysight plan: stopped\n")

@@ -21,6 +21,7 @@ def make_page(tmp_path, text):
     return read_page(path)
 
 
+# A page with links, commands and blocks of all kinds, all of them right.
 SOUND = """# Page
 
 [there](other.md), [part](other.md#two-words-code-and-more), [second](other.md#again-1), [here](#page), [out](https://a.b/c)
@@ -99,9 +100,11 @@ def test_each_fault_is_found_with_its_line(tmp_path, text, fault):
     faults = page_faults(make_page(tmp_path, f"# Page\n\n{text}\n"))
     assert len(faults) == 1
     assert fault in faults[0]
+    # The text begins in line 3. A mark takes one line before the block, and the fault of a block is reported at its
+    # first line or at the command in it.
     line = int(faults[0].split(":")[1])
-    fence = 3 + text.startswith("<!--")
-    assert line in (fence, fence + 1)
+    first_line = 4 if text.startswith("<!--") else 3
+    assert line in (first_line, first_line + 1)
 
 
 def make_folder(tmp_path):
@@ -125,7 +128,7 @@ def test_a_command_that_never_ends_is_a_failure_and_is_ended(tmp_path):
 
 
 def test_the_commands_of_a_page_end_with_the_check(tmp_path):
-    """A terminated check once left them running."""
+    """They do so when the check itself is terminated, too."""
     pid = tmp_path / "pid"
     make_page(tmp_path, f"# Page\n\n```sh\necho $$ > {pid}.part\nmv {pid}.part {pid}\nsleep 10000\n```\n")
     check = subprocess.Popen(
@@ -144,8 +147,8 @@ def test_the_commands_of_a_page_end_with_the_check(tmp_path):
     wait_for(lambda: not runs(commands), "the page's commands end with the check")
 
 
-def test_a_block_that_a_line_left_of_it_ends_is_found(tmp_path):
-    """What follows would be shown as code."""
+def test_a_block_that_ends_at_a_line_with_less_indentation_is_found(tmp_path):
+    """In a list such a line ends the block; the next fence begins another one, and what follows is shown as code."""
     faults = page_faults(make_page(tmp_path, "# Page\n\n1. a\n\n   ```toml\n   x = 1\ny = 2\n   ```\n\n## Next\n"))
     assert len(faults) == 1
     assert ":10: a heading in a code block" in faults[0]

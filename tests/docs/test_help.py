@@ -35,7 +35,7 @@ def test_help_has_an_example_that_works(parser):
     _, heading, examples = text.partition("example")
     assert heading, f"`{parser.prog} --help` shows no example"
     lines = re.findall(r"^(?:s?: *|  +)((?:polysight|python -m)\S*(?: .*)?)$", examples, re.MULTILINE)
-    # A remark may follow
+    # A remark may follow an example, after a comma or three spaces.
     lines = [re.split(r", |   ", line)[0].strip() for line in lines]
     assert any(line.startswith(parser.prog) for line in lines), f"no example of {parser.prog} in {examples!r}"
     assert [f for line in lines for f in command_faults(line)] == []
@@ -53,18 +53,19 @@ def test_help_begins_with_a_sentence_an_example_and_the_options_used_most():
         assert sentence.count(". ") == 0, f"{parser.prog}: one sentence"
         first = re.search(r"\noptions:\n(.*?)(?:\n\n|\Z)", text, re.DOTALL)
         listed_options = re.findall(r"^  (-\S+)", first[1], re.MULTILINE) if first else []
+        # At most three besides -h; the others have headings of their own.
         assert len([option for option in listed_options if option != "-h,"]) <= 3, f"{parser.prog}: {listed_options}"
-        missing = [
-            a for a in parser._actions if a.help is not argparse.SUPPRESS
-        ]  # removed options say what to use instead
-        assert all(name in text for a in missing for name in a.option_strings), parser.prog
+        # Options that were removed are still accepted, to say what replaces them, but they are not listed.
+        listed_actions = [action for action in parser._actions if action.help is not argparse.SUPPRESS]
+        assert all(name in text for action in listed_actions for name in action.option_strings), parser.prog
 
 
 @pytest.mark.parametrize("parser", list_all_parsers(), ids=lambda p: p.prog.replace(" ", "-"))
 def test_every_option_is_explained(parser):
     assert parser.description
-    dumb = [a.dest for a in parser._actions if not a.help and not isinstance(a, argparse._SubParsersAction)]
-    assert not dumb, f"{parser.prog}: no help for {dumb}"
+    options = [action for action in parser._actions if not isinstance(action, argparse._SubParsersAction)]
+    without_help = [action.dest for action in options if not action.help]
+    assert not without_help, f"{parser.prog}: no help for {without_help}"
 
 
 def test_readme_names_every_command():

@@ -19,7 +19,7 @@ from polysight_shared.faults import EXPLANATIONS, PiFault
 from polysight_simulators.scene import decode_scene, simulate
 
 
-def test_links_and_commands():
+def test_links_of_all_pages_lead_somewhere_and_their_commands_exist():
     faults = [fault for path in all_pages() for fault in page_faults(read_page(path))]
     assert not faults, "\n".join(faults)
 
@@ -33,11 +33,14 @@ def test_every_page_is_found_from_the_index():
 def test_fault_numbers_and_exit_statuses_are_documented():
     text = (ROOT / "docs/how-to/when-it-goes-wrong.md").read_text(encoding="utf-8")
     for fault in PiFault:
-        e = EXPLANATIONS[fault]
-        assert f"* **{int(fault)}**: {e.problem} ({e.cause}): {e.remedy}" in " ".join(text.split())
+        explanation = EXPLANATIONS[fault]
+        line = f"* **{int(fault)}**: {explanation.problem} ({explanation.cause}): {explanation.remedy}"
+        assert line in " ".join(text.split())
     kinds = {PolysightError, NoResult, *PolysightError.__subclasses__()}
-    answer = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
-    assert {kind.exit_status for kind in kinds} | {0, 130} == answer
+    # 130 is that of a program that Ctrl-C ended: 128 + the number of SIGINT.
+    expected_statuses = {kind.exit_status for kind in kinds} | {0, 130}
+    documented_statuses = set(map(int, re.findall(r"^\| (\d+) \|", text.split("## Messages")[0], re.MULTILINE)))
+    assert documented_statuses == expected_statuses
 
 
 def test_every_request_to_a_scan_is_documented():
@@ -84,7 +87,7 @@ def test_the_label_file_that_is_shown_can_be_learnt_from(tmp_path):
 
 
 def test_the_python_blocks_about_imaging_run(tmp_path, monkeypatch):
-    """They use rooms behind the public interface, whose names change."""
+    """They use packages that are not part of the public interface, whose names may change without notice."""
     simulate(
         load_published_rig(), decode_scene(make_scene(COPPER, columns=4, rows=3), "test"), tmp_path / "scans" / "points"
     )

@@ -29,12 +29,12 @@ def test_an_error_points_to_a_page_of_this_installation():
 
 
 @pytest.mark.parametrize("text", ["http://x/docs/how-to/install.md", "/a/docs/how-to/install.md"])
-def test_whole_paths_stay_as_they_are(text):
+def test_whole_paths_and_addresses_are_not_changed(text):
     assert expand_paths(text) == text
 
 
 def test_a_wheel_holds_the_pages(tmp_path, monkeypatch):
-    """`copy_data` of the build; the rest of that file builds the wheel."""
+    """Only the function `copy_data` of setup.py is run: the rest of that file would build the wheel."""
     monkeypatch.chdir(REPO / "host")
     tree = ast.parse(Path("setup.py").read_text(encoding="utf-8"))
     function = next(node for node in tree.body if getattr(node, "name", "") == "copy_data")

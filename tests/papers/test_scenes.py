@@ -22,17 +22,21 @@ from polysight_shared.errors import ErrorCode
 @pytest.mark.parametrize("seed", range(20))
 def test_random_places_never_overlap_and_stay_on_the_plane(seed):
     box_places = places(seed)
-    assert all(abs(c) <= REACH_MM for xy in box_places for c in xy)
-    for i, a in enumerate(box_places):
-        assert all(max(abs(a[0] - b[0]), abs(a[1] - b[1])) >= APART_MM for b in box_places[:i])
+    for i, (x_mm, y_mm) in enumerate(box_places):
+        assert abs(x_mm) <= REACH_MM
+        assert abs(y_mm) <= REACH_MM
+        # Two boxes of one size do not overlap if they are far enough apart in x or in y.
+        for other_x_mm, other_y_mm in box_places[:i]:
+            assert max(abs(x_mm - other_x_mm), abs(y_mm - other_y_mm)) >= APART_MM
 
 
-def test_the_rig_side_by_side_sees_the_plane_front_on(tmp_path):
-    steep = load_published_rig()
-    near = load_instrument(front_on(RIG_FILE, tmp_path))
-    assert np.degrees(specular_incidence_rad(steep)) == pytest.approx(55, abs=0.2)
-    assert np.degrees(specular_incidence_rad(near)) < 2
-    assert near.chirp == steep.chirp
+def test_a_rig_with_its_boards_side_by_side_sees_the_plane_from_the_front(tmp_path):
+    published = load_published_rig()
+    side_by_side = load_instrument(front_on(RIG_FILE, tmp_path))
+    assert np.degrees(specular_incidence_rad(published)) == pytest.approx(55, abs=0.2)
+    # Not 0, as boards have a size; the limit is chosen.
+    assert np.degrees(specular_incidence_rad(side_by_side)) < 2
+    assert side_by_side.chirp == published.chirp
 
 
 def test_the_plane_of_fig13_is_seen_under_50_degrees():
@@ -53,7 +57,7 @@ def test_a_tone_s_frequency_and_amplitude_are_found(if_hz):
     gains = np.array([1.0, 1j, -0.5, 0.25])[:, None, None]
     samples = gains * 40 * np.exp(2j * np.pi * if_hz * t)
     frequency, amplitude = tones(samples.astype(np.complex64), chirp)
-    # A thirtieth of a bin of the Fourier transform, 2.15 MHz / 256
+    # Chosen: a thirtieth of a bin of the Fourier transform, which is 2.15 MHz / 256.
     assert frequency[0] == pytest.approx(if_hz, abs=300)
     assert amplitude[0] == pytest.approx(40 * np.sqrt((np.abs(gains) ** 2).sum()), rel=2e-3)
 
@@ -76,8 +80,9 @@ def test_a_scene_that_cannot_be_simulated_is_named():
         pass
 
 
-def test_the_filter_s_corners_come_back_from_the_sweep():
+def test_the_corners_of_the_high_pass_filter_are_found_from_the_sweep_of_figure_9():
     item = catalogue.MAKERS["fig9"](Run(config=RIG_FILE))
+    # Both limits are chosen: the response is found well, the corners less so, as they can stand in for each other.
     assert item.data["largest_difference_db"] < 0.2
     assert item.data["fitted_corners_hz"] == pytest.approx(item.data["programmed_corners_hz"], rel=0.15)
 
@@ -117,7 +122,7 @@ def test_names_stand_in_the_middle_of_the_plates():
 
 def test_the_smear_around_a_tone_rises_with_the_power_of_its_noise():
     chirp = load_published_rig().chirp
-    # Complex noise of 20 chirps, and a tone at a fifth of the sample rate
+    # Complex noise of 20 chirps, and a tone at a fifth of the sample rate.
     noise = np.random.default_rng(1).standard_normal((1, 20, chirp.samples, 2)) @ [1, 1j]
     tone = np.exp(2j * np.pi * 0.2 * np.arange(chirp.samples))
     axes = Figure().add_subplot()
@@ -125,5 +130,5 @@ def test_the_smear_around_a_tone_rises_with_the_power_of_its_noise():
     loud_db = _draw_skirts(axes, (tone + 0.1 * noise).astype(np.complex64), chirp)
     for part, level_db in quiet_db.items():
         assert level_db < -30
-        # Ten times the amplitude
+        # Ten times the amplitude are 20 dB.
         assert loud_db[part] - level_db == pytest.approx(20, abs=1)

@@ -19,18 +19,26 @@ from polysight.planning.plan_command import _format_bytes, _format_duration, mea
 from polysight.store import manifest
 from polysight.store.logs import EventWriter
 from polysight.store.scan_folder import EVENTS, MANIFEST, ScanFolder
-from polysight_shared.errors import ErrorCode
+from polysight_shared.errors import ConfigError, ErrorCode
 from polysight_shared.messages import Capture
 from polysight_shared.raster import plan_raster
 from polysight_simulators.scene import decode_scene, simulate
 
 RIG = ["--config", str(RIG_FILE)]
+# A plan of a few minutes.
 SMALL = ["--columns", "40", "--rows", "30"]
+# The scan in which noise and times are measured; chosen.
 PULSES = 8
 ROWS = 2
 COLUMNS = 12
+# Its direct path over the noise of a chirp.
 SNR_DB = 12.0
+# Seconds from a row's last trigger to the first one of the next row.
 GAP_S = 20.0
+# Signal to noise of a position with 16 chirps over that of one.
+GAIN_OF_16_CHIRPS_DB = 12.04
+# A plan that is not possible, or none.
+NOT_POSSIBLE = 1
 
 
 def test_text_and_json_have_the_same_plan(capsys):
@@ -39,6 +47,7 @@ def test_text_and_json_have_the_same_plan(capsys):
     assert main(["plan", *RIG, *SMALL, "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
     assert f"{numbers['columns']} x {numbers['rows']} positions" in words
+    # The total is one of the values: the others add up to it.
     assert sum(numbers["time_s"].values()) == pytest.approx(2 * numbers["time_s"]["total"])
     assert "simulated" in words
     assert "simulated" in numbers["noise_source"]
@@ -78,10 +87,10 @@ def test_aliases_of_tilted_surfaces_are_reported_only_for_visible_tilts(capsys, 
 @pytest.mark.parametrize(
     ("options", "status"),
     [
-        ([*SMALL, "--speed-mm-s", "100"], 1),
-        (["--minutes", "0.5"], 1),
-        (["--width-mm", "5000"], 2),
-        (["--step-x-mm", "5e-324"], 2),
+        ([*SMALL, "--speed-mm-s", "100"], NOT_POSSIBLE),
+        (["--minutes", "0.5"], NOT_POSSIBLE),
+        (["--width-mm", "5000"], ConfigError.exit_status),
+        (["--step-x-mm", "5e-324"], ConfigError.exit_status),
     ],
     ids=["refused plan", "no plan", "broken rule", "endless steps"],
 )
@@ -102,9 +111,10 @@ def test_a_plan_that_is_impossible_fails(options, status):
     ],
 )
 def test_a_value_that_is_not_a_quantity_is_a_usage_error(option):
-    with pytest.raises(SystemExit) as e:
+    # argparse ends the program with 2.
+    with pytest.raises(SystemExit) as ended:
         main(["plan", *RIG, *option])
-    assert e.value.code == 2
+    assert ended.value.code == 2
 
 
 def test_the_lines_of_a_plan_make_the_rig_file_that_plan(capsys, tmp_path):
@@ -176,12 +186,15 @@ def read_plan(capsys):
 
 def test_noise_and_standstill_are_measured_in_the_scan(scan, rig, read_plan):
     without = read_plan()
-    same_plan = read_plan("--like", scan)
-    # 16 chirps
-    assert same_plan["position_snr_db"] == pytest.approx(SNR_DB + 12.04, abs=0.7)
-    assert "simulated scan quiet" in same_plan["noise_source"]
-    assert abs(without["position_snr_db"] - same_plan["position_snr_db"]) > 5
-    assert same_plan["time_s"]["standstill"] == without["time_s"]["standstill"]  # without a Pi there are no times
+    like_scan = read_plan("--like", scan)
+    # Chosen: noise measured in 24 positions is known to some tenths of a decibel.
+    assert like_scan["position_snr_db"] == pytest.approx(SNR_DB + GAIN_OF_16_CHIRPS_DB, abs=0.7)
+    assert "simulated scan quiet" in like_scan["noise_source"]
+    assert abs(without["position_snr_db"] - like_scan["position_snr_db"]) > 5
+    # The scan was made without a Pi and has no times: those of the plan are kept.
+    assert like_scan["time_s"]["standstill"] == without["time_s"]["standstill"]
+
+    # With events of a Pi, what a gap between two rows takes beyond the motion is the standstill of each of 30 rows.
     small = PlanChanges(columns=COLUMNS, rows=ROWS, pulses=PULSES).apply(rig)
     grid = small.grid
     stage = small.stage
@@ -208,19 +221,20 @@ def test_noise_is_measured_in_a_scan_with_two_antennas(tmp_path):
 def test_options_override_the_scan(scan, rig, read_plan):
     add_events_of_a_pi(scan, rig, GAP_S)
     values = read_plan("--like", scan, "--snr-db", "3", "--row-overhead-s", "0.5")
-    assert values["position_snr_db"] == pytest.approx(3 + 12.04, abs=0.01)
+    assert values["position_snr_db"] == pytest.approx(3 + GAIN_OF_16_CHIRPS_DB, abs=0.01)
+    # 30 rows of half a second.
     assert values["time_s"]["standstill"] == pytest.approx(15.0)
 
 
 def test_without_a_plan_more_time_is_advised_only_where_it_helps(capsys):
     plan = ["plan", *RIG, "--columns", "40", "--rows", "30", "--minutes"]
-    assert main([*plan, "0.5"]) == 1
+    assert main([*plan, "0.5"]) == NOT_POSSIBLE
     enough = re.search(r"--minutes (\d+) are enough", capsys.readouterr().err)[1]
     assert main([*plan, enough]) == 0
     capsys.readouterr()
     # The steps themselves have aliases in this scene.
     coarse = ["--step-y-mm", "12", "--scene-mm", "300,300"]
-    assert main([*plan, "30", *coarse]) == 1
+    assert main([*plan, "30", *coarse]) == NOT_POSSIBLE
     message = capsys.readouterr().err
     assert "more time does not help" in message
     assert "--step-y-mm" in message

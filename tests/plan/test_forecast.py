@@ -25,8 +25,10 @@ from polysight_shared.config import Instrument
 from polysight_shared.errors import ErrorCode
 from polysight_shared.geometry import specular_midpoint_m
 
+LIGHT_M_PER_S = 299792458.0
 
-def test_without_changes_the_rig_file_stays(rig):
+
+def test_a_plan_without_changes_is_that_of_the_rig_file(rig):
     assert PlanChanges().apply(rig) == rig
 
 
@@ -85,43 +87,54 @@ def test_the_loss_by_motion_is_that_of_the_sum_over_the_pulses(rig):
     burst = predict_burst(moving)
     antennas = Antennas.from_rig(moving, moving.receivers[0])
     middle = np.array(specular_midpoint_m(moving, moving.receivers[0]))
-    f = moving.chirp.first_sample_hz + moving.chirp.hz_per_sample * 96
-    x = -(moving.grid.columns - 1) / 2 * 2e-3 + 100e-3 * 1.2e-3 * (np.arange(16) - 7.5)
-    from_stage = middle - np.outer(x, [1, 0, 0])
+    # The middle of the 192 linear samples.
+    frequency_hz = moving.chirp.first_sample_hz + moving.chirp.hz_per_sample * 96
+    # The 16 pulses of the first column, 1.2 ms apart at 100 mm/s.
+    first_column_m = -(moving.grid.columns - 1) / 2 * 2e-3
+    x_m = first_column_m + 100e-3 * 1.2e-3 * (np.arange(16) - 7.5)
+    from_stage = middle - np.outer(x_m, [1, 0, 0])
     away_tx = from_stage - antennas.tx_m
     away_rx = from_stage - antennas.rx_m[0]
-    path = np.linalg.norm(away_tx, axis=1) + np.linalg.norm(away_rx, axis=1)
-    loss = -20 * np.log10(abs(np.mean(np.exp(2j * np.pi * f * path / 299792458.0))))
+    path_m = np.linalg.norm(away_tx, axis=1) + np.linalg.norm(away_rx, axis=1)
+    phases = np.exp(2j * np.pi * frequency_hz * path_m / LIGHT_M_PER_S)
+    loss_db = -20 * np.log10(abs(np.mean(phases)))
+    # From the first pulse to the last: 15 x 1.2 ms.
     assert burst.travel_mm == pytest.approx(1.8)
-    assert burst.travel_wavelengths == pytest.approx(1.8e-3 * f / 299792458.0)
+    assert burst.travel_wavelengths == pytest.approx(1.8e-3 * frequency_hz / LIGHT_M_PER_S)
     assert burst.duration_ms == pytest.approx(16 * 1.2)
+    # A step of 2 mm takes 20 ms, of which the burst fills 19.2.
     assert burst.between_ms == pytest.approx(20.0)
     assert burst.duty == pytest.approx(0.96)
-    assert burst.edge_loss_db == pytest.approx(loss, rel=0.2)
+    # Chosen: the forecast takes the change of the path as linear over the burst.
+    assert burst.edge_loss_db == pytest.approx(loss_db, rel=0.2)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
     """A point seen from a line of positions: the strongest response away from it is at the alias-free distance."""
-    step = (16.0, 8.0)[axis]
-    n = 30
-    changed = PlanChanges(**({"step_x_mm": step, "columns": n} if axis == 0 else {"step_y_mm": step, "rows": n})).apply(
-        rig
-    )
-    free_m = compute_field_limits(changed).alias_free_mm[axis] / 1e3
+    # Steps so wide that ghosts lie within some decimetres; chosen.
+    if axis == 0:
+        step_mm = 16.0
+        changes = PlanChanges(step_x_mm=step_mm, columns=30)
+    else:
+        step_mm = 8.0
+        changes = PlanChanges(step_y_mm=step_mm, rows=30)
+    free_m = compute_field_limits(changes.apply(rig)).alias_free_mm[axis] / 1e3
+    # Ghosts are nearest at the highest frequency, that of the last of the 192 linear samples.
     f = np.array([rig.chirp.first_sample_hz + rig.chirp.hz_per_sample * 192])
     slope = PhaseSlope(rig, axis)
     a = Antennas.from_rig(rig, rig.receivers[0])
     # From the middle of the aperture's middle half the object and its ghost lie symmetrically.
     middle = np.array(specular_midpoint_m(rig, rig.receivers[0]))
     unit = np.eye(3)[axis]
-    offsets = np.outer((np.arange(5) - 2) * step / 1e3, unit)
+    offsets = np.outer((np.arange(5) - 2) * step_mm / 1e3, unit)
     point = middle - free_m / 2 * unit
 
     def path(voxel):
         return sum(np.linalg.norm(voxel - p - offsets, axis=1) for p in (a.tx_m, a.rx_m[0]))
 
-    samples = np.exp(2j * np.pi * np.outer(path(point), f) / 299792458.0)
+    samples = np.exp(2j * np.pi * np.outer(path(point), f) / LIGHT_M_PER_S)
+    # Distances from the point at which a ghost is looked for.
     places = np.linspace(0.5, 1.6, 441) * free_m
     voxels = point + np.outer(places, unit)
     reference = np.full(len(offsets), 0.0)
@@ -129,6 +142,7 @@ def test_ghosts_are_at_the_same_place_as_in_a_backprojected_image(rig, axis):
     ghost = places[int(np.argmax(image))]
     assert image.max() > 0.8 * len(offsets)
     assert slope.slope(ghost - free_m / 2, float(f[0])) > slope.slope(-free_m / 2, float(f[0]))
+    # Chosen: five positions have a broad response, and the forecast is for the worst place of the aperture.
     assert ghost == pytest.approx(free_m, rel=0.3)
 
 
@@ -156,7 +170,8 @@ def test_the_published_plan_is_possible_and_takes_two_hours(rig):
 @pytest.mark.parametrize(
     ("changes", "topic", "value", "refused"),
     [
-        (PlanChanges(speed_mm_s=100.0), "burst", "20", True),  # 16 pulses of 1.5 ms in 20 ms
+        # 16 pulses of 1.5 ms do not fit into the 20 ms of a step.
+        (PlanChanges(speed_mm_s=100.0), "burst", "20", True),
         (PlanChanges(speed_mm_s=120.0, pulses=2), "speed", "100 mm/s", True),
         (PlanChanges(step_x_mm=2.001, pulses=2), "step x", "2.001 mm", True),
         (PlanChanges(step_y_mm=8.0), "aliasing", "in y", False),
@@ -184,9 +199,9 @@ def list_notes(rig: Instrument, topic: str, scene_mm: tuple[float, float] | None
 @pytest.mark.parametrize(
     ("topic", "at_the_limit", "beyond"),
     [
-        # 20,000 steps/s
+        # The stage reaches 20,000 steps/s, at 200 steps/mm.
         ("speed", PlanChanges(speed_mm_s=100.0, pulses=2), PlanChanges(speed_mm_s=101.0, pulses=2)),
-        # Chirps in half of the time
+        # The limit is that chirps fill half of the time: 50 of 1 ms in the 100 ms of a step.
         ("idle", PlanChanges(pulses=50, period_us=1000.0), PlanChanges(pulses=49, period_us=1000.0)),
         # A single pulse is not idle between pulses, but measures no noise.
         ("idle", PlanChanges(pulses=1), PlanChanges(pulses=2)),
@@ -243,10 +258,10 @@ def test_notes_of_the_field_count_from_the_edge_of_the_scene(rig):
 
 def test_the_note_about_an_unknown_if_ends_with_the_start_offsets(rig):
     (text,) = list_notes(rig, "IF")
-    # 38.8 MHz/us for 5 ns
+    # The radars start within 5 ns of each other, in which a ramp of 38.8 MHz/us rises by 194 kHz.
     assert "margin of 194 kHz" in text
     assert not list_notes(make_programmed_rig(), "IF")
-    # Beyond the rate of the samples
+    # An IF above the sample rate of 2.15 MHz.
     assert list_notes(make_programmed_rig(3e6), "IF")
 
 

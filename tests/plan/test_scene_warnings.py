@@ -17,6 +17,7 @@ from polysight.planning import find_scene_warnings, read_scene, warn_of_scene
 from polysight.planning.plan_command import format_rig_lines
 
 OWN_SCENE = Path(__file__).resolve().parents[2] / "examples" / "own-scene.toml"
+# A scanned area of 360 mm; chosen, so that it has few positions.
 GRID = {"columns": 61, "rows": 61, "step_x_mm": 6.0, "step_y_mm": 6.0}
 
 
@@ -26,6 +27,7 @@ def make_plate(x_mm: float, y_mm: float = 0.0, side_mm: float = 45.0, **material
 
 
 def list_topics(tmp_path: Path, *plates: dict[str, Any], grid: dict[str, Any] = GRID) -> list[str]:
+    """Topics of the warnings about a scene with these plates."""
     path = tmp_path / "scene.toml"
     path.write_text(tomli_w.dumps({"name": "plates", "grid": grid, "plates": list(plates)}))
     return [warning.where for warning in warn_of_scene(*read_scene(path, load_published_rig()))]
@@ -50,7 +52,7 @@ def test_the_example_scene_needs_no_change():
         ([make_plate(150)], ["aperture"]),
         ([make_plate(0, thickness_mm=1.2)], ["thickness"]),
         ([make_plate(0, thickness_mm=40.0)], []),
-        # They reflect nothing, so there is no ratio to be changed.
+        # Thin sheets of air reflect nothing, so that there is no ratio that their thickness could change.
         ([make_plate(0, thickness_mm=3.0, permittivity=[1.0, 0.0])], []),
         ([make_plate(0, thickness_mm=0.0)], []),
     ],

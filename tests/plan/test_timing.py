@@ -18,17 +18,19 @@ class Stage:
     """The simulated stage in virtual time, homed and set up as by the Pi."""
 
     def __init__(self, rig: Instrument) -> None:
-        s = rig.stage
-        self.board = PythonStage(Rig(s.steps_per_mm))
+        stage = rig.stage
+        steps_per_mm = stage.steps_per_mm
+        self.board = PythonStage(Rig(steps_per_mm))
         self._sequence = 0
         self.command("HELLO")
         for parameter, value in (
-            (Parameter.ACCEL, s.accel_mm_s2 * s.steps_per_mm),
+            (Parameter.ACCEL, stage.accel_mm_s2 * steps_per_mm),
+            # A minute, so that the test need not send any.
             (Parameter.HEARTBEAT, 60_000),
-            (Parameter.TRAVEL_X, s.travel_x_mm * s.steps_per_mm),
-            (Parameter.TRAVEL_Y, s.travel_y_mm * s.steps_per_mm),
-            (Parameter.TRAVEL_SPEED, s.travel_speed_mm_s * s.steps_per_mm),
-            (Parameter.BACKLASH, s.backlash_mm * s.steps_per_mm),
+            (Parameter.TRAVEL_X, stage.travel_x_mm * steps_per_mm),
+            (Parameter.TRAVEL_Y, stage.travel_y_mm * steps_per_mm),
+            (Parameter.TRAVEL_SPEED, stage.travel_speed_mm_s * steps_per_mm),
+            (Parameter.BACKLASH, stage.backlash_mm * steps_per_mm),
         ):
             self.command("SET", int(parameter), round(value))
         self.command("ENABLE", 1)
@@ -79,8 +81,8 @@ def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, ste
     rig = msgspec.structs.replace(rig, stage=msgspec.structs.replace(rig.stage, backlash_mm=backlash))
     estimate = scan_time(rig, 0.0)
     total, edges = time_scan(rig)
-    # A row has three legs: to its run-up, the row, and the stop behind it. Ramps begin at some steps/s, not at rest,
-    # and the clock is read every millisecond: a few ms a leg, and 20 at most.
+    # A row has three legs: to its run-up, the row, and the stop after it. Ramps begin at some steps/s, not at rest,
+    # and the clock is read every millisecond. Together these are a few ms a leg, and 20 ms at most.
     legs = 3 * rig.grid.rows
     assert estimate.total_s - estimate.tail_s == pytest.approx(total, abs=0.02 * legs)
     assert len(edges) == rig.grid.rows * rig.grid.columns
@@ -91,11 +93,14 @@ def test_the_estimate_is_the_time_of_the_simulated_stage(rig, speed, step_x, ste
 
 
 def test_one_more_row_adds_its_motion_turn_overhead_and_tail(rig):
-    ten = scan_time(PlanChanges(rows=10).apply(rig), 0.25)
-    eleven = scan_time(PlanChanges(rows=11).apply(rig), 0.25)
-    longer_duration = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + 0.25 + tail_s(rig)
-    # The first row is half a step nearer to the corner.
-    assert eleven.total_s - ten.total_s == pytest.approx(longer_duration + eleven.approach_s - ten.approach_s)
+    # Chosen time that a row takes besides its motion.
+    overhead_s = 0.25
+    ten = scan_time(PlanChanges(rows=10).apply(rig), overhead_s)
+    eleven = scan_time(PlanChanges(rows=11).apply(rig), overhead_s)
+    one_row_s = row_motion_s(rig.grid, rig.stage) + turn_s(rig.grid, rig.stage) + overhead_s + tail_s(rig)
+    # The first row is half a step nearer to the corner, which the stage reaches sooner.
+    approach_change_s = eleven.approach_s - ten.approach_s
+    assert eleven.total_s - ten.total_s == pytest.approx(one_row_s + approach_change_s)
 
 
 @settings(max_examples=50)

@@ -46,6 +46,9 @@ BANNER_TIMEOUT_S = 3.0
 ANSWER_TIMEOUT_S = 0.15
 # How often a line is sent before the stage counts as lost: for 2.1 s, because a busy machine may read late (chosen).
 TRIES = 14
+# How often a line is sent that arrives damaged: those answers come at once, and a stage that chatters sends any number
+# of them (chosen).
+DAMAGED_TRIES = 4
 # Error numbers of answers that report a damaged line: it is sent again.
 RETRIED_ERRORS = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)
 # Status requests to a moving stage per heartbeat, so that a lost one does not stop it.
@@ -289,12 +292,16 @@ class StageLink:
         self._last_line = Command(sequence, verb, args).encode()
         while not self._answers.empty():
             self._answers.get()
+        damaged = 0
         for _ in range(TRIES):
             self._commanded_s = time.monotonic()
             self._write(self._last_line)
             answer = self._answer(sequence)
             if answer is not None and answer.number not in RETRIED_ERRORS:
                 return answer
+            damaged += answer is not None
+            if damaged == DAMAGED_TRIES:
+                break
         raise StageLostError(
             f"stage at {self.port} does not answer {verb} {self.lost}".rstrip(),
             "cable unplugged, board without the sketch, or wrong port",

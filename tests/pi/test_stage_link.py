@@ -71,6 +71,21 @@ def test_a_line_is_sent_again_with_its_number_and_acts_once(dry_stage, connect):
     assert [(c.sequence, c.verb) for c in dry_stage.seen] == [(0, "HELLO"), (1, "SET"), (2, "SET")]
 
 
+def test_a_line_that_always_arrives_damaged_is_sent_four_times(dry_stage, connect, monkeypatch):
+    """A stage that chatters would otherwise be sent more lines than it reads."""
+    link, _ = connect()
+    lines: list[bytes] = []
+
+    def report_damage(line: bytes) -> None:
+        lines.append(line)
+        dry_stage.say(Reply("error", None, StageError.BAD_CRC))
+
+    monkeypatch.setattr(dry_stage, "_line", report_damage)
+    with pytest.raises(StageLostError):
+        link.request("CLEAR")
+    assert len(lines) == 4
+
+
 def test_waiting_for_a_lost_answer_leaves_time_for_a_stop():
     """The thread that waits for an answer sends the stops, within half a second; a busy machine has 2 s to answer."""
     assert stage.ANSWER_TIMEOUT_S <= 0.5 / 3

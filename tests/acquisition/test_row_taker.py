@@ -188,7 +188,7 @@ def test_a_pi_that_stopped_within_a_row_is_an_error_with_its_reason(bench):
         bench.take()
 
 
-def test_the_rows_end_in_the_journal_of_a_pi_in_a_fault_counts(bench):
+def test_a_pi_in_a_fault_whose_journal_has_the_rows_end_has_ended_the_row(bench):
     bench.pi.state = "fault"
     bench.status = msgspec.structs.replace(STATUS, state="fault")
     bench.journal = [make_end("fault")]
@@ -196,6 +196,7 @@ def test_the_rows_end_in_the_journal_of_a_pi_in_a_fault_counts(bench):
 
 
 def test_a_heartbeat_from_before_the_row_is_not_believed(bench):
+    """The newest heartbeat says that the Pi is idle, but its status says that the row runs."""
     bench.pi.state = "idle"
     bench.batches = [[], [], [make_end()]]
     assert bench.take().finished == make_end()
@@ -207,6 +208,7 @@ def test_data_is_not_waited_for_if_it_is_complete_or_the_scan_is_to_stop_now(ben
     bench.is_complete = not is_stopped
 
     def stop_now() -> None:
+        # The first request stops after the row, the second one at once.
         bench.stop.request()
         bench.stop.request()
 
@@ -229,6 +231,7 @@ def test_data_is_waited_for_until_nothing_came_for_the_limit(bench, last_arrival
 
 def test_a_stop_now_aborts_the_row_once_and_waits_for_its_end(bench):
     def stop_now() -> None:
+        # The first request stops after the row, the second one at once.
         bench.stop.request()
         bench.stop.request()
 
@@ -277,15 +280,18 @@ def test_a_card_whose_frames_contradict_the_pulses_is_reset_before_the_next_row(
 
 def test_a_held_row_has_no_time_limit_and_is_told_once(bench):
     """However long the Pi holds it, also if it is held just before the limit; afterwards the limit counts anew."""
-    looks = int(row_limit_s(RIG, ROW) / 0.5)
+    # The taker looks at the events each 0.5 s; its clock begins at 1000 s.
+    look_s = 0.5
+    looks = int(row_limit_s(RIG, ROW) / look_s)
+    held_from_s = 1000.0 + (looks - 1) * look_s
+    held_until_s = held_from_s + 3 * looks * look_s
 
     def hold_for_three_limits() -> None:
-        held_from_s = 1000.0 + (looks - 1) * 0.5
-        bench.pi.state = "held" if held_from_s <= bench.clock.now < held_from_s + 1.5 * looks else "running"
+        bench.pi.state = "held" if held_from_s <= bench.clock.now < held_until_s else "running"
 
     bench.at_events = hold_for_three_limits
+    # One limit before, three held, and nearly one after: ten looks less
     bench.batches = [*([[]] * (5 * looks - 10)), [*BURSTS, make_end()]]
-    # One limit before, three held, and nearly one after
     assert bench.take().finished == make_end()
     assert len(bench.notices) == 1
     assert "row 4 is held" in bench.notices[0]

@@ -125,12 +125,13 @@ def compute_layer_probability(plates: int, brightness_std: float) -> tuple[float
             continue
         # ln |H| of the sheet minus that of the half space
         off_of_sheet = np.log(np.abs(r_s)) - np.log(np.abs(fresnel(half_space, ANGLES[0])[0]))
-        of_sheet_and_half_space = []
+        # Of the sheet, and of the half space
+        layer_probabilities = []
         for brightness_off in (off_of_sheet, 0.0):
             measured_off = float(brightness_off + brightness_std * rng.standard_normal())
             evidence = RatioEvidence(ANGLES[0], t, 0.01**2 * np.eye(2), 0.5, measured_off, brightness_std)
-            of_sheet_and_half_space.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
-        probabilities.append(of_sheet_and_half_space)
+            layer_probabilities.append(weigh_kinds(AT_ANGLES[:1], (evidence,)).sheet)
+        probabilities.append(layer_probabilities)
     thin, thick = np.median(probabilities, axis=0)
     return float(thin), float(thick)
 
@@ -147,7 +148,7 @@ def test_brightness_of_unevenly_lit_plates_is_weak_evidence():
 
 
 def test_a_patch_that_may_be_a_layer_gets_no_permittivity_from_a_probability_of_a_fifth_on():
-    """The 95 % region of a half space would not hold the truth that often.
+    """With more than a fifth of layers among such patches less than 95 % of their regions would hold the truth.
 
     The brightness decides: a patch with the same ratio and a half space's own brightness gets a permittivity.
     """
@@ -252,7 +253,10 @@ def test_a_likely_unknown_material_is_listed_as_a_rival(unknown, rival):
 
 
 def test_beside_metal_that_may_be_painted_names_are_as_probable_as_in_both_cases_together():
-    """Rubber if the metal is bare, glass if it is painted; one broad error of t would contain other materials, too."""
+    """Rubber if the metal is bare, glass if it is painted; one broad error of t would contain other materials, too.
+
+    t is the ratio V / H relative to the metal: where that is painted, every t differs.
+    """
     covariance = 0.004**2 * np.eye(2)
     bare, painted = (
         RatioEvidence(ANGLES[0], complex(inverse_ratio(LIBRARY[name], ANGLES[0])), covariance, 0.5)
@@ -262,7 +266,9 @@ def test_beside_metal_that_may_be_painted_names_are_as_probable_as_in_both_cases
     offset = painted.inverse_ratio - bare.inverse_ratio
     shift = np.array([offset.real, offset.imag])
     middle = bare.inverse_ratio + 0.4 * offset
-    both = RatioEvidence(ANGLES[0], middle, covariance + 0.24 * np.outer(shift, shift), 0.5, cases=cases)
+    # Mean and covariance of both cases together: t scatters by 0.4 * 0.6 of the squared distance between them, too.
+    spread = 0.4 * 0.6 * np.outer(shift, shift)
+    both = RatioEvidence(ANGLES[0], middle, covariance + spread, 0.5, cases=cases)
     pixels = np.full((20, 1), middle)
     as_bare, as_painted, as_both = (name_patch(AT_ANGLES[:1], [e], pixels).patch_name for e in (bare, painted, both))
     assert (as_bare.name, as_painted.name) == ("rubber", "glass")

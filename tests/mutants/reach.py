@@ -1,8 +1,8 @@
-"""Find the tests that come to a place of the code: one run of the suite against a copy with a mark at each place.
+"""Find the tests that run a changed line of the code: one run of the suite against a copy with a mark at each line.
 
-A mark is a statement before the one that is marked. When it runs, it notes its number and the test that runs; programs
-that the test has started know its name from their environment. A constant of a module or class is marked where it is
-used.
+A mark is an added statement before the one that a mutant changes. When it runs, it writes its number and the name of
+the running test to a file; programs that the test has started know its name from their environment. A constant of a
+module or class is evaluated at its import, so that it is marked where it is used.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from xml.etree import ElementTree
 from tests.mutants.draw import Mutant, list_files
 from tests.support.paths import REPO
 
+# Packages (rooms) whose tests lie in a folder of another name.
 TESTS_OF_ROOM = {"pi_controller": "pi", "planning": "plan", "results": "verdict"}
 FLAGS = "tests/house/test_flags.py"
 PROJECTS = ("shared", "pi_controller", "simulators", "host", "papers", "worlds")
@@ -68,7 +69,8 @@ class Reach:
         def order(test: str) -> tuple[bool, float]:
             return not test.startswith(f"tests/{folder}/"), self.seconds.get(test, 0.0)
 
-        # Flags are judged by laws that read the code; without a place in a function that is all.
+        # An exchanged True and False may be the argument of a struct or a default, which only the tests that read the
+        # code notice: these run for each such mutant, also if no test runs its line.
         selected = [FLAGS] if "True" in mutant.operator else []
         spent_s = 0.0
         for test in sorted(tests, key=order):
@@ -123,7 +125,8 @@ def mark(mutants: Sequence[Mutant], log: Path, copy: Path) -> None:
     for file, numbers_at in marks.items():
         lines = (REPO / file).read_text(encoding="utf-8").splitlines()
         for line in sorted(numbers_at, reverse=True):
-            indent = lines[line - 1][: len(lines[line - 1]) - len(lines[line - 1].lstrip())]
+            marked_line = lines[line - 1]
+            indent = " " * (len(marked_line) - len(marked_line.lstrip()))
             calls = [f"__import__('{MARKS_MODULE}').pass_by({n})" for n in sorted(numbers_at[line])]
             lines.insert(line - 1, indent + "; ".join(calls))
         (copy / file).write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -171,7 +174,11 @@ def load(file: Path) -> Reach:
 
 
 def find_marks(mutant: Mutant) -> list[tuple[Path, int]]:
-    """Files and lines of the statements that come to a mutant: its own in a function, else the users of its name."""
+    """Files and lines to be marked for a mutant.
+
+    In a function this is the mutant's own statement. A constant of a module or class is marked where its name is used;
+    if it is used nowhere, each function of its file is marked.
+    """
     tree = _parse(mutant.file)
     function = _find_innermost(tree, mutant.line, (ast.FunctionDef, ast.AsyncFunctionDef))
     if function is not None:
@@ -181,7 +188,7 @@ def find_marks(mutant: Mutant) -> list[tuple[Path, int]]:
     names = {_find_name(target) for target in _list_targets(statement)}
     marks = {mark for name in names for mark in _find_users(mutant.file, name, in_class=class_of is not None)}
     if class_of is not None:
-        # A field's default matters to those who make one.
+        # The default of a field matters where an object of the class is made.
         marks |= set(_find_users(mutant.file, class_of.name, in_class=False))
     if not marks:
         functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]
@@ -213,7 +220,9 @@ def _find_name(target: ast.expr) -> str:
 
 
 def _find_users(file: Path, name: str, in_class: bool) -> Iterator[tuple[Path, int]]:
-    """Statements in functions that use a name of a file: by itself there and where it is imported, or as attribute."""
+    """Statements in functions that use a name of `file`: there and where it is imported by the name alone, or anywhere
+    as an attribute (`module.NAME`, `self.name`). `in_class`: the name is a class's, so that only attributes count.
+    """
     if not name:
         return
     for importing_file in list_files():
@@ -247,7 +256,7 @@ def _start(statement: Any) -> int:
 
 
 def _find_statement_line(function: Any, line: int) -> int:
-    """Line before which a mark may stand: of the innermost statement of a function that holds a line."""
+    """Line of the innermost statement of a function that contains `line`; a mark may stand before it."""
     mark_line = _find_first_line(function)
     blocks = [function.body]
     while blocks:

@@ -97,6 +97,7 @@ def test_a_cube_without_reference_is_referenced_to_the_direct_path_and_its_zeros
         file = folder / f"{board}_synced.npy"
         cube = np.load(file)
         phase_turns = rng.uniform(0, 1, cube.shape[1:3])
+        # Delays of 40 to 60 of the 256 bins of the range transform: chosen, far from its ends
         range_bins = rng.uniform(40, 60, cube.shape[1:3])
         part_of_chirp = np.arange(256) / 256
         turns = phase_turns[..., None] + range_bins[..., None] * part_of_chirp

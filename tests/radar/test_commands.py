@@ -87,8 +87,8 @@ VECTORS: list[tuple[c.Command, str]] = [
 ]
 
 
-# The library's bytes without that request: only the sub-block and the message id are compared. The profile is given by
-# the library's codes.
+# Messages in which the library did not request an acknowledgement: their flags differ from ours, so that only the
+# sub-block and the message id are compared. The profile's values are those of the library's codes.
 _PROFILE = c.Profile(
     start_hz=1435384036 * c.START_HZ_PER_CODE,
     slope_hz_per_s=414 * c.SLOPE_HZ_PER_S_PER_CODE,
@@ -144,7 +144,8 @@ def test_bytes_are_those_of_ti_s_library(sent: c.Command, expected: str):
 def test_parts_of_an_image_are_those_of_the_reference_encoder():
     """TI's library sent an image of 1000 bytes: the first message is compared by its digest, and the last one whole.
 
-    The image has these bytes at its begin and end, and zeros between them.
+    The image begins with 224 bytes that count upwards and ends with 80 that count downwards; between them it is zero.
+    Sequence numbers are those of the recorded messages.
     """
     image = bytes(range(8, 232)) + bytes(1000 - 224 - 80) + bytes(200 - n for n in range(80))
     parts = split_into_chunks(image)
@@ -160,6 +161,7 @@ def test_parts_of_an_image_are_those_of_the_reference_encoder():
     )
 
 
+# Codes of 76 to 81 GHz, and of slopes up to 266 MHz/us (ICD 81 and 83).
 @given(st.integers(0x5471C71C, 0x5A000000), st.integers(-5510, 5510))
 def test_a_frequency_or_slope_gets_the_nearest_code(start: int, slope: int):
     assert c.start_code(start * c.START_HZ_PER_CODE) == start
@@ -167,6 +169,7 @@ def test_a_frequency_or_slope_gets_the_nearest_code(start: int, slope: int):
     assert c.start_code((start + 0.49) * c.START_HZ_PER_CODE) == start
 
 
+# Periods from 300 us to the largest that fits into 28 bits of 5 ns.
 @given(st.integers(0, 65535), st.floats(300.0, 1.342e6), st.integers(1, 255))
 def test_frames_can_be_decoded_from_their_bytes(frames: int, period_us: float, loops: int):
     data = c.Frame(frames, period_us, 256, loops).data()

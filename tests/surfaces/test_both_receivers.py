@@ -53,6 +53,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[SeenEchoes, Shape]:
     shape_tangents = np.einsum("ijn,jcn->nci", patch.tangents(), np.array([patch.d_a, patch.d_b]))
     rotation = np.swapaxes(compute_tangents(normals), 1, 2) @ shape_tangents
     curvature = rotation @ np.moveaxis(patch.curvature(), -1, 0) @ np.swapaxes(rotation, 1, 2)
+    # Cosine of the incidence angle
     _, cos = find_normals(points, OFFSETS_M, optics.tx.at_m, optics.h.at_m)
     # H sees the points from `OFFSETS_M`; V, which stands elsewhere, from other positions.
     seen_from = {
@@ -66,6 +67,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[SeenEchoes, Shape]:
         # The series needs stage offsets that lie in the plane z = 0.
         wave = record_shapes([solid], boards, np.array([frequency_hz]), at_m)[channel][0, 0]
         direct_m = np.linalg.norm(receiver_m - optics.tx.at_m)
+        # The path, and its first and second derivatives over the stage's position.
         path, slope, bend = predict_echo(points, normals, curvature, at_m, optics.tx.at_m, receiver_m)
         echoes[channel] = replace(
             make_empty_echoes(),
@@ -73,6 +75,7 @@ def see_exactly(solid: WorldShape, optics: Optics) -> tuple[SeenEchoes, Shape]:
             path_m=path,
             slope=slope,
             bend=bend,
+            # Samples are conjugate to waves, and their phase is that of the path beyond the direct one.
             amplitude=wave.conj() * np.exp(-1j * optics.wave_number * direct_m),
             amplitude_std=np.zeros(len(path)),
             band_rise=np.zeros(len(path)),
@@ -88,7 +91,7 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
     permittivity of 2.8; and the curvature of the wave turns r_p by 0.005 rad.
     """
     ratios = {}
-    share_of_v = np.ones(len(OFFSETS_M))
+    share_of_v = np.zeros(len(OFFSETS_M))
     for name, stack in (("metal", METAL), ("medium", Stack(below=medium))):
         measured, shape = see_exactly(sphere("ball", stack, CENTRE_M, RADIUS_M), optics)
         voltages = find_voltages(measured, optics, shape)
@@ -96,6 +99,7 @@ def test_a_large_ball_gives_both_receivers_what_the_series_says(medium, optics):
         expected = predict_voltages(voltages, reflect_points(eps, voltages, optics.wave_number))
         h, v = (voltages.voltage / expected).T
         ratios[name] = h / v
+        # The last one, of the dielectric, remains.
         share_of_v = np.abs(expected[:, 1] / expected[:, 0])
     # V is small near Brewster's angle: its error counts relative to H. The limit is chosen, far below both effects.
     error = ratios["medium"] / ratios["metal"] - 1
@@ -111,9 +115,9 @@ def find_pattern(antenna: Antenna, points: np.ndarray, at_m: np.ndarray) -> np.n
 @pytest.mark.parametrize("medium", [2.8 - 0.1j, 4.5 - 0.3j, 8 - 1j], ids=["2.8", "4.5", "8"])
 @pytest.mark.parametrize("axis", [None, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)], ids=["sphere", "upright", "level"])
 def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
-    """What the model neglects is beyond the first order of the curvature; the gains are known here.
+    """The model holds to the first order of the curvature; the reported error is that of what it neglects.
 
-    Once it was reported twice as large, and equal in all directions of the complex plane.
+    The gains of the antennas are known here, so that there is no other error.
     """
     x, y, _ = CENTRE_M
     # Fronts are 0.5 m before the stage; radii of 100 and 150 mm.
@@ -132,8 +136,10 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
     gain_h = find_pattern(tx, shape.points, OFFSETS_M) * find_pattern(rx_h, shape.points, OFFSETS_M)
     gain_v = find_pattern(tx, shape.points, at_v_m) * find_pattern(rx_v, shape.points, at_v_m)
     without_patterns = voltages.voltage / np.stack([gain_h, gain_v], axis=1)
+    # A noise far below the model's error
     voltages = replace(voltages, voltage=without_patterns, std=np.full(without_patterns.shape, 1e-4))
     fit = fit_permittivity(voltages, UNIT_GAINS, optics.wave_number)
+    # Without disturbed scans the errors of places, axes and leakage are left out.
     errors = add_common_errors(fit, voltages, UNIT_GAINS, [], optics.wave_number)
     std = np.sqrt(np.trace(errors["model"]))
     # The reported error is at most two times too small, and about three times too large.
@@ -144,8 +150,9 @@ def test_the_error_of_the_model_is_what_the_series_shows(axis, medium, optics):
 def test_the_level_of_metal_is_known_as_well_as_both_its_directions_are(behind_m, most_std, gains, optics):
     """The level (gain of TX times that of the receiver) is learnt from a sphere at one distance.
 
-    At another distance a direction of arrival belongs to another direction of departure than at the sphere: 15 degrees
-    at 180 mm. So the level is less well known there: `most_std`, chosen.
+    There each direction of arrival at the receiver occurs with one direction of departure from TX. 180 mm behind, the
+    same arrival comes with a departure that differs by 15 degrees, which the sphere has not shown. So the level is less
+    well known there: `most_std`, chosen.
     """
     learnt = gains(optics)
     x, y, z = CENTRE_M
@@ -168,6 +175,7 @@ def test_echoes_have_their_phases_at_the_wave_number_of_the_rig():
     """
     rig = load_instrument(find_packaged(Path("instrument.toml")))
     optics = make_optics(rig)
+    # Paths of 0.1 to 0.6 m beyond the direct one
     reduced = reduction(rig.chirp, (0.1, 0.6))
     offsets = scan_offsets(21, 21)
     cube = np.zeros((1, reduced.frequencies_hz.size, 21, 21), np.complex64)

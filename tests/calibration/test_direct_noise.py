@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.support.doctor.case import FRAMES, RIG, setup_of, simulate_frames
+from tests.support.doctor.case import FRAMES, RIG, make_setup, simulate_frames
 
 from polysight.calibration.direct_signal import find_direct
 
@@ -13,6 +13,6 @@ def test_the_noise_power_is_that_of_the_measured_amplitude(noise_counts):
     words = simulate_frames("RH").astype(float)
     noisy = words + noise_counts * np.random.default_rng(6).standard_normal(words.shape)
     frames = np.round(noisy).clip(-32768, 32767).astype(np.int16)
-    signal = find_direct(RIG, RIG.by_name("RH"), frames, np.ones(FRAMES, bool), setup_of("RH"))
+    signal = find_direct(RIG, RIG.by_name("RH"), frames, np.ones(FRAMES, bool), make_setup("RH"))
     scatter = np.var(signal.power) / (2 * signal.power.mean())
     assert signal.noise_power.mean() == pytest.approx(scatter, rel=0.5)

@@ -1,4 +1,4 @@
-"""What the watch of the Pi's memory does where a client fills it: drawn sizes, no clients and no waits."""
+"""What the watch of the Pi's memory does where a client fills it: drawn sizes, no waits; and one in this process."""
 
 import os
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from polysight_pi.system import CHECK_INTERVAL_S, CUTTING_TIME_S, MAX_BYTES, SPARE_BYTES, MemoryWatch
+from polysight_shared import messages as m
 
 
 class Ended:
@@ -75,3 +76,13 @@ def test_memory_that_stays_in_use_after_a_cut_raises_the_limit():
     assert len(watch.said) == 2
     # The second time at the check that found more, not at the one that found as much.
     assert watch.said[1].endswith(", 0 MiB are left")
+
+
+def test_memory_of_the_tests_cuts_no_connection_of_a_service_in_their_process(pi, capfd):
+    """A browser's test lost its connections when the tests before it had grown by more than the limit leaves."""
+    memory = bytearray(b"x") * (2 * SPARE_BYTES)
+    for _ in range(20):
+        assert isinstance(pi.host.ask(m.Status()), m.StatusReply)
+        pi.clock.sleep(CHECK_INTERVAL_S)
+    assert len(memory) == 2 * SPARE_BYTES
+    assert "were cut" not in capfd.readouterr().err

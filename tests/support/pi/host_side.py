@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 import zmq
 
-from polysight_pi import executor, journal, lines, service, stage
+from polysight_pi import executor, journal, lines, service, stage, system
 from polysight_pi.service import Service
 from polysight_shared import messages as m
 from polysight_shared.config import Instrument
@@ -172,6 +172,9 @@ class Running:
 
     def __init__(self, instrument: Instrument, wires: Path) -> None:
         self.clock = TickingClock()
+        # The memory of this process is that of the tests, too: without a limit the watch cuts no connection for it.
+        self._without_limit = patch.object(system, "MAX_BYTES", 1 << 40)
+        self._without_limit.start()
         self.service = Service(instrument, wires)
         self.service.executor._machine._clock = self.clock
         self.thread = threading.Thread(target=self.service.serve)
@@ -185,3 +188,4 @@ class Running:
         self.thread.join()
         self.service.close()
         self.clock.close()
+        self._without_limit.stop()

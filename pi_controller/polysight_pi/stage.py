@@ -42,10 +42,10 @@ BITS_PER_BYTE = 10
 # The first opening of the port resets an UNO, whose boot loader takes up to 2 s; a second more is chosen.
 BANNER_TIMEOUT_S = 3.0
 # The longest line and its answer take 14 ms at 115200 baud. While an answer is lost the stage may move already, and a
-# stop waits for this timeout; it is a third of the 0.5 s within which a stop has to be sent.
-ANSWER_TIMEOUT_S = 0.15
+# stop waits for this timeout; it is a fifth of the 0.5 s within which a stop has to be sent.
+ANSWER_TIMEOUT_S = 0.1
 # How often a line is sent before the stage counts as lost: for 2.1 s, because a busy machine may read late (chosen).
-TRIES = 14
+TRIES = 21
 # How often a line is sent that arrives damaged: those answers come at once, and a stage that chatters sends any number
 # of them (chosen).
 DAMAGED_TRIES = 4

@@ -1,5 +1,6 @@
 """What becomes of a take's files: those of a committed row get their final names, those of a rejected one go."""
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -31,7 +32,10 @@ def scan(tmp_path):
         for suffix in (PART_SUFFIX, ".idx", PACKETS_SUFFIX):
             (tmp_path / name / "0000").with_suffix(suffix).write_bytes(b"row")
     facts: list[Any] = []
-    row_path = lambda board, row: tmp_path / board / f"{row:04d}.bin"  # noqa: E731
+
+    def row_path(board: str, row: int) -> Path:
+        return tmp_path / board / f"{row:04d}.bin"
+
     return SimpleNamespace(path=tmp_path, instrument=RIG, row_path=row_path, facts=facts, append=facts.append)
 
 

@@ -172,11 +172,11 @@ class Running:
 
     def __init__(self, instrument: Instrument, wires: Path) -> None:
         self.clock = TickingClock()
+        self.service = Service(instrument, wires)
+        self.service.executor._machine._clock = self.clock
         # The memory of this process is that of the tests, too: without a limit the watch cuts no connection for it.
         self._without_limit = patch.object(system, "MAX_BYTES", 1 << 40)
         self._without_limit.start()
-        self.service = Service(instrument, wires)
-        self.service.executor._machine._clock = self.clock
         self.thread = threading.Thread(target=self.service.serve)
         self.thread.start()
         server = self.service.server

@@ -297,11 +297,18 @@ class StageLink:
             self._commanded_s = time.monotonic()
             self._write(self._last_line)
             answer = self._answer(sequence)
-            if answer is not None and answer.number not in RETRIED_ERRORS:
+            if answer is None:
+                continue
+            if answer.number not in RETRIED_ERRORS:
                 return answer
-            damaged += answer is not None
+            damaged += 1
             if damaged == DAMAGED_TRIES:
-                break
+                raise StageLostError(
+                    f"stage at {self.port} received {verb} damaged {damaged} times, or its answers are",
+                    "the USB cable is disturbed or too long, or stage.baud differs from the sketch's",
+                    "use a short shielded USB cable, and check stage.baud",
+                    code=ErrorCode.NO_ANSWER,
+                )
         raise StageLostError(
             f"stage at {self.port} does not answer {verb} {self.lost}".rstrip(),
             "cable unplugged, board without the sketch, or wrong port",

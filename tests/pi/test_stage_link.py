@@ -81,8 +81,9 @@ def test_a_line_that_always_arrives_damaged_is_sent_four_times(dry_stage, connec
         dry_stage.say(Reply("error", None, StageError.BAD_CRC))
 
     monkeypatch.setattr(dry_stage, "_line", report_damage)
-    with pytest.raises(StageLostError):
+    with pytest.raises(StageLostError, match="damaged 4 times") as error:
         link.request("CLEAR")
+    assert "cable" in error.value.why
     assert len(lines) == 4
 
 

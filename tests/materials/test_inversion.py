@@ -12,6 +12,7 @@ from polysight.materials.kinds import (
     Kind,
     Kinds,
     PatchMeasurement,
+    RatioCase,
     compute_probability_of_same_material,
     find_permittivity_slope,
     list_literature_kinds,
@@ -21,10 +22,10 @@ from polysight.materials.result import ratio_error
 from polysight.polarimetry import permittivity_from_ratio
 
 # Names of this file: t is V / H relative to metal; leakage is a pair (a, b), of p into H and of s into V; `theta` is
-# the incidence angle. Chi-square of two numbers is below 2.279 with a probability of 68 % and below 5.991 with 95 %:
+# the incidence angle. Chi-square of two numbers is below 2.279 with a probability of 68 % and below 5.99 with 95 %:
 # so far the errors of real part and loss may be away, in their common covariance.
 CHI2_68 = 2.279
-CHI2_95 = 5.991
+CHI2_95 = 5.99
 THETA = np.radians(55.0)
 KINDS = Kinds(list_literature_kinds(), float(THETA))
 # Materials of Table 2 of the paper. The first eight are in the scenes, all sixteen in the libraries.
@@ -391,6 +392,34 @@ def test_errors_hold_both_signs_of_phase_in_the_share_of_their_probability(evide
         assert sum(joined_patch.shares.values()) == pytest.approx(1.0)
     # Without doubt nothing changes.
     assert join_signs(right_sign, wrong_sign, 1e-6)[0] == right_sign
+
+
+def test_both_cases_of_paint_hold_both_signs_of_phase_too():
+    """Each case has its own t and its own errors; the estimate of the wrong sign is added to either."""
+    prior = RigPrior(theta_std_rad=1e-3, leakage_std=0.01)
+    measurements = draw_world(np.random.default_rng(4), (0j, 0j))
+    solution = invert(measurements, prior, KINDS)
+    mirrored_measurements, mirrored_prior = mirror_phases(measurements, prior)
+    wrong_sign = invert(mirrored_measurements, mirrored_prior, KINDS)
+    # Both signs explain the data alike.
+    wrong_sign = replace(wrong_sign, log_evidence=solution.log_evidence)
+    patches = []
+    for patch in solution.patches:
+        t = patch.evidence.inverse_ratio
+        painted = RatioCase(0.4, t + 0.1j, 2 * patch.evidence.covariance)
+        bare = RatioCase(0.6, t, patch.evidence.covariance)
+        patches.append(replace(patch, evidence=replace(patch.evidence, cases=(painted, bare))))
+    right_sign = replace(solution, patches=tuple(patches))
+    joined, probability_of_wrong = join_signs(right_sign, wrong_sign, 0.3)
+    for right_patch, wrong_patch, joined_patch in zip(
+        right_sign.patches, wrong_sign.patches, joined.patches, strict=True
+    ):
+        for case, joined_case in zip(right_patch.evidence.cases, joined_patch.evidence.cases, strict=True):
+            distance2 = abs(wrong_patch.evidence.inverse_ratio - case.inverse_ratio) ** 2
+            if_wrong = np.trace(wrong_patch.evidence.covariance) + distance2
+            expected = (1 - probability_of_wrong) * np.trace(case.covariance) + probability_of_wrong * if_wrong
+            assert np.trace(joined_case.covariance) == pytest.approx(expected)
+            assert (joined_case.probability, joined_case.inverse_ratio) == (case.probability, case.inverse_ratio)
 
 
 def test_the_kinds_of_plates_count_less_for_the_leakage_if_it_was_never_measured():

@@ -30,7 +30,7 @@ def test_scans_without_names_of_their_specimens_make_an_underconfident_library()
     """
     text = advise(fit_samples(draw_pixels(spread=(0.12, 0.6), scans=6, seed=1, labelled=False)))
     assert "underconfident" in text
-    assert "each material has one specimen" in text
+    assert "no second specimen of a material is named" in text
     assert f"scan {FREEDOM_NEEDED} more" in text
 
 

@@ -224,10 +224,7 @@ class RatioEvidence:
         if not self.cases:
             return [(1.0, self)]
         return [
-            (
-                case.probability,
-                replace(self, inverse_ratio=case.inverse_ratio, covariance=case.covariance, cases=()),
-            )
+            (case.probability, replace(self, inverse_ratio=case.inverse_ratio, covariance=case.covariance, cases=()))
             for case in self.cases
         ]
 

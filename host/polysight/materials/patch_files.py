@@ -147,7 +147,8 @@ def _pack_cases(cases: Sequence[RatioCase]) -> Real:
 def _unpack_cases(rows: Real) -> tuple[RatioCase, ...]:
     """Return what :func:`_pack_cases` packed. Raises ValueError for rows of another shape or without probabilities."""
     known_rows = [row for row in rows.reshape(2, 7) if np.isfinite(row).all()]
-    if known_rows and not (np.isclose(sum(row[0] for row in known_rows), 1) and min(row[0] for row in known_rows) > 0):
+    probabilities = [row[0] for row in known_rows]
+    if known_rows and not (min(probabilities) > 0 and np.isclose(sum(probabilities), 1)):
         raise ValueError("the probabilities of the cases of a patch are not positive, or their sum is not 1")
     return tuple(RatioCase(float(row[0]), complex(*row[1:3]), row[3:].reshape(2, 2)) for row in known_rows)
 

@@ -22,8 +22,8 @@ def describe_accuracy(library: Library) -> list[str]:
         materials_in_one_scan = ", ".join(fit["not_judged"])
         if not fit["judged"]:
             lines.append(
-                f"{angle} degrees: accuracy not known: it is measured on materials that two scans show,"
-                " and only metal is in two of them. Scan each material once more, placed again, and train on all scans"
+                f"{angle} degrees: accuracy not known: for that a material other than metal has to be in two scans."
+                " Scan each material once more, placed again, and train on all scans"
             )
             continue
         lines += _judge_confidence(angle, fit)
@@ -80,9 +80,7 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
     if abs(misfit) > max(2 * share_std, LEAST_MISFIT):
         kind = "overconfident" if misfit > 0 else "underconfident"
         if misfit < 0 and not fit["specimen_freedom"]:
-            cause = (
-                "each material has one specimen: how specimens differ is unknown, and counts as an error of placement"
-            )
+            cause = "no second specimen of a material is named: how specimens differ counts as an error of placement"
         elif misfit < 0:
             cause = "its specimens differ less than published ones, whose spread counts as that of 4 specimens"
         elif fit["scans"] < FEW_SCANS:

@@ -422,7 +422,7 @@ FRAME_PERIOD_US = (MIN_PERIOD_US, 1.342e6)
 SAMPLE_MEMORY_BYTES = 16384
 # Uncertainty of one board's start against the pulse (ICD 92).
 TRIGGER_UNCERTAINTY_S = 5e-9
-# Share of the sample rate that the receiver's digital filter passes (ICD 85).
+# Share of the sample rate that the receiver passes (docs/spec/mmwavelink.md, with its other limits).
 PASSBAND = 0.9
 # 266 MHz/us, for which the bandwidth of the synthesizer is set (`APLL_BANDWIDTH`).
 MAX_SLOPE_CODE = 5510

@@ -25,7 +25,7 @@ RESPONSE_TIMEOUT_S = 1.0
 ATTEMPTS = 3
 # Time from the interrupt to the first word (ICD 20).
 SETTLE_S = 30e-6
-# Time from the falling interrupt to the first word read, as in the driver that TI supplies for this board.
+# Time from the falling interrupt to the first word read, as in TI's port of mmWaveLink to the USB chip.
 DATA_DELAY_S = 1e-3
 # Time between two polls (chosen).
 _INTERVAL_S = 0.5e-3

@@ -46,12 +46,12 @@ class ChirpConfig(msgspec.Struct, frozen=True):
 class Collection(msgspec.Struct, frozen=True):
     """The settings of a data collection, as in its JSON files. Lengths in mm, times in ms, angles in degrees.
 
-    `board_dist` is in metres.
-    `total_x` and `total_y` are numbers of positions, and `dx` and `dy` their distances; `num_trigger` is the number of
-    pulses at a position, `period_frame` the time between them, and `num_chirp` the number of chirps of a pulse.
-    `moving_direction` is "row" (along x) or "col". With `packet_zero_filling` the file of a row has zeros where packets
-    were lost, otherwise nothing. Angles and offsets that are None stay those of the base rig. `num_adc` is not used,
-    the number of samples is that of `chirp_configs`; a file without it is not a file of the published program.
+    Of the lengths `board_dist` alone is in metres. `total_x` and `total_y` are numbers of positions, and `dx` and `dy`
+    their distances; `num_trigger` is the number of pulses at a position, `period_frame` the time between them, and
+    `num_chirp` the number of chirps of a pulse. `moving_direction` is "row" (along x) or "col". With
+    `packet_zero_filling` the file of a row has zeros where packets were lost, otherwise nothing. Angles and offsets
+    that are None stay those of the base rig. `num_adc` is not used, the number of samples is that of `chirp_configs`; a
+    file without it is not a file of the published program.
     """
 
     dx: _Step

@@ -287,10 +287,10 @@ class Adversary:
         self.resets += 1
         self._waiting = np.zeros(0, np.int64)
 
-    def _make_stream(self, data: NDArray[np.int64]) -> list[bytes]:
-        """Return the packets that these bytes of the data (by number) fill."""
-        self._waiting = np.concatenate([self._waiting, data])
-        return self._note_last_bytes(self._card.feed(self._bytes[data]))
+    def _make_stream(self, byte_numbers: NDArray[np.int64]) -> list[bytes]:
+        """Return the packets that these bytes of the data fill."""
+        self._waiting = np.concatenate([self._waiting, byte_numbers])
+        return self._note_last_bytes(self._card.feed(self._bytes[byte_numbers]))
 
     def _end(self) -> list[bytes]:
         """Return the short packet with the bytes that wait for a full one."""
@@ -301,7 +301,6 @@ class Adversary:
         for row in rows:
             size = len(row) - DATA_HEADER_BYTES
             last_byte = 0
-            # The last packet of a record may be filled up beyond its data.
             if self._waiting.size:
                 last_byte = int(self._waiting[min(size, self._waiting.size) - 1])
             self._last_bytes.append(last_byte)

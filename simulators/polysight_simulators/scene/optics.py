@@ -250,9 +250,9 @@ def plate_scale(ant: Antennas, scene: Scene, frequency_hz: float) -> complex:
 
 
 def point_scale(ant: Antennas) -> float:
-    """Return the factor of 1 / (r1 r2) with which a point of amplitude 1 at the specular midpoint is as strong as TX.
+    """Return the factor with which a point of amplitude 1 at the specular midpoint equals the direct path.
 
-    That is, as the direct path.
+    It is that of a point's 1 / (r1 r2), square metres.
     """
     r1, r2, _, _ = ant.legs(ant.centre_m[0], ant.centre_m[1], 0)
     return float(r1 * r2)

@@ -14,7 +14,7 @@ from polysight.sync.loops import estimate_tone
 from polysight_shared.errors import ErrorCode
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Of a row, and chirps of each position
+# Positions of a row, and chirps of each position
 POSITIONS = 9
 PULSES = 6
 
@@ -87,7 +87,8 @@ def test_a_disturbed_row_is_restored_to_the_ideal(make_row, setup):
     synchronised = synchronise_row(frames, valid, setup)
     assert synchronised.valid.all()
     assert (synchronised.chirps == PULSES).all()
-    # Noise of -12 dB, averaged over the pulses, over direct path and echo, which are equally strong (sqrt 2 together)
+    # Noise of -12 dB, averaged over the pulses, relative to direct path and echo, which are equally strong (together
+    # the square root of 2). The average over the four samples of a block halves it once more, as measured.
     noise_floor = 10 ** (-12 / 20) / np.sqrt(PULSES) / np.sqrt(2)
     assert _compute_relative_error(synchronised, ideal) < 1.3 * noise_floor
 
@@ -98,8 +99,9 @@ def test_offsets_have_no_effect_beyond_noise(make_row, setup):
     frames, valid, _ = make_row(offsets=False, snr_db=30)
     without_offsets = synchronise_row(frames, valid, setup)
     difference = np.abs(with_offsets.samples - without_offsets.samples)
-    # Noise of -30 dB is 0.03 of the direct path.
-    assert np.sqrt((difference**2).mean()) < 0.04 * COUNTS
+    # Noise of -30 dB is averaged over the pulses and over four samples; a difference of two averages has sqrt(2) of it.
+    noise_of_difference = 10 ** (-30 / 20) * np.sqrt(2 / (PULSES * 4))
+    assert np.sqrt((difference**2).mean()) < 1.5 * noise_of_difference * COUNTS
 
 
 def test_the_high_pass_filter_is_compensated(make_row, short_bursts_rig, setup):
@@ -107,8 +109,9 @@ def test_the_high_pass_filter_is_compensated(make_row, short_bursts_rig, setup):
     compensating_setup = BoardSetup.from_rig(short_bursts_rig, short_bursts_rig.receivers[1])
     compensated = synchronise_row(frames, valid, compensating_setup)
     not_compensated = synchronise_row(frames, valid, setup)
-    # The first blocks still have the filter's start.
+    # In the first blocks the filter has not settled.
     after_start = slice(3, None)
+    # Measured: 0.005 with and 0.08 without compensation
     error = _compute_relative_error(compensated, ideal, after_start)
     assert error < 0.04
     assert error < 0.4 * _compute_relative_error(not_compensated, ideal, after_start)
@@ -119,14 +122,18 @@ def test_errors_shrink_from_received_to_averaged(make_row, setup):
     frames, valid, _ = make_row()
     synchronised = synchronise_row(frames, valid, setup)
     assert list(synchronised.stages) == ["received", "aligned", "averaged", "referenced"]
-    f, phase, amplitude = zip(*synchronised.stages.values(), strict=True)
-    # Alignment removes the offsets of the chirps; the average over the pulses reduces the noise. The phase of received
-    # chirps is random (more than 1 rad). The factors are chosen.
-    assert f[0] > 20 * f[1]
-    assert f[1] > 1.5 * f[2]
-    assert phase[0] > 1 > 20 * phase[1]
-    assert phase[1] > phase[2]
-    assert amplitude[1] > 1.5 * amplitude[2]
+    f_hz, phase_rad, amplitude = zip(*synchronised.stages.values(), strict=True)
+    received, aligned, averaged = 0, 1, 2
+    # Alignment removes the offsets of the chirps: 100 kHz become 29 Hz (measured).
+    assert f_hz[received] > 20 * f_hz[aligned]
+    # The phase of received chirps is random: 1.7 rad. Alignment leaves 0.004 rad.
+    assert phase_rad[received] > 1
+    assert phase_rad[aligned] < 1 / 20
+    # The average over six pulses reduces the noise, in theory by 2.4: measured are 2.3 in frequency and amplitude.
+    assert f_hz[aligned] > 1.5 * f_hz[averaged]
+    assert phase_rad[aligned] > phase_rad[averaged]
+    assert amplitude[aligned] > 1.5 * amplitude[averaged]
+    # Noise of -12 dB (0.25) in 6 x 4 x 192 samples changes the amplitude by 0.3 %.
     np.testing.assert_allclose(synchronised.direct_amplitude, COUNTS, rtol=0.05)
 
 
@@ -151,6 +158,7 @@ def test_measured_errors_are_the_true_ones(rig, paths, noise, setup):
     mean_echo = echo.mean(axis=1, keepdims=True)
     tone = estimate_tone((echo * mean_echo.conj()).sum(axis=0).astype(np.complex64))
     f_hz, rad, _ = synchronised.stages["referenced"]
+    # A standard deviation of 400 positions is known to 1 / sqrt(2 * 400) = 3.5 %; the limits, 15 %, are four of these.
     # A block is four samples.
     assert f_hz == pytest.approx(tone.frequency.std() * rig.chirp.sample_rate_hz / 4, rel=0.15)
     assert rad == pytest.approx(np.angle(tone.amplitude).std(), rel=0.15)
@@ -169,12 +177,11 @@ def test_residuals_of_a_sample_of_positions_agree_with_those_of_all(rig, paths, 
     frames = (frames + COUNTS * noise(frames.shape, power_db=-12.0, rng=rng)).reshape(4, -1, 256).astype(np.complex64)
     few_examined = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=64))
     all_positions = synchronise_row(frames, np.ones(300 * PULSES, bool), replace(setup, examined=300))
-    assert {name: values.shape[1] for name, values in few_examined.errors.items() if name != "referenced"} == {
-        "received": 64 * PULSES,
-        "aligned": 64 * PULSES,
-        "averaged": 64,
-    }
+    assert few_examined.errors["received"].shape[1] == 64 * PULSES
+    assert few_examined.errors["aligned"].shape[1] == 64 * PULSES
+    assert few_examined.errors["averaged"].shape[1] == 64
     assert all_positions.errors["averaged"].shape[1] == 300
+    # A standard deviation of 64 positions is known to 1 / sqrt(2 * 64) = 9 %; 35 % are four of these.
     for stage, spread in all_positions.stages.items():
         np.testing.assert_allclose(few_examined.stages[stage], spread, rtol=0.35)
 
@@ -195,18 +202,22 @@ def test_clipped_and_missing_chirps_are_left_out(make_row, setup):
     assert np.abs(synchronised.samples[:, is_valid] / COUNTS - ideal[:, is_valid]).mean() < 0.2
 
 
-def test_bursts_of_one_chirp(make_row, setup):
-    """They are synchronised only by the direct path; residuals that need two chirps are missing."""
+def test_bursts_of_one_chirp_are_synchronised_by_the_direct_path_alone(make_row, setup):
+    """Residuals that need two chirps are missing."""
     frames, valid, ideal = make_row(snr_db=20)
     single_chirp = replace(setup, pulses=1)
     synchronised = synchronise_row(frames[:, ::PULSES], valid[::PULSES], single_chirp)
     assert synchronised.valid.all()
     assert (synchronised.chirps == 1).all()
     assert "referenced" not in synchronised.stages
-    # The amplitude varies by the noise alone, a tenth.
+    noise = 10 ** (-20 / 20)
     _, _, amplitude_error = synchronised.stages["received"]
-    assert amplitude_error < 0.2
-    assert _compute_relative_error(synchronised, ideal) < 1.3 * 10 ** (-20 / 20)
+    # The amplitude is estimated from the samples of four RX. Half of the noise's power changes it, the other half its
+    # phase.
+    noise_of_amplitude = noise / np.sqrt(2 * 4 * 192)
+    assert amplitude_error < 2 * noise_of_amplitude
+    # As above, without an average over pulses: 0.35 of the noise is measured.
+    assert _compute_relative_error(synchronised, ideal) < 1.3 * noise
 
 
 def test_a_row_without_frames_is_invalid(setup):
@@ -242,9 +253,16 @@ def test_a_row_of_a_cube_is_converted_and_masked_where_it_is_empty_or_not_finite
     turn = np.exp(2j * np.pi * rng.uniform(size=(4, short_bursts_rig.chirp.samples))).astype(np.complex64)
     constant = np.arange(4).astype(np.complex64)
     no_direct_path = None
-    form = CubeForm(conjugate, turn, constant, no_direct_path, short_bursts_rig.chirp, "")
+    form = CubeForm(
+        conjugate=conjugate,
+        turn=turn,
+        constant=constant,
+        path=no_direct_path,
+        chirp=short_bursts_rig.chirp,
+        how="",
+    )
     # A row that was scanned in the other direction
-    row = form.convert_row(cube[:, ::-1], 16)
+    row = form.convert_row(cube[:, ::-1], pulses=16)
     masked = [POSITIONS - 1 - position for position in (1, 3, 4)]
     assert np.flatnonzero(~row.valid).tolist() == sorted(masked)
     assert not row.samples[:, ~row.valid].any()

@@ -21,6 +21,12 @@ from polysight.sync.offsets import AlignedRow, align_in_numpy, align_pieces, ali
 # Bits of a vector: SSE, AVX2 and AVX-512
 WIDTHS = (128, 256, 512)
 
+# Samples in which a chirp is linear, as in the published rig
+LINEAR = (0, 192)
+
+# Chirps of `draw_bursts` (five positions of six chirps) that were received: all of them
+ALL_VALID = np.ones((5, 6), bool)
+
 
 @pytest.fixture(scope="module")
 def library_file(tmp_path_factory):
@@ -72,7 +78,7 @@ def assert_equal_rows(result: AlignedRow, expected: AlignedRow):
     # Silent chirps have no band, so that its middle is arbitrary.
     has_signal = expected.good.any(axis=1)
     np.testing.assert_allclose(result.centre[has_signal], expected.centre[has_signal], rtol=0, atol=1e-6)
-    # So is the tone of a chirp that matches no other one.
+    # The tone of a chirp that matches no other one is arbitrary, too.
     usable = (expected.coherence > 0.1) & has_signal[:, None]
     assert result.halves.dtype == expected.halves.dtype
     largest = max(1.0, float(np.abs(expected.halves).max()))
@@ -99,11 +105,11 @@ def assert_aligned_equally(loops, words, valid, linear, equaliser=None):
 def test_one_usable_chirp_is_the_average_wherever_it_is_in_the_burst(loops, value_of_others):
     burst = draw_bursts(positions=3, chirps=1)
     for by in (loops.align, align_in_numpy):
-        expected = align(by, burst, np.ones((3, 1), bool), (0, 192))
+        expected = align(by, burst, np.ones((3, 1), bool), LINEAR)
         for usable_chirp in range(6):
             words = np.full((3, 6, *burst.shape[2:]), value_of_others, np.int16)
             words[:, usable_chirp] = burst[:, 0]
-            result = align(by, words, np.ones((3, 6), bool), (0, 192))
+            result = align(by, words, np.ones((3, 6), bool), LINEAR)
             is_usable = np.arange(6) == np.full((3, 1), usable_chirp)
             np.testing.assert_array_equal(result.good, is_usable)
             np.testing.assert_allclose(result.centre, expected.centre, rtol=0, atol=1e-6)
@@ -123,8 +129,8 @@ def test_a_row_in_pieces_is_the_same_row(loops):
             yield memory[: 7 - i]
             memory[:] = 0
 
-    in_pieces = align_pieces(read_pieces(), valid, (0, 192), by=loops.align)
-    in_one_piece = align(loops.align, words, valid, (0, 192))
+    in_pieces = align_pieces(read_pieces(), valid, LINEAR, by=loops.align)
+    in_one_piece = align(loops.align, words, valid, LINEAR)
     for values, expected in zip(in_pieces, in_one_piece, strict=True):
         np.testing.assert_array_equal(values, expected)
 
@@ -134,7 +140,7 @@ def test_pieces_with_fewer_or_more_positions_than_the_row_are_refused(loops, pos
     """The row has five."""
     for by in (loops.align, align_in_numpy):
         with pytest.raises(ValueError, match="position"):
-            align_pieces([draw_bursts(1)] * positions, np.ones((5, 6), bool), (0, 192), by=by)
+            align_pieces([draw_bursts(1)] * positions, ALL_VALID, LINEAR, by=by)
 
 
 @pytest.mark.parametrize("linear", [(0, 192), (8, 204), (3, 243), (10, 90), (4, 44)])
@@ -142,21 +148,21 @@ def test_pieces_with_fewer_or_more_positions_than_the_row_are_refused(loops, pos
 def test_loops_agree_for_any_linear_part(loops, rig, linear, filtered):
     """Beginnings and lengths that are whole blocks of four samples, and others."""
     equaliser = make_equaliser(rig) if filtered else None
-    assert_aligned_equally(loops, draw_bursts(), np.ones((5, 6), bool), linear, equaliser)
+    assert_aligned_equally(loops, draw_bursts(), ALL_VALID, linear, equaliser)
 
 
 @pytest.mark.parametrize(("samples", "linear"), [(255, (0, 192)), (193, (1, 193)), (198, (5, 181)), (37, (0, 36))])
 def test_loops_agree_for_any_number_of_samples(loops, rig, samples, linear):
     """Also if samples do not fill whole vectors or blocks."""
     words = draw_bursts(samples=samples)
-    assert_aligned_equally(loops, words, np.ones((5, 6), bool), linear, make_equaliser(rig))
+    assert_aligned_equally(loops, words, ALL_VALID, linear, make_equaliser(rig))
 
 
 @pytest.mark.parametrize("chirps", [1, 2, 3, 16, 19, 40])
 def test_loops_agree_for_any_number_of_chirps(loops, rig, chirps):
     """Sixteen are transformed together; a single one has no reference."""
     words = draw_bursts(positions=3, chirps=chirps)
-    assert_aligned_equally(loops, words, np.ones((3, chirps), bool), (0, 192), make_equaliser(rig))
+    assert_aligned_equally(loops, words, np.ones((3, chirps), bool), LINEAR, make_equaliser(rig))
 
 
 def test_loops_agree_for_absent_silent_saturated_and_foreign_chirps(loops, rig):
@@ -175,8 +181,8 @@ def test_loops_agree_for_absent_silent_saturated_and_foreign_chirps(loops, rig):
     # More foreign chirps than others; and a silent position
     words[5, :5] = rng.integers(-1000, 1000, words[5, :5].shape)
     words[6] = 0
-    aligned = align(loops.align, words, valid, (0, 192), make_equaliser(rig))
-    assert_equal_rows(aligned, align(align_in_numpy, words, valid, (0, 192), make_equaliser(rig)))
+    aligned = align(loops.align, words, valid, LINEAR, make_equaliser(rig))
+    assert_equal_rows(aligned, align(align_in_numpy, words, valid, LINEAR, make_equaliser(rig)))
     assert not aligned.good[1].any()
     assert not aligned.good[6].any()
     assert not aligned.good[3, [2, 5]].any()
@@ -188,26 +194,31 @@ def test_loops_agree_for_absent_silent_saturated_and_foreign_chirps(loops, rig):
 @pytest.mark.parametrize("mode", ["complex1x", "complex2x"])
 def test_loops_agree_for_any_filter(loops, mode):
     words = draw_bursts()
-    valid = np.ones((5, 6), bool)
     for corners_hz in [(), (175e3,), (700e3, 1400e3), (350e3, 700e3, 2800e3)]:
-        equaliser = Equaliser(HighPass(corners_hz), 10e6, mode == "complex2x", 4, 3 / 192)
-        assert_aligned_equally(loops, words, valid, (0, 192), equaliser)
+        equaliser = Equaliser(
+            model=HighPass(corners_hz),
+            sample_rate_hz=10e6,
+            signed=mode == "complex2x",
+            spacing=4,
+            reach=3 / 192,
+        )
+        assert_aligned_equally(loops, words, ALL_VALID, LINEAR, equaliser)
 
 
 def test_loops_agree_for_words_in_another_order_in_memory(loops):
     words = draw_bursts()[:, :, :, ::-1]
     assert not words.flags.c_contiguous
-    assert_aligned_equally(loops, words, np.ones((5, 6), bool), (0, 192))
+    assert_aligned_equally(loops, words, ALL_VALID, LINEAR)
 
 
 def test_loops_agree_for_any_number_of_positions_and_none(loops):
     for positions in (0, 1, 17):
         words = draw_bursts(positions=positions)
         valid = np.ones((positions, 6), bool)
-        result = align(loops.align, words, valid, (0, 192))
+        result = align(loops.align, words, valid, LINEAR)
         assert result.halves.shape == (positions, 2, 4, 48)
         if positions:
-            assert_equal_rows(result, align(align_in_numpy, words, valid, (0, 192)))
+            assert_equal_rows(result, align(align_in_numpy, words, valid, LINEAR))
 
 
 def test_loops_agree_on_the_direct_path(loops, rig, paths, noise, counts):
@@ -229,13 +240,15 @@ def test_loops_agree_on_the_direct_path(loops, rig, paths, noise, counts):
     expected = offsets.reference(aligned, path, rig.chirp, sync_loops.NumpyLoops)
     result = offsets.reference(aligned, path, rig.chirp, loops)
     np.testing.assert_array_equal(result.found, expected.found)
-    assert 30 < result.found.sum() < 37
+    # The law is tested at most positions, but not at 7 and 11.
+    assert 30 < result.found.sum() <= 37 - 2
     is_found = result.found
     largest = np.abs(expected.samples).max()
     np.testing.assert_allclose(result.samples, expected.samples, rtol=0, atol=1e-5 * largest)
     np.testing.assert_allclose(result.noise, expected.noise, rtol=1e-5)
     np.testing.assert_allclose(result.frequency[is_found], expected.frequency[is_found], rtol=0, atol=1e-7)
     np.testing.assert_allclose(result.amplitude[is_found], expected.amplitude[is_found], rtol=1e-5)
+    # The drift is a small difference of phases: their rounding changes it by 7e-5 (measured).
     assert result.drift == pytest.approx(expected.drift, rel=1e-3, abs=1e-10)
 
 
@@ -265,7 +278,7 @@ def test_loops_agree_on_peaks_and_medians_of_any_spectrum(loops, size):
 
 def test_three_receivers_are_aligned_in_numpy():
     words = draw_bursts()[..., :3]
-    assert align_row(words, np.ones(words.shape[:2], bool), (0, 192)).good.all()
+    assert align_row(words, ALL_VALID, LINEAR).good.all()
 
 
 def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
@@ -273,7 +286,7 @@ def test_the_compiled_loops_are_used_if_available(library_file, monkeypatch):
     monkeypatch.setattr(sync_loops, "load_library", lambda: library)
     # Calling the form in NumPy would fail.
     monkeypatch.setattr("polysight.sync.offsets.align_in_numpy", None)
-    assert align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)).good.all()
+    assert align_row(draw_bursts(), ALL_VALID, LINEAR).good.all()
 
 
 @pytest.fixture
@@ -304,7 +317,7 @@ def test_without_compiled_loops_there_is_one_warning(library_file, tmp_path, mon
     monkeypatch.setattr(sync_loops, "Library", lambda: library_class(file))
     with caplog.at_level(logging.WARNING), ThreadPoolExecutor(3) as pool:
         # Three threads load it at the same time.
-        for row in pool.map(lambda _: align_row(draw_bursts(), np.ones((5, 6), bool), (0, 192)), range(3)):
+        for row in pool.map(lambda _: align_row(draw_bursts(), ALL_VALID, LINEAR), range(3)):
             assert row.good.all()
     (record,) = caplog.records
     assert "python -m polysight.sync.build" in record.getMessage()
@@ -324,7 +337,7 @@ def test_a_failing_compiler_is_an_error_with_its_command(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_system_s_compiler_comes_first_and_ziglang_last(monkeypatch, tmp_path):
+def test_the_system_s_compiler_is_preferred_unless_cc_names_another(monkeypatch, tmp_path):
     (tmp_path / "cc").write_text("#!/bin/sh\n", encoding="utf-8")
     (tmp_path / "cc").chmod(0o755)
     assert build.find_compiler({"PATH": str(tmp_path)}) == [str(tmp_path / "cc")]

@@ -19,7 +19,8 @@ def decimate_tone(cycles):
 
 
 # Largest deviation in the inside of the record, and at its first and last three blocks, where the filter has fewer
-# samples; chosen. The passband is 13 bins to either side of the middle.
+# samples. It grows towards the end of the passband, 13 bins to either side of the middle: at 12 bins it is 4.6e-4
+# inside and 6e-3 at the ends (measured).
 @pytest.mark.parametrize(
     ("bins", "max_inside", "max_at_ends"), [(0, 1e-4, 1e-3), (2, 1e-4, 2e-3), (5.4, 1e-4, 2e-3), (12, 1e-3, 1e-2)]
 )
@@ -40,7 +41,7 @@ def test_decimation_changes_the_power_of_white_noise_by_the_factor_that_it_repor
     rng = np.random.default_rng(1)
     noise = (rng.standard_normal((4000, 192)) + 1j * rng.standard_normal((4000, 192))).astype(np.complex64)
     power = np.abs(flatten(fold(noise))) ** 2
-    # The noise has the power 2, 1 in each part.
+    # The noise has the power 2, 1 in each part. The mean of 4000 x 42 powers is known to 0.5 %.
     assert power[:, 3:-3].mean() == pytest.approx(2 * decimator().noise, rel=0.01)
     # The first and the last block are little more than a mean of four samples.
     assert power[:, [0, -1]].mean() < 1.3 * 2 / 4

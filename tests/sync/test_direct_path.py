@@ -1,8 +1,7 @@
 """The direct path is found in the presence of an equally strong object, with its phase at the Cramer-Rao bound.
 
 The direct path from TX to RX is the reference of frequency and phase of each position. The echo of the object lies only
-3 to 4 bins of the 192 linear samples above it. A bin is 11 kHz; limits of errors in hertz and radians are chosen where
-no bound is named.
+3 to 4 bins of the 192 linear samples above it. A bin is 11 kHz: an error of 11 Hz is a thousandth of it.
 """
 
 import msgspec
@@ -90,6 +89,7 @@ def run(rig, paths, noise, direct_paths, align_single):
 def test_without_an_object_the_direct_path_is_exact(run, board):
     referenced, error_hz, phase_error = run(board, echo=0.0)
     assert referenced.found.all()
+    # Measured: 0.4 Hz, 4e-5 of a bin, and 4e-5 rad
     assert np.abs(error_hz).max() < 0.5
     assert np.abs(phase_error).max() < 1e-3
 
@@ -102,15 +102,16 @@ def test_a_tone_whose_last_frequency_step_is_more_than_a_fiftieth_of_a_bin_is_no
     signal, _ = paths(board, positions=4, echo=0.0, rng=np.random.default_rng(0))
     first, last = whole_blocks(rig.chirp.linear_samples)
 
-    class Unsettled(loops.NumpyLoops):
+    class UnsettledLoops(loops.NumpyLoops):
         @staticmethod
         def remove(*arguments):
             removed = loops.NumpyLoops.remove(*arguments)
             return removed._replace(step=np.full_like(removed.step, step_bins / (last - first)))
 
-    referenced = reference(align_single(signal, np.ones(4, bool)), direct_paths[board.name], rig.chirp, by=Unsettled)
+    aligned = align_single(signal, np.ones(4, bool))
+    referenced = reference(aligned, direct_paths[board.name], rig.chirp, by=UnsettledLoops)
     assert (referenced.found == is_found).all()
-    assert (np.abs(referenced.samples).max() > 0) == is_found
+    assert referenced.samples.any() == is_found
 
 
 # `cycles`: per sample
@@ -137,7 +138,7 @@ def test_a_cube_that_is_mixed_down_may_have_any_if_near_zero(rig, paths, direct_
 def test_the_object_3_to_4_bins_away_does_not_bias_the_direct_path(run, board, echo, echoes):
     referenced, error_hz, phase_error = run(board, echo=echo, echoes=echoes)
     assert referenced.found.all()
-    # Hz: a thousandth of a bin of the linear samples
+    # A thousandth of a bin of the linear samples; 4 Hz and 3e-4 rad are measured.
     assert np.abs(error_hz).max() < 12
     assert phase_error.std() < 1e-3
 
@@ -156,6 +157,7 @@ def test_the_bias_is_small_for_every_object_distance(rig, align_single, board, z
     points = np.add(specular_midpoint_m(rig, board), aside_m)
     echo_m = np.linalg.norm(points - tx, axis=1)[:, None] + np.linalg.norm(points[:, None] - rx, axis=2)
     bins_per_m = rig.chirp.hz_per_sample * LINEAR_SAMPLES / SPEED_OF_LIGHT_M_S
+    # The two boards see the echo at distances that differ by some hundredths of a bin.
     assert (echo_m - direct_m).mean() * bins_per_m == pytest.approx(bins, abs=0.05)
     turns_per_m = sweep_turns_per_m(rig)
     received = np.exp(2j * np.pi * turns_per_m * direct_m[:, None])
@@ -186,7 +188,8 @@ def test_suppression_of_clutter_behind_the_object_costs_little_noise(board, dire
         power = (np.abs(clutter @ weights.reshape(rx, blocks).T) ** 2).sum(axis=1).mean()
         power_of_plain_mean = rx * (np.abs(clutter @ plain_mean) ** 2).mean()
         assert power < 0.35 * power_of_plain_mean
-    # 3 and 9 % more noise; chosen.
+    # The power of the clutter is 0.15 to 0.22 of that in a plain mean (measured). The cost is noise: that of the
+    # amplitude is up to 3 % and that of the frequency up to 8 % above the bounds.
     bounds = np.sqrt([1 / (rx * blocks), 1 / (rx * (time**2).sum())])
     assert (np.linalg.norm(path.estimator, axis=1) < [1.03, 1.09] * bounds).all()
 
@@ -206,7 +209,7 @@ def test_clutter_half_as_strong_on_a_path_0_9_m_longer_hardly_changes_the_phase(
     referenced = reference(align_single(received, np.ones(n, bool)), direct_paths[board.name], rig.chirp)
     true_frequency = 0.3 + rig.chirp.hz_per_sample * direct_m[0] / SPEED_OF_LIGHT_M_S
     assert referenced.found.all()
-    # 0.14 degrees, and half a hundredth of a bin
+    # 0.14 degrees and half a hundredth of a bin; 0.0019 rad and 19 Hz are measured.
     assert scatter_of_phase(referenced.amplitude) < 2.5e-3
     assert (referenced.frequency - true_frequency).std() * rig.chirp.sample_rate_hz < 50
 
@@ -215,6 +218,7 @@ def test_unequal_receivers_do_not_bias_the_direct_path_much(run, board):
     """The gains of the four RX differ by 20 % and by 0.2 rad."""
     referenced, error_hz, phase_error = run(board, gain=0.2, echoes=5)
     assert referenced.found.all()
+    # Two thousandths of a bin, and a tenth of a degree; 1 Hz and 2e-4 rad are measured.
     assert error_hz.std() < 25
     assert phase_error.std() < 2e-3
 
@@ -228,6 +232,7 @@ def test_noise_is_near_the_cramer_rao_bound(run, board):
     frequency_bound = np.sqrt(power / 2 / (4 * n * (n**2 - 1) / 12)) / 2 / np.pi * sample_rate_hz
     phase_bound = np.sqrt(power / 2 / (4 * n))
     assert referenced.found.all()
+    # The suppression of clutter costs some percent of noise (as above): 10 and 6 % are measured.
     assert error_hz.std() < 1.2 * frequency_bound
     assert phase_error.std() < 1.15 * phase_bound
 
@@ -243,6 +248,7 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
     direct_m = np.linalg.norm(rx - tx, axis=1)
     echo_m = np.linalg.norm(mirror_point - tx) + np.linalg.norm(mirror_point - rx, axis=1)
     bins = (echo_m - direct_m).mean() * rig.chirp.hz_per_sample * LINEAR_SAMPLES / SPEED_OF_LIGHT_M_S
+    # The two boards differ by some hundredths of a bin.
     assert bins == pytest.approx(2.5, abs=0.05)
     turns_per_m = sweep_turns_per_m(rig)
     # In turns: the phase of the echo relative to the direct path, and that of both
@@ -252,11 +258,11 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
     signal *= np.exp(2j * np.pi * (0.3 * (np.arange(256) - CENTRE) + phase))
     signal += noise(signal.shape, power_db=-16, rng=rng)
     referenced = reference(align_single(signal, np.ones(trials, bool)), prepare(near, board), near.chirp)
-    error = np.angle(referenced.amplitude) - 2 * np.pi * phase[:, 0, 0]
-    error = np.angle(np.exp(1j * error) / np.exp(1j * error).mean())
     assert referenced.found.all()
     bound_of_one_tone = np.sqrt(10**-1.6 / 2 / (4 * LINEAR_SAMPLES))
-    assert error.std() < 1.2 * bound_of_one_tone
+    without_phase = referenced.amplitude * np.exp(-2j * np.pi * phase[:, 0, 0])
+    # 3 % above the bound are measured.
+    assert scatter_of_phase(without_phase) < 1.2 * bound_of_one_tone
 
 
 # A tone above (1) or below (-1) the direct path, by the distance of the object's echo, and its strength relative to the
@@ -265,7 +271,7 @@ def test_two_tones_2_5_bins_apart_at_16_db_cost_little_over_one_tones_bound(rig,
 def test_the_second_peak_is_used_where_the_amplitude_is_an_outlier(
     rig, paths, noise, direct_paths, align_single, board, side, strength
 ):
-    """At some positions a tone hides the direct path; its amplitude is known from the row."""
+    """At some positions a tone hides the direct path. The amplitude of the direct path is known from the other ones."""
     path = direct_paths[board.name]
     rng = np.random.default_rng(6)
     signal, direct_m = paths(board, positions=40, echo=0.0, rng=rng)
@@ -310,6 +316,7 @@ def test_halves_are_scaled_to_the_average_of_their_chirps():
 def test_the_lower_of_two_peaks_is_used_if_the_object_is_stronger(run, board):
     referenced, error_hz, _ = run(board, echo=1.0, direct=0.5, spread_m=0.05)
     assert referenced.found.all()
+    # A hundredth of a bin; the peak of the object is 3 to 4 bins higher.
     assert np.abs(error_hz).max() < 100
 
 
@@ -319,7 +326,9 @@ def test_a_slope_difference_of_the_crystals_is_removed(run, board):
     # Relative to the direct path, whose amplitude is 1000 counts
     with_drift = referenced.samples / 1000
     without_drift = run(board, drift_hz=0.0, snr_db=20)[0].samples / 1000
+    # Both rows have the same noise: only the drift could make them differ. 0.01 is measured.
     assert np.sqrt((np.abs(with_drift - without_drift) ** 2).mean()) < 0.05
+    # The Cramer-Rao bound at 20 dB is sqrt(0.01 / 2 / (4 * 192)) = 0.0026 rad, as measured.
     assert phase_error.std() < 0.01
 
 
@@ -338,6 +347,7 @@ def test_a_referenced_echo_has_the_positive_phase_of_its_excess_path(rig, paths,
     block_turns_per_m = direct_paths[board.name].sweep_hz / SPEED_OF_LIGHT_M_S
     excess_m = echo_m - direct_m
     expected = 1 + 0.8 * np.exp(2j * np.pi * block_turns_per_m * excess_m[:, None])
+    # Words are rounded to thousandths of the direct path; 1.5e-3 are measured.
     np.testing.assert_allclose(referenced.samples[:, 0] / 1000, expected, atol=3e-3)
 
 
@@ -352,6 +362,7 @@ def check_direct_path_is_real(referenced, path):
 @pytest.mark.parametrize("echo", [0.0, 1.0, 2.0])
 def test_the_direct_path_in_referenced_samples_has_its_amplitude_and_no_phase(run, direct_paths, board, echo):
     referenced, _, _ = run(board, echo=echo, echoes=9, snr_db=10)
+    # The law is tested at nearly all positions.
     assert referenced.found.mean() > 0.95
     check_direct_path_is_real(referenced, direct_paths[board.name])
 
@@ -376,6 +387,7 @@ def test_of_two_tones_that_look_like_direct_path_and_object_the_one_with_the_row
     referenced = reference(align_single(signal, np.ones(60, bool)), path, rig.chirp, loop)
     amplitude = np.abs(referenced.amplitude)
     is_usual = np.abs(amplitude / np.median(amplitude) - 1) < 0.1
+    # A tone of 0.4 does not have the usual amplitude: most of the disturbed positions have that of the direct path.
     assert is_usual[disturbed].sum() > len(disturbed) / 2
     assert np.ptp(referenced.frequency[is_usual]) < below / 10
     check_direct_path_is_real(referenced, path)
@@ -403,8 +415,7 @@ def test_a_direct_path_below_three_tenths_of_the_rows_is_lost(
     signal[9] *= relative
     signal = shift_if(signal, 0.2)
     referenced = reference(align_single(signal, np.ones(40, bool)), direct_paths[board.name], rig.chirp)
-    assert referenced.found[9] == is_found
-    assert referenced.found.sum() == 39 + is_found
+    assert np.flatnonzero(~referenced.found).tolist() == ([] if is_found else [9])
 
 
 def test_a_row_of_noise_has_no_direct_path(rig, noise, direct_paths, align_single, board):
@@ -417,7 +428,8 @@ def test_a_row_of_noise_has_no_direct_path(rig, noise, direct_paths, align_singl
 def test_a_direct_path_is_found_from_15_db_over_the_noise_of_its_estimate(run, board, snr_db, least, most):
     """-13.5 dB in a sample of one RX becomes 15 dB by averaging over 4 RX and 192 samples (28.9 dB), with a window.
 
-    There some are found and some not (`least` and `most`); 3 dB to either side nearly none or nearly all, chosen.
+    At this limit some are found and others not. 3 dB below nearly none is found, 3 dB above nearly all: `least` and
+    `most` limit the share that is found.
     """
     referenced, _, _ = run(board, echo=0.0, snr_db=snr_db, positions=300)
     assert least <= referenced.found.mean() <= most

@@ -127,7 +127,7 @@ def clip(words, limit):
 
 @pytest.mark.parametrize("limit", [0.4, 0.6, 0.75])
 def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, receive_bursts, counts, limit):
-    """`limit`: where it is clipped, relative to the largest word."""
+    """`limit`: the level at which words are clipped, relative to the largest word."""
     words = make_words(counts, 8 * receive_bursts(20.0, echo=0.3))
     largest = np.abs(words).max()
     # In the receiver, before the converter
@@ -145,7 +145,7 @@ def test_a_burst_whose_chirps_are_all_clipped_is_not_used(align, receive_bursts,
 def test_clipped_chirps_among_others_are_left_out(align, receive_bursts, counts):
     chosen = choose_chirps(5, np.random.default_rng(2))
     words = make_words(counts, 2.5 * receive_bursts(20.0))
-    # Direct path and echo together have up to 5000.
+    # Direct path and echo together reach 5000 counts: four times as much is clipped at 7000.
     clipped = clip(4 * words, 7000)
     words = np.where(chosen[..., None, None, None], clipped, words)
     aligned = align(words)
@@ -190,7 +190,7 @@ def test_chirps_left_out_are_counted(rig, receive_bursts, counts):
 
 
 def test_no_chirp_of_a_burst_of_three_counts_as_disturbed(align, receive_bursts, counts):
-    """Three are too few to say which one differs from the others."""
+    """With three chirps it is not certain which one differs from the others."""
     frames = receive_bursts()[:, :3]
     rng = np.random.default_rng(5)
     second_of_each = np.arange(3) == np.full((POSITIONS, 1), 1)

@@ -12,7 +12,7 @@ ORDERS = list(permutations(range(4)))
 
 
 def draw_row(path: DirectPath, order: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Direct path [rx] and echo [rx, position] of RX in another order, steered by the rig file's."""
+    """Direct path [rx] and echo [rx, position] of RX in this order, with the phases of the rig file's order removed."""
     _, tx_m, rx_m, specular_m = path.geometry
     wavenumber = 2 * np.pi * path.sweep_hz.mean() / SPEED_OF_LIGHT_M_S
     rx = np.array(rx_m)
@@ -20,15 +20,19 @@ def draw_row(path: DirectPath, order: tuple[int, ...]) -> tuple[np.ndarray, np.n
     excess_m = excess_path_m(np.array(tx_m), rx, np.array([specular_m]))[:, 0]
     places = list(order)
     direct = np.exp(1j * wavenumber * (direct_m[places] - direct_m))
-    positions = np.exp(2j * np.pi * np.linspace(0, 1, 9))
-    return direct, (direct * np.exp(1j * wavenumber * excess_m[places]))[:, None] * positions
+    echo_of_rx = direct * np.exp(1j * wavenumber * excess_m[places])
+    # Along the row the phase of the echo turns once.
+    phase_of_position = np.exp(2j * np.pi * np.linspace(0, 1, 9))
+    return direct, echo_of_rx[:, None] * phase_of_position
 
 
 def test_every_order_of_four_rx_is_found(rig):
     """On the board of V, whose orders differ by more than a constant phase."""
     path = prepare(rig, rig.by_name("RV"))
     for order in ORDERS[1:]:
-        assert judge_rx_order(*draw_row(path, order), path) == tuple(place + 1 for place in order)
+        direct, echo = draw_row(path, order)
+        # Orders are reported in numbers from 1.
+        assert judge_rx_order(direct, echo, path) == tuple(place + 1 for place in order)
 
 
 def test_of_orders_that_fit_equally_the_one_with_fewest_changes_is_reported(rig):
@@ -37,10 +41,12 @@ def test_of_orders_that_fit_equally_the_one_with_fewest_changes_is_reported(rig)
     chirp, tx_m, rx_m, specular_m = path.geometry
     same_place = path._replace(geometry=(chirp, tx_m, (rx_m[0], rx_m[0], *rx_m[2:]), specular_m))
     for order in ((2, 1, 0, 3), (2, 0, 1, 3)):
-        assert judge_rx_order(*draw_row(same_place, order), same_place) == (3, 2, 1, 4)
+        direct, echo = draw_row(same_place, order)
+        assert judge_rx_order(direct, echo, same_place) == (3, 2, 1, 4)
 
 
 def test_rx_in_the_rig_files_order_are_not_reported(rig):
     for board in rig.receivers:
         path = prepare(rig, board)
-        assert judge_rx_order(*draw_row(path, ORDERS[0]), path) == ()
+        direct, echo = draw_row(path, ORDERS[0])
+        assert judge_rx_order(direct, echo, path) == ()

@@ -30,7 +30,7 @@ from polysight_shared.errors import DeviceError, ErrorCode, PolysightError, conv
 from polysight_shared.findings import Finding
 from polysight_shared.raster import MAX_WIDTH_NS, WIDTH_TEXT, check_burst_fits
 from polysight_shared.sockets import (
-    PI_KEYS,
+    PI_SECRET_KEY,
     advise_keys,
     advise_owner,
     create_publisher,
@@ -95,10 +95,9 @@ def check_all(instrument: Instrument, wires: Path | None) -> Iterator[Finding]:
         yield _check_real_time()
         yield from check_lines(instrument)
     yield run_check("stage", _check_stage, instrument)
-    # A rig file that keeps less space free than the journals usually need passes with that.
-    yield run_check(
-        "journal", _check_journal, Path(pi.journal_dir), min(instrument.limits.free_disk_bytes, JOURNAL_BYTES)
-    )
+    # The rig file may ask for less free space than the journals usually need: then that is enough.
+    needed_bytes = min(instrument.limits.free_disk_bytes, JOURNAL_BYTES)
+    yield run_check("journal", _check_journal, Path(pi.journal_dir), needed_bytes)
     yield run_check("keys", _check_keys, keys, (pi.command_address, pi.event_address))
     yield run_check("command address", _check_address, create_replier, pi.command_address, keys)
     yield run_check("event address", _check_address, create_publisher, pi.event_address, keys)
@@ -117,7 +116,7 @@ def _check_wires(instrument: Instrument, wires: Path) -> str:
 
 def _check_real_time() -> Finding:
     """Request the same real-time rights as the service, so that pulse widths are measured with them."""
-    # Process and thread may be refused the same right: it is named once.
+    # The process and the thread may be refused the same right; a dict names each right once, in this order.
     refused = dict.fromkeys(system.prepare_process() + system.prepare_thread())
     if refused:
         remedy = "the systemd unit grants both (LimitRTPRIO, LimitMEMLOCK); a shell does not"
@@ -143,10 +142,13 @@ def _check_journal(path: Path, needed_bytes: int) -> str:
 
 
 def _check_keys(folder: Path, addresses: tuple[str, ...]) -> str | Finding:
-    """Check that the Pi's secret key is there, for its user alone, and lets a client in, unless all are loopback."""
+    """Check that the Pi's secret key exists, that its user alone can read it, and that a client is allowed.
+
+    Without addresses other than loopback no keys are needed.
+    """
     if all(is_loopback(a) for a in addresses):
         return "not needed: both addresses are loopback"
-    secret = folder / PI_KEYS[0]
+    secret = folder / PI_SECRET_KEY
     if not secret.is_file():
         raise DeviceError(f"{secret} is missing", "keys were not made yet", advise_keys(folder))
     if secret.stat().st_mode & 0o077:

@@ -13,7 +13,7 @@ import zmq.utils.z85
 from zmq.auth import create_certificates, load_certificate
 
 from polysight_shared.errors import ConfigError, ErrorCode, quote
-from polysight_shared.sockets import HOST_KEYS, PI_KEYS, advise_keys
+from polysight_shared.sockets import HOST_KEYS, PI_SECRET_KEY, advise_keys
 
 # Names of the two pairs of keys that `make_keys` makes.
 KEY_PAIRS = ("pi", "host")
@@ -102,7 +102,7 @@ def allow_client(folder: Path, name: str) -> list[Path]:
 
     Raises ConfigError if the name is taken or not valid, or before the keys of the Pi are made.
     """
-    if not (folder / PI_KEYS[0]).exists():
+    if not (folder / PI_SECRET_KEY).exists():
         summary = f"{folder} has no keys of the Pi"
         raise ConfigError(summary, "they were not made yet", advise_keys(folder), code=ErrorCode.FILE_MISSING)
     if (

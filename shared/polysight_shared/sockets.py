@@ -18,7 +18,8 @@ Socket = zmq.Socket[bytes]
 HOST_KEYS = ("pi.key", "host.key_secret")
 """Key files that the host needs, made on the Pi. `pi.key_secret` never leaves the Pi."""
 # Key files that the Pi needs.
-PI_KEYS = ("pi.key_secret",)
+PI_SECRET_KEY = "pi.key_secret"
+PI_KEYS = (PI_SECRET_KEY,)
 # First frame of every event; the second is the packed event.
 EVENT_TOPIC = b"event"
 # Longest message of a subscriber to the Pi (its topics); after a longer one the Pi closes its connection; chosen.
@@ -75,7 +76,7 @@ def is_loopback(address: str) -> bool:
 def advise_keys(key_dir: Path) -> str:
     """Return the advice to make the Pi's keys in this folder, in the place of damaged ones."""
     command = f"polysight-pi keys --dir {quote(key_dir)}"
-    if not (key_dir / PI_KEYS[0]).exists():
+    if not (key_dir / PI_SECRET_KEY).exists():
         return f"make them: `{command}`"
     return f"make new ones: `{command} --replace`, then copy {' and '.join(HOST_KEYS)} to the host"
 

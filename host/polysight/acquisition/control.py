@@ -30,15 +30,17 @@ from polysight_shared.errors import ErrorCode, ScanError, quote
 # Names of the folder in a scan folder, and of the file with the sign of life.
 CONTROL_FOLDER = "control"
 ALIVE_FILE = "alive"
-# Time between two looks for command files (chosen).
+# Time between two looks of a scan for command files (chosen).
 _POLL_S = 0.2
+# Time between two looks of a command's sender for its acceptance: it waits little longer than the scan takes.
+_ACCEPTANCE_POLL_S = _POLL_S / 4
 # A sign of life that is unchanged is written again after this time, far below LAPSE_S.
 _ALIVE_INTERVAL_S = 1.0
 # Time in which a scan accepts a command; chosen.
 _TIMEOUT_S = 5.0
 LAPSE_S = 15.0
 """After this time without a sign of life a scan's program hangs, or its machine has failed; chosen."""
-# Characters of the name of who gave a command; more of it is cut off.
+# Length of a command sender's name in characters; the rest of a longer one is cut off.
 MAX_ASKER = 60
 Doing = Literal["rows", "materials"]
 
@@ -66,7 +68,10 @@ class StopRequest:
 
     @property
     def pending(self) -> str:
-        """Name of the command in force, obeyed already or not: `abort`, `stop`, `pause`, or "" for none."""
+        """The strongest command that holds now: `abort`, `stop`, `pause`, or "" for none.
+
+        It stays after the scan has obeyed it.
+        """
         if self.now:
             return ScanCommand.ABORT
         if self.after_row:
@@ -330,7 +335,7 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
                 "press Ctrl-C in its terminal; the emergency stop stops the stage",
                 code=ErrorCode.NO_ANSWER,
             )
-        time.sleep(_POLL_S / 4)
+        time.sleep(_ACCEPTANCE_POLL_S)
 
 
 def _write_command(path: Path, asker: str) -> None:

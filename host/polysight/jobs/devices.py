@@ -40,9 +40,9 @@ from polysight_shared.errors import ConfigError, DeviceError
 from polysight_shared.findings import Finding
 from polysight_shared.messages import Axis
 
-# Timeout of a request to a card that may be starting, all attempts together, and the time between two requests; both
-# chosen.
+# A card that was switched off and on starts for a while. Timeout of a request to it, all attempts together; chosen.
 _REPLY_TIMEOUT_S = 1.5
+# Time between two such requests; chosen.
 _PAUSE_S = 0.2
 
 
@@ -172,7 +172,9 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
             f"{name}: a card, FPGA {card.read_version()}, answers at {present.card_address}:{present.command_port}; its"
             f" EEPROM is written again, and cannot be read back.\n{name}: {settings.text()}"
         )
-        program_eeprom(card, settings, confirm(message, settings.confirmation, yes))
+        typed_answer = confirm(message, settings.confirmation, yes)
+        # Writes only if the answer is `settings.confirmation`; raises ConfigError otherwise.
+        program_eeprom(card, settings, typed_answer)
     sys.stdout.write(f"{name}: written, and the card reports no failure. Now switch the card off and on.\n")
     sys.stdout.flush()
     if wait_s > 0:
@@ -203,7 +205,8 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
         else:
             if was_off:
                 return version
-        # An interface that is down refuses immediately.
+        # Without a pause the loop would not rest while the host's interface is down, where each request fails
+        # immediately.
         time.sleep(_PAUSE_S)
     missing = "the card was not switched off"
     if was_off:
@@ -229,7 +232,7 @@ def reset_card(config: Path, name: str, radar: bool) -> int:
     return 0
 
 
-# Word for a step of a board's check that holds, or does not.
+# Words in the output for a step of a board's check that was passed (True) and for a failed one.
 _RESULT_WORDS = {True: "ok", False: "FAILED"}
 
 
@@ -238,9 +241,9 @@ def plan_radars(config: Path) -> int:
 
     Raises ConfigError.
     """
-    lines, holds = plan_lines(_load_rig_of_native(config))
+    lines, all_hold = plan_lines(_load_rig(config))
     sys.stdout.write("\n".join(lines) + "\n")
-    return exit_status(holds)
+    return exit_status(all_hold)
 
 
 def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json: bool) -> int:
@@ -248,20 +251,21 @@ def check_radar(config: Path, name: str, trace: Path | None, slow: bool, as_json
 
     `trace` is a new file for the words exchanged (None: not kept); `slow` uses the slow SPI clock.
     """
-    rig = _load_native_rig(config, name)
+    rig = _load_rig_of_board(config, name)
     _check_trace(trace)
     clock = SystemClock()
-    return _run_check(rig, name, clock, lambda: _open_words(rig, name, clock, trace, slow), as_json)
+    return _run_check(rig, name, clock, lambda: _open_link(rig, name, clock, trace, slow), as_json)
 
 
 def replay_radar(config: Path, trace: Path, as_json: bool) -> int:
     """Run the same check against a trace; return 0 if all steps pass. Raises ConfigError, OSError."""
-    words = ReplayedWords(trace)
-    name = str(words.facts.get("board", ""))
+    # The trace replaces both the clock and the link to the board.
+    replay = ReplayedWords(trace)
+    name = str(replay.facts.get("board", ""))
     if not as_json:
         sys.stdout.write(f"replayed from {trace}, not a board\n")
-    # The trace replaces both the clock and the link to the board.
-    return _run_check(_load_native_rig(config, name), name, words, lambda: words, as_json)
+    rig = _load_rig_of_board(config, name)
+    return _run_check(rig, name, replay, lambda: replay, as_json)
 
 
 def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path | None, slow: bool) -> int:
@@ -269,15 +273,15 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
 
     `trace` and `slow` as for :func:`check_radar`. Raises ConfigError, DeviceError, OSError.
     """
-    rig = _load_native_rig(config, name)
+    rig = _load_rig_of_board(config, name)
     checked_image = read_image(image)
     clock = SystemClock()
     sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked_image.patches)}\n")
     _check_trace(trace)
-    words = _open_words(rig, name, clock, trace, slow)
+    link = _open_link(rig, name, clock, trace, slow)
     # A flash is written by a board that was started without this image.
     image_for_ram = None if flash else checked_image
-    board = make_radar_board(rig, name, words, clock, image_for_ram)
+    board = make_radar_board(rig, name, link, clock, image_for_ram)
     try:
         if flash:
             sys.stdout.write(f"{name}: {_write_flash(board, image, checked_image)}\n")
@@ -292,8 +296,8 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     return 0
 
 
-def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[], WordLink], as_json: bool) -> int:
-    """Check a board on the link that `open_words` opens; print each step as it ends, or all of them as JSON."""
+def _run_check(rig: Instrument, name: str, clock: Clock, open_link: Callable[[], WordLink], as_json: bool) -> int:
+    """Check a board on the link that `open_link` opens; print each step as it ends, or all of them as JSON."""
     rows: list[StepResult] = []
 
     def print_result(row: StepResult) -> None:
@@ -304,7 +308,11 @@ def _run_check(rig: Instrument, name: str, clock: Clock, open_words: Callable[[]
 
     firmware = read_firmware(rig)
     transmits = rig.transmitter.name == name
-    board = check_board(open_words, lambda w: make_radar_board(rig, name, w, clock, firmware), transmits, print_result)
+
+    def make_board(link: WordLink) -> RadarBoard:
+        return make_radar_board(rig, name, link, clock, firmware)
+
+    board = check_board(open_link, make_board, transmits, print_result)
     report = {}
     if board:
         report = board.report()
@@ -369,15 +377,15 @@ def _check_trace(trace: Path | None) -> None:
         raise ConfigError(f"{trace} exists already", "traces are never overwritten", "give another name")
 
 
-def _open_words(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
+def _open_link(rig: Instrument, name: str, clock: SystemClock, trace: Path | None, slow: bool) -> WordLink:
     """Open the USB link to a board, over which words of 16 bits go; with `trace` all of them are written there too."""
-    words = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
+    link = open_board(rig.radar.native[name].place, slow or rig.radar.slow_spi)
     if trace is None:
-        return words
-    return trace_words(words, clock, trace, rig, name)
+        return link
+    return trace_words(link, clock, trace, rig, name)
 
 
-def _load_rig_of_native(config: Path) -> Instrument:
+def _load_rig(config: Path) -> Instrument:
     """Load a rig file. Raises ConfigError if its radars are not configured by this program."""
     rig = load_instrument(config)
     if not rig.radar.native:
@@ -389,9 +397,9 @@ def _load_rig_of_native(config: Path) -> Instrument:
     return rig
 
 
-def _load_native_rig(config: Path, name: str) -> Instrument:
+def _load_rig_of_board(config: Path, name: str) -> Instrument:
     """Load a rig file and check the settings of its radars. Raises ConfigError if this board is not under `native`."""
-    rig = _load_rig_of_native(config)
+    rig = _load_rig(config)
     if name not in rig.radar.native:
         raise ConfigError(f"radar.native has no board {name!r}", "a typing error", f"one of {sorted(rig.radar.native)}")
     # The frames of one row are the most that a board has to count.

@@ -20,14 +20,15 @@ from polysight_shared.errors import PolysightError
 from polysight_shared.findings import Finding
 from polysight_shared.tables import decode, read_toml, to_builtins
 
-# Gap in resolution cells; plates nearer to one another may merge into one patch: chosen, half a cell more than the
-# width of a point at half power.
+# Gap in resolution cells below which two plates may merge into one patch. Chosen: a point is one cell wide at half
+# power, and half a cell more is left between two of them.
 LEAST_GAP_CELLS = 1.5
-# Largest change of the ratio over the sweep, relative to a half space, that is not worth a warning; chosen.
+# The reflection at a plate's back makes the ratio V / H of the plate differ from that of a half space of the same
+# medium. Largest relative difference within the sweep that is not worth a warning; chosen.
 LARGEST_RIPPLE = 0.05
 # Tables of a scene file that replace keys of the rig file.
 _OVERRIDES = ("grid", "burst", "image", "stage")
-# Frequencies of the sweep at which a plate's back is computed; chosen.
+# Number of frequencies of the sweep at which that difference is computed; chosen.
 _SWEEP_POINTS = 41
 Pair = tuple[float, float]
 
@@ -71,28 +72,30 @@ def read_scene(path: Path, rig: Instrument) -> tuple[Instrument, list[Plate]]:
 
 
 def find_scene_warnings(scene: Path, config: Path) -> list[Finding]:
-    """Return the notes about the plates of a scene file and the ghosts of its steps; none for a wrong file.
+    """Return the notes about the plates of a scene file, and about the ghosts that its grid's steps make by aliasing.
 
-    The simulator says what is wrong with a file.
+    A wrong file has no notes: the simulator says what is wrong with it.
     """
     try:
         rig, plates = read_scene(scene, load_instrument(config))
     except PolysightError:
         return []
     notes = list(warn_of_scene(rig, plates))
-    # A plate that is larger than the image covers every pixel itself, so that its ghosts add nothing.
-    image_mm = rig.image.columns * rig.image.pixel_mm, rig.image.rows * rig.image.pixel_mm
-    smaller = [plate for plate in plates if plate.size_mm[0] < image_mm[0] or plate.size_mm[1] < image_mm[1]]
+    # A plate that covers the whole image has its ghosts on itself, where they add nothing.
+    width_mm = rig.image.columns * rig.image.pixel_mm
+    height_mm = rig.image.rows * rig.image.pixel_mm
+    smaller = [plate for plate in plates if plate.size_mm[0] < width_mm or plate.size_mm[1] < height_mm]
     if smaller:
-        # Ghosts lie on other plates, or make patches of their own: the scene reaches as far as its plates. No noise
-        # changes them, so any will do.
-        scene_mm = _measure_reach(smaller, axis=0), _measure_reach(smaller, axis=1)
-        notes += [note for note in find_warnings(rig, Noise(), scene_mm) if note.where == "aliasing"]
+        # A ghost is harmful where it lies on another plate or makes a patch of its own: the plates set the extent of
+        # the scene. The warnings about aliasing do not depend on the noise.
+        scene_mm = _measure_extent(smaller, axis=0), _measure_extent(smaller, axis=1)
+        warnings = find_warnings(rig, Noise(), scene_mm)
+        notes += [note for note in warnings if note.where == "aliasing"]
     return notes
 
 
-def _measure_reach(plates: Sequence[Plate], axis: int) -> float:
-    """Return the width of the smallest scene about the image's centre that holds the plates, mm."""
+def _measure_extent(plates: Sequence[Plate], axis: int) -> float:
+    """Return the width of the smallest scene that is centred on the image and holds the plates, mm."""
     return 2 * max(abs(edge) for plate in plates for edge in plate.edges(axis))
 
 
@@ -110,7 +113,8 @@ def warn_of_scene(rig: Instrument, plates: Sequence[Plate]) -> Iterator[Finding]
         yield from _warn_of_size(plate, cell_mm)
         yield from _warn_of_aperture(plate, rig)
         yield from _warn_of_thickness(plate, rig)
-    # One row, or one column, resolves nothing across it; the notes of the aperture say so.
+    # A grid of one row, or of one column, resolves nothing across it: its cell is infinite. The notes about the
+    # aperture report that.
     if all(map(math.isfinite, cell_mm)):
         for first, second in combinations(plates, 2):
             yield from _warn_of_gap(first, second, cell_mm)
@@ -124,7 +128,7 @@ def _warn_of_gap(first: Plate, second: Plate, cell_mm: Pair) -> Iterator[Finding
         other_low, other_high = second.edges(axis)
         gaps_mm.append(max(low, other_low) - min(high, other_high))
     cells = [gap / cell for gap, cell in zip(gaps_mm, cell_mm, strict=True)]
-    # Plates side by side overlap along one axis; diagonal ones are apart along both.
+    # Plates side by side overlap along one axis, where the gap is negative: the larger gap is the one between them.
     axis = int(np.argmax(cells))
     if cells[axis] < LEAST_GAP_CELLS:
         least_mm = LEAST_GAP_CELLS * cell_mm[axis]
@@ -137,7 +141,7 @@ def _warn_of_gap(first: Plate, second: Plate, cell_mm: Pair) -> Iterator[Finding
 
 
 def _warn_of_size(plate: Plate, cell_mm: Pair) -> Iterator[Finding]:
-    """Warn of a plate too small for a pixel without influence of its edges."""
+    """Warn of a plate that is so small that its edges disturb every pixel of it."""
     margin_mm = SegmentSettings().margin_mm
     for axis in (0, 1):
         least_mm = 2 * margin_mm + cell_mm[axis]
@@ -154,7 +158,7 @@ def _warn_of_aperture(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     zone_mm = compute_field_limits(rig).mirror_zone_mm
     aperture_mm = ((rig.grid.columns - 1) * rig.grid.step_x_mm, (rig.grid.rows - 1) * rig.grid.step_y_mm)
     for axis in (0, 1):
-        # A mirror needs this margin of aperture on every side: the first Fresnel zone around its specular point.
+        # Around the specular point of a smooth plate the aperture must hold the first Fresnel zone, on every side.
         reach_mm = aperture_mm[axis] / 2 - zone_mm[axis]
         low, high = plate.edges(axis)
         beyond_mm = max(-low, high) - reach_mm
@@ -180,7 +184,8 @@ def _warn_of_thickness(plate: Plate, rig: Instrument) -> Iterator[Finding]:
     if not (np.all(sheet_s) and np.all(bulk_s)):
         # Nothing is reflected: air, or no thickness.
         return
-    # V / H stays finite at the Brewster angle; near it, where V / H vanishes, the change is relative to the limit.
+    # At the Brewster angle V / H vanishes, and with it the reference of the relative change: LARGEST_RIPPLE replaces
+    # a smaller reference.
     sheet_ratio = sheet_p / sheet_s
     bulk_ratio = bulk_p / bulk_s
     change = np.abs(sheet_ratio - bulk_ratio) / np.maximum(np.abs(bulk_ratio), LARGEST_RIPPLE)

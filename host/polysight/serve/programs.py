@@ -31,7 +31,8 @@ from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, Polysig
 from polysight_shared.files import write_atomically
 
 OOM_SCORE = Path("/proc/self/oom_score_adj")
-# $0 is the path of log and status without their ends, $1 the kernel's score of the memory killer; the program follows.
+# Shell script that runs a program and records its exit status. Its arguments: $0, the path of the log and status files
+# without suffix; $1, the score for the kernel's memory killer; then, after `shift` as "$@", the program's command line.
 LAUNCH_SCRIPT = (
     '{ echo "$1" > /proc/self/oom_score_adj; } 2> /dev/null; shift;'
     ' "$@" >> "$0.log" 2>&1 < /dev/null; echo $? > "$0.status"'
@@ -52,7 +53,7 @@ class Programs:
             self._oom_score = OOM_SCORE.read_text(encoding="ascii").strip()
         self._running: list[int] = []
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="programs")
-        # The thread begins with its first work.
+        # The executor creates its thread, which takes the present priority, with the first job.
         self._thread.submit(self._reap).result()
 
     def start(self, folder: Path, kind: str, words: Sequence[str | Path]) -> None:
@@ -106,10 +107,13 @@ class Programs:
     def _reap(self) -> None:
         """Let the system forget the programs that have ended."""
         for pid in list(self._running):
-            ended = pid
-            with suppress(ChildProcessError):
-                ended, _ = os.waitpid(pid, os.WNOHANG)
-            if ended:
+            try:
+                ended_pid, _ = os.waitpid(pid, os.WNOHANG)
+                has_ended = ended_pid != 0
+            except ChildProcessError:
+                # The system has forgotten it already.
+                has_ended = True
+            if has_ended:
                 self._running.remove(pid)
 
     def close(self) -> None:
@@ -132,7 +136,7 @@ def _check_place(program_folder: Path, kind: str) -> None:
 
 # More than a weekend of scans of two hours each.
 MAX_WAITING = 50
-# Time between two attempts to start the next scan; chosen.
+# Time between two looks at the scans' states, each of which may start the next scan; chosen.
 LOOK_S = 2.0
 # States of a scan (`page.status`) after which a person has to look at the rig.
 UNFINISHED_STATES = ("stopped", "failed", "lost", "frozen", "damaged")
@@ -156,8 +160,9 @@ class Queue:
         self._start = start
         self._list_states = list_states
         self._held = ""
-        # Unfinished scans that do not hold the queue, because they were unfinished already at the last look, or when a
-        # person added or released. None: all but the newest, which may have ended while the server was restarted.
+        # Unfinished scans that a person knows of, so that they do not hold the queue: those of the last look, or of the
+        # moment at which a person filled an empty queue or released it. None after a start of the server: all
+        # unfinished scans but the newest scan, which may have ended while no server ran.
         self._seen: set[str] | None = None
         self._lock = threading.Lock()
         self._ended = threading.Event()
@@ -184,7 +189,7 @@ class Queue:
             write_atomically(self._folder / f"{time.time_ns()}.json", request)
 
     def remove(self, name: str) -> None:
-        """Take a request out; one that is not there is out already."""
+        """Take a request out of the queue; a name that is not in the queue is no error."""
         with self._lock:
             for waiting, path in self._list_requests():
                 if waiting == name:
@@ -223,11 +228,13 @@ class Queue:
             unfinished = self._find_unfinished(states)
             seen_scans = self._seen
             if seen_scans is None:
-                seen_scans = unfinished - set(list(states)[:1])
+                newest_scan = next(iter(states), "")
+                seen_scans = unfinished - {newest_scan}
             self._seen = unfinished
             # This applies to a scan that a person started, too: the cause of its stop may stop all scans.
-            for new in sorted(unfinished - seen_scans):
-                self._held = f"{new}: {states[new]}"
+            new_scans = sorted(unfinished - seen_scans)
+            if new_scans:
+                self._held = f"{new_scans[0]}: {states[new_scans[0]]}"
                 return
             self._start(path.read_bytes())
         except ScanError as e:

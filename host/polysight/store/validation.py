@@ -18,10 +18,11 @@ from polysight_shared.raster import plan_raster
 
 # Bytes of a file that are in memory at a time (chosen).
 _CHUNK = 1 << 22
-# Remedies of a damaged file, a damaged manifest and a damaged event log.
+# Remedies of a damaged file of a row and of a damaged event log.
 _COPY_REMEDY = "restore it from a copy, or resume takes its row again"
-_ALL_THERE = "every row is committed"
 _FETCH_REMEDY = "resume fetches the rest from the Pi's journal"
+# What is said instead of a remedy if the damaged lines of the manifest cost no row.
+_NO_ROW_LOST = "every row is committed"
 
 
 def to_text(finding: Finding) -> str:
@@ -84,7 +85,9 @@ def validate(path: Path) -> list[Finding]:
     findings += _check_dropped(scan)
     findings += _find_strays(scan, rows)
     findings += _check_events(scan)
-    missing = scan.plan.rows - sum(0 <= r < scan.plan.rows for r in rows)
+    # A committed row may lie outside the plan: `_check_row` reports it, and it takes the place of no planned row.
+    planned_rows = range(scan.plan.rows)
+    missing = len([row for row in planned_rows if row not in rows])
     ended = scan.facts(ScanEnded)
     if missing:
         remedy = f"`polysight resume {quote(path)}` takes them"
@@ -112,22 +115,24 @@ def find_damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
 
 
 def describe_damage(scan: scan_folder.ScanFolder, path: Path) -> str:
-    """Compare a row's files with the manifest; return the faults as text, "" if there are none.
+    """Compare the files of one board and row with the manifest; return the faults as text, "" if there are none.
 
-    `path` is its payload; that no committed row has this file is a fault, too.
+    `path` is the board's payload file of the row. If no committed row has such a file, the text says so.
     """
     for row in scan.committed_rows().values():
         for board in row.boards.values():
             if (scan.path / board.file).resolve() == path.resolve():
-                return "; ".join(map(to_text, find_board_faults(scan, board, row.pulses)))
+                # The radar records one frame for each pulse.
+                faults = find_board_faults(scan, board, frames=row.pulses)
+                return "; ".join(map(to_text, faults))
     return "the manifest has no such committed row"
 
 
-def _add_lost_rows(fault: Finding, lost: str) -> Finding:
-    """Add to a fault of the manifest which rows are `lost`; it is a note if none is."""
-    if lost:
-        return msgspec.structs.replace(fault, level="error", do=lost)
-    return msgspec.structs.replace(fault, level="note", do=_ALL_THERE)
+def _add_lost_rows(fault: Finding, loss: str) -> Finding:
+    """Return a fault of the manifest with the text about its lost rows; with an empty text it is only a note."""
+    if loss:
+        return msgspec.structs.replace(fault, level="error", do=loss)
+    return msgspec.structs.replace(fault, level="note", do=_NO_ROW_LOST)
 
 
 def _describe_loss(scan: scan_folder.ScanFolder) -> str:
@@ -158,7 +163,7 @@ def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]
     if set(row.boards) != boards:
         findings.append(_make_error(row_text, f"boards {sorted(row.boards)}, recorded are {sorted(boards)}"))
     for board in row.boards.values():
-        findings += find_board_faults(scan, board, pulses)
+        findings += find_board_faults(scan, board, frames=pulses)
     return findings
 
 
@@ -203,12 +208,14 @@ def find_board_faults(scan: scan_folder.ScanFolder, board: BoardRow, frames: int
         return [*findings, _make_error(file_name, "differs from the committed data (CRC)", _COPY_REMEDY)]
     try:
         facts, _ = read_index(index)
-        gaps = [(int(a), int(b)) for a, b in facts.get("missing", [])]
+        gaps = [(int(begin), int(end)) for begin, end in facts.get("missing", [])]
     except (PolysightError, TypeError, ValueError) as e:
         return [*findings, _make_error(file_name, str(e))]
-    ordered = all(a < b for a, b in gaps) and all(x[1] < y[0] for x, y in pairwise(gaps))
-    is_inside = all(a >= 0 and b <= board.bytes for a, b in gaps)
-    if not ordered or not is_inside or sum(b - a for a, b in gaps) != board.missing_bytes:
+    none_is_empty = all(begin < end for begin, end in gaps)
+    are_apart = all(gap[1] < next_gap[0] for gap, next_gap in pairwise(gaps))
+    are_inside = all(begin >= 0 and end <= board.bytes for begin, end in gaps)
+    gap_bytes = sum(end - begin for begin, end in gaps)
+    if not (none_is_empty and are_apart and are_inside) or gap_bytes != board.missing_bytes:
         findings.append(_make_error(file_name, f"its gaps do not make the {board.missing_bytes} missing bytes"))
     return findings
 
@@ -301,11 +308,12 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
     else:
         row = 0
         committed = LogDigest(0, "")
-    # Damage after the last commit is only a note: those events were perhaps not on the disk before a power cut. How
-    # many bytes belong to commits is known if no row is committed (none), and from the last digest, which rows of
-    # earlier releases and simulated ones lack.
-    is_known = bool(commits) or not scan.facts(RowCommitted)
-    is_committed_damage = bool(log.damage) and not (is_known and log.length >= committed.bytes)
+    # Damage after the last commit is only a note: a power cut may have come before those events were on the disk.
+    # Where the committed bytes end is in the digest of the last commit. Rows of earlier releases and simulated rows
+    # have no digest: there, any damage counts as damage of committed events.
+    end_is_known = bool(commits) or not scan.facts(RowCommitted)
+    commits_are_undamaged = end_is_known and log.length >= committed.bytes
+    is_committed_damage = bool(log.damage) and not commits_are_undamaged
     if is_committed_damage:
         findings.append(_make_error(scan_folder.EVENTS, log.damage, _FETCH_REMEDY))
     elif log.damage:
@@ -320,7 +328,7 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
 
 
 def _check_committed_events(path: Path, length: int, row: int, committed: LogDigest) -> list[Finding]:
-    """Compare the event log, of `length` good bytes, with its digest when a row was committed."""
+    """Compare the event log, whose first `length` bytes are good, with its digest at the commit of `row`."""
     size = committed.bytes
     when = f"row {row} was committed"
     if length < size:

@@ -1,7 +1,9 @@
-"""The stage of a simulated rig: a serial port that behaves like the board, trigger and motion on the simulated wires.
+"""The stage of a simulated rig.
 
-It is the sketch's own code, compiled for this machine (arduino_stage/pc); without a C++ compiler, or with `--python`,
-a stand-in with the same dialogue and the same step times.
+A client talks to it through a serial port that behaves like that of the board. The edges of its trigger line and its
+motion are sent to the hub of the simulated wires. The program is the sketch's own code, compiled for this machine
+(arduino_stage/pc); without a C++ compiler, or with `--python`, it is a stand-in with the same dialogue and the same
+step times.
 """
 
 import argparse
@@ -26,17 +28,20 @@ from polysight_simulators.process import announce_ready, check_link, make_parser
 from polysight_simulators.stage.motion import TICK_HZ
 from polysight_simulators.stage.python_stage import PythonStage, Rig
 
-# Boot loader of the board (chosen), and longest waits for bytes between two advances, all wall time.
+# All times of this file are wall time.
+# Time that the board's boot loader takes after a reset; chosen.
 BOOT_MS = 200
+# Longest wait for bytes before the simulated time advances, while the stage steps and while it rests.
 STEP_POLL_MS = 2
 REST_POLL_MS = 20
-# inotify(7)
+# Masks of inotify(7): closed after writing or after reading; opened.
 _IN_CLOSE = 0x08 | 0x10
 _IN_OPEN = 0x20
+# Its event without a file name: watch descriptor, mask, cookie, length of the name.
 _EVENT = struct.Struct("iIII")
-# Longest single advance while the stage steps, wall time; chosen. A process that gets no CPU time for longer slows the
-# simulated world down, instead of making the steps of all that time together.
-LONGEST_LEAP_NS = 20 * NS_PER_MS
+# Longest time by which a stepping stage advances together; chosen. If this process gets no CPU time for longer, the
+# simulated world is late, instead of making all the missed steps together.
+LONGEST_ADVANCE_NS = 20 * NS_PER_MS
 
 
 class SerialPort:
@@ -74,7 +79,7 @@ class SerialPort:
 
     @property
     def is_open(self) -> bool:
-        """True if a client held the port open at the last call of :meth:`was_opened`."""
+        """True if the port was open at the last call of :meth:`was_opened`."""
         return self._clients > 0
 
     def wait(self, timeout_ms: int) -> None:
@@ -86,7 +91,7 @@ class SerialPort:
         poll.poll(timeout_ms)
 
     def was_opened(self) -> bool:
-        """Take note of opening and closing. True when DTR rose, which resets an UNO, however shortly it had been low.
+        """Take note of opening and closing; True if DTR rose since the last call, which resets an UNO.
 
         The kernel raises DTR when a serial port is opened, and lowers it at the last close unless HUPCL was taken away.
         """
@@ -95,7 +100,7 @@ class SerialPort:
         except BlockingIOError:
             return False
         rose = False
-        # A watch on one file: no names follow.
+        # The watch is on one file, not on a folder: no event is followed by a file name.
         for _, mask, _, _ in _EVENT.iter_unpack(events):
             if mask & _IN_OPEN:
                 rose |= not self._dtr
@@ -103,7 +108,9 @@ class SerialPort:
                 self._clients += 1
             if mask & _IN_CLOSE:
                 self._clients -= 1
-                self._dtr = self._clients > 0 or not termios.tcgetattr(self._master)[2] & termios.HUPCL
+                control_flags = termios.tcgetattr(self._master)[2]
+                drops_at_close = bool(control_flags & termios.HUPCL)
+                self._dtr = self._clients > 0 or not drops_at_close
         return rose
 
     def read(self) -> bytes:
@@ -139,40 +146,42 @@ def serve(
     stage: PythonStage, port: SerialPort, wires: WireClient | None, time_scale: float, boot_ms: int, stop: Signal
 ) -> None:
     """Run the stage behind its port until `stop` is set. Raises DeviceError when the wires break."""
-    started = time.monotonic_ns()
-    advanced_to = started
+    started_ns = time.monotonic_ns()
+    advanced_to_ns = started_ns
     ticks = 0.0
-    boot_ends = 0
-    running = False
+    boot_ends_ns = 0
+    is_booted = False
     while not stop.is_set():
         port.wait(STEP_POLL_MS if stage.stepping else REST_POLL_MS)
-        now = time.monotonic_ns()
+        now_ns = time.monotonic_ns()
         if stage.stepping:
-            leap = min(now - advanced_to, LONGEST_LEAP_NS)
+            elapsed_ns = min(now_ns - advanced_to_ns, LONGEST_ADVANCE_NS)
         else:
-            leap = now - advanced_to
-        advanced_to = now
-        ticks += leap * time_scale * TICK_HZ * 1e-9
-        now_ms = (now - started) // NS_PER_MS
+            elapsed_ns = now_ns - advanced_to_ns
+        advanced_to_ns = now_ns
+        ticks += elapsed_ns * time_scale * TICK_HZ * 1e-9
+        now_ms = (now_ns - started_ns) // NS_PER_MS
         # Opening the port resets the board; its boot loader ignores bytes until it ends.
         if port.was_opened():
-            boot_ends = now + boot_ms * NS_PER_MS
-            running = False
+            boot_ends_ns = now_ns + boot_ms * NS_PER_MS
+            is_booted = False
         is_open = port.is_open
 
-        # At rest the time advances before bytes are read, so that motion begins now. While the stage steps they are
-        # read first: otherwise a late process would find a host silent whose bytes wait.
+        # A resting stage advances before it reads its bytes: a motion that they order begins at the present time. A
+        # stepping stage reads first: it stops if its host is silent for too long, and if this process was late, bytes
+        # of the host are waiting.
         if not stage.stepping:
             stage.advance(int(ticks), now_ms)
-        if is_open and not running and now >= boot_ends:
+        if is_open and not is_booted and now_ns >= boot_ends_ns:
             port.flush()
             stage.reset(now_ms)
-            running = True
-        elif is_open and running:
+            is_booted = True
+        elif is_open and is_booted:
             stage.receive(port.read())
         if stage.stepping:
             stage.advance(int(ticks), now_ms)
 
+        # `stage.wires` holds the messages since the last round, `wires` is the connection to the hub that gets them.
         if wires is not None and stage.wires:
             wires.send(*stage.wires)
         stage.wires.clear()
@@ -196,7 +205,9 @@ def parser() -> argparse.ArgumentParser:
     argument_parser.add_argument(
         "--time-scale", type=float, default=1.0, metavar="X", help="motion runs X times the wall clock"
     )
-    argument_parser.add_argument("--boot-ms", type=int, default=BOOT_MS, metavar="N", help="reset to banner, wall time")
+    argument_parser.add_argument(
+        "--boot-ms", type=int, default=BOOT_MS, metavar="N", help="wall time from a reset to the board's banner"
+    )
     argument_parser.add_argument(
         "--python", action="store_true", help="the Python stand-in, even where a C++ compiler exists"
     )

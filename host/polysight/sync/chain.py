@@ -43,7 +43,7 @@ from polysight.sync.rx_order import find_rx_order
 from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.errors import DataError, ErrorCode
 
-# Stages of `SyncedRow.errors`, and of what each one's errors are.
+# Stages of `SyncedRow.errors`, and the signal whose errors are measured after each.
 STAGES = {
     "received": "one chirp as received",
     "aligned": "one chirp after burst alignment",
@@ -311,18 +311,20 @@ def errors(
     chirp_errors = np.array([*aligned.error[examined].swapaxes(0, 1)[:, good], amplitude_error[good]])
 
     positions_with_several_chirps = examined[good.sum(axis=1) > 1]
+    object_errors = np.zeros((3, 0))
     # A dead RX has no direct path: its figures are not finite.
     with np.errstate(divide="ignore", invalid="ignore"):
-        out = {
-            "received": received,
-            "aligned": chirp_errors,
-            "averaged": _estimate_direct_path_errors(referenced.samples[:, examined], path),
-            "referenced": _estimate_object_errors(
-                _reference_halves(aligned, referenced, positions_with_several_chirps), path
-            )
-            if positions_with_several_chirps.size
-            else np.zeros((3, 0)),
-        }
+        direct_path_errors = _estimate_direct_path_errors(referenced.samples[:, examined], path)
+        if positions_with_several_chirps.size:
+            halves = _reference_halves(aligned, referenced, positions_with_several_chirps)
+            object_errors = _estimate_object_errors(halves, path)
+    out = {
+        "received": received,
+        "aligned": chirp_errors,
+        "averaged": direct_path_errors,
+        "referenced": object_errors,
+    }
+    # From cycles per sample to Hz.
     for values in out.values():
         values[0] *= sample_rate_hz
     return out

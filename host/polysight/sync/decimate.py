@@ -57,8 +57,8 @@ class Decimator(NamedTuple):
     taps
         float32 [3, TAPS]: of the first block, of inner ones, of the last block; 0 for samples beyond the ends.
     flat
-        float32 [FLAT, FLAT]: of the first four blocks, over blocks 0 to 8; of inner ones, over their neighbours; of the
-        last four blocks, over the last nine.
+        float32 [output, FLATTENED_BLOCKS]: for the first four blocks, taps over blocks 0 to 8; for an inner block, over
+        it and four on either side; for the last four blocks, over the last nine.
     noise
         Noise power of a sample after both filters, relative to a sample before.
     """

@@ -20,20 +20,23 @@ from polysight_shared.config import Board, Chirp, Instrument
 from polysight_shared.geometry import Vector, rx_positions_m, specular_midpoint_m, tx_position_m
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Standard deviation in x and y of the echoes' origin, around the mirror point; chosen.
+# Standard deviation in x and y of the places that echoes come from, around the mirror point (the specular point between
+# TX and RX on the object plane); chosen.
 _SPREAD_M = 0.1
 # Relative gain and phase differences of the RX that the nulls tolerate; chosen.
 _GAIN_SPREAD = 0.3
 # Noise power of a sample relative to an echo as strong as the direct path; chosen.
 _NOISE_POWER = 1e-2
-# Clutter behind the object: largest excess path, and its total power relative to the direct path. With this power in R
-# the estimate holds a sixth of the clutter's power that it holds without it, and 0.5 % more noise.
+# Clutter behind the object: largest excess path, and its total power relative to the direct path. With this power in
+# the covariance R, the estimate contains a sixth of the clutter's power that it otherwise does, and 0.5 % more noise.
 _CLUTTER_M = 1.5
 _CLUTTER_POWER = 4e-3
 
 
 class DirectPath(NamedTuple):
     """Steering and estimators for a board's direct path, from geometry alone; fixed for a scan.
+
+    After steering and mixing down, the direct path is A exp(j w t) at all RX, t in samples from the middle.
 
     Attributes
     ----------
@@ -42,7 +45,7 @@ class DirectPath(NamedTuple):
     folded_steering
         complex64 [rx, block]: steering at the middle of each block of `FOLD` linear samples.
     estimator
-        complex128 [2, rx * block]: rows give A and A w (w in radians per sample) of the steered samples at w near 0.
+        complex128 [2, rx * block]: its rows times the steered samples give A and A w (w in radians per sample, near 0).
     drift_estimator
         complex128 [3, rx * block]: A, A w and A q, q the drift in radians per sample squared.
     half_estimators
@@ -75,7 +78,7 @@ class DirectPath(NamedTuple):
         return _prepare(*self.geometry, tuple(np.flatnonzero(dead).tolist()))
 
     def reorder_rx(self, order: Sequence[int]) -> DirectPath:
-        """Return them for another order of the RX: recorded RX k is the one at place `order[k]`, counted from 0."""
+        """Return the same for another order of the RX: recorded RX k is that at place `order[k]`, counted from 0."""
         places = list(order)
         blocks = self.folded_steering.shape[1]
 
@@ -114,6 +117,11 @@ def prepare(rig: Instrument, board: Board) -> DirectPath:
 def _prepare(
     chirp: Chirp, tx_m: Vector, rx_m: tuple[Vector, ...], specular_m: Vector, dead: tuple[int, ...] = ()
 ) -> DirectPath:
+    """Return what :func:`prepare` does, without the `dead` RX (indices).
+
+    The covariance R [rx * block, rx * block] of all but the direct path is a sum of three: echoes from places around
+    the mirror point, clutter behind the object, and noise.
+    """
     tx = np.array(tx_m)
     is_live = ~np.isin(np.arange(len(rx_m)), dead)
     rx = np.array(rx_m)[is_live]
@@ -121,7 +129,7 @@ def _prepare(
     middles = block_frequencies_hz(chirp)
     direct = np.linalg.norm(rx - tx, axis=-1)
     lag_s = (direct - direct[0])[:, None] / SPEED_OF_LIGHT_M_S
-    # Echoes in the steered, demodulated samples: a tone at the excess path, with the object's phases at the RX.
+    # Echoes in the steered samples, exp(j 2 pi f excess / c): [point, rx, block].
     grid = np.linspace(-3, 3, 25) * _SPREAD_M
     dx, dy = (m.ravel() for m in np.meshgrid(grid, grid))
     amplitude = np.sqrt(np.exp(-(dx**2 + dy**2) / (2 * _SPREAD_M**2)))

@@ -50,23 +50,24 @@ from polysight_shared.config import Chirp
 
 # Burst alignment: reference chirps tried per position; chosen.
 _REFERENCES = 4
-# A good chirp has at least this part of the coherence of the position's median chirp; chosen.
+# A chirp is averaged if its coherence is at least this part of the median over the chirps of its position; chosen.
 _GOOD_COHERENCE = 0.5
-# A chirp is disturbed if, in one of its parts, the energy that the sum of the others does not explain is this many
-# times the usual (chosen); noise reaches twice the usual.
+# A chirp is disturbed if, in one of its eight parts, the energy that the sum of the others does not explain is this
+# many times the usual of the burst (chosen); noise reaches twice the usual.
 _UNEXPLAINED_RATIO = 8.0
 # Unexplained share of a part's energy that is never a disturbance: -30 dB, above the effect of 0.1 bins of frequency.
 _NEGLIGIBLE_SHARE = 1e-3
 # Times that a burst is aligned, each without the chirps found disturbed before; chosen.
 _ROUNDS = 4
-# Clipping below full scale: smallest magnitude of the limit, and one in so many words of a chirp at it; chosen.
+# An amplifier may clip below full scale: smallest magnitude at which it is taken to do so; chosen.
 _LEAST_LIMIT = 1024
+# It clips a chirp if more than one in so many of the chirp's words lie at the largest magnitude of the burst; chosen.
 _AT_LIMIT = 32
 
 # Gauss-Newton steps to the direct path's frequency. In noise the last one stays large: no direct path is found.
 _STEPS = 3
-# If the strongest peak has a second one of this relative amplitude (chosen) below it, nearer by the object's distance
-# from the direct path (10 % less to 10 % more), then the second is the direct path.
+# The strongest peak is that of the object, and a second one below it that of the direct path, if they are as far apart
+# as the geometry says (within 10 %) and the second has at least this relative amplitude; chosen.
 _COMPARABLE_AMPLITUDE = 0.35
 # Smallest amplitude of a direct path, relative to the row's median; chosen.
 _LEAST_AMPLITUDE = 0.3
@@ -75,11 +76,11 @@ _OUTLIER_STDS = 5.0
 # Smallest power of a direct path relative to the noise; noise reaches 12 once in 100,000 positions.
 _LEAST_SNR = 30.0
 
-# An RX is dead if its power is this part (-23 dB, chosen) of the strongest one's, without its noise.
+# An RX is dead if its power without noise is less than this part (-23 dB, chosen) of that of the strongest RX.
 _DEAD_SHARE = 0.005
-# The strongest RX says nothing about others if a smaller part of its power is signal, and not noise; chosen.
+# No RX is called dead where a smaller part of the strongest one's power is signal, and the rest noise; chosen.
 _LEAST_SIGNAL_SHARE = 0.5
-# About this number of positions is judged together; chosen.
+# Neighbouring positions whose powers are summed to find dead RX; chosen.
 JUDGED_POSITIONS = 4
 # The same number for signals without the direct path: the echoes of several plates cancel at single positions.
 JUDGED_ECHOES = 16
@@ -267,8 +268,9 @@ def _align(
 def find_clipped(words: NDArray[np.int16], valid: NDArray[np.bool_], full_scale: int) -> NDArray[np.bool_]:
     """Return which of the received chirps [position, chirp] were clipped by the receiver.
 
-    They reach full scale, or one in `_AT_LIMIT` of their words lies within 1/2048 of the burst's largest magnitude
-    below full scale: an amplifier saturates earlier. A tone has 2 % of its words there, fewer with noise or an echo.
+    A clipped chirp reaches full scale; or, if an amplifier saturates earlier, more than one in `_AT_LIMIT` of its words
+    lie within 1/2048 of the burst's largest magnitude. An unclipped tone has 2 % of its words there, fewer with noise
+    or an echo.
     """
     magnitude: NDArray[np.int32] = np.abs(words.reshape(*words.shape[:2], -1).astype(np.int32))
     peak = magnitude.max(axis=-1)
@@ -326,25 +328,24 @@ def _align_round(
 
 
 def _find_disturbed(
-    left: NDArray[np.float64], level: NDArray[np.float64], usable: NDArray[np.bool_]
+    unexplained: NDArray[np.float64], level: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return the chirps [position, chirp] with a part that the others explain badly, as with interference.
+    """Return the chirps [position, chirp] with a part that the sum of the others does not explain: interference.
 
-    `left` [position, chirp, part] is the energy that the others' sum does not explain, `level` [position, part] that of
-    the average. `left` is compared with its median over the chirps, and with the smallest of the two chirps on either
-    side, for the stage's motion raises it in neighbouring chirps alike. With fewer than four chirps none is disturbed.
+    `unexplained` [position, chirp, part] is the energy that the sum of the others does not explain, `level` [position,
+    part] the energy of the average. The usual unexplained energy is the larger of two: its median over the chirps, and
+    the smallest of the two chirps on either side, as the stage's motion raises it in neighbouring chirps alike. With
+    fewer than four chirps none is disturbed.
     """
-    median = _take_lower_median(left, usable[..., None])[:, None]
-    padded = np.pad(np.where(usable[..., None], left, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
-    chirps = left.shape[1]
+    median = _take_lower_median(unexplained, usable[..., None])[:, None]
+    padded = np.pad(np.where(usable[..., None], unexplained, np.inf), ((0, 0), (2, 2), (0, 0)), constant_values=np.inf)
+    chirps = unexplained.shape[1]
+    # Chirps -2, -1, +1 and +2 from each.
     neighbour = np.minimum.reduce([padded[:, k : k + chirps] for k in (0, 1, 3, 4)])
-    usual_level = np.maximum(median, np.where(np.isfinite(neighbour), neighbour, 0.0))
-    enough = usable.sum(axis=1) >= 4
-    return (
-        usable
-        & enough[:, None]
-        & (left > _UNEXPLAINED_RATIO * usual_level + _NEGLIGIBLE_SHARE * level[:, None]).any(axis=2)
-    )
+    usual = np.maximum(median, np.where(np.isfinite(neighbour), neighbour, 0.0))
+    limit = _UNEXPLAINED_RATIO * usual + _NEGLIGIBLE_SHARE * level[:, None]
+    has_enough_chirps = usable.sum(axis=1) >= 4
+    return usable & has_enough_chirps[:, None] & (unexplained > limit).any(axis=2)
 
 
 def _take_lower_median(values: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -560,7 +561,7 @@ def reference(aligned: AlignedRow, path: DirectPath, chirp: Chirp, by: Loops | N
         estimator=complex64(path.drift_estimator),
         steps=_STEPS,
     )
-    # From the median bin, for tones fill few bins; the median power of noise is ln 2 of its mean.
+    # Noise power, from the median bin, as tones fill few bins; the median power of noise is ln 2 of its mean.
     floor = first.median**2 / np.log(2) / (search_window(n) ** 2).sum()
     drifts = _divide(first.estimate[:, 2], first.estimate[:, 0])[usable]
     drift = _find_middle(drifts) if usable.any() else 0.0
@@ -613,8 +614,8 @@ def find_dead_rx(
     """Find the RX that receive noise or nothing in some part of a row while another one receives a signal, bool [rx].
 
     `signal` and `again` [rx, position, sample] hold the same signals, up to a phase of each position, with independent
-    noise. The power of an RX without its noise is the part of their product that is in phase in all RX. Any `judged`
-    neighbouring positions are judged together.
+    noise. The power of an RX without its noise is the part of their product that is in phase in all RX. Powers are
+    summed over each `judged` neighbouring positions.
     """
     product = np.vecdot(signal, again)
     total = product.sum(axis=0)

@@ -65,7 +65,7 @@ def test_images_and_samples_are_those_of_numpy(aperture, library, make_imager):
     weights = rng.uniform(size=aperture.shape[2:]).astype(np.float32)
     numpy_imager = make_imager(aperture)
     if make_imager is DirectImager:
-        # It computes on the library of its samples.
+        # The direct imager computes on the library of its samples.
         imager = make_imager(aperture)
     else:
         imager = make_imager(aperture, xp=xp, device=device)

@@ -24,7 +24,8 @@ RIG = load_published_rig()
 
 def test_focus_of_a_too_narrow_scan_writes_figure_and_numbers_that_are_not_certain(tmp_path, capsys):
     simulate(RIG, decode_scene(SCENE, "t"), tmp_path / "scan")
-    assert main(["focus", str(tmp_path / "scan"), "--out", str(tmp_path / "focus"), "--depth", "6"]) == 0
+    exit_status = main(["focus", str(tmp_path / "scan"), "--out", str(tmp_path / "focus"), "--depth", "6"])
+    assert exit_status == 0
     assert "object_distance_mm = " in capsys.readouterr().out
     focus = json.loads((tmp_path / "focus" / "focus.json").read_text())
     assert focus["simulated"]
@@ -60,10 +61,11 @@ def test_x_and_y_are_the_rigs_for_scans_by_rows_and_by_columns(tmp_path, capsys,
 
     monkeypatch.setattr(offline, "focus_sweep", lambda *_, **__: sweep_result)
     monkeypatch.setattr(report, "draw_focus_figure", record_figure)
-    assert main(["focus", str(data), "--out", str(tmp_path / "focus")]) == 0
+    exit_status = main(["focus", str(data), "--out", str(tmp_path / "focus")])
+    assert exit_status == 0
     output = capsys.readouterr().out
-    # The tilt along x is printed before that along y.
-    assert 0 < output.index("+2.00") < output.index("-1.00")
+    # The tilt along x (2 degrees) is printed before that along y (-1).
+    assert output.index("+2.00") < output.index("-1.00")
     focus = json.loads((tmp_path / "focus" / "focus.json").read_text())
     assert tuple(focus["tilt_deg"]) == tilt_deg
     ((sweep, *pictures, x_m, y_m, _),) = figures
@@ -72,5 +74,5 @@ def test_x_and_y_are_the_rigs_for_scans_by_rows_and_by_columns(tmp_path, capsys,
     for picture in pictures:
         row, column = np.unravel_index(np.argmax(np.abs(picture)), (20, 24))
         brightest_mm = 1e3 * np.array([x_m[column] - x_m.mean(), y_m[row] - y_m.mean()])
-        # Two pixels of 3 mm
-        np.testing.assert_allclose(brightest_mm, point_mm, atol=6.0)
+        # If x and y were exchanged the point would be 24 mm off in both. The limit is two pixels of 3 mm.
+        np.testing.assert_allclose(brightest_mm, point_mm, atol=2 * 3.0)

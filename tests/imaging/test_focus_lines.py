@@ -1,4 +1,6 @@
-"""What `polysight focus` prints of the plane by the plates and by sharpness."""
+"""The text that `polysight focus` prints about the plane through the flat plates and about the sharpest plane."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,6 +8,9 @@ import pytest
 from polysight.imaging import Focus
 from polysight.imaging.plane import PlaneEstimate
 from polysight.jobs.process import _format_focus
+
+# Object distance of the rig file
+DISTANCE_MM = 700.0
 
 PLATES = PlaneEstimate(
     offset_m=1.2e-3, offset_std_m=0.35e-3, tilt_rad=(0.01, -0.02), tilt_std_rad=(0.001, 0.002),
@@ -17,8 +22,8 @@ SHARPEST = Focus(
 )  # fmt: skip
 
 
-def test_the_plane_by_the_plates_and_the_sharpest_one_are_printed_in_mm_and_degrees():
-    text = "\n".join(_format_focus("s7", 700.0, SHARPEST, PLATES))
+def test_the_plane_through_the_plates_and_the_sharpest_one_are_printed_in_mm_and_degrees():
+    text = "\n".join(_format_focus("s7", DISTANCE_MM, SHARPEST, PLATES))
     assert "4 flat plates lie +1.20 +- 0.35 mm" in text
     assert "by the range of their echoes: object_distance_mm = 701.20" in text
     assert "tilt: +0.57 +- 0.06 degrees along x, -1.15 +- 0.11 along y" in text
@@ -27,7 +32,8 @@ def test_the_plane_by_the_plates_and_the_sharpest_one_are_printed_in_mm_and_degr
 
 
 @pytest.mark.parametrize("by_phase", [False, True])
-def test_the_method_is_that_of_the_plates(by_phase):
-    plates = PlaneEstimate(**{**vars(PLATES), "by_phase": by_phase})
-    text = "\n".join(_format_focus("s7", 700.0, SHARPEST, plates))
-    assert ("by the phase of their echoes" in text, "by the range of their echoes" in text) == (by_phase, not by_phase)
+def test_the_text_says_whether_the_plane_through_the_plates_is_by_phase_or_by_range(by_phase):
+    plates = replace(PLATES, by_phase=by_phase)
+    text = "\n".join(_format_focus("s7", DISTANCE_MM, SHARPEST, plates))
+    assert ("by the phase of their echoes" in text) == by_phase
+    assert ("by the range of their echoes" in text) != by_phase

@@ -62,6 +62,7 @@ def test_a_point_on_a_pixel_has_its_phase_and_amplitude_in_both_channels(make_ri
     point = np.array([grid.x_m[25], grid.y_m[14], grid.z_m + behind_m])
     amplitude = 0.8 * np.exp(1j)
     images = _build(rig, lambda b: points_rows(rig, b, [point], [amplitude])).finish(behind_m)
+    # A percent; errors of up to 6e-5 are measured.
     for raw in (images.h_raw, images.v_raw):
         assert abs(raw[14, 25] / amplitude - 1) < 0.01
 
@@ -122,6 +123,7 @@ def test_a_uniform_plane_is_flat_after_division_with_missing_positions(make_rig,
     random_holes = {(int(row), int(i)) for row, i in np.random.default_rng(0).integers(0, 31, (60, 2))}
     holes = random_holes | {(5, i) for i in range(37)}
     images = _build(rig, lambda b: plane_rows(rig, b, 0.5j, holes), taper=taper).finish()
+    # Nearly the whole image is compared.
     assert images.valid.mean() > 0.9
     for flat, raw in ((images.h, images.h_raw), (images.v, images.v_raw)):
         # Samples are conjugates of waves, images are not.
@@ -145,7 +147,7 @@ def test_the_image_of_a_sheet_has_its_reflection_coefficient(make_rig, plane_row
     images = _build(rig, lambda b: plane_rows(rig, b, reflect_sheet(sweep_hz).conj())).finish()
     spectrum = Spectrum.from_chirp(chirp)
     mean_r_s = (reflect_sheet(spectrum.frequency_hz[0]) * spectrum.weight[0]).sum()
-    # Large enough to detect a wrong sign
+    # A wrong sign would change the imaginary part by 0.27, which is far more than 2 % of the amplitude (0.47).
     assert abs(mean_r_s.imag) > 0.1
     for flat in (images.h, images.v):
         np.testing.assert_allclose(flat[images.valid], mean_r_s, atol=0.02 * abs(mean_r_s))
@@ -154,7 +156,7 @@ def test_the_image_of_a_sheet_has_its_reflection_coefficient(make_rig, plane_row
 def test_receiver_gains_are_measured_on_the_direct_path_and_removed(make_rig, points_rows):
     rig = make_rig()
     point = np.array(specular_midpoint_m(rig, rig.receivers[0]))
-    # Gains in units of the converter: 800 and differences between the RX; any would do.
+    # Arbitrary gains, in units of the converter: 800 and differences between the RX
     gains = np.array([1.0, 0.8 * np.exp(0.4j), 1.3 * np.exp(-0.3j), 0.9]) * 800
     equal_gains = _build(rig, lambda b: points_rows(rig, b, [point], [0.7])).finish()
     builder = _build(rig, lambda b: points_rows(rig, b, [point], [0.7], gains=gains))
@@ -231,13 +233,13 @@ def test_random_offsets_of_every_chirp_do_not_change_the_image(make_rig, points_
 
     images = _build(rig, disturb).finish()
     for image, ideal_image in ((images.h_raw, ideal.h_raw), (images.v_raw, ideal.v_raw)):
-        # 1 for equal images; the limit is chosen, for the noise.
+        # The correlation is 1 for equal images. The noise leaves 0.998 (measured).
         correlation = abs(np.vdot(image, ideal_image)) / np.linalg.norm(image) / np.linalg.norm(ideal_image)
         assert correlation > 0.98
 
 
 @pytest.mark.parametrize("change", [0.0, 0.2 - 0.3j])
-def test_the_change_of_a_plane_over_the_sweep_is_what_its_reflectivity_changes(make_rig, synced_row, change):
+def test_the_dispersion_of_a_plane_is_the_change_of_its_reflectivity_over_the_sweep(make_rig, synced_row, change):
     """A mirror whose reflectivity grows as 1 + change (f - middle) / sweep; the sweep is that of the linear part."""
     rig = make_rig(columns=31, rows=21, step_x=8.0, step_y=8.0, pixels=(12, 10))
     chirp = rig.chirp
@@ -257,7 +259,7 @@ def test_the_change_of_a_plane_over_the_sweep_is_what_its_reflectivity_changes(m
     dispersion = builder.form_dispersion()
     valid = builder.finish().valid
     for channel in (dispersion.h, dispersion.v):
-        # The window leaves a little of the direct path.
+        # The window leaves a little of the direct path: 3e-4 is measured.
         np.testing.assert_allclose(channel[valid], change, atol=0.02)
     ends = chirp.first_sample_hz + chirp.hz_per_sample * np.array([first, last])
     np.testing.assert_allclose(dispersion.band_hz, ends)
@@ -324,6 +326,7 @@ def test_measured_offsets_of_rows_improve_the_focus(make_rig, points_rows):
     peak = np.abs(ideal_image).max()
     error_known = np.abs(with_true_offsets.finish().h_raw - ideal_image).max() / peak
     error_ignored = np.abs(with_planned_offsets.finish().h_raw - ideal_image).max() / peak
+    # Measured: 0.4 % of the peak with the true offsets, 4.4 % with the planned ones
     assert error_known < 0.01
     assert error_ignored > 10 * error_known
 
@@ -344,6 +347,7 @@ def test_jittered_positions_are_imaged_exactly_with_a_notice(make_rig, points_ro
         planned_xyz_m = np.pad(planned_xy_m, ((0, 0), (0, 1)))
         with_true_offsets.add_row(board.name, index, row, planned_xyz_m + jitter_m[index])
     images = with_true_offsets.finish()
+    # Measured: 1.0001 with the true offsets, 0.88 with the planned ones, since the samples do not add up in phase
     assert abs(images.h_raw[4, 4] - 1) < 0.01
     assert abs(with_planned_offsets.finish().h_raw[4, 4]) < 0.95
     assert images.notices
@@ -395,6 +399,7 @@ def test_points_anywhere_are_found_within_a_tenth_of_a_pixel_and_their_phase_wit
             fine_grid = replace(grid, x_m=point[0] + fine_m, y_m=point[1] + fine_m, pixel_m=2e-4)
             image, _, _ = samples.image(fine_grid)
             x, y = _find_peak(image, fine_grid.x_m, fine_grid.y_m)
+            # Errors of up to 1e-7 m and 2e-5 rad are measured.
             assert np.hypot(x - point[0], y - point[1]) < 0.1 * grid.pixel_m
             assert abs(np.angle(image[8, 8] / amplitude)) < 0.05
 
@@ -476,14 +481,14 @@ def test_images_are_formed_again_on_a_plane_that_is_off_and_within_reach(monkeyp
 
 
 class PlatesOfOneReceiver:
-    """What the plane estimate asks of a receiver (`BoardSamples`), for plates at given heights.
+    """Replaces `BoardSamples`, the samples of a receiver, in the plane estimate; for plates at given heights.
 
     The slope of an image is its change with range. That of a plate is the slope at its height, alternating by the
     standard deviation up and down from pixel to pixel. `turns_rad`: phase of a plate's pixels, alternating in sign.
     A mirror on the plane has the image 1 and the slope 0; metal reflects with the factor -1.
     """
 
-    # Change of the relative slope of an echo per metre of its height, 1 / m^2; any value would do.
+    # Change of the relative slope of an echo per metre of its height, 1 / m^2; arbitrary
     SLOPE_PER_M = 40.0
 
     # Change of the phase of an echo with its height, radians per metre.
@@ -562,16 +567,13 @@ RANDOM_HEIGHTS_M = np.random.default_rng(3).uniform(0, 6e-3, (40, 10))
 
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.03])
 def test_plates_of_any_heights_are_on_a_plane_that_is_tilted_as_the_plates_are(monkeypatch, tilt_rad):
-    """Level plates of several thicknesses seemed to lie on a plane tilted by up to 2.8 degrees without their own tilts.
-
-    Their heights alone fit some tilted plane. The limits are chosen between the errors with and without the own tilts.
-    """
+    """The heights of level plates of several thicknesses fit a tilted plane. Their own tilts show that it is level."""
     monkeypatch.setattr(plane, "_fit_plane_by_phase", lambda *_: None)
     masks, grid = make_masks(5)
     x_m = np.array([grid.x_m[mask.any(axis=0)].mean() for mask in masks])
     truth_rad = (np.arctan(tilt_rad), 0.0)
     errors_deg = {}
-    # A rise of exactly 0 would be one that is not known.
+    # A rise of exactly 0 means that it is not known.
     seen_rises = [(tilt_rad + 1e-6, 1e-6)] * len(masks)
     for name, own_rises in (("seen", seen_rises), ("unseen", [])):
         tilts_rad = []
@@ -580,15 +582,19 @@ def test_plates_of_any_heights_are_on_a_plane_that_is_tilted_as_the_plates_are(m
             builder = SimpleNamespace(grid=grid, boards={"RH": board})
             tilts_rad.append(plane.find_plane(builder, masks, own_rises).tilt_rad)
         errors_deg[name] = np.sqrt(np.mean(np.degrees(np.array(tilts_rad) - truth_rad) ** 2))
+    # Measured: 0.3 degrees with the plates' own tilts, 1.3 degrees without
     assert errors_deg["seen"] < 0.4
     assert errors_deg["unseen"] > 0.6
 
 
 def test_tilts_of_few_or_differing_plates_determine_the_planes_tilt_poorly():
     prior_of_equal_tilts = plane.TiltPrior.from_plates([(0.01, 0.0), (0.01, 0.0), (0.01, 0.0)])
+    # The prior without plates, 0, draws the mean 6 % towards it.
     assert prior_of_equal_tilts.mean[0] == pytest.approx(0.01, rel=0.1)
     # Their tilt along y is not known.
-    assert (prior_of_equal_tilts.mean[1], prior_of_equal_tilts.std[1]) == (0.0, plane.TiltPrior.from_plates([]).std[1])
+    prior_without_plates = plane.TiltPrior.from_plates([])
+    assert prior_of_equal_tilts.mean[1] == 0.0
+    assert prior_of_equal_tilts.std[1] == prior_without_plates.std[1]
     # Two plates are too few: their scatter is not known.
     prior_of_two = plane.TiltPrior.from_plates([(0.01, 0.01), (0.01, 0.01)])
     assert (prior_of_two.mean == 0).all()

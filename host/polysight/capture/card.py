@@ -38,9 +38,9 @@ from polysight_shared.config import Board, Card, Instrument
 from polysight_shared.errors import ConfigError, DeviceError, ErrorCode, ProtocolError
 from polysight_shared.findings import Finding
 
-# Times that a command is sent before the card counts as silent (chosen); they share the timeout.
+# Number of times that a command is sent before the card counts as silent (chosen); all together have one timeout.
 ATTEMPTS = 3
-# Time to wait for a second answer to a request: a second card answers as soon as the first (chosen).
+# Time to wait for a second answer to one request, which a second card with this address would send (chosen).
 _TWIN_S = 0.05
 # Datagrams that may wait in the command socket when the time is over: Linux's usual 212,992 bytes hold 280 short ones.
 SOCKET_DATAGRAMS = 1000
@@ -423,7 +423,7 @@ HOPS = ("host", "route", "link", "card", "receiver", "buffer", "radar")
 """The host's address and ports, the interface, its cable, the card; then the receiver process, its buffer, data."""
 # Remedy in the note on a radar whose data was not recorded.
 PULSES_REMEDY = "`polysight doctor`: it sends pulses with the stage at rest, and reports each one"
-# The hops of a silent card that are not the card itself.
+# Names in `HOPS` of the hops before a silent card that may be the cause.
 _FAULTY_HOP = {Hop.ROUTE: "route", Hop.LINK: "link"}
 # Time between two queries for data of a radar (chosen).
 _POLL_S = 0.05

@@ -46,13 +46,14 @@ _PCAP_HEADS = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"
 _UDP_HEADER_BYTES = 8
 # Largest capture file: 18 minutes of three boards at the published scan's pace, 22.9 MB a row of 17.5 s and board.
 _MAX_PCAP_BYTES = 4 << 30
-# Longest record that byte counts are believed to be of: more than seven hundred rows of the published scan.
+# Longest record of a capture: more than seven hundred rows of the published scan. Byte counts that span more are not
+# those of one record.
 _MAX_RECORD_BYTES = 1 << 34
-# Chosen: a peak over the median of the range profile that noise does not have, a constant offset that the radar's
-# high-pass filter does not let through, and the share of the loudest antenna's level below which one counts as off
-# (-23 dB, as in synchronisation).
+# Height of a peak over the median of the range profile that noise does not reach; chosen.
 _CLEAR_PEAK_DB = 10.0
+# Constant offset, in counts, that the radar's high-pass filter does not let through; chosen.
 _HIGH_DC = 0.05 * _FULL_SCALE
+# Level relative to the loudest antenna's below which an antenna counts as off (-23 dB, as in synchronisation); chosen.
 SILENT_SHARE = 0.07
 # First bytes of other kinds of files, and what `recognise_format` calls them.
 MAGIC = {
@@ -116,13 +117,13 @@ class CardReport:
 class Report:
     """Content of a recording.
 
-    `profile_db` is the power range profile, Hann window, mean over chirps and antennas, in dB over its median;
-    float64 [samples]; its highest bin but those of a constant offset is `peak_bin`, of `peak_db`. `rx_profile_db` is
-    that of every antenna, over the same median. `rx_rms` and `rx_dc` (constant offset) are one value per antenna, ADC
-    counts. `clipped` counts values at full scale in all of the payload, `left_over_bytes` the bytes after the last
-    complete chirp. `chirps` are those in the file, of which the first `MAX_CHIRPS` make the other statistics. `remarks`
-    are sentences on suspicious properties; `card` is None unless the file is a packet capture. `simulated` is set by
-    the caller.
+    `profile_db`, float64 [samples], is the power range profile: with a Hann window, mean over chirps and antennas, in
+    dB over its median. `peak_bin` is its highest bin, apart from those that a constant offset fills, and `peak_db` the
+    value there. `rx_profile_db`, [rx, samples], are the profiles of the antennas, in dB over the same median. `rx_rms`
+    and `rx_dc` (constant offset) are one value per antenna, in ADC counts. `clipped` counts values at full scale in all
+    of the payload, `left_over_bytes` the bytes after the last complete chirp. `chirps` is the number of chirps in the
+    file; all other statistics are those of the first `MAX_CHIRPS`. `remarks` are sentences on suspicious properties;
+    `card` is None unless the file is a packet capture. `simulated` is set by the caller.
     """
 
     path: Path
@@ -226,7 +227,8 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
             "record again; `polysight inspect` needs at least one chirp",
             code=ErrorCode.NOT_ENOUGH_DATA,
         )
-    # int16, for clipping; `cube` complex [rx, chirp, sample] and `power` [rx, bin] for all else.
+    # int16 [word] of the whole payload, for the count of clipped values. Everything else is computed from `cube`,
+    # complex [rx, chirp, sample], and `power` [rx, bin].
     words = payload[: payload.size // 2 * 2].view("<i2")
     shape = min(chirps, MAX_CHIRPS), layout.samples, layout.rx
     if layout.lanes == 4:
@@ -238,7 +240,7 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
     floor = max(float(np.median(mean)), 1e-12)
     profile = 10 * np.log10(np.maximum(mean, 1e-12) / floor)
     profile_of_rx = 10 * np.log10(np.maximum(power, 1e-12) / floor)
-    # Without the bins that a constant offset fills, on both sides of zero.
+    # A constant offset fills bin 0 and, through the Hann window, bins 1 and -1: they are left out.
     peak = 2 + int(np.argmax(profile[2:-1]))
     report = Report(
         path=path,
@@ -254,7 +256,8 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
         profile_db=profile,
         rx_profile_db=profile_of_rx,
     )
-    # Evenly spread values of 16 bits have 0.8 of full scale; a receiver with such a level clips, and has a peak.
+    # I and Q of uniformly distributed 16-bit values have an RMS of sqrt(2 / 3) = 0.8 of full scale. A receiver with
+    # such a level would clip, and have a peak.
     if report.peak_db < _CLEAR_PEAK_DB and min(report.rx_rms) > 0.5 * _FULL_SCALE:
         raise DataError(
             f"{path}: not a recording: its values fill the whole range of 16 bits, without a peak in the range profile",
@@ -269,13 +272,17 @@ def inspect_payload(path: Path, payload: NDArray[np.uint8], layout: Layout) -> R
 def is_mirrored(power: NDArray[np.float64]) -> bool:
     """True if a complex spectrum, float64 [bin], is at negative frequencies: I and Q are swapped.
 
-    TI's mode "complex 1x" has IFs up to 0.9 sample rates, so power in the upper half is not a proof, and the last
-    quarter is compared with the first: returns come from near. Three bins on either side of zero are left out. Four
-    times the power counts as mirrored (both chosen).
+    Most echoes are from near objects, so their power is in the first quarter of the bins, or if I and Q are swapped, in
+    the last one. The halves cannot be compared: TI's mode "complex 1x" has IFs up to 0.9 of the sample rate, which fill
+    the upper half, too. The spectrum counts as mirrored if the last quarter has four times the power of the first.
+    Three bins on either side of zero are left out (both numbers are chosen).
     """
-    n = power.size
-    rim = 3
-    return bool(power[n - n // 4 : n - rim].sum() > 4 * power[rim + 1 : n // 4 + 1].sum())
+    bins = power.size
+    quarter = bins // 4
+    omitted = 3
+    first_quarter = power[omitted + 1 : quarter + 1]
+    last_quarter = power[bins - quarter : bins - omitted]
+    return bool(last_quarter.sum() > 4 * first_quarter.sum())
 
 
 def _collect_remarks(report: Report, mirrored: bool) -> list[str]:

@@ -226,8 +226,9 @@ class BatchReceiver:
 
     def receive_all(self) -> Iterator[int]:
         """Fetch every packet that came before this call, in batches; yield the number in each, as :meth:`receive`."""
-        # Packets may come without end, and they come in order: after a full buffer all that waited are fetched. Their
-        # times are less certain: they are wrong after the wall clock was set, and by the error of its reading.
+        # Packets may come without end. They come in order, so that after as many bytes as the buffer holds, all that
+        # waited are fetched. The times of arrival would be a less certain criterion: they are wrong after the wall
+        # clock was set, and by the error of its reading.
         buffer_bytes = self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self.is_drained = False
         while not self.is_drained and buffer_bytes >= 0:
@@ -237,8 +238,8 @@ class BatchReceiver:
     def _read_times(self, n: int) -> NDArray[np.int64]:
         """Return the arrival times of the last `n` packets on the monotonic clock, int64 [n], ns.
 
-        The kernel gives them on the wall clock; if that clock was set since the last call, all are now. Times
-        do not decrease and do not lie in the future.
+        The kernel gives them on the wall clock. If that clock was set since the last call, all packets get the present
+        time. Times do not decrease and do not lie in the future.
         """
         differ_ns = measure_clock_difference()
         now_ns = time.monotonic_ns()

@@ -34,9 +34,9 @@ COUNTERS_AFTER_RESET = Counters(0, 1)
 """Counters of the first packet of a card that was switched on or reset."""
 # If fewer packets seem to be of another record, or of a second card, they count as damaged; chosen.
 MIN_PACKETS_OF_A_RECORD = 3
-# Packets by which the network can delay one packet at most. If a packet arrives later than that, the card restarted and
-# used the same counters twice. Chosen: far more than a switch or the kernel reorders.
-_FAR_BEHIND = 64
+# Largest number of later packets that may arrive before a packet. If more do, the card has restarted and used the same
+# counters twice. Chosen: far more than a switch or the kernel reorders.
+_MOST_OVERTAKING_PACKETS = 64
 # A size of fewer packets does not count as the size of full packets: the last packet of a record is short.
 _MIN_PACKETS_OF_A_SIZE = 3
 
@@ -115,7 +115,7 @@ class PlacedRecord:
     # Why the row is not located; "" if it is.
     reason: str
     counts: PacketCounts
-    # Missing bytes by kind; for a record that is not located, by its counters only.
+    # Missing bytes by kind, as the packets' counters show them, also for a record that is not located.
     losses: Losses
     # Knowledge for placing the next record.
     past: EarlierRecords
@@ -123,7 +123,7 @@ class PlacedRecord:
     offsets: Counts
     # int64 [n, 2]: time (host's monotonic clock, ns), and end of the furthest packet that had come by then, bytes.
     arrivals: Counts
-    # Missing or uncertain ranges before the furthest byte that came, sorted; those by counters if it is not located.
+    # Missing or uncertain ranges before the furthest byte that came, sorted, as the packets' counters show them.
     holes: list[Gap] = field(default_factory=list)
     # True if nothing but missing whole frames (missed triggers) keeps the row from being located.
     slipped: bool = False
@@ -281,7 +281,7 @@ class _Record:
 
 
 def _find_record(log: PacketLog, past: EarlierRecords, not_before_ns: int) -> _Record:
-    """Select the packets of the record that begins at `past.start`; unknown: as after a reset."""
+    """Select the packets of the record that begins at `past.start`; if that is unknown, as after a reset."""
     full_payload = find_full_payload(log)
     is_early = log.arrivals_ns < not_before_ns
     start = past.start or COUNTERS_AFTER_RESET
@@ -298,7 +298,8 @@ def _find_record(log: PacketLog, past: EarlierRecords, not_before_ns: int) -> _R
         stops = (offsets + sizes)[is_of_row]
         length = int(stops.max())
         ended = bool((sizes[is_of_row][stops == length] < full_payload).all())
-    # Counters further ahead than these (chosen: two rows of bytes, four of packets) are those of damaged headers.
+    # Counters further ahead than these limits are those of damaged headers. Chosen: two rows of bytes, and as many
+    # packets as four rows have.
     is_near = (
         (offsets < 2 * expected + 2 * full_payload)
         & (steps > 0)
@@ -381,7 +382,7 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
         return _Doubt("every packet is of another record, of a second card, or came before the first pulse")
     # A card that restarts within the row begins with its first counters again, and never counts to the row's end. If
     # the row began with them, too, the same counters come twice.
-    counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _FAR_BEHIND * record.full
+    counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _MOST_OVERTAKING_PACKETS * record.full
     counted_again = row.counts.restarted > 0 and not record.ends_as_planned
     if counted_again or (record.start == COUNTERS_AFTER_RESET and counted_twice):
         return _Doubt("the card restarted within it")
@@ -418,7 +419,9 @@ def _continue_past(record: _Record, doubt: _Doubt) -> EarlierRecords:
     is_certain = not doubt.text or doubt.frames_missing
     if not is_certain or not record.of_row.any() or record.later.any():
         return EarlierRecords()
-    return EarlierRecords(start=record.start.advance(record.length, -(-record.length // record.full)))
+    # The last packet of a record may be short: the quotient is rounded up.
+    packets = -(-record.length // record.full)
+    return EarlierRecords(start=record.start.advance(record.length, packets))
 
 
 def _count_packets(
@@ -504,16 +507,18 @@ class _Row:
         offsets = self._record.offsets[packets]
         order = np.argsort(offsets, kind="stable")
         sorted_offsets = offsets[order]
-        new = np.append(True, np.diff(sorted_offsets) != 0)[: order.size]
+        # The slice is for a row without packets.
+        is_new_place = np.append(True, np.diff(sorted_offsets) != 0)[: order.size]
         self._placed[packets] = True
         self.offsets[packets] = offsets
-        if new.all():
+        if is_new_place.all():
             return
-        # Packets i..j-1 of the order have one place.
-        firsts = np.flatnonzero(new)
-        for i, j in zip(firsts.tolist(), [*firsts[1:].tolist(), order.size], strict=True):
-            if j - i > 1:
-                self._compare_overlap(packets[order[i:j]].tolist())
+        # In this order, the packets of one place are those from `first` to before `end`.
+        firsts = np.flatnonzero(is_new_place).tolist()
+        ends = [*firsts[1:], order.size]
+        for first, end in zip(firsts, ends, strict=True):
+            if end - first > 1:
+                self._compare_overlap(packets[order[first:end]].tolist())
 
     def _compare_overlap(self, packets: list[int]) -> None:
         """Compare packets of one place, in order of arrival, with the longest so far.
@@ -573,26 +578,28 @@ class _Row:
         is_joined = (log_starts[1:] == log_starts[:-1] + sizes[:-1]) & (offsets[1:] == offsets[:-1] + sizes[:-1])
         firsts = np.flatnonzero(np.append(True, ~is_joined))
         lasts = np.append(firsts[1:] - 1, len(placed) - 1)
-        for i, j in zip(firsts.tolist(), lasts.tolist(), strict=True):
-            a = int(offsets[i])
-            b = int(stops[j])
-            out[a:b] = self._log.payload[log_starts[i] : log_starts[i] + b - a]
+        for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):
+            start = int(offsets[first])
+            stop = int(stops[last])
+            log_start = log_starts[first]
+            out[start:stop] = self._log.payload[log_start : log_start + stop - start]
 
 
 def _count_losses(missing: list[Gap], extent: int, expected: int) -> Losses:
     """Sort missing ranges into head, gaps and tail; `extent`: end of the furthest packet, 0 if none came."""
     if not extent:
         return Losses(tail_bytes=expected)
-    head = sum(b - a for a, b in missing if a == 0)
-    inner = [min(b, extent) - a for a, b in missing if 0 < a < extent]
-    return Losses(head, len(inner), sum(inner), expected - extent)
+    head = sum(stop - start for start, stop in missing if start == 0)
+    inner = [min(stop, extent) - start for start, stop in missing if 0 < start < extent]
+    return Losses(head_bytes=head, gaps=len(inner), gap_bytes=sum(inner), tail_bytes=expected - extent)
 
 
 def _find_gaps(covered: list[Gap], extent: int) -> list[Gap]:
     """Return the ranges of [0, extent) that are not covered; `covered` is sorted and joined."""
-    # Pairs of edges: the end of one covered range (first: 0) and the start of the next (last: `extent`).
-    edges = [0, *(edge for gap in covered for edge in gap), extent]
-    return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a]
+    # A gap reaches from the end of a covered range to the start of the next one.
+    starts = [0, *(stop for _, stop in covered)]
+    stops = [*(start for start, _ in covered), extent]
+    return [(start, stop) for start, stop in zip(starts, stops, strict=True) if stop > start]
 
 
 def _merge(gaps: list[Gap]) -> list[Gap]:

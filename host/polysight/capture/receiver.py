@@ -93,9 +93,9 @@ def take_priority(real_time: int = REAL_TIME) -> tuple[str, str]:
     return f"nice {NICE}", refused
 
 
-# Timeouts of the first answer, for which the process has to start, and of others: ending a row waits for the disk. Both
-# are chosen.
+# Timeout of the first answer, before which the process has to start; chosen.
 _START_TIMEOUT_S = 30.0
+# Timeout of all other answers; chosen. The answer to the end of a row waits for the disk.
 _ANSWER_TIMEOUT_S = 60.0
 
 
@@ -301,7 +301,7 @@ class ReceiverProcess(Closing):
 
     def __init__(self, board: Board, buffer_bytes: int, core: Core | None = None) -> None:
         self.board = board
-        self._progress = Progress(-1, 0, 0, False, 0)
+        self._progress = Progress(row=-1, take=0, received=0, complete=False, last_arrival_ns=0)
         host_socket, receiver_socket = socket.socketpair()
         with receiver_socket:
             self._process = subprocess.Popen(
@@ -353,7 +353,7 @@ class ReceiverProcess(Closing):
         """
         request = BeginRow(row, take, expected_bytes, frame_bytes, str(path), after_reset)
         stale = self._ask(request, Began, _ANSWER_TIMEOUT_S).stale
-        self._progress = Progress(row, take, 0, expected_bytes == 0, 0)
+        self._progress = Progress(row, take, received=0, complete=expected_bytes == 0, last_arrival_ns=0)
         return stale
 
     def poll(self) -> Progress:
@@ -370,8 +370,8 @@ class ReceiverProcess(Closing):
         """End the row; its file is durable on return. Raises DeviceError.
 
         Packets from before `not_before_ns` (monotonic clock), a time before the first pulse, count as left over from
-        before the row. With bit 7 or 9 in `card_status`, the card dropped data before numbering it, and the row is
-        masked as a whole.
+        before the row. With DDR_FULL or LVDS_BUFFER_FULL in `card_status`, the card dropped data before numbering it,
+        and the row is masked as a whole.
         """
         return self._ask(EndRow(int(card_status or 0), not_before_ns), RowCapture, _ANSWER_TIMEOUT_S)
 

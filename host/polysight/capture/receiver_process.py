@@ -1,8 +1,9 @@
 """Receiver process of one card: `python -m polysight.capture.receiver_process FD`.
 
-A separate process, so that processing in the host cannot delay reception. It waits in one poll() for requests on the
-inherited socket FD and for the card's data, and ends when the socket closes, which happens at the latest when the host
-ends. A *take* is one attempt to record a row; the record, what the card sends between start and stop, is the row's.
+It is a separate process, so that processing in the host cannot delay reception. It waits in one poll() for requests on
+the inherited socket FD and for the card's data, and ends when the socket closes, which happens at the latest when the
+host ends. A *take* is one attempt to record a row. A *record* is what the card sends between start and stop; each take
+has a record of its own.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from polysight_shared.errors import DeviceError, PolysightError
 
 # Batches fetched before requests are checked again (chosen): they hold more packets than a receive buffer of 8 MiB.
 _MAX_BATCHES = 64
-# Pause after a preview, in durations of that preview: previews take a twentieth of the time at most.
-_PREVIEW_SHARE = 20
+# Pause after a preview, in units of the time that this preview took: previews take a twentieth of the time at most.
+_PAUSE_PER_PREVIEW = 20
 # Remedy where requests came in a wrong order: that is an error of this program, not of the user.
 _RESTART_REMEDY = "start the scan again"
 # Pause after each reception in which packets gather in the kernel's buffer: fewer, larger batches (chosen).
@@ -52,7 +53,7 @@ class _Row:
         self.drops = 0
         # Time before the first pulse of the row, monotonic clock; 0 while it is unknown.
         self.not_before_ns = 0
-        # Content of the last report on the preview: whether all frames were complete, and whether the record had ended.
+        # The last notice to the host: whether all frames were complete, and whether the record had ended.
         self._reported = (False, False)
         # Number of packets at the last preview.
         self._previewed = 0
@@ -72,7 +73,7 @@ class _Row:
             return False
         self._update()
         ended_ns = time.monotonic_ns()
-        self._next_preview_ns = ended_ns + _PREVIEW_SHARE * (ended_ns - began_ns)
+        self._next_preview_ns = ended_ns + _PAUSE_PER_PREVIEW * (ended_ns - began_ns)
         last_reported = self._reported
         self._reported = (self._preview.complete, self._preview.ended)
         return self._reported != last_reported and any(self._reported)
@@ -150,7 +151,7 @@ class Receiver:
             return self._end(request)
         # A `Report`: the request for the progress.
         if self._row is None:
-            return messages.Progress(-1, 0, 0, False, 0)
+            return messages.Progress(row=-1, take=0, received=0, complete=False, last_arrival_ns=0)
         self._row.not_before_ns = request.not_before_ns or self._row.not_before_ns
         return self._row.progress()
 

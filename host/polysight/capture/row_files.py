@@ -145,8 +145,8 @@ def read_index(path: Path) -> tuple[dict[str, Any], NDArray[np.int64]]:
 # Suffix of the packet file, which lies next to the row's file.
 PACKETS_SUFFIX = ".pkt"
 FORMAT = 2
-"""Files of format 1 are read, but not what they say of earlier records of the card: a row that is placed again from one
-has an unknown start and is masked as a whole."""
+"""Files of format 1 are read, too, but not their entries on earlier records of the card: a row that is placed again
+from such a file has an unknown start, and is masked as a whole."""
 RUN = np.dtype([("sequence", "<u4"), ("byte_count", "<u8"), ("packets", "<u4"), ("size", "<u2"), ("place", "<i8")])
 """Run of consecutive packets of one size: counters of the first, number of packets, payload of each, and its place.
 
@@ -272,7 +272,7 @@ def _restore_log(
     """
     packets = runs["packets"].astype(np.int64)
     sizes = runs["size"].astype(np.int64)
-    # Each product fits 48 bits; their sum need not fit 64.
+    # A product has 48 bits at most, but the sum of many may exceed 64 bits: it is a sum of Python's integers.
     payload_bytes = sum((packets * sizes).tolist())
     if expected != row.size or payload_bytes > PacketLog.max_kept_bytes(expected) or (sizes == 0).any():
         raise ValueError("it belongs to another row, or has more payload than a receiver keeps")

@@ -77,15 +77,17 @@ def check_board(
     try:
         words = open_words()
     except PolysightError as error:
-        on_result(StepResult("USB", False, opening, error.what, f"{error.why}; {error.remedy}"))
+        on_result(
+            StepResult("USB", passed=False, expected=opening, outcome=error.what, remedy=f"{error.why}; {error.remedy}")
+        )
         return None
-    on_result(StepResult("USB", True, opening, "opened"))
+    on_result(StepResult("USB", passed=True, expected=opening, outcome="opened"))
     board = make_board(words)
     steps_done: list[Step] = []
 
     def on_step(step: Step, outcome: str) -> None:
         steps_done.append(step)
-        on_result(StepResult(step.name, True, step.expected, outcome))
+        on_result(StepResult(step.name, passed=True, expected=step.expected, outcome=outcome))
         if step.name == "reset":
             on_result(_judge_supplies(board))
 
@@ -107,32 +109,43 @@ def _check_frame(board: RadarBoard, transmits: bool, on_result: Callable[[StepRe
     if transmits:
         expected += " (this board transmits)"
     try:
-        on_result(StepResult("one frame", True, expected, board.run_one_frame()))
+        on_result(StepResult("one frame", passed=True, expected=expected, outcome=board.run_one_frame()))
     except PolysightError as error:
-        on_result(StepResult("one frame", False, expected, error.what, f"{error.why}; {error.remedy}"))
+        on_result(
+            StepResult(
+                "one frame", passed=False, expected=expected, outcome=error.what, remedy=f"{error.why}; {error.remedy}"
+            )
+        )
         return
     expected = "profile, chirp and frame as sent"
     try:
         differences = board.read_back()
         if differences:
             remedy = "compare the fields with docs/spec/mmwavelink.md; a reserved field that differs is harmless"
-            on_result(StepResult("read back", False, expected, "; ".join(differences), remedy))
+            on_result(
+                StepResult("read back", passed=False, expected=expected, outcome="; ".join(differences), remedy=remedy)
+            )
         else:
-            on_result(StepResult("read back", True, expected, "as sent"))
+            on_result(StepResult("read back", passed=True, expected=expected, outcome="as sent"))
     except PolysightError as error:
-        on_result(StepResult("read back", False, expected, error.what, f"{error.why}; {error.remedy}"))
+        on_result(
+            StepResult(
+                "read back", passed=False, expected=expected, outcome=error.what, remedy=f"{error.why}; {error.remedy}"
+            )
+        )
 
 
 def _describe_failure(step: Step | None, error: PolysightError) -> StepResult:
     """Return the result of the step that failed; None: all steps had passed when the error came."""
     if step is None:
-        return StepResult("bring-up", False, "", error.what, f"{error.why}; {error.remedy}")
+        return StepResult(
+            "bring-up", passed=False, expected="", outcome=error.what, remedy=f"{error.why}; {error.remedy}"
+        )
     picture = ""
     if step.name == "reset":
         picture = f"\n{JUMPERS}"
-    return StepResult(
-        step.name, False, step.expected, error.what, f"{error.why}; {error.remedy or step.remedy}{picture}"
-    )
+    remedy = f"{error.why}; {error.remedy or step.remedy}{picture}"
+    return StepResult(step.name, passed=False, expected=step.expected, outcome=error.what, remedy=remedy)
 
 
 def _judge_supplies(board: RadarBoard) -> StepResult:
@@ -142,9 +155,13 @@ def _judge_supplies(board: RadarBoard) -> StepResult:
     if isinstance(boot_errors, int) and boot_errors >> VOLTAGE_MONITOR_BIT & 1:
         remedy = "measure the RF supplies (1.3 V or 1.0 V), 1.8 V and 3.3 V"
         return StepResult(
-            "power rails", False, expected, "the main core runs; its voltage monitor reports an error", remedy
+            "power rails",
+            passed=False,
+            expected=expected,
+            outcome="the main core runs; its voltage monitor reports an error",
+            remedy=remedy,
         )
-    return StepResult("power rails", True, expected, "the main core runs; no error reported")
+    return StepResult("power rails", passed=True, expected=expected, outcome="the main core runs; no error reported")
 
 
 # Version of the file format of traces.

@@ -377,7 +377,7 @@ _RF_CODES = (
 _RF_ERRORS = {1: "RF firmware assert", 2: "RF firmware abort", 3: "ESM group 1", 4: "ESM group 2", 7: "monitoring"}
 # ICD 223
 _ANALOG_NAMES = {0: "1.8 V supply", 1: "1.3 V / 1.0 V RF supply", 2: "VCO LDO shorted", 3: "PA LDO shorted"}
-# Bits 0..26 of 0x5001, 1 = passed
+# Self-tests of the RF core in the event 0x5001: bits 0 to 26, each set if its test passed.
 _RF_TESTS = 0x07FFFFFF
 # Bits of group 1 that are fatal. RF core: the programmable filter's double bit error (ICD 216, which reserves the bit
 # of its parity error). Main core: "FRC lockstep" (ICD 320). The others are not in the list of fatal events.

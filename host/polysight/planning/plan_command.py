@@ -469,8 +469,8 @@ def measure_row_overhead(folder: Path) -> float | None:
             triggers_ns[take] = (first_ns, event.edge_ns)
     gaps_s = []
     for (take, (_, last_ns)), (next_take, (first_ns, _)) in pairwise(triggers_ns.items()):
-        # A row that was taken again has a gap of another kind before it. The one gap before a resumed run's first row
-        # hardly changes the median.
+        # The gap before a retake of the same row is of another kind and does not count. The gap at which a scan was
+        # resumed counts, but it hardly changes the median.
         if next_take[0] == take[0] + 1:
             gaps_s.append((first_ns - last_ns) / 1e9)
     if not gaps_s:
@@ -580,7 +580,7 @@ def _explain_no_plan(
     rig: Instrument, minutes: float, noise: Noise, row_overhead_s: float, scene_mm: tuple[float, float] | None
 ) -> tuple[str, str]:
     """Return why no plan was found, and what to do: more time where that helps, otherwise other steps."""
-    if not propose(rig, _MOST_MINUTES, 1, noise, row_overhead_s, scene_mm):
+    if not propose(rig, _MOST_MINUTES, count=1, noise=noise, row_overhead_s=row_overhead_s, scene_mm=scene_mm):
         grid = rig.grid
         return (
             f"steps of {grid.step_x_mm:g} x {grid.step_y_mm:g} mm and multiples of them have aliases in this scene, or"

@@ -1,5 +1,7 @@
-"""Laws of flags that have one value everywhere: a value cannot be changed by whom it is handed to, pairs are complete,
-a thread holds up no program's end, a file of somebody else is never unpickled.
+"""Flags in the source that have the same value in every call or class: `frozen`, `strict`, `daemon` and others.
+
+They decide that nobody changes a record that was passed to him, that `zip` drops no items, that no thread keeps a
+program from ending, and that no file from outside is unpickled. Few tests would notice a single wrong flag.
 """
 
 from __future__ import annotations
@@ -12,7 +14,8 @@ from pathlib import Path
 import pytest
 from tests.house.test_roof import PROJECTS, ROOT
 
-CHANGED_IN_PLACE = {
+# Classes that are not frozen, by kind. Their fields are filled in one after another, by the code that reads them.
+MUTABLE_CLASSES = {
     "dataclass": {
         "BoardEchoes", "BoardRows", "CardReport", "CardSurvey", "CheckContext", "EventLog", "Manifest", "Maximum",
         "PacketCounts", "PlacesFit", "Report", "RunningJog", "RunningRow", "ScanResult", "Take", "Windows", "_Motion",
@@ -20,11 +23,10 @@ CHANGED_IN_PLACE = {
     },
     "Struct": {"BoardCounts", "BoardFacts", "TraceLine", "_Head"},
 }  # fmt: skip
-"""Classes whose fields are filled in one after the other, and are read by those who fill them."""
 
-# Name of the function and of its flag, the flag's value, and how many calls have the other one.
+# Function, its flag, the value of the flag, and the number of calls with the opposite value.
 FLAGS = [
-    # Of three ends two are active; of two libraries one may have more patches; figures with fewer colours than lines.
+    # Seven calls may drop items on purpose. For example, one of two libraries may have more patches than the other.
     ("zip", "strict", True, 7),
     ("Thread", "daemon", True, 0),
     ("Process", "daemon", True, 0),
@@ -47,32 +49,38 @@ def nodes() -> list[ast.AST]:
     return [node for tree in parse_sources() for node in ast.walk(tree)]
 
 
-def find_name(called: ast.expr) -> str:
-    return called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
+def find_name(expression: ast.expr) -> str:
+    """Last name of an expression such as `zip` or `np.load`; "" for any other expression."""
+    return expression.attr if isinstance(expression, ast.Attribute) else getattr(expression, "id", "")
 
 
 def find_flag(keywords: list[ast.keyword], name: str) -> object:
-    """Value of a flag that is written out; None without one."""
-    return next((k.value.value for k in keywords if k.arg == name and isinstance(k.value, ast.Constant)), None)
+    """Value of the keyword argument `name` if it is a constant, else None."""
+    for keyword in keywords:
+        if keyword.arg == name and isinstance(keyword.value, ast.Constant):
+            return keyword.value.value
+    return None
 
 
-def test_values_that_are_handed_on_cannot_be_changed(nodes):
-    changed = {"dataclass": set(), "Struct": set()}
+def test_every_class_is_frozen_except_those_that_are_listed(nodes):
+    mutable = {"dataclass": set(), "Struct": set()}
     for node in nodes:
         if not isinstance(node, ast.ClassDef):
             continue
         for decorator in node.decorator_list:
-            called = decorator.func if isinstance(decorator, ast.Call) else decorator
-            keywords = decorator.keywords if isinstance(decorator, ast.Call) else []
-            if find_name(called) == "dataclass" and find_flag(keywords, "frozen") is not True:
-                changed["dataclass"].add(node.name)
-        if any(find_name(base) == "Struct" for base in node.bases) and find_flag(node.keywords, "frozen") is not True:
-            changed["Struct"].add(node.name)
-    assert changed == CHANGED_IN_PLACE
+            is_call = isinstance(decorator, ast.Call)
+            decorator_name = find_name(decorator.func if is_call else decorator)
+            keywords = decorator.keywords if is_call else []
+            if decorator_name == "dataclass" and find_flag(keywords, "frozen") is not True:
+                mutable["dataclass"].add(node.name)
+        is_struct = any(find_name(base) == "Struct" for base in node.bases)
+        if is_struct and find_flag(node.keywords, "frozen") is not True:
+            mutable["Struct"].add(node.name)
+    assert mutable == MUTABLE_CLASSES
 
 
-@pytest.mark.parametrize(("function", "flag", "value", "exceptions"), FLAGS, ids=lambda x: str(x))
-def test_a_flag_has_its_value_everywhere(function, flag, value, exceptions, nodes):
+@pytest.mark.parametrize(("function", "flag", "value", "exceptions"), FLAGS, ids=str)
+def test_a_flag_has_the_same_value_in_every_call_with_few_exceptions(function, flag, value, exceptions, nodes):
     calls = [n for n in nodes if isinstance(n, ast.Call) and find_name(n.func) == function]
     values = Counter(find_flag(call.keywords, flag) for call in calls)
     assert values[value] > 0

@@ -1,4 +1,4 @@
-"""Laws of the roof: six projects, each a folder with its package inside; no links, one import name for each class."""
+"""Layout of the repository: six projects with one version, each a folder with one package; no symbolic links."""
 
 import importlib
 import subprocess
@@ -21,19 +21,24 @@ PROJECTS = {
 }
 
 
-def test_the_repository_has_no_links():
+# File mode of a symbolic link in git's index
+LINK_MODE = "120000"
+
+
+def test_the_repository_has_no_symbolic_links():
     listed = subprocess.run(["git", "ls-files", "-s"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:
         pytest.skip("not a git checkout: the files of the project are not known")
-    assert [line for line in listed.stdout.splitlines() if line.startswith("120000")] == []
+    assert [line for line in listed.stdout.splitlines() if line.startswith(LINK_MODE)] == []
 
 
 @pytest.mark.parametrize(("folder", "package"), PROJECTS.items())
-def test_a_project_holds_its_one_package(folder, package):
+def test_a_project_has_one_package(folder, package):
     packages = {p.parent.name for p in (ROOT / folder).glob("*/__init__.py")}
     assert packages == {package}
-    # setup.py
-    assert not list((ROOT / folder).glob("*.py")) or folder == "host"
+    # The host's setup.py compiles its loops in C; other projects have no module outside of the package.
+    if folder != "host":
+        assert not list((ROOT / folder).glob("*.py"))
 
 
 @pytest.mark.parametrize("folder", PROJECTS)
@@ -45,8 +50,8 @@ def test_all_projects_have_one_version(folder):
 
 
 @pytest.mark.parametrize("folder", PROJECTS)
-def test_every_program_and_entry_point_of_a_project_exists(folder):
-    """The names are text, so that only this test notices a renamed function."""
+def test_every_command_and_entry_point_of_a_project_names_a_function(folder):
+    """The names are text in pyproject.toml, so that only this test notices when a function is renamed."""
     project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     targets = list(project.get("scripts", {}).values())
     for group in project.get("entry-points", {}).values():
@@ -56,21 +61,23 @@ def test_every_program_and_entry_point_of_a_project_exists(folder):
         assert callable(getattr(importlib.import_module(module), function, None)), target
 
 
-def test_an_editable_installation_is_a_path_that_editors_follow():
-    """No import hook: type checkers do not run hooks."""
+def test_an_editable_installation_is_a_path_file():
+    """Not an import hook, because type checkers and editors run no hooks, and would not find the packages."""
     for folder in PROJECTS:
         name = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"]
         try:
             files: list[PackagePath] = distribution(name).files or []
         except PackageNotFoundError:
             files = []
-        pth = [f for f in files if f.suffix == ".pth"]
-        if not pth:
+        path_files = [f for f in files if f.suffix == ".pth"]
+        if not path_files:
             pytest.skip("the projects are not installed in place: `make test` does that")
-        assert Path(pth[0].read_text(encoding="utf-8").strip()).resolve() == ROOT / folder
+        path = path_files[0].read_text(encoding="utf-8").strip()
+        assert Path(path).resolve() == ROOT / folder
 
 
-def test_an_error_is_one_class_wherever_it_is_imported_from():
+def test_the_host_raises_the_error_class_of_the_shared_package():
+    """If a second copy of the shared package were imported, `except PolysightError` would miss the host's errors."""
     import polysight
     from polysight.store import ScanFolder
     from polysight_shared.errors import PolysightError

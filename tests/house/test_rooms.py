@@ -1,4 +1,8 @@
-"""Laws of the house: size of files and functions, public names of rooms, and the content of the host's root."""
+"""Style and structure of the source: sizes of files and functions, and which module may import which.
+
+A room is a folder of `host/polysight`, such as `imaging` or `sync`; its front is its `__init__.py`, which imports the
+names that other rooms may use (docs/decisions/0008-rooms.md).
+"""
 
 import ast
 import subprocess
@@ -13,14 +17,17 @@ from tests.house.test_roof import PROJECTS
 ROOT = Path(__file__).parents[2]
 HOST = ROOT / "host" / "polysight"
 PAPERS = ROOT / "papers" / "polysight_papers"
-LINES = 700
-FUNCTION_LINES = 60
-ENTERED_BY_MODULE = ("cli", "jobs")
-"""Rooms whose modules are loaded one at a time, so that a command loads no more than it needs."""
-ALSO_SOURCE = (".cpp", ".c", ".h", ".js")
+MAX_FILE_LINES = 700
+MAX_FUNCTION_LINES = 60
+# The pipeline shows the whole processing, so it must stay short enough to be read in one go.
+MAX_PIPELINE_LINES = 135
+# Rooms whose modules are imported one by one instead of from the front, so that a command loads no more than it needs.
+ROOMS_WITHOUT_FRONT = ("cli", "jobs")
+OTHER_SOURCE_SUFFIXES = (".cpp", ".c", ".h", ".js")
 
 
-def list_tracked(*suffixes: str) -> list[Path]:
+def list_source_files(*suffixes: str) -> list[Path]:
+    """Files with these suffixes that git tracks, or would add; no symbolic links."""
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=False
     )
@@ -32,14 +39,13 @@ def list_tracked(*suffixes: str) -> list[Path]:
 
 @dataclass
 class FileFacts:
-    """Facts of a file that the laws below use; it is parsed once for all of them.
+    """Facts of a Python file that the tests below use, so that it is parsed once for all of them."""
 
-    Each list has lines: of imports with the dots before a relative one, the module, and the names taken from it; of
-    functions with their lines of code; of errors for people that lack one of their three parts.
-    """
-
+    # Of each import: its line, the number of dots of a relative one, the module, and the names imported from it.
     imports: list[tuple[int, int, str, list[str]]] = field(default_factory=list)
+    # Name of each function, and the number of its lines of code.
     functions: list[tuple[str, int]] = field(default_factory=list)
+    # Lines that raise an error for users without one of its three parts: what happened, why, and what to do.
     incomplete_errors: list[int] = field(default_factory=list)
 
 
@@ -61,54 +67,63 @@ def read_facts(file: Path) -> FileFacts:
 
 
 def test_no_file_is_over_700_lines():
-    sizes = {f: len(f.read_text(encoding="utf-8").splitlines()) for f in list_tracked(".py", *ALSO_SOURCE)}
-    assert {str(f.relative_to(ROOT)): n for f, n in sizes.items() if n > LINES} == {}
+    too_long = {}
+    for file in list_source_files(".py", *OTHER_SOURCE_SUFFIXES):
+        lines = len(file.read_text(encoding="utf-8").splitlines())
+        if lines > MAX_FILE_LINES:
+            too_long[str(file.relative_to(ROOT))] = lines
+    assert too_long == {}
 
 
 def count_code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef, lines: list[str]) -> int:
-    """Number of lines of a function without its docstring, comments and empty lines, which are welcome."""
-    head = function.body[0].lineno - function.lineno
+    """Number of lines of a function without its docstring, comments and empty lines."""
+    signature_lines = function.body[0].lineno - function.lineno
     statements = function.body
     if ast.get_docstring(function) is not None:
         statements = statements[1:]
     if not statements:
-        return head
+        return signature_lines
+    # `lineno` counts from 1, and `end_lineno` is the last line.
     body = lines[statements[0].lineno - 1 : function.end_lineno]
-    return head + sum(bool(line.strip()) and not line.lstrip().startswith("#") for line in body)
+    code_lines = [line for line in body if line.strip() and not line.lstrip().startswith("#")]
+    return signature_lines + len(code_lines)
 
 
 def test_no_function_is_over_60_lines_of_code():
-    long = {
-        f"{file.relative_to(ROOT)}:{name}": lines
-        for file in list_tracked(".py")
-        for name, lines in read_facts(file).functions
-        if lines > FUNCTION_LINES
-    }
-    assert long == {}
+    too_long = {}
+    for file in list_source_files(".py"):
+        for name, lines in read_facts(file).functions:
+            if lines > MAX_FUNCTION_LINES:
+                too_long[f"{file.relative_to(ROOT)}:{name}"] = lines
+    assert too_long == {}
 
 
 PROGRAM_FOLDERS = ("host", "shared", "pi_controller", "papers")
-ERRORS_FOR_PEOPLE = ("ConfigError", "DataError", "DeviceError", "ScanError")
+ERRORS_FOR_USERS = ("ConfigError", "DataError", "DeviceError", "ScanError")
 
 
 def lacks_a_part(call: ast.Call) -> bool:
-    """True for an error that is raised without a cause or an advice."""
-    if not isinstance(call.func, ast.Name) or call.func.id not in ERRORS_FOR_PEOPLE:
+    """True for an error for users that is made without its cause (`why`) or its remedy."""
+    if not isinstance(call.func, ast.Name) or call.func.id not in ERRORS_FOR_USERS:
+        return False
+    # The three parts may be in an unpacked tuple: `DataError(*parts)`.
+    if any(isinstance(argument, ast.Starred) for argument in call.args):
         return False
     keywords = {keyword.arg for keyword in call.keywords}
-    is_unpacked = any(isinstance(argument, ast.Starred) for argument in call.args)
-    return len(call.args) + len(keywords & {"why", "remedy"}) < 3 and not is_unpacked
+    parts = len(call.args) + len(keywords & {"why", "remedy"})
+    return parts < 3
 
 
 def test_every_error_gives_its_cause_and_a_remedy():
-    files = [file for file in list_tracked(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
+    files = [file for file in list_source_files(".py") if file.relative_to(ROOT).parts[0] in PROGRAM_FOLDERS]
     incomplete = {str(file.relative_to(ROOT)): read_facts(file).incomplete_errors for file in files}
     assert {name: lines for name, lines in incomplete.items() if lines} == {}
 
 
-def test_the_root_of_host_is_the_flow_and_rooms():
+def test_the_host_s_own_folder_has_the_pipeline_and_its_settings_only():
     assert {p.name for p in HOST.glob("*.py")} == {"__init__.py", "__main__.py", "pipeline.py", "settings.py"}
-    assert len((HOST / "pipeline.py").read_text(encoding="utf-8").splitlines()) <= 135
+    pipeline_lines = (HOST / "pipeline.py").read_text(encoding="utf-8").splitlines()
+    assert len(pipeline_lines) <= MAX_PIPELINE_LINES
 
 
 def list_rooms() -> list[Path]:
@@ -116,15 +131,16 @@ def list_rooms() -> list[Path]:
 
 
 @pytest.mark.parametrize("room", list_rooms(), ids=lambda p: p.name)
-def test_the_front_of_each_room_describes_it(room):
+def test_the_front_of_each_room_describes_it_in_about_ten_lines(room):
     tree = ast.parse((room / "__init__.py").read_text(encoding="utf-8"))
     docstring = ast.get_docstring(tree) or ""
     assert 2 <= len(docstring.splitlines()) <= 14, (
-        f"{room.name}/__init__.py: what it takes and gives, in about ten lines"
+        f"{room.name}/__init__.py: describe in about ten lines what the room takes and returns"
     )
 
 
 def list_imports(file: Path) -> list[tuple[int, str]]:
+    """Line and module of each import that is not `from . import name`."""
     return [(line, module) for line, _, module, _ in read_facts(file).imports if module]
 
 
@@ -135,50 +151,61 @@ def find_room(file: Path) -> str:
     return ""
 
 
-def test_neighbours_import_only_from_a_rooms_front():
-    past = []
-    for file in (f for top in (HOST, PAPERS) for f in top.rglob("*.py")):
+def list_host_and_papers() -> list[Path]:
+    return [*HOST.rglob("*.py"), *PAPERS.rglob("*.py")]
+
+
+def test_a_room_s_modules_are_imported_by_the_room_only():
+    """Not `from polysight.sync.tone import find_tone` in another room: that name is imported from `polysight.sync`."""
+    forbidden_imports = []
+    for file in list_host_and_papers():
+        # The public interface `polysight` loads a module when one of its names is used.
+        if file == HOST / "__init__.py":
+            continue
+        allowed_rooms = (find_room(file), *ROOMS_WITHOUT_FRONT)
         for line, module in list_imports(file):
-            parts = module.split(".")
-            inside = (find_room(file), *ENTERED_BY_MODULE)
-            if parts[0] == "polysight" and len(parts) > 2 and parts[1] not in inside and file != HOST / "__init__.py":
-                past.append(f"{file.relative_to(ROOT)}:{line} {module}")
-    assert past == []
-
-
-def test_no_module_is_imported_past_the_front_of_its_room():
-    """Not `from polysight.sync import tone` either, unless the front names it; nor relative imports."""
-    past = []
-    for file in (f for top in (HOST, PAPERS) for f in top.rglob("*.py")):
-        for line, level, module, names in read_facts(file).imports:
-            parts = module.split(".")
-            if level:
-                past.append(f"{file.relative_to(ROOT)}:{line} a relative import")
-            elif parts[0] == "polysight" and len(parts) == 2 and parts[1] not in (find_room(file), *ENTERED_BY_MODULE):
-                room = HOST / parts[1]
-                # A module at the root, such as pipeline.py, is not a room.
-                if not room.is_dir():
-                    continue
-                named = {name for *_, taken in read_facts(room / "__init__.py").imports for name in taken}
-                modules = [name for name in names if (room / f"{name}.py").exists() and name not in named]
-                past += [f"{file.relative_to(ROOT)}:{line} {name}" for name in modules]
-    assert past == []
-
-
-def test_only_simulators_use_simulators():
-    """Also at run time in a wheel: the demo starts them as programs."""
-    files = [f for top in ("host", "papers", "pi_controller", "shared") for f in (ROOT / top).rglob("*.py")]
-    forbidden_imports = [
-        f"{f.relative_to(ROOT)}:{line} {module}"
-        for f in files
-        for line, module in list_imports(f)
-        if module.startswith("polysight_simulators")
-    ]
+            package, *folders_and_module = module.split(".")
+            is_inside_a_room = package == "polysight" and len(folders_and_module) > 1
+            if is_inside_a_room and folders_and_module[0] not in allowed_rooms:
+                forbidden_imports.append(f"{file.relative_to(ROOT)}:{line} {module}")
     assert forbidden_imports == []
 
 
-def test_worlds_know_nothing_of_ours():
-    """Simulators judge the instrument, so they share no code and no assumption with it."""
+def test_a_room_s_front_offers_only_the_modules_that_it_imports():
+    """Not `from polysight.sync import tone` in another room, unless the front imports `tone`; no relative imports."""
+    forbidden_imports = []
+    for file in list_host_and_papers():
+        for line, dots, module, names in read_facts(file).imports:
+            if dots:
+                forbidden_imports.append(f"{file.relative_to(ROOT)}:{line} a relative import")
+                continue
+            package, _, room = module.partition(".")
+            is_room = package == "polysight" and bool(room) and "." not in room and (HOST / room).is_dir()
+            if not is_room or room in (find_room(file), *ROOMS_WITHOUT_FRONT):
+                continue
+            offered: set[str] = set()
+            for *_, names_in_front in read_facts(HOST / room / "__init__.py").imports:
+                offered.update(names_in_front)
+            for name in names:
+                is_module = (HOST / room / f"{name}.py").exists()
+                if is_module and name not in offered:
+                    forbidden_imports.append(f"{file.relative_to(ROOT)}:{line} {name}")
+    assert forbidden_imports == []
+
+
+def test_no_program_of_the_instrument_imports_the_simulators():
+    """The demo, too, starts them as programs: a wheel of the host can be installed without them."""
+    forbidden_imports = []
+    for project in ("host", "papers", "pi_controller", "shared"):
+        for file in (ROOT / project).rglob("*.py"):
+            for line, module in list_imports(file):
+                if module.startswith("polysight_simulators"):
+                    forbidden_imports.append(f"{file.relative_to(ROOT)}:{line} {module}")
+    assert forbidden_imports == []
+
+
+def test_the_simulators_in_worlds_import_nothing_of_the_instrument():
+    """They judge the instrument, so they must not share its code, and with it its assumptions."""
     files = (ROOT / "worlds").rglob("*.py")
     used = {module.split(".")[0] for file in files for _, module in list_imports(file)}
     assert used - set(sys.stdlib_module_names) == {"numpy", "scipy", "polysight_worlds"}
@@ -190,9 +217,13 @@ def test_every_folder_of_modules_is_a_package():
     assert [str(f.relative_to(ROOT)) for f in folders if not (f / "__init__.py").exists()] == []
 
 
-def test_the_pi_half_needs_only_what_its_wheel_brings():
-    allowed = {*sys.stdlib_module_names, "polysight_pi", "polysight_shared", "gpiod", "msgpack", "msgspec", "serial"}
-    allowed.add("zmq")
-    files = [f for top in ("shared", "pi_controller") for f in (ROOT / top / PROJECTS[top]).glob("*.py")]
-    foreign_imports = {f"{f.name}: {m}" for f in files for _, m in list_imports(f) if m.split(".")[0] not in allowed}
-    assert foreign_imports == set()
+def test_the_pi_s_program_imports_only_the_dependencies_of_its_wheel():
+    dependencies = {"polysight_pi", "polysight_shared", "gpiod", "msgpack", "msgspec", "serial", "zmq"}
+    allowed = {*sys.stdlib_module_names, *dependencies}
+    forbidden_imports = []
+    for project in ("shared", "pi_controller"):
+        for file in (ROOT / project / PROJECTS[project]).glob("*.py"):
+            for line, module in list_imports(file):
+                if module.split(".")[0] not in allowed:
+                    forbidden_imports.append(f"{file.relative_to(ROOT)}:{line} {module}")
+    assert forbidden_imports == []

@@ -1,53 +1,76 @@
-"""docs/architecture.md lists the files from a packet to a name: each exists, and a scan calls them in order."""
+"""docs/architecture.md lists the stops of a scan's data, from a radar packet to a material's name.
+
+A stop is a file and one function in it. Each must exist, and processing a scan must call them in the listed order.
+"""
 
 import ast
 import re
 import sys
 from pathlib import Path
 from types import FrameType
+from typing import NamedTuple
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-ROW = re.compile(r"^\| (\d+) \| [^|]+ \| `([^`]+)` \| `([^`]+)` \|$")
-PROCESSED_FROM = 6
-"""The first file of the processing; those before it run in the processes of a scan, which tests/e2e covers."""
+# A line of the table: number of the stop, what happens, file and function.
+STOP_PATTERN = re.compile(r"^\| (\d+) \| [^|]+ \| `([^`]+)` \| `([^`]+)` \|$")
+# More stops would be no overview.
+MAX_STOPS = 12
+# The first stop in the processing of a recorded scan. Earlier ones run while the scan is recorded; tests/e2e does that.
+FIRST_STOP_OF_PROCESSING = 6
+# A reader who follows one row from its raw bytes to a material's name must open at most so many files.
+MAX_FILES_OF_A_ROW = 30
+# Methods of Pipeline that process a row, in their order.
+STEPS_OF_A_ROW = ("add_row", "form_images", "place_plane", "find_materials")
 
 
-def read_stops() -> list[tuple[int, Path, str]]:
+class Stop(NamedTuple):
+    number: int
+    file: Path
+    function: str
+
+
+class Walk(NamedTuple):
+    """Calls of the instrument's functions while a small scan is processed."""
+
+    # File and name of each function, in the order of their first calls.
+    calls: list[tuple[str, str]]
+    # Files of the functions that were called within the steps of a row.
+    files_of_a_row: set[str]
+
+
+def read_stops() -> list[Stop]:
     lines = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").splitlines()
-    return [(int(m[1]), ROOT / m[2], m[3]) for m in map(ROW.match, lines) if m]
+    matches = [match for match in map(STOP_PATTERN.match, lines) if match]
+    return [Stop(number=int(m[1]), file=ROOT / m[2], function=m[3]) for m in matches]
 
 
 def list_functions(file: Path) -> set[str]:
-    """Names of functions, methods as `Class.method`."""
-    tree = ast.parse(file.read_text(encoding="utf-8"))
-    names = {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
-    for c in (n for n in tree.body if isinstance(n, ast.ClassDef)):
-        names |= {f"{c.name}.{n.name}" for n in c.body if isinstance(n, ast.FunctionDef)}
+    """Names of the functions in a file; methods are named `Class.method`."""
+    names = set()
+    for node in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.ClassDef):
+            names |= {f"{node.name}.{method.name}" for method in node.body if isinstance(method, ast.FunctionDef)}
     return names
 
 
-def test_there_are_at_most_twelve_and_they_are_numbered():
-    assert [n for n, _, _ in read_stops()] == list(range(1, len(read_stops()) + 1))
-    assert 1 < len(read_stops()) <= 12
+def test_the_stops_are_numbered_and_at_most_twelve():
+    numbers = [stop.number for stop in read_stops()]
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert 1 < len(numbers) <= MAX_STOPS
 
 
-@pytest.mark.parametrize(("file", "name"), [(f, n) for _, f, n in read_stops()], ids=lambda v: getattr(v, "name", v))
-def test_every_stop_is_a_file_and_a_function(file, name):
-    assert name in list_functions(file)
-
-
-# Files of the host and of shared that one row passes from its raw bytes to a name; 51 in November 2026.
-MAX_FILES = 30
-ROW_TO_NAME = ("add_row", "form_images", "place_plane", "find_materials")
+@pytest.mark.parametrize("stop", read_stops(), ids=lambda stop: f"{stop.file.name}-{stop.function}")
+def test_every_stop_is_a_function_in_its_file(stop):
+    assert stop.function in list_functions(stop.file)
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
-    """Functions (file, name) of the host in the order in which processing a small scan first calls them, and the files
-    that are called in the pipeline's steps from raw row to name.
-    """
+def walk(tmp_path_factory) -> Walk:
+    """The calls that processing a small simulated scan makes."""
     from polysight.jobs.process import process
     from polysight.materials import load_catalogue
     from polysight.pipeline import Pipeline
@@ -56,40 +79,45 @@ def walk(tmp_path_factory) -> tuple[list[tuple[str, str]], set[str]]:
     folder = tmp_path_factory.mktemp("walk")
     command = ["simulate", str(ROOT / "examples" / "own-scene.toml"), "--config", str(ROOT / "instrument.toml")]
     assert main([*command, "--out", str(folder / "scan")]) == 0
-    load_catalogue()  # it is read once for all scans
+    # The catalogue of materials is read once for all scans, so it is not a part of the walk.
+    load_catalogue()
+    # A dictionary without values keeps the order of the first calls.
     calls: dict[tuple[str, str], None] = {}
     files: set[str] = set()
-    steps = {getattr(Pipeline, name).__code__: name for name in ROW_TO_NAME}
-    open_steps: list[str] = []
+    steps = {getattr(Pipeline, name).__code__: name for name in STEPS_OF_A_ROW}
+    running_steps: list[str] = []
 
-    def look(frame: FrameType, event: str, _: object) -> None:
+    def record_call(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
         if code in steps:
             if event == "call":
-                open_steps.append(steps[code])
+                running_steps.append(steps[code])
             elif event == "return":
-                open_steps.pop()
+                running_steps.pop()
         if event == "call" and ("polysight" in code.co_filename):
             calls.setdefault((code.co_filename, code.co_name))
-            if open_steps:
+            if running_steps:
                 files.add(code.co_filename)
 
-    sys.setprofile(look)
+    sys.setprofile(record_call)
     try:
         assert process(folder / "scan", folder / "out", threads=1) == 0
     finally:
         sys.setprofile(None)
     our_files = {f for f in files if "/host/polysight/" in f or "/polysight_shared/" in f}
-    return list(calls), our_files
+    return Walk(calls=list(calls), files_of_a_row=our_files)
 
 
-def test_a_scan_passes_the_stops_in_their_order(walk):
-    calls, _ = walk
-    stop_numbers = {(str(file), name.rpartition(".")[2]): n for n, file, name in read_stops() if n >= PROCESSED_FROM}
-    passed = [stop_numbers[call] for call in calls if call in stop_numbers]
-    assert passed == sorted(stop_numbers.values())
+def test_processing_a_scan_calls_the_stops_in_their_order(walk):
+    stop_numbers = {}
+    for stop in read_stops():
+        if stop.number >= FIRST_STOP_OF_PROCESSING:
+            # A call has the bare name of a method.
+            method = stop.function.rpartition(".")[2]
+            stop_numbers[str(stop.file), method] = stop.number
+    called_stops = [stop_numbers[call] for call in walk.calls if call in stop_numbers]
+    assert called_stops == sorted(stop_numbers.values())
 
 
-def test_from_raw_row_to_name_few_files_are_passed(walk):
-    _, files = walk
-    assert len(files) <= MAX_FILES, sorted(files)
+def test_few_files_process_a_row_from_its_bytes_to_a_name(walk):
+    assert len(walk.files_of_a_row) <= MAX_FILES_OF_A_ROW, sorted(walk.files_of_a_row)

@@ -21,7 +21,9 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-TOGETHER = {
+# A file whose tests share an expensive fixture with another file's (such as a worker's browser), and that other file:
+# both run in the same worker.
+WORKER_OF_FILE = {
     "tests/process/test_drawn_boxes.py": "tests/process/test_laws.py",
     "tests/process/test_products.py": "tests/process/test_samples.py",
     **dict.fromkeys(
@@ -34,12 +36,12 @@ TOGETHER = {
         "tests/serve/test_pages.py",
     ),
 }
-"""Files whose tests share an expensive fixture with another file's, such as a worker's browser."""
 
-ROOMS = ("tests/api", "tests/materials")
-"""Folders with an expensive fixture for most of their files: one worker runs them."""
+# Folders with an expensive fixture for most of their files: each is run by one worker.
+FOLDERS_OF_ONE_WORKER = ("tests/api", "tests/materials")
 
-FIRST = (
+# Files and folders that take longest. They are started first, so that no worker ends long after the others.
+LONGEST = (
     "tests/e2e/test_operator_page.py",
     "tests/materials",
     "tests/serve/test_pages.py",
@@ -72,20 +74,19 @@ FIRST = (
     "tests/jobs/test_batch.py",
     "tests/serve/test_attack.py",
 )
-"""Files and folders that take longest. They are begun first, so that no worker ends long after the others."""
 
 
 def find_worker_group(node_id: str) -> str:
     """Folder or file whose tests share a worker."""
     file = node_id.partition("::")[0]
     folder = file.rpartition("/")[0]
-    return folder if folder in ROOMS else TOGETHER.get(file, file)
+    return folder if folder in FOLDERS_OF_ONE_WORKER else WORKER_OF_FILE.get(file, file)
 
 
 def sort_longest_first(items: list[pytest.Item]) -> None:
-    """Sort tests in place: those of the longest files first, the others in the old order."""
-    place = {file: n for n, file in enumerate(FIRST)}
-    items.sort(key=lambda item: place.get(find_worker_group(item.nodeid), len(place)))
+    """Sort tests in place: those of the longest files come first, and the others keep their order."""
+    rank = {file: n for n, file in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(find_worker_group(item.nodeid), len(rank)))
 
 
 class ByFile(LoadScopeScheduling):
@@ -101,45 +102,54 @@ class ByFile(LoadScopeScheduling):
 
 
 def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
-    """Folder `name` of this run. The first worker that needs it fills it by `make`; tests must not change it."""
+    """Return a temporary folder that all workers of this run share.
+
+    The first worker that needs it fills it by `make`, while others wait; tests must not change it.
+    """
     base = factory.getbasetemp()
-    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # Each worker has its own folder in the one of the run.
+        base = base.parent
+    shared = base / "once"
     shared.mkdir(exist_ok=True)
     folder = shared / name
-    complete_copy = shared / f"{name}.whole"
+    filled_marker = shared / f"{name}.whole"
     with (shared / f"{name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        if not complete_copy.exists():
+        if not filled_marker.exists():
             folder.mkdir()
             make(folder)
-            complete_copy.touch()
+            filled_marker.touch()
     return folder
 
 
-# Lines of each table of costs; chosen.
-_SHOWN = 60
-# Name under which a worker's report has the costs.
-_NAME = "costs"
+# Each table of costs shows the most expensive folders, files or tests only.
+_TABLE_LINES = 60
+# Key of the costs in the reports that workers send.
+_COSTS_KEY = "costs"
 # Unit of the times in /proc.
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class ProcessTimes:
-    """Processor time of this process and of all programs that it started, directly or not.
+    """Processor time of this process and of all programs that it started, directly or through others.
 
-    A program that was seen once is followed even after its parent has ended: most processes of a browser are such
-    orphans. An ended one counts with its time at the last call, unless a process of ours may have awaited it.
+    A program that was seen once is followed even after its parent has ended, because most processes of a browser are
+    such orphans. The system adds the time of an ended program to that of the parent which waits for it. An orphan has
+    no such parent: it counts with the time that was read last.
     """
 
     def __init__(self) -> None:
-        # The parent's number and the ticks until now, by process number and time of start: numbers are reused.
+        # The process id of the parent and the ticks used so far. The key has the process id and the time of start,
+        # because ids are reused.
         self._followed: dict[tuple[int, str], tuple[int, int]] = {}
+        # Ticks of the orphans that have ended.
         self._orphans_ticks = 0
 
     def read_s(self) -> float:
-        """Seconds until now."""
-        # Fields of proc_pid_stat(5) after the name; the third field has index 0. Used are 4 (parent, index 1), 14 to 17
-        # (times, 11 to 14) and 22 (time of start, 19).
+        """Seconds of processor time used so far."""
+        # The fields of proc_pid_stat(5) after the program's name, by process id. The list begins with the third field
+        # of the manual: its 4 (parent) has index 1, its 14 to 17 (times) have 11 to 14, its 22 (time of start) has 19.
         table = {}
         for folder in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208
             with suppress(OSError):
@@ -155,23 +165,29 @@ class ProcessTimes:
             new_pids = set(children.get(parents_to_visit.pop(), ())) - our_pids
             our_pids |= new_pids
             parents_to_visit.extend(new_pids)
-        self._orphans_ticks += self._count_lost({os.getpid(), *our_pids})
-        self._followed = {
-            (pid, table[pid][19]): (int(table[pid][1]), sum(map(int, table[pid][11:15]))) for pid in our_pids
-        }
+        self._orphans_ticks += self._count_orphans_ticks({os.getpid(), *our_pids})
+        self._followed = {}
+        for pid in our_pids:
+            fields = table[pid]
+            parent = int(fields[1])
+            used_ticks = sum(map(int, fields[11:15]))
+            start_time = fields[19]
+            self._followed[pid, start_time] = (parent, used_ticks)
         ticks = self._orphans_ticks + sum(used for _, used in self._followed.values())
         usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
         return ticks / _TICKS_PER_S + sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
-    def _count_lost(self, running: set[int]) -> int:
-        """Ticks of the processes that have ended since the last call without a parent of ours."""
+    def _count_orphans_ticks(self, running: set[int]) -> int:
+        """Ticks of the processes that have ended since the last call, and for which no running process waited."""
         ended = {pid: values for (pid, _), values in self._followed.items() if pid not in running}
-        lost_ticks = 0
-        for parent, used in ended.values():
+        orphans_ticks = 0
+        for parent, used_ticks in ended.values():
+            # If the parent has ended, too, its own parent may have waited for both, and so on.
             while parent in ended:
-                parent = ended[parent][0]
-            lost_ticks += used if parent not in running else 0
-        return lost_ticks
+                parent, _ = ended[parent]
+            if parent not in running:
+                orphans_ticks += used_ticks
+        return orphans_ticks
 
 
 class Costs:
@@ -184,7 +200,7 @@ class Costs:
         self._wall_s: Counter[str] = Counter()
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Tests begin; until now each worker imported and collected all of them."""
+        """Record the costs of importing and collecting the tests, which every worker does before the first test."""
         before_s = self._last_s
         self._last_s = self._now_s()
         collected_s = [now - time_before for now, time_before in zip(self._last_s, before_s, strict=True)]
@@ -192,11 +208,11 @@ class Costs:
         if output is None:
             self._add("collection", collected_s)
         else:
-            output[_NAME] = collected_s
+            output[_COSTS_KEY] = collected_s
 
     def pytest_testnodedown(self, node: Any) -> None:
-        """Add a worker's collection."""
-        self._add("collection", node.workeroutput.get(_NAME, (0.0, 0.0)))
+        """Add the costs of a worker's collection when the worker ends."""
+        self._add("collection", node.workeroutput.get(_COSTS_KEY, (0.0, 0.0)))
 
     def _add(self, name: str, spent_s: Any) -> None:
         self._cpu_s[name] += spent_s[0]
@@ -217,40 +233,43 @@ class Costs:
         before_s = self._last_s
         self._last_s = self._now_s()
         spent_s = [max(0.0, now - time_before) for now, time_before in zip(self._last_s, before_s, strict=True)]
-        report.user_properties.append((_NAME, spent_s))
+        report.user_properties.append((_COSTS_KEY, spent_s))
         return report
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Add a test's times to the sums."""
         for name, spent_s in report.user_properties:
-            if name == _NAME:
+            if name == _COSTS_KEY:
                 self._add(report.nodeid, spent_s)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """The table: processor and clock seconds."""
+        """Print tables of processor seconds and seconds by the clock."""
         write = terminalreporter.write_line
         terminalreporter.section("costs")
         write(f"{self._cpu_s.total() / 60:.1f} CPU minutes, {self._wall_s.total() / 60:.1f} worker minutes")
         for title, cpu_s, wall_s in (
-            ("rooms", _by_part(self._cpu_s, _room), _by_part(self._wall_s, _room)),
-            ("files", _by_part(self._cpu_s, _file), _by_part(self._wall_s, _file)),
+            ("folders", _sum_by(_get_folder, self._cpu_s), _sum_by(_get_folder, self._wall_s)),
+            ("files", _sum_by(_get_file, self._cpu_s), _sum_by(_get_file, self._wall_s)),
             ("tests", self._cpu_s, self._wall_s),
         ):
             write(f"{'CPU s':>8} {'wall s':>8}  {title}")
-            for name, spent_s in cpu_s.most_common(_SHOWN):
+            for name, spent_s in cpu_s.most_common(_TABLE_LINES):
                 write(f"{spent_s:8.1f} {wall_s[name]:8.1f}  {name}")
 
 
-def _file(test: str) -> str:
+def _get_file(test: str) -> str:
+    """File of a test, whose name is `FILE::FUNCTION`."""
     return test.partition("::")[0]
 
 
-def _room(test: str) -> str:
-    return "/".join(_file(test).split("/")[:2])
+def _get_folder(test: str) -> str:
+    """Folder in `tests`, such as `tests/imaging`."""
+    return "/".join(_get_file(test).split("/")[:2])
 
 
-def _by_part(tests: Counter[str], part: Callable[[str], str]) -> Counter[str]:
-    parts: Counter[str] = Counter()
-    for name, spent_s in tests.items():
-        parts[part(name)] += spent_s
-    return parts
+def _sum_by(get_part: Callable[[str], str], seconds_by_test: Counter[str]) -> Counter[str]:
+    """Seconds of all tests of a file or a folder."""
+    sums: Counter[str] = Counter()
+    for test, spent_s in seconds_by_test.items():
+        sums[get_part(test)] += spent_s
+    return sums

@@ -1,4 +1,5 @@
-"""Mutation testing: `make mutants` changes the code at random places, and sees whether a test notices.
+"""Mutation testing: `make mutants` changes the code at random places, and counts how many changes the tests notice.
 
-`draw` draws the changes, `reach` finds the tests that come to each, `judge` runs these against it. No tests are here.
+`draw` draws the changes, `coverage` finds the tests that execute each changed statement, and `judge` runs these tests
+against the changed code. This folder has no tests.
 """

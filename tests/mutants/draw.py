@@ -1,4 +1,8 @@
-"""Draw random changes of the code: a file by its size, an operator of cosmic-ray, one place where it applies."""
+"""Draw random changes of the code.
+
+A file is drawn with a probability proportional to its size, then an operator of cosmic-ray, and then one of the
+operator's occurrences in the file: the expressions that it can change.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +20,16 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 from tests.support.paths import REPO
 
+# The folder of each project, and the package in it.
 PACKAGES = {
     "host": "polysight",
     "shared": "polysight_shared",
     "pi_controller": "polysight_pi",
     "papers": "polysight_papers",
 }
-# `|` and `&` stand in annotations, decorators are properties: their mutants are equivalent or do not import. What is
-# None is equal to None. Operators on variables need the names of two.
+# Operators (parts of their names in cosmic-ray) whose mutants say nothing about the tests. `|` and `&` of this code are
+# mostly in annotations, and its decorators are mostly `property`: such mutants behave the same or cannot be imported.
+# `is None` and `== None` are the same. Operators on variables need the names of two variables as arguments.
 UNUSED_OPERATORS = (
     "BitOr",
     "BitAnd",
@@ -40,7 +46,10 @@ UNUSED_OPERATORS = (
 
 @dataclass(frozen=True)
 class Mutant:
-    """A change of one place: the file from the root, and the name and number of the operator's occurrence in it."""
+    """One change: the `occurrence`-th expression of a file that an operator can change, counted from 0.
+
+    `file` is relative to the root of the repository; `line` is that of the expression.
+    """
 
     file: Path
     operator: str
@@ -51,27 +60,31 @@ class Mutant:
         return f"{self.file}:{self.line} {self.operator.removeprefix('core/')} {self.occurrence}"
 
     @property
-    def room(self) -> str:
-        """Room of `host`, or the name of another package."""
-        is_module_of_host = self.file.parts[0] == "host" and len(self.file.parts) > 3
-        return self.file.parts[2] if is_module_of_host else self.file.parts[0]
+    def package(self) -> str:
+        """Name of the package in `host/polysight`, such as `imaging`; elsewhere the folder of the project."""
+        folders = self.file.parts[:-1]
+        if folders[0] == "host" and len(folders) > 2:
+            return folders[2]
+        return folders[0]
 
 
 def list_files() -> list[Path]:
-    """Files that are changed, from the root."""
-    files = [f for top, package in PACKAGES.items() for f in (REPO / top / package).rglob("*.py")]
+    """Files that mutants may change, relative to the root of the repository."""
+    files: list[Path] = []
+    for project, package in PACKAGES.items():
+        files.extend((REPO / project / package).rglob("*.py"))
     return sorted(f.relative_to(REPO) for f in files)
 
 
 def draw_mutants(count: int, seed: int) -> list[Mutant]:
-    """Draw `count` different mutants that are Python, sorted by file."""
+    """Draw `count` different mutants that Python can compile, sorted by file and line."""
     generator = random.Random(seed)
     files = list_files()
     sizes = [(REPO / f).stat().st_size for f in files]
     operators = [n for n in operator_names() if not any(word in n for word in UNUSED_OPERATORS)]
     mutants: set[Mutant] = set()
     while len(mutants) < count:
-        file = generator.choices(files, sizes)[0]
+        (file,) = generator.choices(files, weights=sizes)
         operator = generator.choice(operators)
         lines = _find_lines(file, operator)
         if lines:
@@ -83,30 +96,35 @@ def draw_mutants(count: int, seed: int) -> list[Mutant]:
 
 
 def apply_mutation(mutant: Mutant) -> str:
-    """Return the changed file's text; empty if it is not changed, or no Python without a warning."""
+    """Return the text of the changed file; "" if nothing changes, or if Python rejects it or warns of its syntax."""
     original = (REPO / mutant.file).read_text(encoding="utf-8")
     mutated = mutate_code(original, get_operator(mutant.operator)(), mutant.occurrence)
     if mutated is None or mutated == original:
         return ""
     try:
         with warnings.catch_warnings():
-            # Python itself warns of an identity with a text or number.
+            # Python warns of `is` with a text or a number: such a mutant would be noticed without any test.
             warnings.simplefilter("error", SyntaxWarning)
             compile(mutated, str(mutant.file), "exec")
     except SyntaxError:
-        # Two stars before a dictionary are not a power, but the operator takes them for one.
+        # The operator that replaces powers (`**`) also replaces the two stars before an unpacked dictionary.
         return ""
     return mutated
 
 
 def _find_lines(file: Path, operator: str) -> list[int]:
-    """Line of each occurrence of an operator in a file."""
+    """Line of each expression in a file that an operator can change."""
     find_positions = get_operator(operator)().mutation_positions
-    return [start[0] for node in _list_nodes(file) for start, _ in find_positions(node)]
+    lines = []
+    for node in _list_nodes(file):
+        # A position is a start and an end, each a line and a column.
+        lines.extend(start[0] for start, _ in find_positions(node))
+    return lines
 
 
 @cache
 def _list_nodes(file: Path) -> list[Any]:
+    """All nodes of a file's syntax tree."""
     return list(_walk(get_ast((REPO / file).read_text(encoding="utf-8"))))
 
 

@@ -1,4 +1,4 @@
-"""One small simulated scan, and what the commands make of it."""
+"""One small simulated scan of copper and PET, and the products that `polysight process` makes of it."""
 
 import shutil
 from contextlib import redirect_stdout
@@ -20,10 +20,14 @@ PET = {"name": "PET", "centre_mm": [45.0, 0.0], "size_mm": [45.0, 45.0], "permit
 
 
 def simulate_plates(folder: Path, *plates: dict[str, Any], **more: Any) -> Path:
-    """A scan of plates on the grid of examples/own-scene.toml, or an empty one on a coarse grid."""
-    columns, rows, step_mm = (31, 27, (10.0, 6.0)) if plates else (15, 17, (14.0, 8.0))
+    """Simulate a scan of plates on the grid of examples/own-scene.toml; without plates on a coarser, faster grid."""
+    grid: dict[str, Any]
+    if plates:
+        grid = {"columns": 31, "rows": 27, "step_mm": (10.0, 6.0)}
+    else:
+        grid = {"columns": 15, "rows": 17, "step_mm": (14.0, 8.0)}
     image = {"columns": 90, "rows": 60, "pixel_mm": 2.0}
-    scene = make_scene(*plates, columns=columns, rows=rows, step_mm=step_mm, image=image)
+    scene = make_scene(*plates, **grid, image=image)
     return simulate(load_published_rig(), decode_scene(scene, "test"), folder, **more)
 
 
@@ -41,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def products(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Products of `polysight process` for a copy of that scan folder; the samples are kept."""
+    """Products of `polysight process` for a copy of the scan folder, so that `folder` itself is not changed."""
     products_folder = tmp_path_factory.mktemp("processed")
     run_command("process", shutil.copytree(folder, products_folder / "scan"), "--out", products_folder / "products")
     return products_folder / "products"

@@ -1,4 +1,4 @@
-"""Products as `polysight process` leaves them, of a small made-up image."""
+"""A folder of products (images, materials, settings, quality) as `polysight process` writes it, of a random image."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tests.support.rigs import load_rig_table
 from polysight.imaging import Images
 from polysight.products import write_image, write_json
 
-# Two segments of materials.json.
+# Two patches (areas of one material) in materials.json, where they are called segments.
 PATCH = {
     "label": 4, "name": "PET", "confidence": 0.75, "votes": {"PET": 0.75, "glass": 0.2, "unknown": 0.05},
     "metal_reference": False, "metal_like": False, "box_mm": [-30.0, -40.0, 50.0, 40.0], "outline_mm": [],
@@ -23,7 +23,7 @@ METAL = {**PATCH, "label": 5, "name": None, "confidence": None, "votes": {}, "me
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Products from another person: no raw data, no patches.npz."""
+    """Products without raw data and without patches.npz, as somebody may receive them from another lab."""
     rng = np.random.default_rng(3)
     h, v = (rng.standard_normal((2, 6, 11)) + 1j * rng.standard_normal((2, 6, 11))).astype(np.complex64)
     products = tmp_path / "one"

@@ -1,4 +1,7 @@
-"""Lines of the error budget: what is known is written, with signs and errors, and what is not known is left out."""
+"""The report's table of the error budget: sources of error of a scan's permittivities, and how large each one is.
+
+Known values have a sign and a standard deviation; unknown values have no line.
+"""
 
 import pytest
 
@@ -11,16 +14,18 @@ PLANE = "Plane of the plates, relative to the rig file"
 
 
 def list_cells(**parts) -> list[list[str]]:
-    """The cells of each line of the table of a budget with these parts."""
+    """The cells of each line in the table of an error budget with these parts; none if there is no table."""
     table = make_budget_table(ErrorBudget(**parts))
-    return [] if table is None else [row["cells"] for row in table["rows"]]
+    if table is None:
+        return []
+    return [row["cells"] for row in table["rows"]]
 
 
 @pytest.mark.parametrize(
     ("value", "digits", "text"),
     [(1.25, 1, "+1.2"), (-1.26, 1, "−1.3"), (-0.04, 1, "+0.0"), (0.0, 2, "+0.00"), (-0.04, 2, "−0.04")],
 )
-def test_a_number_has_its_sign_and_zero_a_plus(value, digits, text):
+def test_a_number_is_written_with_its_sign_and_zero_with_a_plus(value, digits, text):
     assert _format_with_sign(value, digits) == text
 
 
@@ -35,21 +40,26 @@ def test_without_a_budget_there_is_no_table():
         ("prior and scene", "not measured; estimated from its prior and the scene"),
     ],
 )  # fmt: skip
-def test_the_source_of_a_leakage_is_said(source, text):
+def test_the_table_says_how_the_leakage_was_found(source, text):
     assert list_cells(leakage=LeakageError(source=source)) == [["Leakage", text]]
 
 
 def test_leakages_are_complex_numbers_with_their_errors():
     leakage = LeakageError(h=(0.0123, -0.0456), v=(-0.02, 0.0), std=(0.001, None), source="scene")
-    assert list_cells(leakage=leakage)[1:] == [
+    _, *lines = list_cells(leakage=leakage)
+    assert lines == [
         [LEAKAGE_OF_H, "+0.012 − 0.046i ± 0.001"],
         [LEAKAGE_OF_V, "−0.020 + 0.000i"],
     ]
-    # A number of which a part is not known is left out: the line of the source is left.
+
+
+def test_a_leakage_of_which_one_part_is_unknown_has_no_line():
     leakage = LeakageError(h=(None, 0.1), v=(0.1, None), source="scene")
-    assert len(list_cells(leakage=leakage)) == 1
+    assert list_cells(leakage=leakage) == [["Leakage", "estimated from the scene"]]
+    # The second error is that of V.
     leakage = LeakageError(v=(0.1, 0.2), std=(0.5, 0.25), source="scene")
-    assert list_cells(leakage=leakage)[1:] == [[LEAKAGE_OF_V, "+0.100 + 0.200i ± 0.250"]]
+    _, *lines = list_cells(leakage=leakage)
+    assert lines == [[LEAKAGE_OF_V, "+0.100 + 0.200i ± 0.250"]]
 
 
 @pytest.mark.parametrize(
@@ -79,14 +89,14 @@ def test_an_angle_of_incidence_has_two_digits(incidence, cells):
         (PlaneError(known=True, tilt_deg=(0.5, None)), [[PLANE, "+0.0 mm"]]),
     ],
 )  # fmt: skip
-def test_a_plane_is_written_with_what_is_known_of_it(plane, cells):
+def test_lines_on_the_plane_of_the_plates_have_known_values_only(plane, cells):
     assert list_cells(plane=plane) == cells
 
 
 def test_evidence_for_metal_is_a_score_and_the_ratio_of_the_channels():
     assert list_cells(metal=MetalScore(others=3)) == []
-    text = "Evidence that the reference is metal"
-    assert list_cells(metal=MetalScore(score=-2.04, others=3)) == [[text, "score −2.0 from 3 other patches"]]
+    heading = "Evidence that the reference is metal"
+    assert list_cells(metal=MetalScore(score=-2.04, others=3)) == [[heading, "score −2.0 from 3 other patches"]]
     with_ratio = MetalScore(score=2.0, others=1, channel_ratio_db=-0.5)
-    (cells,) = list_cells(metal=with_ratio)
-    assert cells[1] == "score +2.0 from 1 other patches; V over H −0.5 dB relative to the direct path"
+    text = "score +2.0 from 1 other patches; V over H −0.5 dB relative to the direct path"
+    assert list_cells(metal=with_ratio) == [[heading, text]]

@@ -1,4 +1,4 @@
-"""NetCDF of a folder of products, read back by xarray."""
+"""`polysight export --netcdf` writes the products of a scan, and xarray reads the same values from the file."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def export_folder(folder: Path) -> xarray.Dataset:
     return read_netcdf(out / "image.nc")
 
 
-def test_the_file_holds_the_products(folder):
+def test_images_and_their_axes_are_the_same_as_in_the_products(folder):
     dataset = export_folder(folder)
     with np.load(folder / "image.npz") as saved:
         for name in ("h", "v", "p", "valid"):
@@ -33,10 +33,11 @@ def test_the_file_holds_the_products(folder):
             centre_m = dataset.attrs[f"image_centre_{axis}_m"]
             np.testing.assert_allclose(dataset[f"{axis}_mm"], 1e3 * (rig_m - centre_m), atol=1e-5)
             assert float(dataset[f"{axis}_mm"].mean()) == pytest.approx(0, abs=1e-9)
-            assert (dataset[f"{axis}_m"].attrs["units"], dataset[f"{axis}_mm"].attrs["units"]) == ("m", "mm")
+            assert dataset[f"{axis}_m"].attrs["units"] == "m"
+            assert dataset[f"{axis}_mm"].attrs["units"] == "mm"
 
 
-def test_the_table_is_that_of_the_materials(folder):
+def test_names_and_numbers_of_patches_are_those_in_materials_json(folder):
     dataset = export_folder(folder)
     # PATCH and METAL in conftest.py, by their labels.
     pet = dataset.sel(patch=4)
@@ -47,18 +48,24 @@ def test_the_table_is_that_of_the_materials(folder):
     assert (pet["permittivity_real_standard_error"], pet["permittivity_loss_standard_error"]) == (0.0625, 0.125)
     assert complex(pet["ratio"]) == 10j
     assert np.isnan(metal["permittivity"])
-    # The same numbers as in materials.json, in the same frame.
-    assert (float(pet["centre_x_mm"]), float(pet["centre_y_mm"]), float(pet["width_mm"])) == (10, 0, 80)
+    # Its box in materials.json, which is in mm from the image's centre, too.
+    left, _, right, _ = (-30, -40, 50, 40)
+    assert float(pet["centre_x_mm"]) == (left + right) / 2
+    assert float(pet["centre_y_mm"]) == 0
+    assert float(pet["width_mm"]) == right - left
     assert float(pet["patch_incidence_rad"]) == pytest.approx(np.radians(54.5))
     assert dataset["label"].dtype == np.int32
-    inside = dataset["label"].sel(x_mm=pet["centre_x_mm"], y_mm=pet["centre_y_mm"], method="nearest")
-    assert (inside, dataset["label"].sel(x_mm=-100, y_mm=0, method="nearest")) == (4, 5)
+    label_inside_pet = dataset["label"].sel(x_mm=pet["centre_x_mm"], y_mm=pet["centre_y_mm"], method="nearest")
+    label_inside_metal = dataset["label"].sel(x_mm=-100, y_mm=0, method="nearest")
+    assert label_inside_pet == 4
+    assert label_inside_metal == 5
 
 
 def test_the_attributes_give_the_origin_of_the_data(folder):
     attributes = export_folder(folder).attrs
     assert attributes["scan_id"] == "s"
     assert attributes["simulated"] is True
+    # Rows 0, 1 and 5 were recorded.
     assert attributes["rows_missing"].startswith("2-4, 6-")
     assert attributes["positions_masked"] == "RH 2 of 9"
     assert '"columns"' in attributes["instrument"]
@@ -73,7 +80,7 @@ def test_netcdf_has_no_complex_variables(folder):
         assert f["h_imag"].attrs["long_name"].endswith("imaginary part")
 
 
-def test_splitting_and_joining_is_the_identity():
+def test_joining_the_parts_of_split_complex_variables_restores_the_dataset():
     variables = {
         "a": (
             "t",
@@ -93,7 +100,7 @@ def test_splitting_and_joining_is_the_identity():
     assert {name: v.dtype for name, v in joined.items()} == {name: v.dtype for name, v in dataset.items()}
 
 
-def test_images_alone_export_too(folder):
+def test_images_without_materials_and_settings_can_be_exported(folder):
     for name in ("materials.json", "scan.json", "quality.json"):
         (folder / name).unlink()
     dataset = export_folder(folder)

@@ -1,4 +1,4 @@
-"""The table of materials in every format, number by number, compared with the patches of materials.json."""
+"""The table of patches in CSV and MATLAB files of `polysight export`: each cell is compared with materials.json."""
 
 import csv
 
@@ -64,35 +64,45 @@ EXPECTED = {
 
 @pytest.fixture
 def exported_folder(tmp_path):
-    """The folder of exports of products that hold these two patches."""
+    """Folder with the exported files of these two patches."""
     products = tmp_path / "products"
     ones = np.ones((2, 3), np.complex64)
-    axes = (np.array([-0.1, 0.0, 0.1]), np.array([0.0, 0.1]))
-    write_image(products / "image.npz", Images(ones, ones, *axes, np.ones((2, 3), bool), ones))
+    images = Images(
+        h=ones,
+        v=ones,
+        x_m=np.array([-0.1, 0.0, 0.1]),
+        y_m=np.array([0.0, 0.1]),
+        valid=np.ones((2, 3), bool),
+        p=ones,
+    )
+    write_image(products / "image.npz", images)
     write_json(products / "materials.json", {"scan_id": "s", "simulated": True, "segments": [PATCH, METAL]})
     assert main(["export", str(products), "--csv", "--mat", "--out", str(tmp_path / "out")]) == 0
     return tmp_path / "out"
 
 
+def replace_unknown(values: list, replacement: object) -> list:
+    """The values with the replacement for None."""
+    return [replacement if value is None else value for value in values]
+
+
 def test_csv_keeps_every_digit(exported_folder):
-    with (exported_folder / "materials.csv").open(newline="", encoding="utf-8") as f:
-        header, *rows = csv.reader(f)
-    columns = [list(column) for column in zip(*rows, strict=True)]
-    written = dict(zip(header, columns, strict=True))
-    assert written == {
-        name: ["" if value is None else str(value) for value in values] for name, values in EXPECTED.items()
-    }
-
-
-def are_same(values, expected) -> bool:
-    """True if a column has these values; NaN and empty texts mean unknown ones."""
-    if any(isinstance(e, str) for e in expected):
-        return ["" if np.size(v) == 0 else v for v in values] == ["" if e is None else e for e in expected]
-    return np.array_equal(np.asarray(values, float), [np.nan if e is None else e for e in expected], equal_nan=True)
+    with (exported_folder / "materials.csv").open(newline="", encoding="utf-8") as file:
+        header, pet_row, metal_row = csv.reader(file)
+    assert header == list(EXPECTED)
+    for name, pet_cell, metal_cell in zip(header, pet_row, metal_row, strict=True):
+        expected_cells = [str(value) for value in replace_unknown(EXPECTED[name], "")]
+        assert [pet_cell, metal_cell] == expected_cells, name
 
 
 def test_a_matlab_file_has_the_same_columns(exported_folder):
-    content = scipy.io.loadmat(exported_folder / "image.mat", simplify_cells=True)["materials"]
-    assert set(content) == set(EXPECTED)
+    """Unknown numbers are NaN, and unknown texts are empty arrays."""
+    columns = scipy.io.loadmat(exported_folder / "image.mat", simplify_cells=True)["materials"]
+    assert set(columns) == set(EXPECTED)
     for name, expected in EXPECTED.items():
-        assert are_same(content[name], expected), name
+        if any(isinstance(value, str) for value in expected):
+            texts = ["" if np.size(value) == 0 else value for value in columns[name]]
+            assert texts == replace_unknown(expected, ""), name
+        else:
+            numbers = np.asarray(columns[name], float)
+            np.testing.assert_array_equal(numbers, np.array(replace_unknown(expected, np.nan), float), err_msg=name)

@@ -1,4 +1,7 @@
-"""Names in any script: figures draw them without warnings, and the page shows each in full."""
+"""Names of materials in any script: the report's figures draw them without warnings, and its page shows each in full.
+
+A character that no font has is a question mark in figures; a list on the page then gives the full name.
+"""
 
 import warnings
 from html import unescape
@@ -18,36 +21,39 @@ NAMES = ["木板", "ガラス", "유리 3", "стекло", "Plexiglas®", "\U00
 PERMITTIVITY = {"real": 3.9, "imag": -0.6, "real_p30_p70": [3.8, 4.0], "imag_p30_p70": [-0.7, -0.5]}
 
 
-def make_row(label: int, name: str, truth: str) -> dict:
+def make_patch(label: int, name: str) -> dict:
+    """A patch of this name in materials.json; its true name is the same."""
     return {
         "label": label, "name": name, "confidence": 0.9, "metal_reference": False, "metal_like": False,
         "centre_mm": [0, 0], "box_mm": [-20, -20, 20, 20], "outline_mm": [], "permittivity": PERMITTIVITY,
         "ratio": {"real": 4.4, "imag": 0.6}, "interior_pixels": 9, "metal_distance": 1.0,
-        "truth": {"name": truth, "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
+        "truth": {"name": name, "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
     }  # fmt: skip
 
 
 def make_result_of_names(names: list[str]) -> ProcessedScan:
+    """Result of a scan with a patch and a true plate of each name, which are all in the title, too."""
     image = np.full((12, 12), 0.5 + 0.1j, np.complex64)
-    axis = np.linspace(-0.05, 0.05, 12)
+    axis_m = np.linspace(-0.05, 0.05, 12)
+    plates = [TruthPlate(name, box_mm=(-20, -20, 20, 20), permittivity=4 - 0.4j) for name in names]
     return make_result(
-        Images(image, image / 2, axis, axis, np.ones((12, 12), bool), image * 2),
-        {"segments": [make_row(k, name, name) for k, name in enumerate(names, 1)]},
-        {},
+        Images(h=image, v=image / 2, x_m=axis_m, y_m=axis_m, valid=np.ones((12, 12), bool), p=image * 2),
+        content={"segments": [make_patch(label, name) for label, name in enumerate(names, 1)]},
+        quality={},
         facts=ScanFacts(scan_id=" ".join(names), simulated=True),
-        plates=tuple(TruthPlate(name, (-20, -20, 20, 20), 4 - 0.4j) for name in names),
+        plates=tuple(plates),
     )
 
 
 @pytest.fixture(autouse=True)
-def make_warnings_errors():
+def turn_warnings_into_errors():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
 
 
-def test_figures_and_page_of_names_are_made_without_warnings(tmp_path):
-    """All names in one report, because a report takes seconds; all of them in its title."""
+def test_a_report_with_names_in_many_scripts_is_made_without_warnings_and_shows_them_in_full(tmp_path):
+    """One report has all names, because a report takes seconds."""
     html = unescape(write_report(tmp_path, make_result_of_names(NAMES)).read_text(encoding="utf-8"))
     for number, name in enumerate(NAMES, 1):
         assert name in html

@@ -1,4 +1,4 @@
-"""The report is one file, loads no other files, and marks simulated data."""
+"""The report on a scan: an HTML page that loads no other files, shows all results and says if they are simulated."""
 
 import base64
 import json
@@ -25,20 +25,23 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class Page(HTMLParser):
-    """Collects what a browser would load or show."""
+    """The tags of a page, the addresses from which a browser would load or to which it would link, and its text."""
 
     def __init__(self, html):
         super().__init__()
         self.sources = []
         self.text = []
         self.tags = []
+        # Number of open tags whose text a browser does not show.
         self._hidden = 0
         self.feed(html)
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
         self._hidden += tag in ("style", "script")
-        self.sources += [v for k, v in attrs if k in ("src", "href", "srcset", "data", "poster", "action")]
+        for name, value in attrs:
+            if name in ("src", "href", "srcset", "data", "poster", "action"):
+                self.sources.append(value)
 
     def handle_endtag(self, tag):
         self._hidden -= tag in ("style", "script")
@@ -49,9 +52,12 @@ class Page(HTMLParser):
 
     @property
     def words(self):
+        """The shown text with single spaces."""
         return " ".join(" ".join(self.text).split())
 
 
+# Less than five screens of a phone, which is 844 pixels high.
+MAX_HEIGHT_PX = 4000
 COMMON = {"votes": {}, "distance": 0.2, "pixels": 400, "interior_pixels": 100, "incidence_deg": 55.0}
 MATERIALS = [
     {
@@ -67,10 +73,10 @@ MATERIALS = [
         "truth": {"name": "acrylic", "metal": False, "permittivity": {"real": 4.0, "imag": -0.4}},
     },
 ]  # fmt: skip
-TRUTH = (
-    TruthPlate("copper", (-50, -20, -10, 20), None),
-    TruthPlate("acrylic", (10, -20, 50, 20), 4 - 0.4j),
-    TruthPlate("cork", (-10, 30, 10, 50), 10.6 - 0j),
+TRUE_PLATES = (
+    TruthPlate("copper", box_mm=(-50, -20, -10, 20), permittivity=None),
+    TruthPlate("acrylic", box_mm=(10, -20, 50, 20), permittivity=4 - 0.4j),
+    TruthPlate("cork", box_mm=(-10, 30, 10, 50), permittivity=10.6 - 0j),
 )
 QUALITY = {
     "boards": {
@@ -106,7 +112,7 @@ def draw_two_plates():
 
 @pytest.fixture(scope="module")
 def scan():
-    """Two plates, one of them named wrong, and a third that was not found."""
+    """Result of a scan of three plates: copper, acrylic that was named PET, and cork that was not found."""
     h, v, p, segments = draw_two_plates()
     x = np.linspace(-0.06, 0.06, 61)
     interior = np.zeros((61, 61), bool)
@@ -121,53 +127,60 @@ def scan():
         facts=ScanFacts(scan_id="of two <plates> & more", simulated=True, processed_utc="2026-11-23T10:00:00+00:00"),
         labels=segments,
         pixel_names={2: (np.array(["PET <b>", "unknown"] * 50), interior)},
-        plates=TRUTH,
+        plates=TRUE_PLATES,
         expected_accuracy=0.96,
     )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def page(scan, tmp_path_factory):
+    """Folder of the report, and its HTML."""
     out = tmp_path_factory.mktemp("report")
     path = write_report(out, scan)
     return out, path.read_text(encoding="utf-8")
 
 
-def test_a_phone_shows_the_result_before_anything_is_opened(page, browser):
-    """Two screens of verdict and picture, then the names: not the images, tables and settings."""
-    browser.visit((page[0] / "report.html").as_uri(), PHONE)
+def test_a_phone_shows_verdict_picture_and_names_with_everything_else_folded_away(page, browser):
+    """Images, tables and settings are shown when the reader opens them."""
+    out, _ = page
+    phone_width_px, *_ = PHONE
+    browser.visit((out / "report.html").as_uri(), PHONE)
     browser.wait("document.readyState == 'complete'", "the report")
-    assert browser.evaluate("document.documentElement.scrollHeight") <= 4000
-    assert browser.evaluate("document.documentElement.scrollWidth") == PHONE[0]
+    assert browser.evaluate("document.documentElement.scrollHeight") <= MAX_HEIGHT_PX
+    assert browser.evaluate("document.documentElement.scrollWidth") == phone_width_px
     assert browser.evaluate("document.querySelectorAll('details[open]').length") == 0
 
 
-def test_a_phone_shows_nine_patches_and_many_reasons_in_as_much(scan, browser, tmp_path):
-    """A report as long as those of disturbed scenes; its figures are of the scan of two plates."""
-    texts = {
+def test_the_report_on_nine_patches_and_seven_reasons_is_not_longer_on_a_phone(scan, browser, tmp_path):
+    """Reports on disturbed scenes are as long as this one. Its figures are those of the scan of three plates."""
+    reason = {
         "what": "plates are rough, wavy or bent: the phase of H scatters by 4 degrees, more than flat ones do",
         "why": "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
         "do": "fit it as a layer (polysight permittivity --layer), or lay plates and metal flat and free of others",
     }
-    quality = QUALITY | {"verdict": {"level": "care", "reasons": [texts] * 7}}
-    plate = MATERIALS[1] | {"name": "cardboard (rough, in two lines)"}
-    patches = [MATERIALS[0], *(plate | {"label": number} for number in range(2, 10))]
+    quality = QUALITY | {"verdict": {"level": "care", "reasons": [reason] * 7}}
+    copper, pet = MATERIALS
+    cardboard = pet | {"name": "cardboard (rough, in two lines)"}
+    patches = [copper, *(cardboard | {"label": number} for number in range(2, 10))]
     content = {"segments": patches, "library": "a library of nine materials from 16 scans. " * 10, "model": "knn"}
-    busy = replace_results(scan, quality=ScanQuality.decode(quality), materials=ScanMaterials.decode(content))
-    assert busy.verdict is not None
-    write_report(tmp_path, busy)
+    long_scan = replace_results(scan, quality=ScanQuality.decode(quality), materials=ScanMaterials.decode(content))
+    assert long_scan.verdict is not None
+    write_report(tmp_path, long_scan)
     browser.visit((tmp_path / "report.html").as_uri(), PHONE)
     browser.wait("document.readyState == 'complete'", "the report")
     assert browser.evaluate("document.querySelectorAll('ol > li').length") == 7
-    assert browser.evaluate("document.documentElement.scrollHeight") <= 4000
+    assert browser.evaluate("document.documentElement.scrollHeight") <= MAX_HEIGHT_PX
 
 
-def test_nothing_is_loaded_from_elsewhere(page):
+def test_the_report_loads_nothing_but_the_images_in_it(page):
     _, html = page
-    assert not re.search(r"(?:https?:)?//[a-z0-9]", re.sub(r"base64,[A-Za-z0-9+/=]+", "", html), re.IGNORECASE)
+    without_images = re.sub(r"base64,[A-Za-z0-9+/=]+", "", html)
+    address = r"(?:https?:)?//[a-z0-9]"
+    assert not re.search(address, without_images, re.IGNORECASE)
     parsed = Page(html)
     assert parsed.sources
-    assert all(s.startswith("data:image/png;base64,") for s in parsed.sources)
+    for source in parsed.sources:
+        assert source.startswith("data:image/png;base64,")
     assert not {"script", "link", "iframe", "object"} & set(parsed.tags)
     assert "@import" not in html
     assert "url(" not in html
@@ -175,11 +188,15 @@ def test_nothing_is_loaded_from_elsewhere(page):
 
 def test_images_are_embedded_and_saved_in_the_folder_of_the_page(page):
     out, html = page
-    inline = [base64.b64decode(s.partition(",")[2]) for s in Page(html).sources]
-    files = {p.name: p.read_bytes() for p in (out / "figures").iterdir()}
+    embedded = []
+    for source in Page(html).sources:
+        _, _, encoded = source.partition(",")
+        embedded.append(base64.b64decode(encoded))
+    files = {path.name: path.read_bytes() for path in (out / "figures").iterdir()}
     assert len(files) == 9
-    assert all(data.startswith(PNG) for data in files.values())
-    assert sorted(inline) == sorted(files.values())
+    for content in files.values():
+        assert content.startswith(PNG)
+    assert sorted(embedded) == sorted(files.values())
     assert {
         "amplitude_h.png",
         "amplitude_v.png",
@@ -188,37 +205,40 @@ def test_images_are_embedded_and_saved_in_the_folder_of_the_page(page):
         "materials.png",
         "truth.png",
     } <= set(files)
-    assert sorted(p.name for p in out.iterdir()) == ["figures", "report.html"]
+    assert sorted(path.name for path in out.iterdir()) == ["figures", "report.html"]
 
 
 def test_every_output_is_labelled_as_simulated(page):
     _, html = page
     words = Page(html).words
     assert words.startswith("SIMULATED: Scan of two")
+    # The title, the banner and the footer say so, and each figure and each table.
     assert words.count("SIMULATED") >= 3 + html.count("<figure") + html.count("<caption")
     for alt in re.findall(r'alt="([^"]*)"', html):
         assert "simulated" in alt
 
 
 def test_measured_data_is_not_called_simulated(scan, tmp_path):
+    measured_scan = replace_results(scan, facts=ScanFacts(simulated=False))
     with skip_rendering():
-        html = write_report(tmp_path, replace_results(scan, facts=ScanFacts(simulated=False))).read_text(
-            encoding="utf-8"
-        )
+        html = write_report(tmp_path, measured_scan).read_text(encoding="utf-8")
     assert "simulated" not in Page(html).words.lower()
 
 
 def test_results_are_shown_with_the_truth(page):
     _, html = page
     words = Page(html).words
-    assert "0 of 2 plates named right" in words  # the metal is a reference, not a result
+    # Copper is not counted: it is the reference, not a result.
+    assert "0 of 2 plates named right" in words
     assert "50.0 % of interior pixels named right; their own confidence expects 96.0 %" in words
     assert "✗ acrylic" in words
     assert "✓ copper" in words
     assert "Not found: cork" in words
+    # Error of the real part: 3.9 for 4.0.
     assert "-2.5 %" in words
     assert "(3.80 … 4.00)" in words
     assert "metal-like" in words
+    # 998 of 1000.
     assert "99.80 % of 1000 frames of recorded rows received" in words
     assert "RH phase (rad)" in words
     assert "frames masked 2" in words
@@ -234,59 +254,71 @@ def test_names_cannot_break_the_page(page):
     assert "two &lt;plates&gt; &amp; more" in html
 
 
-def test_bare_images_make_a_report_too(scan, tmp_path):
-    bare = make_result(scan.images, None, {})
-    words = Page(write_report(tmp_path, bare).read_text(encoding="utf-8")).words
+def test_a_result_without_materials_and_quality_has_a_report_on_its_images(scan, tmp_path):
+    images_only = make_result(scan.images, content=None, quality={})
+    words = Page(write_report(tmp_path, images_only).read_text(encoding="utf-8")).words
     assert "Images" in words
     assert "Materials" not in words
     assert "Quality" not in words
 
 
-def test_dark_and_invalid_images_do_not_fail(scan, tmp_path):
-    zero = np.zeros_like(scan.h)
-    dark = Images(zero, zero, scan.x_m, scan.y_m, np.zeros(zero.shape, bool), zero * np.complex64(np.nan))
-    assert write_report(tmp_path, make_result(dark, {}, {})).exists()
+def test_images_of_zeros_without_a_valid_pixel_have_a_report(scan, tmp_path):
+    zeros = np.zeros_like(scan.h)
+    no_pixel_is_valid = np.zeros(zeros.shape, bool)
+    not_a_number = zeros * np.complex64(np.nan)
+    images = Images(h=zeros, v=zeros, x_m=scan.x_m, y_m=scan.y_m, valid=no_pixel_is_valid, p=not_a_number)
+    assert write_report(tmp_path, make_result(images, content={}, quality={})).exists()
+
+
+ROWS = 4
+COLUMNS = 6
 
 
 def replace_boards(scan, boards):
-    return replace_results(scan, plan=RasterPlan(6, 4, 10.0, 5.0), quality=ScanQuality.decode({"boards": boards}))
+    """The result with these contents of quality.json for a scan of 4 rows of 6 positions."""
+    plan = RasterPlan(columns=COLUMNS, rows=ROWS, step_x_mm=10.0, step_y_mm=5.0)
+    return replace_results(scan, plan=plan, quality=ScanQuality.decode({"boards": boards}))
 
 
-def test_masked_positions_come_out_of_runs_and_of_rows_that_are_absent(scan):
+def test_positions_are_masked_in_runs_of_columns_and_in_rows_that_were_not_recorded(scan):
+    # Row 2 is masked in columns 0 and 1, and in column 5; row 3 was not recorded.
     boards = {"RH": {"masked_columns": {"2": [[0, 2], [5, 6]]}, "rows_recorded": [0, 1, 2]}}
+    expected_mask = np.zeros((ROWS, COLUMNS), bool)
+    expected_mask[2, [0, 1, 5]] = True
+    expected_mask[3] = True
     mask = find_masked_positions(replace_boards(scan, boards))["RH"]
-    assert np.argwhere(mask).tolist() == [[2, 0], [2, 1], [2, 5], *([3, c] for c in range(6))]
+    np.testing.assert_array_equal(mask, expected_mask)
 
 
-def test_runs_and_their_mask_are_the_same(scan):
+def test_a_mask_is_the_same_after_it_was_stored_as_runs_of_columns(scan):
     rng = np.random.default_rng(5)
-    for share in (0.0, 0.3, 1.0):
-        rows = rng.uniform(size=(4, 6)) < share
-        runs = {str(i): find_masked_runs(row) for i, row in enumerate(rows) if row.any()}
-        masks = find_masked_positions(
-            replace_boards(scan, {"RH": {"masked_columns": runs, "rows_recorded": [0, 1, 2, 3]}})
-        )
-        assert (masks["RH"] == rows).all()
+    for masked_share in (0.0, 0.3, 1.0):
+        mask = rng.uniform(size=(ROWS, COLUMNS)) < masked_share
+        runs = {str(row): find_masked_runs(mask[row]) for row in range(ROWS) if mask[row].any()}
+        boards = {"RH": {"masked_columns": runs, "rows_recorded": list(range(ROWS))}}
+        restored = find_masked_positions(replace_boards(scan, boards))["RH"]
+        np.testing.assert_array_equal(restored, mask)
 
 
-def test_the_report_has_the_masked_data_the_gains_and_the_whole_rig_file(scan):
+def test_the_report_has_the_masked_positions_the_gains_and_the_whole_rig_file(scan):
     boards = {"RH": {"masked_columns": {"2": [[0, 3]]}, "rows_recorded": [0, 1, 2, 3], "raw_crc32": {"0": "deadbeef"}}}
     gains = {"RH": [RxGain(0.0, 0.0), RxGain(1.25, -8.1)]}
     rig = load_rig_table() | {"name": "a <rig>"}
-    answer = replace_results(
-        replace_boards(scan, boards), facts=ScanFacts(simulated=True, rx_gains=gains, instrument=rig)
-    )
-    picture = encode_png(draw_coverage_figure(answer, find_masked_positions(answer)))
-    page = Page(render(answer, {"coverage": picture}))
-    assert base64.b64encode(picture).decode() in page.sources[0]
-    assert "RH 3 of 24 (12.50%)" in page.words
+    facts = ScanFacts(simulated=True, rx_gains=gains, instrument=rig)
+    scan_of_plan = replace_results(replace_boards(scan, boards), facts=facts)
+    picture = encode_png(draw_coverage_figure(scan_of_plan, find_masked_positions(scan_of_plan)))
+    page = Page(render(scan_of_plan, {"coverage": picture}))
+    first_picture, *_ = page.sources
+    assert base64.b64encode(picture).decode() in first_picture
+    assert f"RH 3 of {ROWS * COLUMNS} (12.50%)" in page.words
     assert "+1.25 dB" in page.words
     assert "-8.1°" in page.words
     assert 'name = "a <rig>"' in page.words
+    # Checksums of the rows are for programs.
     assert "deadbeef" not in page.words
 
 
-BOARD = {
+IMAGING_OF_RH = {
     "masked_positions": 12,
     "rows_without_data": 0,
     "loss_db": 0.0437,
@@ -297,78 +329,100 @@ BOARD = {
 }
 
 
-def test_the_imaging_table_has_a_column_for_each_board_and_marks_unknown_values():
-    table = make_imaging_table(
-        {"RH": BOARD, "RV": {"masked_positions": 70000}, "notices": ["RV: imaging by direct sum"]}
-    )
+def test_the_imaging_table_has_a_column_for_each_board_and_a_dash_for_unknown_values():
+    imaging_of_rv = {"masked_positions": 70000}
+    table = make_imaging_table({"RH": IMAGING_OF_RH, "RV": imaging_of_rv, "notices": ["RV: imaging by direct sum"]})
     assert table["head"] == ["Board", "RH", "RV"]
-    cells = {row["cells"][0]: row["cells"][1:] for row in table["rows"]}
-    assert cells["Positions masked"] == ["12", "70000"]
-    assert cells["Point response at half power, x × y (mm)"] == ["7.51 × 5.1", "–"]
-    assert cells["The paper's r λ / L, x × y (mm)"] == ["2.8 × –", "–"]
+    values = {}
+    for row in table["rows"]:
+        heading, *values_of_boards = row["cells"]
+        values[heading] = values_of_boards
+    assert values["Positions masked"] == ["12", "70000"]
+    assert values["Point response at half power, x × y (mm)"] == ["7.51 × 5.1", "–"]
+    assert values["The paper's r λ / L, x × y (mm)"] == ["2.8 × –", "–"]
     assert "direct sum" in table["caption"]
 
 
-def replace_every_number(content, value):
-    """The content with each number that is not a count replaced."""
-    if isinstance(content, dict):
-        # A result of a value that is not a number has no permittivity and no ratio.
-        required = ("permittivity", "ratio", "seconds_per_stage")
-        return {key: item if key in required else replace_every_number(item, value) for key, item in content.items()}
+def replace_floats(content, value):
+    """The content with each floating-point number replaced by the value."""
+    if isinstance(content, float):
+        return value
     if isinstance(content, list):
-        return [replace_every_number(item, value) for item in content]
-    return value if isinstance(content, float) else content
+        return [replace_floats(item, value) for item in content]
+    if isinstance(content, dict):
+        replaced = {}
+        for key, item in content.items():
+            # A permittivity and a ratio are always finite, or they are absent.
+            if key in ("permittivity", "ratio", "seconds_per_stage"):
+                replaced[key] = item
+            else:
+                replaced[key] = replace_floats(item, value)
+        return replaced
+    return content
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_numbers_that_are_none_are_shown_as_not_known(scan, value):
-    """New results may contain NaN or infinity; products have null instead."""
-    figures = replace_every_number({"segments": MATERIALS, "quality": QUALITY}, value)
+def test_nan_and_infinity_are_shown_as_not_known(scan, value):
+    """A result that was just computed may contain them; in its files they are null."""
+    materials = {
+        "segments": replace_floats(MATERIALS, value),
+        "pixel_accuracy": value,
+        "library": "",
+        "model": "knn",
+        "metal_reference": {"how": "given"},
+    }
     changed_scan = replace_results(
         scan,
-        materials=ScanMaterials.decode(
-            {"segments": figures["segments"], "pixel_accuracy": value, "library": "", "model": "knn",
-             "metal_reference": {"how": "given"}}
-        ),
-        quality=ScanQuality.decode(figures["quality"]),
+        materials=ScanMaterials.decode(materials),
+        quality=ScanQuality.decode(replace_floats(QUALITY, value)),
         expected_accuracy=value,
-    )  # fmt: skip
+    )
     with skip_rendering():
         html = render(changed_scan, {})
     words = re.findall(r"[\w.]+", Page(html).words.lower())
-    assert not {"nan", "inf", "infinity"} & set(words), [w for w in words if w in ("nan", "inf")]
+    assert not {"nan", "inf", "infinity"} & set(words)
     assert format_value(value) == "–"
 
 
 @pytest.mark.parametrize(
     ("name", "in_library", "text"),
     [
-        ("unknown", False, "acrylic"), ("unknown", True, "✗ acrylic"),
-        ("PET", False, "✗ acrylic"), ("acrylic", True, "✓ acrylic"),
+        ("unknown", False, "acrylic"),
+        ("unknown", True, "✗ acrylic"),
+        ("PET", False, "✗ acrylic"),
+        ("acrylic", True, "✓ acrylic"),
     ],
-)  # fmt: skip
-def test_a_foreign_material_that_is_called_unknown_is_neither_right_nor_wrong(scan, name, in_library, text):
-    foreign = MATERIALS[1] | {"name": name, "truth": MATERIALS[1]["truth"] | {"in_library": in_library}}
+)
+def test_unknown_is_neither_right_nor_wrong_for_a_material_that_is_not_in_the_library(scan, name, in_library, text):
+    """The plate is acrylic. The mark in front of the true name says whether the name that it was given is right."""
+    copper, pet = MATERIALS
+    plate = pet | {"name": name, "truth": pet["truth"] | {"in_library": in_library}}
+    content = {
+        "segments": [copper, plate],
+        "library": "",
+        "model": "knn",
+        "pixel_accuracy": 0.5,
+        "metal_reference": {"how": "given"},
+    }
     # As read from a file.
-    figures = json.loads(json.dumps({"segments": [MATERIALS[0], foreign], "library": "", "model": "knn"}))
-    figures |= {"pixel_accuracy": 0.5, "metal_reference": {"how": "given"}}
+    materials = ScanMaterials.decode(json.loads(json.dumps(content)))
     with skip_rendering():
-        words = Page(render(replace_results(scan, materials=ScanMaterials.decode(figures)), {})).words
+        words = Page(render(replace_results(scan, materials=materials), {})).words
     assert text in words
     assert ("✗ acrylic" in words) is (text == "✗ acrylic")
     assert ("✓ acrylic" in words) is (text == "✓ acrylic")
     assert ("not in the library" in words) is (text == "acrylic")
 
 
-def test_a_standard_deviation_is_not_shown_as_the_value():
+def test_a_value_and_its_standard_deviation_have_rows_of_their_own():
     boards = {"RH": {"stage_backlash_mm": {"shift": 0.12, "std": 0.01}}}
     (table,) = make_quality_tables({"boards": boards})
     cells = [row["cells"] for row in table["rows"]]
     assert cells == [["stage backlash shift (mm)", "0.12"], ["stage backlash std (mm)", "0.01"]]
 
 
-def test_a_scene_without_plates_to_name_has_no_count_of_them(scan):
-    """Such as a metal plate alone, processed with itself as the reference."""
+def test_a_scene_with_metal_alone_has_no_count_of_plates_named_right(scan):
+    """Metal is the reference, so that there is no plate to name."""
     assert scan.named_plates is not None
-    metal = [plate for plate in scan.plates if plate.permittivity is None]
-    assert replace_results(scan, plates=metal).named_plates is None
+    metal_plates = [plate for plate in scan.plates if plate.permittivity is None]
+    assert replace_results(scan, plates=metal_plates).named_plates is None

@@ -20,7 +20,7 @@ enum StageError : uint8_t {
   ERROR_EMERGENCY_STOP = 14,  // the emergency stop is pressed
   ERROR_STOPPED = 15,  // the stage was stopped by command
   ERROR_TOO_FAST = 16,  // the speed exceeds the firmware's step rate
-  ERROR_NO_RUN_UP = 17,  // no room to accelerate before the first point
+  ERROR_NO_RUN_UP = 17,  // no space to accelerate before the first point
   ERROR_SEQUENCE = 18,  // the sequence number is not the next one
   ERROR_DISABLED = 19,  // the motors are switched off
 };

@@ -216,7 +216,9 @@ def _check_chip(pi: Pi) -> str:
         with load_gpiod().Chip(path) as chip:
             return f"{path} is {chip.get_info().label!r}"
     except OSError as e:
-        raise DeviceError(f"{path}: {e.strerror}", "no such device, or no right", "set pi.gpio_chip; group gpio") from e
+        raise DeviceError(
+            f"{path}: {e.strerror}", "no such device, or no permission", "set pi.gpio_chip; group gpio"
+        ) from e
 
 
 def _check_trigger(pi: Pi) -> str:
@@ -285,7 +287,7 @@ def judge_widths(widths_ns: list[int], one_shot: bool) -> str | Finding:
 
 def _check_release(modules: Path) -> Finding:
     """Warn if the kernel keeps an output's level when its program dies: SYNC_IN could stay high."""
-    summary = "this kernel does not say if outputs are released when their program dies"
+    summary = "this kernel does not report whether outputs are released when their program ends"
     for module in ("pinctrl_bcm2835", "pinctrl_rp1"):
         parameter = modules / module / "parameters" / "persist_gpio_outputs"
         if parameter.exists():

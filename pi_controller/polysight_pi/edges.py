@@ -276,5 +276,5 @@ class EdgeTimes:
         elif lost_edges and abs(late_s - lost_edges * self._interval_s) <= (lost_edges + 1) * tolerance_s:
             kind = f"{lost_edges} edges lost"
         else:
-            kind = "a late edge, or lost ones beside a spurious one"
+            kind = "a late edge, or lost edges and a spurious one"
         return f"{kind} at point {point}: {interval_s * 1e3:.2f} ms after the one before, not {expected_s * 1e3:.2f} ms"

@@ -191,7 +191,7 @@ class Executor:
         if run is None or run.scan_id != scan_id:
             return make_refusal(PiFault.NOT_READY, f"run {scan_id} is not begun", remedy="BeginRun")
         if run.owner != owner:
-            return make_refusal(PiFault.NOT_OWNER, f"run {scan_id} is another program's")
+            return make_refusal(PiFault.NOT_OWNER, f"run {scan_id} belongs to another program")
         self._machine.note_host_alive()
         return self._accept()
 
@@ -243,7 +243,8 @@ class Executor:
         if late_part and self.unresponsive_s > LATE_S:
             # After a pause of the whole program, the first thread to wake finds the others late.
             late_part += (
-                f", nor has the executor turned for {self.unresponsive_s:.1f} s: the computer was too busy or slept"
+                f"; this program did not run for {self.unresponsive_s:.1f} s: the computer was too busy "
+                "or was suspended"
             )
         if late_part:
             self._machine.stop_motion(PiFault.PROGRAM_LATE, late_part)
@@ -351,7 +352,7 @@ class Executor:
             # The client that started a jog may stop it, also in the run of a lost host.
             owned = False
         if run and owned and getattr(command, "owner", "") not in (run.owner, self.take_over_key):
-            raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} is another program's")
+            raise RefusedError(PiFault.NOT_OWNER, f"run {run.scan_id} belongs to another program")
         match command:
             case m.BeginRun():
                 if self._postpone(request, command):
@@ -561,7 +562,7 @@ class Executor:
                 PiFault.BAD_REQUEST,
                 f"take {command.take} of row {index} is not newer than take {newest}",
                 "a late copy of an old command, or a program that does not know the scan's events",
-                "ask for the scan's events (Replay), and count on from them",
+                "request the scan's events (Replay), and continue counting from them",
             )
         accepted = self._accept("RunRow", run.plan.row(index), command.take, read_burst(run), run.speed_mm_s)
         self._takes[index] = command.take

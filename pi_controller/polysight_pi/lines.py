@@ -62,7 +62,7 @@ _REASONS = {
     errno.ENOENT: ("there is no such device", "set pi.gpio_chip in instrument.toml to a label or path that exists"),
     errno.EINVAL: ("the chip has no such line, or cannot set it so", "correct [pi] in instrument.toml (see gpioinfo)"),
     errno.ENXIO: ("the chip reports no edges on this line", "use a line of the Pi's own header as pi.trigger_in"),
-    errno.ENODEV: ("the chip is gone", "look at the kernel's log (dmesg)"),
+    errno.ENODEV: ("the chip has disappeared", "look at the kernel's log (dmesg)"),
 }
 _SPI_REASONS = {
     errno.ENOENT: ("SPI is off", "put `dtparam=spi=on` into /boot/firmware/config.txt and reboot the Pi"),
@@ -195,7 +195,7 @@ def _is_stamped_by_the_kernel(pi: Pi) -> bool:
 
 def _line_lost_error(e: OSError) -> DeviceError:
     return DeviceError(
-        f"GPIO lines are gone: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
+        f"GPIO lines are lost: {e.strerror}", "the chip vanished or its driver was unloaded", "`polysight-pi check`"
     )
 
 

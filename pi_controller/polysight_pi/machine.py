@@ -305,7 +305,7 @@ class Machine:
             self._rests = 0
         if self._rests > RESTING_STATUSES * MAX_REPEAT_REQUESTS:
             self._rests = 0
-            reason = "it rests, and does not say how its motion ended: it was reset"
+            reason = "it is at rest, and does not report how its motion ended: it was reset"
             self.handle_event("stage lost", PiFault.STAGE_LOST, reason)
         elif self._rests and self._rests % RESTING_STATUSES == 0:
             # Ask the stage to repeat the end of its motion. The lambda reads `link` inside `_tell_stage`, which handles
@@ -319,7 +319,7 @@ class Machine:
             self.handle_event("row fault", PiFault.EDGE_TIME, time_problem)
         edges = self._loop.counts.edges
         if self.state != "stopping" and self._watch.is_silent(row.points, edges):
-            reason = f"the stage has passed {row.points} points, {edges} edges were received: wire off?"
+            reason = f"the stage has passed {row.points} points, {edges} edges were received: is the wire loose?"
             self.handle_event("lasting fault", PiFault.TRIGGER_LINE_LOST, reason)
         if self.state in ("running", "held") and reply.fields.get("state") == "hold":
             row.edges.note_stop(_read_integer(reply, "x"), row.points)
@@ -408,7 +408,9 @@ class Machine:
         """Return the position of an axis of the stage at rest. Raises RefusedError while it is not known."""
         if not self._is_placed:
             remedy = "ask again in a second"
-            raise RefusedError(PiFault.NOT_READY, "the stage has not said where it rests", "it just stopped", remedy)
+            raise RefusedError(
+                PiFault.NOT_READY, "the stage has not reported where it rests", "it has just stopped", remedy
+            )
         return self.stage.x_mm if axis == "x" else self.stage.y_mm
 
     def _jog(self, command: m.Jog) -> None:

@@ -413,7 +413,7 @@ class StageLink:
             self._write(bytes([Immediate.STATUS]))
         else:
             self._write(Immediate.STOP.sent)
-            self._lose(f"this program has not commanded it for {hung_s:.1f} s: it was stopped")
+            self._lose(f"this program has sent it no command for {hung_s:.1f} s: it was stopped")
 
     def _take(self, line: bytes) -> None:
         """Distribute a received line: answers to the thread that waits for them, and all but errors to `news`."""

@@ -162,7 +162,8 @@ class Pi(Section, frozen=True):
             miso = _MISO[controller]
             require(self.sync_out == (mosi,), f"MOSI of {self.spi_device} is GPIO {mosi}: sync_out = [{mosi}]")
             require(
-                self.pulses_in in (None, miso), f"MISO of {self.spi_device} is GPIO {miso}: pulses_in = {miso}, or none"
+                self.pulses_in in (None, miso),
+                f"MISO of {self.spi_device} is GPIO {miso}: pulses_in must be {miso}, or left out",
             )
 
     @property
@@ -423,7 +424,7 @@ class Instrument(Section, frozen=True):
     def __post_init__(self) -> None:
         for role in ("transmit", "receive_h", "receive_v"):
             n = sum(b.role == role for b in self.boards)
-            require(n == 1, f'boards must hold exactly one with role = "{role}", found {n}')
+            require(n == 1, f'boards must contain exactly one board with role = "{role}", found {n}')
         # No Pi debounces in hardware; the kernel then reads the level some ticks after the edge.
         require(
             self.pi.trigger_debounce_us == 0
@@ -464,7 +465,7 @@ class Instrument(Section, frozen=True):
         for board in self.boards:
             require(
                 not board.rx_order or sorted(board.rx_order) == places,
-                f"boards.rx_order of {board.name} must hold each of {places} once, not {list(board.rx_order)}",
+                f"boards.rx_order of {board.name} must contain each of {places} once, not {list(board.rx_order)}",
             )
         misfit = self.stage.misfit(self.grid)
         require(not misfit, misfit)

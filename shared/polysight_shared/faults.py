@@ -113,7 +113,7 @@ EXPLANATIONS: dict[int, Explanation] = {
     StageError.LIMIT_SWITCH: Explanation(
         "a limit switch was hit",
         "lost steps, or a wrong centre",
-        "polysight-pi home, which leaves the switch by itself",
+        "polysight-pi home; homing moves the stage away from the switch",
     ),
     StageError.HOMING_FAILED: Explanation(
         "homing did not find the switch",
@@ -130,13 +130,13 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the speed exceeds the firmware's step rate", "stage.speed_mm_s x steps_per_mm is too high", "lower the speed"
     ),
     StageError.NO_RUN_UP: Explanation(
-        "no room to accelerate before the first point",
+        "no space to accelerate before the first point",
         "the grid reaches the end of the travel",
         "narrow the grid, or raise accel_mm_s2",
     ),
     StageError.SEQUENCE: Explanation("the sequence number is not the next one", "a line was lost", "send HELLO again"),
     StageError.DISABLED: Explanation(
-        "the motors are switched off", "it was reset, or just switched on", "polysight-pi home"
+        "the motors are switched off", "the stage was reset, or has just been switched on", "polysight-pi home"
     ),
     PiFault.STAGE_LOST: Explanation(
         "the stage does not answer",
@@ -144,7 +144,9 @@ EXPLANATIONS: dict[int, Explanation] = {
         "check the USB cable and stage.port, then polysight-pi home",
     ),
     PiFault.STAGE_ALARM: Explanation(
-        "the stage raised an alarm", "see the stage error beside this fault", "remove its cause, then polysight-pi home"
+        "the stage raised an alarm",
+        "see the stage error that is shown with this fault",
+        "remove its cause, then polysight-pi home",
     ),
     PiFault.EDGE_LOST: Explanation(
         "a trigger edge was lost",
@@ -169,7 +171,7 @@ EXPLANATIONS: dict[int, Explanation] = {
     PiFault.TRIGGER_LINE_LOST: Explanation(
         "the trigger line is not available",
         "another program uses the line, or the GPIO chip disappeared",
-        "stop polysight-pi on the Pi, `polysight-pi check` there, start it again",
+        "stop polysight-pi on the Pi, run `polysight-pi check` there, then start polysight-pi again",
     ),
     PiFault.HOST_LOST: Explanation(
         "the host sends no heartbeat", "the host's program or the network is down", "polysight resume SCAN on the host"
@@ -219,7 +221,7 @@ EXPLANATIONS: dict[int, Explanation] = {
         "the row is retaken; check the trigger wire and its ground",
     ),
     PiFault.POSITION: Explanation(
-        "the stage ended the row at another place than commanded",
+        "the stage ended the row at another position than commanded",
         "the sketch lost count, or answered another command",
         "polysight-pi home, then retake the row; flash the sketch of this release",
     ),

@@ -107,7 +107,7 @@ def _secure(socket: Socket, address: str, key_dir: Path, server: bool) -> None:
 
         public, secret = load_certificate(secret_file)
         if secret is None:
-            raise OSError(f"{secret_file} holds no secret key")
+            raise OSError(f"{secret_file} contains no secret key")
         socket.curve_publickey = public
         socket.curve_secretkey = secret
         if server:

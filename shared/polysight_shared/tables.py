@@ -83,7 +83,7 @@ def _parse_toml(path: Path) -> dict[str, Any]:
         line = e.object[: e.start].count(b"\n") + 1
         raise ConfigError(
             f"{path}: line {line} is not text in UTF-8",
-            "it was saved in another encoding, such as Latin-1 or UTF-16, or it is no text file",
+            "it was saved in another encoding, such as Latin-1 or UTF-16, or it is not a text file",
             "save it as UTF-8 in the editor",
             code=ErrorCode.FILE_UNREADABLE,
         ) from None

@@ -132,7 +132,7 @@ def test_a_card_that_keeps_its_address_must_have_been_off(cards, card, rig, tmp_
     options = ("--mac", NEW_MAC, "--yes", "--wait", "0")
     process = card("program", "RH", *options)
     assert process.status == 0
-    assert "`polysight card` tells" in process.out
+    assert "`polysight card` shows" in process.out
 
     def power_cycle() -> None:
         """The card is off until three requests, a complete round, are lost."""

@@ -79,7 +79,7 @@ def test_pixels_within_half_a_pixel_are_at_one_place(shift_mm, columns):
 
 
 def test_scans_without_a_common_place_have_nothing_to_compare():
-    with expect_refusal(ErrorCode.MISMATCH, "no place in common"):
+    with expect_refusal(ErrorCode.MISMATCH, "no area in common"):
         compare(make_pixels(), make_pixels(x0_mm=8.1))
     nowhere = np.zeros((3, 4), bool)
     with expect_refusal(ErrorCode.MISMATCH):

@@ -200,5 +200,5 @@ def test_processed_rows_are_proven_by_the_digests_of_all_their_boards(monkeypatc
     if is_complete:
         assert scans.find_processed_digests(tmp_path) == digests
     else:
-        with pytest.raises(DataError, match="does not say what it was made from"):
+        with pytest.raises(DataError, match="does not state from which data it was made"):
             scans.find_processed_digests(tmp_path)

@@ -149,4 +149,4 @@ def test_a_box_without_a_finite_ratio_is_noted(scans, tmp_path, capsys):
     capsys.readouterr()
     scan = load_training_scan(out, RIG_FILE)
     assert [e.name for e in make_entries(scan)] == ["copper"]
-    assert f"the box of {MINE} holds no pixel that can be used" in capsys.readouterr().err
+    assert f"the box of {MINE} contains no pixel that can be used" in capsys.readouterr().err

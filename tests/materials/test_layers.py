@@ -141,7 +141,7 @@ def test_a_large_error_of_the_loss_alone_is_not_called_a_layer_that_the_data_do_
     fit = LayerFit(
         6.08 - 0.53j, thickness_m=None, std_real=0.47, std_loss=0.49, std_thickness_m=0.0, chi2=0.0, freedom=0
     )
-    assert fit.warnings() == ["the data hardly tell the loss of this layer: it is known to +- 0.49"]
+    assert fit.warnings() == ["the data hardly determine the loss of this layer: it is known to +- 0.49"]
     assert replace(fit, std_loss=0.15).warnings() == []
     assert replace(fit, std_real=2.0).warnings() == ["the data hardly depend on this layer: its error bar is large"]
 

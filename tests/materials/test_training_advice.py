@@ -39,13 +39,13 @@ def test_scans_without_names_of_their_specimens_make_an_underconfident_library()
     [
         ({"scans": 3}, "known from 3 scans only"),
         ({"specimen_freedom": 2}, "differ more from those learnt"),
-        ({}, "a scan may be disturbed, or a label wrong"),
+        ({}, "a scan may be disturbed, or a label may be wrong"),
     ],
 )
 def test_overconfident_names_are_reported_with_the_likeliest_cause(fit_of_many_specimens, change, cause):
     # Of 200 names the mean confidence is 0.97, and 0.8 are right.
     text = advise(fit_of_many_specimens | {"named": 200, "said": 0.97, "right": 0.8} | change)
-    assert "overconfident: names are said with 97 % and 80 % are right" in text
+    assert "overconfident: names have a mean confidence of 97 %, and 80 % are right" in text
     assert cause in text
 
 

@@ -236,4 +236,4 @@ def test_without_a_scan_the_page_explains_how_to_begin_one():
 
 
 def test_a_renamed_folder_is_reported_as_missing(history):
-    assert judge_status(history, gone=True).headline == "The scan's folder is gone"
+    assert judge_status(history, gone=True).headline == "The scan's folder no longer exists"

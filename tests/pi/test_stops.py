@@ -153,7 +153,7 @@ def test_after_a_pause_of_the_whole_program_the_fault_does_not_name_one_part_onl
     pi.service.executor.post(pause)
     finished = host_in_row.wait_for_event(m.RowFinished)
     assert finished.fault == PiFault.PROGRAM_LATE
-    assert "served, nor has the executor turned for" in finished.reason
+    assert "served; this program did not run for" in finished.reason
 
 
 def test_a_command_of_a_run_is_accepted_only_when_its_event_is_on_the_disk(disk, pi):

@@ -155,7 +155,7 @@ def test_the_report_on_nine_patches_and_seven_reasons_is_not_longer_on_a_phone(s
     """Reports on disturbed scenes are as long as this one. Its figures are those of the scan of three plates."""
     reason = {
         "what": "plates are rough, wavy or bent: the phase of H scatters by 4 degrees, more than flat ones do",
-        "why": "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
+        "why": "H and V see an uneven surface from different places; the errors are larger, and include this scatter",
         "do": "fit it as a layer (polysight permittivity --layer), or lay plates and metal flat and free of others",
     }
     quality = QUALITY | {"verdict": {"level": "care", "reasons": [reason] * 7}}

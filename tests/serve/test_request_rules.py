@@ -262,7 +262,7 @@ def test_a_missing_folder_of_scans_is_made_in_the_current_folder_only(tmp_path, 
 def test_a_live_view_of_a_folder_with_other_files_than_notes_is_refused(tmp_path, capsys):
     """A scan may begin later in an empty or missing folder, or one with the operator's notes or hidden files."""
     _check_scan_folder(tmp_path)
-    assert "no scan is in" in capsys.readouterr().err
+    assert "contains no scan yet" in capsys.readouterr().err
 
     # Written by the page before the scan, and by the system.
     (tmp_path / "operator.json").write_text("{}")

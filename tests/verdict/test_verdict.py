@@ -255,7 +255,7 @@ def test_a_reference_that_may_be_dielectric_is_not_reported_as_painted():
     """`culprit` is the patch that speaks most against metal: it is given only if paint does not explain the patches."""
     (doubt,) = rules.judge_metal("patch 5", False, False, True, False, False, culprit=2, painted=1.0, paint_mm=0.1)
     (paint,) = rules.judge_metal("patch 5", False, False, True, False, False, painted=1.0, paint_mm=0.1)
-    assert "may be no metal: patch 2" in doubt.what
+    assert "may not be metal: relative to it, patch 2" in doubt.what
     assert "may be painted" in paint.what
 
 
@@ -277,7 +277,7 @@ def test_paint_is_reported_of_a_reference_that_a_user_gave_and_of_one_that_the_p
 
 def test_paint_is_reported_on_a_reference_that_is_only_likely_metal_too():
     likely, paint = rules.judge_metal("patch 5", True, False, False, False, False, painted=0.9, paint_mm=0.1)
-    assert "is likely metal, not certainly" in likely.what
+    assert "is probably metal, but this is not certain" in likely.what
     assert "(patch 5) may be painted: probability 0.90, 0.10 mm" in paint.what
     (unpainted,) = rules.judge_metal("patch 5", True, False, False, False, False, painted=0.1, paint_mm=0.1)
     assert unpainted == likely
@@ -322,7 +322,7 @@ def test_reasons_come_from_the_recording_to_the_names():
         "masked",
         "relative to",
         "is weak, -3",
-        "likely metal",
+        "probably metal",
         "residual phase",
         "no permittivity",
         "not judged",
@@ -338,7 +338,7 @@ def test_reasons_come_from_the_recording_to_the_names():
 # Parts of texts by which the reasons of the test above are recognised.
 PARTS = (
     "direct path is missing", "no patch", "no metal", "a damaged", "rows are", "masked", "relative to", "is weak, -3",
-    "likely metal", "residual phase", "no permittivity", "not judged", "incidence angle", "brighter", "the angle was",
+    "probably metal", "residual phase", "no permittivity", "not judged", "incidence angle", "brighter", "the angle was",
     "off the rig", "leakage", "plane is", "across",
 )  # fmt: skip
 
@@ -459,9 +459,9 @@ def test_a_jump_of_both_boards_alike_is_reported_once_and_not_explained_by_a_cab
     """0.41 rad are 23 degrees. Jumps of the boards that differ are reported for each board."""
     findings = row_rules.judge_phase_jumps({"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, 0.38)]})
     assert [r.what for r in findings] == [
-        "the phase of the echo jumps by +23 degrees before row 26 in both boards alike"
+        "the phase of the echo jumps by +23 degrees before row 26 in both boards equally"
     ]
-    assert "no cable of one board" in findings[0].why
+    assert "a cable of one board cannot" in findings[0].why
     findings_of_boards = row_rules.judge_phase_jumps(
         {"RH": [PhaseJump(26, 0.41)], "RV": [PhaseJump(26, -0.38), PhaseJump(40, 0.3)]}
     )

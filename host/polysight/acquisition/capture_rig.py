@@ -80,7 +80,8 @@ class CaptureRig(Closing):
             if (silence_s := instrument.limits.end_of_record_s) <= CARD_TAIL_S:
                 self.warnings.append(
                     f"limits.end_of_record_s is {silence_s:g}: a card sends the last packet after {CARD_TAIL_S:g} s of"
-                    " silence or when the record is stopped, but not every card may do the latter; 3 s is safe"
+                    " silence or when the record is stopped, but possibly not every card sends it when stopped; 3 s "
+                    "is safe"
                 )
             self._stack = stack.pop_all()
 

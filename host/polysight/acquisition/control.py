@@ -304,19 +304,20 @@ def send_command(folder: Path, command: ScanCommand, asker: str = "a program", l
     life = read_life(folder)
     if life is not None and life.killed:
         raise ScanError(
-            f"{folder}: no running scan takes `{command}`", "its program was killed",
+            f"{folder}: no running scan accepts `{command}`", "its program was killed",
             f"`polysight resume {quote(folder)}`; the stage has stopped by itself", code=ErrorCode.NO_ANSWER,
         )  # fmt: skip
     if life is not None and life.doing == "materials":
         raise ScanError(
-            f"{folder}: no running scan takes `{command}`", "its rows have ended, and materials are computed",
-            "wait; nothing moves any more", code=ErrorCode.NO_ANSWER,
+            f"{folder}: no running scan accepts `{command}`", "all its rows are recorded, and materials are being "
+            "computed",
+            "wait; nothing moves now", code=ErrorCode.NO_ANSWER,
         )  # fmt: skip
     try:
         _write_command(path, asker)
     except OSError as e:
         raise ScanError(
-            f"{folder}: no running scan takes `{command}`: {e.strerror}",
+            f"{folder}: no running scan accepts `{command}`: {e.strerror}",
             "no scan runs in this folder, it was moved or renamed, or you may not write to it",
             f"if its program was killed, resume the scan with `polysight resume {quote(folder)}`",
             code=ErrorCode.NO_ANSWER,

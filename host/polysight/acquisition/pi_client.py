@@ -322,7 +322,7 @@ class PiClient(Closing):
         if is_refused:
             return DeviceError(
                 f"the Pi at {self._address} refuses this host's key",
-                "the key was revoked or never allowed, or pi.key here is another Pi's",
+                "the key was revoked or never allowed, or pi.key here belongs to another Pi",
                 f"on the Pi: `polysight-pi keys --list`; here: the key files in {self._instrument.pi.key_dir}"
                 " (docs/how-to/install.md)",
                 code=ErrorCode.REFUSED_BY_PEER,

@@ -161,7 +161,7 @@ def place_frames(
         if received > pulses:
             raise _UndeterminedError("more frames came than pulses were sent")
         if frame_bytes < payload_bytes:
-            raise _UndeterminedError("a packet holds several frames: only the one that fills it has a time")
+            raise _UndeterminedError("a packet contains several frames: only the frame that fills it has a time")
         trains = _find_trains(pulses_ns, received_ns, arrivals, frame_bytes, payload_bytes, frame_ns)
     except _UndeterminedError as e:
         no_frame = np.full(received, -1, dtype=np.int64)
@@ -336,7 +336,7 @@ def _find_pauses(pulses_ns: Times, received_ns: Times) -> Times:
     """
     last = pulses_ns[:, -1]
     if len(last) < 2:
-        raise _UndeterminedError("the offset between the clocks needs two bursts")
+        raise _UndeterminedError("the offset between the clocks cannot be measured with fewer than two bursts")
     pause_ns = int((pulses_ns[1:, 0] - last[:-1]).min())
     if pause_ns < 2 * int(np.diff(pulses_ns[:, :2]).max(initial=0)):
         raise _UndeterminedError("the bursts follow each other without a pause")
@@ -371,7 +371,9 @@ def _predict_arrivals(
     """
     bursts, count = pulses_ns.shape
     if bursts < _MIN_AGREEING_BURSTS:
-        raise _UndeterminedError(f"the offset between the clocks needs {_MIN_AGREEING_BURSTS} bursts")
+        raise _UndeterminedError(
+            f"the offset between the clocks cannot be measured with fewer than {_MIN_AGREEING_BURSTS} bursts"
+        )
     pauses = _find_pauses(pulses_ns, received_ns)
     came_ns = entries[:, 0]
     frame = (entries[:, 1] - 1) // frame_bytes

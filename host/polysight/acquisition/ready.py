@@ -104,7 +104,7 @@ def _wait_ready(pi: PiClient, stop: StopRequest, scan_id: str) -> bool:
         if time.monotonic() > deadline:
             raise ScanError(
                 f"the stage is {status.state!r} {_HOMING_TIMEOUT_S:.0f} s after homing began",
-                "the stage stands still, or its switches are not reached",
+                "the stage does not move, or it does not reach its switches",
                 "look at the stage; `journalctl -u polysight-pi -n 20` on the Pi",
                 code=ErrorCode.STAGE_NOT_READY,
             )
@@ -184,9 +184,10 @@ def check_same_stage(stage: Stage, hello: HelloReply, source: str) -> list[str]:
     if differing := list_stage_differences(stage, hello):
         raise ScanError(
             f"host and Pi place rows differently: {'; '.join(differing)}",
-            f"the rig file of the Pi is not that of {source}; rows of both would be two coordinate systems in one scan",
-            "copy the right [stage] to the other machine and `sudo systemctl restart polysight-pi`; rows taken with"
-            " other values belong to another scan",
+            f"the rig file of the Pi is not that of {source}; rows recorded with both would have different "
+            "coordinates in one scan",
+            "copy the right [stage] to the other machine and `sudo systemctl restart polysight-pi`; rows recorded "
+            "with other values belong to another scan",
             code=ErrorCode.STAGE_DIFFERS,
         )
     if hello.stage:

@@ -359,7 +359,7 @@ def explain_incomplete_row(take: Take, faults: list[TakeFault], scan: ScanFolder
     cause = "packets are lost on the network or in this machine, or a board misses SYNC_IN pulses"
     remedy = "see the counts of row_rejected in the manifest; check cable, receive buffer and load"
     if take.stopped_radars:
-        cause = "a radar has stopped by itself, or the link to it is gone"
+        cause = "a radar has stopped without a command, or its connection is lost"
         remedy = "check its USB cable, its power and its SYNC_IN (docs/how-to/radar-bring-up.md)"
     elif take.silent_boards:
         silent = [
@@ -562,7 +562,7 @@ class RowTaker:
                     return
                 raise ScanError(
                     f"row {take.row.index} did not end within {limit_s:.0f} s",
-                    "the stage stands still, or the Pi's program hangs",
+                    "the stage does not move, or the Pi's program hangs",
                     f"`journalctl -u polysight-pi -n 20` on the Pi, then `polysight resume {quote(self._folder)}`",
                     code=ErrorCode.NO_ANSWER,
                 )

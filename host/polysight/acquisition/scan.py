@@ -269,7 +269,7 @@ class RunningScan:
                 # A card that lost power has lost its configuration.
                 self._rig.configure(take.silent_boards)
             self.result.retakes += 1
-            self._notify("retake", f"row {row.index} is taken again: {join_faults(faults)}")
+            self._notify("retake", f"row {row.index} is retaken: {join_faults(faults)}")
 
     def _take_row(self, row: Row, number: int, taker: RowTaker, transaction: RowTransaction) -> Take | None:
         """Wait until the row may begin, and record it; return None if asked to stop before it began."""
@@ -333,7 +333,7 @@ class RunningScan:
             if self._stop.after_row:
                 return False
             if not waited:
-                self._notify("wait", f"{waiting} rows wait to be processed; the next one begins when they are fewer")
+                self._notify("wait", f"{waiting} rows wait to be processed; the next row begins when fewer are waiting")
             waited = True
             self._queue.wait(_POLL_S)
             self._pi.events()
@@ -565,7 +565,7 @@ def resume_scan(
             raise ScanError(
                 f"{folder} is a scan that is {kind}, and the Pi's backend is {hello.backend!r}",
                 "simulated and measured rows must never be mixed in one scan",
-                "start the Pi with the backend the scan was begun with, or make a new scan",
+                "start the Pi with the backend with which the scan began, or make a new scan",
                 code=ErrorCode.MISMATCH,
             )
         # The Pi's settings must be those that it reported when the scan began. A Pi of an older program reports none:
@@ -617,7 +617,7 @@ def _withdraw_damaged(scan: ScanFolder, writer: ManifestWriter, progress: OnProg
     for row, faults in damaged.items():
         writer.append(RowWithdrawn(row=row, take=rows[row].take, reasons=faults, withdrawn_utc=utc_now()))
     scan.reload()
-    return [f"row {row} is taken again: {'; '.join(faults)}" for row, faults in damaged.items()]
+    return [f"row {row} is retaken: {'; '.join(faults)}" for row, faults in damaged.items()]
 
 
 def _check_cards(scan: ScanFolder, rig: CaptureRig) -> None:
@@ -632,7 +632,7 @@ def _check_cards(scan: ScanFolder, rig: CaptureRig) -> None:
             raise ScanError(
                 f"the card of {name} at {card.board.card_address} sent the rows of {boards_of_card[0]} so far"
                 f" (MAC address {card.mac})",
-                "cards or their addresses were exchanged: later rows would be another board's",
+                "cards or their addresses were exchanged: later rows would be those of another board",
                 "exchange them back, or begin another scan",
                 code=ErrorCode.MISMATCH,
             )

@@ -83,8 +83,8 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
     unknown = [name for name in changes if name not in known_options]
     if unknown:
         raise ConfigError(
-            f"{', '.join(unknown)}: no change of a plan",
-            f"the changes are {', '.join(known_options)}",
+            f"{', '.join(unknown)}: not a setting of a plan",
+            f"the settings are {', '.join(known_options)}",
             "see help(polysight.plan)",
             code=ErrorCode.VALUE_INVALID,
         )
@@ -92,7 +92,7 @@ def plan(rig: PathText | Instrument | None = None, *, scene: Scene | None = None
     if no_numbers:
         raise ConfigError(
             f"{', '.join(no_numbers)}: not a number",
-            "a change of a plan is a number in the unit of its name",
+            "a setting of a plan is a number in the unit that its name has",
             "see help(polysight.plan)",
             code=ErrorCode.VALUE_INVALID,
         )

@@ -124,7 +124,7 @@ def open_scan(
         return _open_products_only(path, settings, process_again or rig is not None)
     source = _open_source(path, rig)
     if rig is not None and isinstance(source, ScanFolder):
-        warnings.warn(f"{path}: `rig` is ignored: a scan folder brings its own", stacklevel=2)
+        warnings.warn(f"{path}: `rig` is ignored: a scan folder has its own rig file", stacklevel=2)
     rig_is_used = rig is not None and not isinstance(source, ScanFolder)
     saved = None if process_again or rig_is_used else find_products(path)
     if saved is not None and isinstance(source, ScanFolder) and not _is_current(saved, source):
@@ -576,7 +576,8 @@ class Scan:
         """The processing of the recorded rows. Raises DataError if there are none."""
         if self._source is None:
             raise DataError(
-                f"{self.folder}: holds no recorded rows", "it is a folder of products", "open the scan folder instead",
+                f"{self.folder}: contains no recorded rows", "it is a folder of products", "open the scan folder "
+                "instead",
                 code=ErrorCode.NO_DATA,
             )  # fmt: skip
         return Processing(self._source, self.folder, self._settings)
@@ -587,7 +588,7 @@ class Scan:
         origin = self._source or self._saved
         if origin is None:
             raise DataError(
-                f"{self.folder}: holds no scan", "it is empty", "open another folder", code=ErrorCode.NO_DATA
+                f"{self.folder}: contains no scan", "it is empty", "open another folder", code=ErrorCode.NO_DATA
             )
         return origin
 

@@ -135,8 +135,8 @@ class CardClient(Closing):
     def _twin_error(self, *addresses_seen: str) -> DeviceError:
         return DeviceError(
             f"{self._name()}: {', '.join(addresses_seen)}",
-            "two cards have this address or were exchanged, or the network doubles packets: rows of either look like"
-            " the other's",
+            "two cards have this address or were exchanged, or the network duplicates packets: rows of one card "
+            "cannot be distinguished from those of the other",
             "give each card its own address (`polysight card`, docs/how-to/install.md), or unplug the second one;"
             f" `arping {self.board.card_address}` shows who answers",
             code=ErrorCode.VALUES_CONFLICT,
@@ -244,7 +244,7 @@ class CardClient(Closing):
         except OSError as e:
             if e.errno in (errno.ENETUNREACH, errno.EHOSTUNREACH):
                 raise explain_missing_route(
-                    self.board, f"no way to {self._name()} from {self.board.host_address}"
+                    self.board, f"no route to {self._name()} from {self.board.host_address}"
                 ) from None
             problem = f"sending to {self._name()} failed: {e.strerror}"
             raise explain_silent_card(self.board, problem) from e
@@ -378,7 +378,7 @@ class EepromSettings:
 
     @staticmethod
     def _make_error(what: str, remedy: str = "correct the board in instrument.toml") -> ConfigError:
-        cause = "a card with them could not be reached"
+        cause = "a card with these settings could not be reached"
         return ConfigError(f"EEPROM settings refused: {what}", cause, remedy, code=ErrorCode.VALUE_INVALID)
 
 

@@ -210,7 +210,9 @@ class BatchReceiver:
             if number in (errno.EAGAIN, errno.EINTR):
                 return 0
             problem = f"receiving from the capture card failed: {os.strerror(number)}"
-            raise DeviceError(problem, "the network interface went down", "`polysight doctor` names the hop")
+            raise DeviceError(
+                problem, "the network interface went down", "`polysight doctor` shows which connection fails"
+            )
         self.lengths[:n] = self._received[:n]
         self.times_ns[:n] = self._read_times(n)
         self._kernel_bytes = int(self._received[:n].sum()) + n * _PACKET_OVERHEAD_BYTES
@@ -312,7 +314,7 @@ def check_receive_buffer(
         )
         cause = limit
         if granted >= needed_bytes:
-            cause = "card.receive_buffer_bytes asks for no more"
+            cause = "card.receive_buffer_bytes requests no more"
             remedy = f"card.receive_buffer_bytes = {enough} in instrument.toml; {remedy}"
         raise DeviceError(problem, cause, remedy, code=ErrorCode.VALUE_INVALID)
     if granted < needed_bytes:

@@ -379,7 +379,7 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
     if log.count == 0:
         return _Doubt("no packet came")
     if not record.of_row.any():
-        return _Doubt("every packet is of another record, of a second card, or came before the first pulse")
+        return _Doubt("every packet belongs to another record or to a second card, or came before the first pulse")
     # A card that restarts within the row begins with its first counters again, and never counts to the row's end. If
     # the row began with them, too, the same counters come twice.
     counted_twice = bool(row.conflicts) or row.counts.late_by_bytes > _MOST_OVERTAKING_PACKETS * record.full
@@ -403,8 +403,8 @@ def _find_doubt(record: _Record, row: _Row, log: PacketLog, frame_bytes: int) ->
     missing = expected - record.length
     if not record.ended:
         return _Doubt(
-            f"the end of the record did not come ({missing} bytes): without it, data that the card dropped unnoticed or"
-            " missed SYNC_IN pulses do not show"
+            f"the end of the record is missing ({missing} bytes): without it, missed SYNC_IN pulses and data that "
+            "the card dropped unnoticed cannot be detected"
         )
     if missing % frame_bytes or frame_bytes == 1:
         return _Doubt(f"the record ended {missing} bytes early: the card dropped data before numbering it")

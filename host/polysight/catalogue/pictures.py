@@ -89,7 +89,7 @@ class Pixels(products.ProcessedScan):
             raise DataError(
                 f"x = {x_mm:.6g} mm, y = {y_mm:.6g} mm lies outside the image",
                 f"it reaches from x {left:.1f} to {right:.1f} mm, and from y {low:.1f} to {high:.1f} mm",
-                "give a place in it, in mm from its centre", code=ErrorCode.VALUE_INVALID,
+                "give a position in it, in mm from its centre", code=ErrorCode.VALUE_INVALID,
             )  # fmt: skip
         return int(np.abs(self.y_mm - y_mm).argmin()), int(np.abs(self.x_mm - x_mm).argmin())
 

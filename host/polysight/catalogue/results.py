@@ -470,8 +470,8 @@ def compare_pixels(a: Pixels, b: Pixels, names: tuple[str, str]) -> Comparison:
     is_in_both = row_inside[:, None] & column_inside[None, :] & a.clear & b.clear[same_place]
     if not is_in_both.any():
         raise DataError(
-            "the two scans have no place in common", "their images lie apart, or one of them is dark",
-            "take other scans", code=ErrorCode.MISMATCH,
+            "the two scans have no area in common", "their images lie apart, or one of them is dark",
+            "choose other scans", code=ErrorCode.MISMATCH,
         )  # fmt: skip
     p = np.where(is_in_both, a.p - b.p[same_place], np.nan).astype(np.complex128)
     known_in_both = is_in_both & a.permittivity.mask & b.permittivity.mask[same_place]

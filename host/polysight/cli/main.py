@@ -46,7 +46,7 @@ def build_parser(command: str | None = None) -> argparse.ArgumentParser:
         prog="polysight",
         description="See what things are made of: bistatic polarimetric SAR with commodity mmWave radars.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog="example:\n  polysight demo --out out/demo\n\n`polysight COMMAND --help` says more about a command.",
+        epilog="example:\n  polysight demo --out out/demo\n\n`polysight COMMAND --help` explains a command.",
     )
     parser.add_argument("--version", action="version", version=f"polysight {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=CommandParser)

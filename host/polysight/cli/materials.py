@@ -271,7 +271,7 @@ def _add_export(add: AddCommand) -> None:
     sub.add_argument("products", type=Path, metavar="DIR", help="folder of products, or a scan folder")
     for name, text in _FORMATS.items():
         sub.add_argument(f"--{name}", action="store_true", help=text)
-    sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export beside it)")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="folder to write into (default: DIR-export, next to DIR)")
 
 
 _LABEL_EXAMPLES = (

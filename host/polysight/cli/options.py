@@ -209,7 +209,9 @@ def _parse_four_numbers(text: str, form: str) -> Box:
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not of the form {form}") from None
     if not all(abs(value) <= _FARTHEST_MM for value in (a, b, c, d)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a place on the image: numbers of at most {_FARTHEST_MM} mm")
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not a position in the image: numbers of at most {_FARTHEST_MM} mm"
+        )
     return a, b, c, d
 
 

@@ -204,7 +204,7 @@ def add_commands(add: AddCommand) -> None:
     sub = add(
         "sync-report",
         _run_sync_report,
-        "report the errors that synchronisation leaves, beside the Cramer-Rao bound",
+        "report the errors that remain after synchronisation, compared with the Cramer-Rao bound",
         "polysight sync-report scans/one --out out/sync",
     )
     _add_data(sub)
@@ -230,7 +230,7 @@ def _add_data(sub: argparse.ArgumentParser, several: bool = False, images: bool 
         "--config",
         type=Path,
         metavar="FILE",
-        help="rig file of published data (default: instrument.toml beside it or here, or the packaged one)",
+        help="rig file of published data (default: instrument.toml in its folder or here, or the packaged one)",
     )
 
 
@@ -400,7 +400,7 @@ def _add_leakage(add: AddCommand) -> None:
         required=True,
         metavar="DEG=SCAN",
         help="scan of thin metal strips in its place, turned by DEG from the vertical towards +x; give two, best 0 and"
-        " 90 (with one, both receivers are taken to leak alike)",
+        " 90 (with one, both receivers are assumed to have the same leakage)",
     )
     sub.add_argument("--config", type=Path, metavar="FILE", help="rig file of published data")
     add_json_option(sub)

@@ -110,7 +110,7 @@ def _add_plan(add: AddCommand) -> None:
     add_config_option(sub, shipped=True)
     sub.add_argument("--minutes", type=_minutes, metavar="M", help="propose the best plans within this time")
     sub.add_argument("--count", type=count, default=5, metavar="N", help="number of proposals (default: 5)")
-    sub.add_argument("--like", type=Path, metavar="SCAN", help="take noise and standstill between rows from this scan")
+    sub.add_argument("--like", type=Path, metavar="SCAN", help="use the noise and the pauses between rows of this scan")
     sub.add_argument(
         "--scene", type=parse_shipped_path, metavar="FILE", help="scene file whose plates are checked, with its grid"
     )
@@ -536,7 +536,7 @@ def _add_simulated(add: AddCommand) -> None:
     sub = add(
         "reproduce",
         _run_reproduce,
-        "make the paper's tables and figures beside the published values",
+        "make the paper's tables and figures, next to the published values",
         "polysight reproduce --out out/reproduce fig18 fig20\n"
         "  polysight reproduce --authors dataset --out out/authors",
     )

@@ -233,7 +233,7 @@ def find_irregularity(aperture: Aperture) -> str | None:
     if np.abs(y - np.linspace(y[0], y[-1], y.size)).max() > _SAME_M:
         return "the rows are not evenly spaced"
     if pitch_y_m(aperture) is None:
-        return "the rows' distance and the pixels' have no common measure"
+        return "the distance of the rows and that of the pixels are not multiples of one length"
     return None
 
 

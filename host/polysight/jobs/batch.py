@@ -475,7 +475,7 @@ def format_table(outcomes: Sequence[Outcome], out: Path) -> str:
         lines.append("  ".join([*words, *numbers, text]).rstrip())
     statuses = [outcome.status for outcome in outcomes]
     counts = ", ".join(f"{statuses.count(s)} {s}" for s in ("done", "skipped", "failed", "stopped") if s in statuses)
-    end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, all of this in {out / SUMMARY_FILE}"
+    end = f"{len(outcomes)} scans: {counts}; products in {out}/<scan>/, this list in {out / SUMMARY_FILE}"
     return "\n".join([*lines, end, ""])
 
 

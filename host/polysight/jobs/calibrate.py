@@ -105,7 +105,7 @@ def direct_path(scan: Path, target: Path, config: Path | None, prior_mm: float, 
         ]
         # An error of more than half the prior (chosen): most of the answer is the prior.
         lines += [
-            f"{name}: the scan does not tell its shift along {axis}: a wider aperture does"
+            f"{name}: the scan does not show its shift along {axis}; a scan with a wider aperture does"
             for axis, e in zip("xyz", place.standard_error_mm, strict=True)
             if e > prior_mm / 2
         ]
@@ -172,7 +172,7 @@ def metal(scan: Path, config: Path | None, bands: int, out: Path, as_json: bool)
         f"gains vary over it by {file.h_variation_db:.2f} dB (H), {file.v_variation_db:.2f} dB (V),"
         f" {file.ratio_variation_db:.2f} dB and {file.ratio_variation_deg:.1f} degrees (H / V)",
         f"scatter of its own pixels: {file.spread:.4f}",
-        f"images: {file.images}, beside the file",
+        f"images: {file.images}, in the folder of the file",
     ]
     if file.bands:
         edges = ", ".join(f"{b.first_hz / 1e9:.2f}..{b.last_hz / 1e9:.2f}" for b in file.bands)
@@ -320,7 +320,7 @@ def leakage(plate: Path, strips: Sequence[tuple[float, Path]], config: Path | No
     if facts["simulated"]:
         lines.append("# simulated scans")
     if len(strips) == 1:
-        lines.append("# one orientation: both boards are taken to leak alike (the axial ratio)")
+        lines.append("# one orientation: both boards are assumed to have the same leakage (the axial ratio)")
     lines += [
         "[polarimetry]",
         f"leakage_h = {leakage_h}",

@@ -97,7 +97,7 @@ def _check_folder(out: Path) -> None:
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out} is a file", "a demo needs a folder", "give another --out")
     if out.exists() and any(out.iterdir()) and not (out / _MARK_FILE).exists():
-        raise ConfigError(f"{out} is not empty", "it holds something else than a demo", "give another --out")
+        raise ConfigError(f"{out} is not empty", "it contains other files than those of a demo", "give another --out")
 
 
 def _make_fresh_folder(out: Path) -> None:

@@ -53,7 +53,7 @@ def show_cards(config: Path, listen_s: float, as_json: bool) -> int:
     """
     rig = load_instrument(config)
     if listen_s:
-        sys.stderr.write(f"listening for at most {listen_s:g} s: let the radars be triggered now\n")
+        sys.stderr.write(f"listening for at most {listen_s:g} s: trigger the radars now\n")
     surveys = survey_cards(rig, listen_s)
     if as_json:
         print_json([_describe_survey(s) for s in surveys])
@@ -95,7 +95,7 @@ def _format_survey(survey: CardSurvey) -> str:
     if board.record:
         role = board.role
     else:
-        role = f"{board.role}, not recorded: only asked"
+        role = f"{board.role}, not recorded: only queried"
     unchecked = [hop.where for hop in survey.hops if hop.level == "note" and not hop.what]
     text = f"{board.name} ({role}): card {board.card_address}:{board.command_port},"
     text += f" data to {board.host_address}:{board.data_port}\n"
@@ -182,7 +182,7 @@ def program_card(config: Path, name: str, mac: str, at: str, yes: bool, wait_s: 
         sys.stdout.write(f"{name}: it answers at {board.card_address}:{board.command_port}, FPGA {version}.\n")
         sys.stdout.write("Whether it sends data to the right port is seen with `polysight card --listen 10`.\n")
     else:
-        sys.stdout.write("Then `polysight card` tells whether it answers at its new address.\n")
+        sys.stdout.write("Then `polysight card` shows whether it answers at its new address.\n")
     return 0
 
 
@@ -214,7 +214,8 @@ def _wait_for_card(board: Board, wait_s: float, same_place: bool) -> str:
     raise DeviceError(
         f"{board.name}: written, but {missing} within {wait_s:g} s",
         "a card takes its addresses when it is switched on; with its EEPROM switch off it keeps its defaults",
-        "switch it off and on, then `polysight card`; if it stays silent, its EEPROM switch brings the defaults back",
+        "switch it off and on, then `polysight card`; if it still does not answer, its EEPROM switch restores the "
+        "defaults",
     )
 
 
@@ -276,7 +277,7 @@ def load_firmware(config: Path, name: str, image: Path, flash: bool, trace: Path
     rig = _load_rig_of_board(config, name)
     checked_image = read_image(image)
     clock = SystemClock()
-    sys.stdout.write(f"{image.name}: whole, for an AWR2243, patches {' and '.join(checked_image.patches)}\n")
+    sys.stdout.write(f"{image.name}: complete, for an AWR2243, patches {' and '.join(checked_image.patches)}\n")
     _check_trace(trace)
     link = _open_link(rig, name, clock, trace, slow)
     # A flash is written by a board that was started without this image.
@@ -364,10 +365,11 @@ def _write_flash(board: RadarBoard, file: Path, image: Image) -> str:
     except KeyboardInterrupt:
         command = f"`polysight radar firmware {board.name} {file} --flash`"
         if parts_sent < parts:
-            note = f"stopped after {parts_sent} of {parts} parts: its flash holds no whole image now; again: {command}"
+            problem = f"stopped after {parts_sent} of {parts} parts"
+            note = f"{problem}: its flash now contains no complete image; repeat: {command}"
             sys.stderr.write(f"\n{board.name}: {note}\n")
         elif parts:
-            sys.stderr.write(f"\n{board.name}: stopped: its flash was written, not verified; again: {command}\n")
+            sys.stderr.write(f"\n{board.name}: stopped: its flash was written, but not verified; repeat: {command}\n")
         raise
 
 

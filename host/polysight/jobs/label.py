@@ -167,7 +167,7 @@ def save_labels(
         raise DataError(
             "no box is left",
             "every patch was left out, or every box removed",
-            f"to have none, delete {folder / LABELS}",
+            f"to have no boxes, delete {folder / LABELS}",
             code=ErrorCode.NO_DATA,
         )
     checked_labels = check_labels(labels, products.x_m, products.y_m, products.valid)
@@ -401,7 +401,10 @@ def _ask_for_name(question: str, boxes: Mapping[str, Box], ask: Ask, metal_missi
             if name not in boxes:
                 _refuse_taken_name(name, boxes)
                 return name, is_metal
-            piece = ask(f"  {name} is there already. Another piece of it? Its name, such as 2 (Enter: another name): ")
+            piece = ask(
+                f"  {name} exists already. If this is another piece of it: name of the piece, such as 2 "
+                "(Enter: another name): "
+            )
             if piece.strip():
                 name = normalise_box_name(f"{remove_specimen(name)}{SPECIMEN_SEPARATOR}{piece}")
                 _refuse_taken_name(name, boxes)

@@ -66,7 +66,7 @@ class _PlainConsole(Console):
     """Console that raises OSError for a closed pipe; rich's own would exit and silence stdout."""
 
     def on_broken_pipe(self) -> None:
-        raise BrokenPipeError("no program reads the messages any more")
+        raise BrokenPipeError("no program reads the messages now")
 
 
 class ScanBar:
@@ -189,14 +189,14 @@ def _add_advice(folder: Path, result: ScanResult, e: BaseException) -> Polysight
     """Return the error to raise if processing failed while the scan continued."""
     remedy = f"the rows are safe: `polysight process {quote(folder)} --out DIR` processes them again"
     if result.exit_status != "success":
-        remedy = f"{result.reason}: `polysight resume {quote(folder)}` goes on, and processes all of them again"
+        remedy = f"{result.reason}: `polysight resume {quote(folder)}` continues, and processes all rows again"
     if isinstance(e, PolysightError):
         e.remedy = join_advice(e.remedy, remedy)
         return e
     traceback.print_exception(e)
     return ScanError(
         f"processing failed, the scan did not: {type(e).__name__}: {e}",
-        "a fault of this program, or there was no memory or room on the disk; the lines above tell where",
+        "a fault of this program, or there was not enough memory or disk space; the lines above show where",
         remedy,
     )
 
@@ -217,7 +217,7 @@ def _check_new(folder: Path) -> None:
         raise ConfigError(
             f"{folder} holds a scan already",
             "scans are never overwritten",
-            f"`polysight resume {quote(folder)}` goes on with it; or give another --out",
+            f"`polysight resume {quote(folder)}` continues it; or give another --out",
         )
     if not folder.is_dir() or any(p.name not in (MANIFEST, *_ALLOWED_ENTRIES) for p in folder.iterdir()):
         raise ConfigError(f"{folder} is not an empty folder", "a scan has a folder of its own", "give another --out")

@@ -93,7 +93,7 @@ def _check_bands(patch: PatchFigures, chirp: Chirp, source: str) -> None:
                 f"patch {patch.label} covers {saved.first_hz / 1e9:.4f} to {saved.last_hz / 1e9:.4f} GHz; the chirp"
                 f" of {source} has that part from {expected.first_hz / 1e9:.4f} to {expected.last_hz / 1e9:.4f} GHz",
                 "the rig file is not that of the scan",
-                "leave --config out: the products bring their own",
+                "leave --config out: the products have their own",
             )
 
 
@@ -247,8 +247,8 @@ def concentration(data: Path, values: Sequence[tuple[str, float]], confidence: f
     sys.stdout.write(
         f"{source}: percent = {line.intercept:.2f} + ({slope_per_degree:.3f}) * angle in degrees,"
         f" {line.patches} patches\neach concentration predicted from the others:\n{''.join(rows)}"
-        f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals hold the"
-        f" truth in {100 * result.covered:.0f} % of the patches\n"
+        f"median error {result.median_error:.3f} percent by weight; the {100 * confidence:.0f} % intervals contain "
+        f"the truth in {100 * result.covered:.0f} % of the patches\n"
     )
     if without_concentration:
         names = ", ".join(without_concentration)

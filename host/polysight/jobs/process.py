@@ -203,8 +203,8 @@ def make_plane_reference(pipeline: Pipeline, images: Images) -> PlaneReference:
     if pipeline.synchroniser.direct_path_known and level_db < WEAK_V_DB:
         raise DataError(
             f"the reference scan {pipeline.source.scan_id} shows no metal",
-            f"V is {-level_db:.0f} dB weaker than H, relative to the direct path: so reflect plastics, glass and water;"
-            " metal reflects both alike",
+            f"V is {-level_db:.0f} dB weaker than H, relative to the direct path: plastics, glass and water reflect "
+            "in this way; metal reflects both equally",
             "scan a bare metal plate that covers the plane",
             code=ErrorCode.NO_DATA,
         )

@@ -238,7 +238,7 @@ def inspect_placement(file: Path, as_json: bool) -> int:
             raise DataError(
                 f"{row}: its packets were not kept",
                 "the scan was simulated without cards, or recorded by an older release",
-                "`polysight validate SCAN` says whether it is whole",
+                "`polysight validate SCAN` shows whether it is complete",
             )
     result = place_again(row)
     # This placement is by byte counts: frames that were placed by their pulses lie elsewhere, with other ranges.
@@ -303,10 +303,10 @@ def _list_replaced_lines(folder: Path, rows: list[ReplacedRow]) -> list[str]:
         for r in rows
         if r.changed
     ]
-    unchanged = [f"row {r.row} of {r.board}: left as it is: {r.why_unchanged}" for r in rows if r.why_unchanged]
+    unchanged = [f"row {r.row} of {r.board}: not changed: {r.why_unchanged}" for r in rows if r.why_unchanged]
     unchanged_rows = sum(not (r.changed or r.why_unchanged) for r in rows)
     return [
         *changed_rows,
         *unchanged,
-        f"{folder}: {unchanged_rows} of {len(rows)} files come out as they were committed",
+        f"{folder}: {unchanged_rows} of {len(rows)} files have the same result as when they were committed",
     ]

@@ -117,7 +117,7 @@ def note(folder: Path, text: str | None, add: list[str], remove: list[str]) -> i
         raise make_missing_path_error(folder)
     if not (is_scan(folder) or store.is_source(folder)):
         raise DataError(
-            f"{folder}: no scan is in it", "notes belong to a scan; nothing was recorded or processed in this folder",
+            f"{folder}: contains no scan", "notes belong to a scan; nothing was recorded or processed in this folder",
             "give the folder of a scan or of products; polysight scans FOLDER lists those under a folder",
             code=ErrorCode.FILE_MISSING,
         )  # fmt: skip
@@ -144,7 +144,7 @@ def ask_scan(folder: Path, request: str) -> int:
     send_command(folder, ScanCommand(request), "polysight ask")
     states = {"pause": "pausing", "continue": "rows", "stop": "stopping", "abort": "aborting"}
     state = STATES[states[request]]
-    words = state.headline if request != "continue" else "The scan goes on"
+    words = state.headline if request != "continue" else "The scan continues"
     sys.stdout.write(f"{folder}: heard {request}: {words}\n")
     return 0
 
@@ -157,7 +157,7 @@ def probe_scan(folder: Path, place_mm: tuple[float, float], library: Path | None
         return 0
     lines = [f"x {result.place_mm[0]:zg} mm, y {result.place_mm[1]:zg} mm from the image's centre"]
     if not result.lit:
-        lines.append("the scan does not light this place")
+        lines.append("the scan does not illuminate this position")
     lines.append(f"|H| {_format_value(result.h_db)} dB, |V| {_format_value(result.v_db)} dB")
     lines.append(f"P = {_format_complex(result.p)} {_format_error(result.p_sigma)}")
     if result.permittivity:
@@ -277,7 +277,7 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
         if rows.kept_files:
             raise DataError(
                 f"{folder}: nothing can be dropped",
-                f"{products} is made from none of its rows",
+                f"{products} was made from none of its rows",
                 f"`polysight process {quote(folder)} --out DIR`, then --products DIR",
             )
         sys.stdout.write(f"{folder}: every processed row is dropped already\n")
@@ -295,9 +295,9 @@ def _confirm_and_drop(scan: store.ScanFolder, folder: Path, products: Path, yes:
     answer = confirm(text, CONFIRMATION_WORD, yes)
     if answer != CONFIRMATION_WORD:
         raise ConfigError(
-            f"nothing dropped: answered {answer!r}",
+            f"nothing was deleted: the answer was {answer!r}",
             f"the answer was not {CONFIRMATION_WORD!r}",
-            f"type {CONFIRMATION_WORD}, or --yes",
+            f"type {CONFIRMATION_WORD}, or give --yes",
         )
     _mark_as_only_data(products, scan)
     store.drop(scan, processed, products)
@@ -340,7 +340,7 @@ def find_processed_digests(folder: Path) -> store.Digests:
     digests = {name: board.raw_crc32 for name, board in boards.items() if board.raw_crc32 is not UNSET}
     if not digests or len(digests) < len(boards):
         raise DataError(
-            f"{products.folder / QUALITY}: does not say what it was made from",
+            f"{products.folder / QUALITY}: does not state from which data it was made",
             "made by an earlier release, or from another program's recordings",
             "`polysight process SCAN --out DIR` makes it again",
         )

@@ -147,7 +147,7 @@ def check_is_metal(scan: Path, gains: Gains) -> None:
     if gains.v_over_h_db < WEAK_V_DB:
         raise DataError(
             f"{scan}: V is {-gains.v_over_h_db:.0f} dB weaker than H, relative to the direct path",
-            "the reference is not of metal, which reflects both alike, or the cable of V is loose",
+            "the reference is not of metal, which reflects both equally, or the cable of V is loose",
             "scan a bare metal sphere or plate that lies alone",
             code=ErrorCode.MISMATCH,
         )
@@ -187,7 +187,7 @@ def sphere(scan: Path, radius_mm: float, config: Path | None, out: Path, as_json
     if abs(1e3 * radius_m / radius_mm - 1) > RADIUS_TOLERANCE:
         raise DataError(
             f"{scan}: the surface has a radius of {1e3 * radius_m:.0f} mm, not {radius_mm:g}",
-            "it is another object, or the boards stand elsewhere than the rig file says",
+            "it is another object, or the boards are at other places than the rig file says",
             "give the sphere's true radius, or calibrate the places of the boards first",
             code=ErrorCode.MISMATCH,
         )

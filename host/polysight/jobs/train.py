@@ -111,7 +111,7 @@ def check_labelled(data: Path) -> None:
         if (scan / TRUTH).exists():
             return
         raise DataError(
-            f"{data}: neither {LABELS} nor {TRUTH} is in it",
+            f"{data}: contains neither {LABELS} nor {TRUTH}",
             "the materials of this scan are not known",
             f"polysight label {quote(data)}; then train again",
         )
@@ -211,7 +211,9 @@ def _add_labels(scan: str, materials: MaterialsResult, simulated: bool, labels: 
     boxes = dict(enumerate(labels.boxes, 1))
     for patch in materials.patches:
         if patch.patch.label in boxes and not materials.usable_pixels(patch.patch).any():
-            sys.stderr.write(f"note: {scan}: the box of {boxes[patch.patch.label]} holds no pixel that can be used\n")
+            sys.stderr.write(
+                f"note: {scan}: the box of {boxes[patch.patch.label]} contains no pixel that can be used\n"
+            )
     names = {label: remove_specimen(box) for label, box in boxes.items()}
     specimens = {label: piece for label, box in boxes.items() if (piece := labels.specimen(box)) is not None}
     return TrainingScan(scan, materials, simulated, versions=versions(), names=names, specimens=specimens)

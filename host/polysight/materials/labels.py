@@ -56,7 +56,7 @@ Plates = tuple[TruthPlate, ...]
 
 def read_truth(path: Path) -> tuple[TruthPlate, ...]:
     """Read the plates of a truth.json. Raises DataError."""
-    remedy = f"give the one that polysight simulate wrote beside its data, or move {path.name} away"
+    remedy = f"give the file that polysight simulate wrote into the folder of its data, or move {path.name} away"
     try:
         return read_true_plates(read_json(path))
     except DataError as e:
@@ -367,7 +367,7 @@ def clean_name(text: str, kind: str = "name") -> str:
     elif kind == "name" and name.casefold() in RESERVED:
         reason = "the classifier uses this word for unknown materials"
     elif kind == "name" and name.casefold().endswith("(literature)"):
-        reason = "names of the literature end like this, which the library has not measured"
+        reason = "this ending marks names of the literature, which the library has not measured"
     elif kind == "name" and name.isdecimal():
         reason = "a plain number is the number of a patch"
     if reason:

@@ -132,7 +132,7 @@ class Bands:
                 code=ErrorCode.VALUE_INVALID,
             )
         if (self.amplitude_h is None) != (self.sigma_h is None):
-            raise PolysightError("bands: amplitude_h and sigma_h go together", code=ErrorCode.KEY_MISSING)
+            raise PolysightError("bands: amplitude_h and sigma_h must be given together", code=ErrorCode.KEY_MISSING)
         if self.covariance is not None and self.covariance.shape != (2 * k[0], 2 * k[0]):
             raise PolysightError(
                 f"bands: a covariance {self.covariance.shape} of {k[0]} complex ratios", code=ErrorCode.MISMATCH
@@ -360,7 +360,7 @@ class LayerFit:
         if self.std_real > 0.2 * self.permittivity.real:
             out.append("the data hardly depend on this layer: its error bar is large")
         elif self.std_loss > max(0.2 * -self.permittivity.imag, 0.2):
-            out.append(f"the data hardly tell the loss of this layer: it is known to +- {self.std_loss:.2f}")
+            out.append(f"the data hardly determine the loss of this layer: it is known to +- {self.std_loss:.2f}")
         if self.at_limit:
             out.append(f"{' and '.join(self.at_limit)} at the limit of the search range: the true value may be beyond")
         return out
@@ -389,7 +389,7 @@ def fit_layer(
             remedy = "give one layer as NAME,?,MM or NAME,?,?"
         raise ConfigError(
             f"{len(unknown_layers)} layers of unknown permittivity",
-            "one can be fitted",
+            "only one can be fitted",
             remedy,
             code=ErrorCode.VALUES_CONFLICT,
         )

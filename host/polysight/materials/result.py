@@ -32,7 +32,7 @@ STEEP_FINDING = Finding(
     "error",
     "tilted or curved beyond what is modelled",
     f"its phase rises by more than {np.degrees(MAX_RISE):.1f} degrees, or bends as that of a radius below "
-    f"{1 / MAX_BEND:.1f} m: H and V see other places, turned polarisations",
+    f"{1 / MAX_BEND:.1f} m: H and V show different places and turned polarisations",
     "lay it flat, or measure it as it is with `polysight surface`",
 )
 """Why a steep patch gets no permittivity."""
@@ -41,7 +41,7 @@ SMEAR = Finding(
     "a smear at the end of the scan",
     "positions without data or with a wrong phase spread plates along x or y, and the correction of the footprint lifts"
     " what lies at the end of the illuminated area",
-    "nothing needs to lie there; scan again without gaps if something does",
+    "if an object lies there, scan again without gaps",
 )
 """Why a steep patch that is a smear gets no permittivity."""
 SMEAR_LEVEL = 0.1

@@ -88,10 +88,10 @@ def _judge_confidence(angle: str, fit: Mapping[str, Any]) -> list[str]:
         elif missing:
             cause = "specimens left out differ more from those learnt than these from each other"
         else:
-            cause = "errors of its scans are not alike: a scan may be disturbed, or a label wrong"
+            cause = "errors of its scans differ: a scan may be disturbed, or a label may be wrong"
         lines.append(
-            f"{angle} degrees: {kind}: names are said with {100 * mean_confidence:.0f} % and"
-            f" {100 * fit['right']:.0f} % are right: {cause}"
+            f"{angle} degrees: {kind}: names have a mean confidence of {100 * mean_confidence:.0f} %, and "
+            f"{100 * fit['right']:.0f} % are right: {cause}"
         )
     if missing:
         lines.append(f"{angle} degrees: {need}")

@@ -25,20 +25,23 @@ from polysight_shared.raster import RasterPlan, plan_raster
 from polysight_shared.tables import decode as decode_config
 
 CAUSES: dict[FaultKind, tuple[str, str]] = {
-    FaultKind.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` takes the row again"),
+    FaultKind.ON_REQUEST: ("Somebody stopped the scan in this row", "Nothing; `polysight resume` retakes the row"),
     FaultKind.RADAR_STOPPED: (
-        "The radar hit a fault of its own",
+        "The radar had an internal fault",
         "It is armed again; if that fails, power-cycle the board",
     ),
     FaultKind.RADAR_WAITS: ("SYNC_IN pulses did not reach the board", "Check its SYNC_IN wire and the fan-out buffer"),
-    FaultKind.NO_END: ("The Pi or the network was busy", "Nothing, while it is rare; else the Pi's load and network"),
+    FaultKind.NO_END: (
+        "The Pi or the network was busy",
+        "Nothing if this is rare; otherwise check the Pi's load and network",
+    ),
     FaultKind.COUNTS_DIFFER: (
         "The stage and the Pi counted different numbers of points",
         "Check the stage's trigger wire",
     ),
     FaultKind.NO_DATA: (
         "The radar is not armed, or its card has lost network or power",
-        "`polysight card` names the silent hop",
+        "`polysight card` shows which connection does not answer",
     ),
     FaultKind.HELD: ("Somebody held the stage for more than 2 s", "Nothing"),
     FaultKind.PULSES_MISSED: (
@@ -47,7 +50,7 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     ),
     FaultKind.SLIPPED: (
         "The board saw edges on SYNC_IN that the Pi did not send",
-        "Check its SYNC_IN wire and ground, and cables beside it",
+        "Check its SYNC_IN wire and ground, and cables next to it",
     ),
     FaultKind.FRAMES_MISSING: (
         "The board missed SYNC_IN pulses, or the end of its data was lost",
@@ -57,15 +60,15 @@ CAUSES: dict[FaultKind, tuple[str, str]] = {
     FaultKind.LOST_BY_HOST: ("This machine was too busy to receive the packets", "Close other programs on the host"),
     FaultKind.LOST_ON_THE_WAY: (
         "Packets were lost between card and host",
-        "Nothing, while it is rare; else check cable and switch",
+        "Nothing if this is rare; otherwise check cable and switch",
     ),
     FaultKind.CONFLICTING: (
         "Packets with the same counters brought different bytes",
-        "Nothing: the row is retaken. If it comes back, reset the card: `polysight card reset BOARD`",
+        "Nothing: the row is retaken. If it happens again, reset the card: `polysight card reset BOARD`",
     ),
     FaultKind.UNLOCATED: (
         "Packets were lost at the row's beginning, or the radar saw triggers that were not sent",
-        "Nothing, while it is rare; else check cable, switch and SYNC_IN wire",
+        "Nothing if this is rare; otherwise check cable, switch and SYNC_IN wire",
     ),
 }
 """Likely cause and remedy by kind of fault. Those of the Pi are in shared/polysight_shared/faults.py."""
@@ -306,7 +309,7 @@ class ScanHistory:
                 make_rejection_notice(fact.row, fact.take, fact.reasons, fact.faults, fact.rejected_utc)
             )
         elif isinstance(fact, store.RowWithdrawn):
-            problem = f"Row {fact.row} on the disk differs from what was committed"
+            problem = f"Row {fact.row} on the disk differs from the committed row"
             why_do = ("The disk is faulty, or the file was changed", "Nothing: the row is retaken")
             self.notices.append(_make_row_notice(fact.row, problem, why_do, fact.reasons, fact.withdrawn_utc))
         elif isinstance(fact, store.ScanResumed):

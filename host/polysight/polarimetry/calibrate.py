@@ -375,9 +375,9 @@ def _check_is_alone(h_db: npt.NDArray[np.float64], v_db: npt.NDArray[np.float64]
     share = np.count_nonzero(is_bright & (v_db - h_db < OTHER_MATERIAL_DB)) / max(1, np.count_nonzero(is_bright))
     if share > OTHER_MATERIAL_SHARE:
         raise DataError(
-            "the reference scan shows other materials beside metal",
+            "the reference scan shows other materials besides metal",
             f"on {100 * share:.0f} % of its bright area V is {-OTHER_MATERIAL_DB:.0f} dB or more weaker relative to H"
-            " than where it is brightest: so reflect plastics, wood, glass and water",
+            " than where it is brightest: plastics, wood, glass and water reflect in this way",
             "scan a flat metal plate alone; a scene with metal in it is processed without a reference (--metal)",
             code=ErrorCode.MISMATCH,
         )

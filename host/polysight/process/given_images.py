@@ -302,7 +302,7 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
     if not_finite.any():
         raise DataError(
             f"{path}: {int(not_finite.sum())} of {not_finite.size} pixels are not finite",
-            "a pixel without data cannot be told from a wrong one",
+            "a pixel without data cannot be distinguished from a wrong one",
             "save valid (bool, [ny, nx]), false where there is no data", code=ErrorCode.VALUE_INVALID,
         )  # fmt: skip
     for name, channel in (("h", h), ("v", v)):
@@ -315,7 +315,7 @@ def _find_valid(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArr
         # Only one channel is empty: the case of both follows below.
         if not peak and (h[valid] != 0).any() | (v[valid] != 0).any():
             raise DataError(
-                f"{path}: {name} is zero everywhere", "materials are told by the ratio of both channels",
+                f"{path}: {name} is zero everywhere", "materials are recognised by the ratio of both channels",
                 "look at the program that made the images", code=ErrorCode.NO_DATA,
             )  # fmt: skip
     is_lit = valid & ((h != 0) | (v != 0))
@@ -482,7 +482,7 @@ def list_reasons_of_given_images(pair: GivenPair, angle: Angle) -> list[Finding]
     """Return what limits the verdict on given images: no direct path, an assumed geometry, an assumed angle."""
     # The last number of a reason is its weight: those of one level are listed by falling weight.
     reasons = [reason(
-        "care", "the images were given: there is no direct path beside them",
+        "care", "the images were given without a direct path",
         "gains of H against V, the recording and the plane of the plates cannot be checked",
         "process the recorded scan where there is one", 2.4,
     )]  # fmt: skip
@@ -539,7 +539,7 @@ def sign_reasons(other_sign: float, conjugated: bool, painted: float = 0.0) -> l
     treatment = "as they are"
     if conjugated:
         treatment = "the other way round"
-    cause = "with the wrong sign losses are wrong; the error bars hold both signs"
+    cause = "with the wrong sign losses are wrong; the error bars include both signs"
     if conjugated and painted > REPORTED_PAINT:
         cause += "; or the sign is as given, and the metal reference is painted"
     return [reason(
@@ -565,7 +565,8 @@ def _check_phases(pair: GivenPair) -> None:
     if (np.abs(product.imag) > LEAST_PHASE_RAD * np.abs(product)).any():
         return
     raise DataError(
-        f"{pair.path}: no phase between h and v in any pixel", "the loss of a material is in the phase of V against H",
+        f"{pair.path}: no phase between h and v in any pixel", "the loss of a material is found from the phase of V "
+        "relative to H",
         "save both complex images as they were formed, not magnitudes or real parts", code=ErrorCode.VALUE_INVALID,
     )  # fmt: skip
 

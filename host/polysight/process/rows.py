@@ -251,7 +251,7 @@ class KeptSamples:
         if not rows:
             remedy = "fetch the files of both receiving boards again"
             if isinstance(source, ScanFolder):
-                remedy = f"`polysight resume {quote(folder)}` takes the missing rows"
+                remedy = f"`polysight resume {quote(folder)}` records the missing rows"
             raise DataError(
                 f"{folder}: no row is recorded whole",
                 "the scan was stopped in its first row, or files are missing",

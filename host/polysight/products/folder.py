@@ -180,7 +180,7 @@ def replace_products(out: Path, scan_id: str, wait: bool = False) -> Iterator[Pa
             keep = True
             raise DeviceError(
                 f"{out}: cannot be replaced: {e.strerror}",
-                "it is a mount point, or you have no permission to write beside it",
+                "it is a mount point, or you have no permission to write into the folder that contains it",
                 f"the new products are in {new}: copy them before the next run; then give another --out",
             ) from None
     finally:

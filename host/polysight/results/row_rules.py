@@ -20,9 +20,10 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[Finding]
     reasons = []
     if shared:
         reasons.append(reason(
-            "care", f"the phase of the echo jumps {_list_jumps(shared)} in both boards alike",
-            "the whole array or the object was knocked, or a row was skipped: no cable of one board does that; it was"
-            " removed from the images as measured between the rows, and the errors contain what may be left",
+            "care", f"the phase of the echo jumps {_list_jumps(shared)} in both boards equally",
+            "the whole array or the object was knocked, or a row was skipped: a cable of one board cannot cause "
+            "this; the jump was removed from the images as measured between the rows, and the errors contain what "
+            "may be left",
             "fix the stage and the object, and scan again", 4.7,
         ))  # fmt: skip
     shared_rows = {jump.row for jump in shared}
@@ -32,8 +33,9 @@ def judge_phase_jumps(jumps: Mapping[str, Sequence[PhaseJump]]) -> list[Finding]
             continue
         reasons.append(reason(
             "care", f"{board}: the phase of the echo jumps {_list_jumps(own)}",
-            "a cable or connector is loose or was touched, or the board was knocked; the direct path does not show it;"
-            " it was removed from the images as measured between the rows, and the errors contain what may be left",
+            "a cable or connector is loose or was touched, or the board was knocked; the direct path does not show "
+            "this; the jump was removed from the images as measured between the rows, and the errors contain what "
+            "may be left",
             "fix cables and boards, and scan again", 4.7,
         ))  # fmt: skip
     return reasons

@@ -247,8 +247,8 @@ def judge_patches(
     if patches == 0 and filled_share > FILLED_SHARE:
         return [reason(
             "none", f"one region fills {100 * filled_share:.0f} % of the image: no edge of a plate is in it",
-            "a plate as large as the image has nothing beside it from which it could stand out; a table, a wall or"
-            " noise alone look the same, so that it is not taken for a patch",
+            "a plate as large as the image has nothing beside it from which it could stand out; a table, a wall or "
+            "noise alone look the same, so the region does not count as a patch",
             "image a larger area (image.columns, image.rows), lay a smaller plate, or"
             " draw a box on it (polysight label; process --labels)", 9.0,
         )]  # fmt: skip
@@ -313,15 +313,16 @@ def judge_metal(
         return [reason(
             "care" if is_likely or only_patch else "none",
             f"the given metal reference ({patch}) does not look like metal",
-            "relative to the direct path it reflects less of V than of H, as no metal does", do, 8.0,
+            "relative to the direct path it reflects less of V than of H; no metal does this", do, 8.0,
         )]  # fmt: skip
     # Before paint: where other patches speak against the metal, a dielectric explains them better than a coating does.
     if is_given and culprit is not None and not is_likely:
         return [reason(
             "care",
-            f"the given metal reference ({patch}) may be no metal: patch {culprit} and others look odd beside it",
-            "the others fit a dielectric reference better; so may thin plates, liquids, or H and V of different"
-            " places",
+            f"the given metal reference ({patch}) may not be metal: relative to it, patch {culprit} and others have "
+            "unusual values",
+            "the others fit a dielectric reference better; thin plates, liquids, or H and V of different places may "
+            "also cause this",
             f"check that {patch} is bare metal; look at patch {culprit}: fit it as a layer, or leave it out", 4.4,
         )]  # fmt: skip
     paint = []
@@ -330,15 +331,15 @@ def judge_metal(
         paint = [reason(
             "care",
             f"the {given}metal reference ({patch}) may be painted: probability {painted:.2f}, {paint_mm:.2f} mm",
-            "all patches have the same additional phase of V / H beside it, as a coating on metal makes it, or a wet"
-            " plate in the place of metal; permittivities are corrected for a coating, with its error",
+            "relative to it all patches have the same additional phase of V / H; a coating on metal causes this, "
+            "and also a wet plate instead of metal; permittivities are corrected for a coating, with its error",
             f"take the paint or film off {patch}, or use bare metal", 2.7,
         )]  # fmt: skip
     if is_given or is_certain:
         return paint
     if is_likely:
         doubt = reason(
-            "care", f"the metal reference ({patch}) is likely metal, not certainly",
+            "care", f"the metal reference ({patch}) is probably metal, but this is not certain",
             "a wet or conducting plate could look like it; all permittivities depend on it", do, 2.8,
         )  # fmt: skip
         return [doubt, *paint]
@@ -355,7 +356,7 @@ def judge_dark_reference(patch: str, brightest: int, brighter_db: float) -> list
     return [reason(
         "care",
         f"the given metal reference ({patch}) is {brighter_db:.0f} dB darker in H than patch {brightest}",
-        "nothing reflects more than metal: it is not metal, lies askew, or its box is beside it",
+        "nothing reflects more than metal: it is not metal, it is tilted, or its box is not on it",
         "look at the picture of H in the report, and give the box of the metal", 5.0,
     )]  # fmt: skip
 
@@ -439,7 +440,7 @@ def judge_copies(
         )]  # fmt: skip
     return [reason(
         "care", f"patches {', '.join(map(str, labels))} repeat the plates, {place_text}",
-        "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed by it as much",
+        "a second path beside the direct path (multipath) modulates the scan; the plates are disturbed equally",
         "take reflectors away from the line between transmitter and receivers, or cover them with absorber", 4.5,
     )]  # fmt: skip
 
@@ -449,11 +450,11 @@ def judge_image_shift(apart_mm: tuple[float, float], has_drift: bool = False) ->
     distance = float(np.hypot(*apart_mm))
     if not is_known(distance) or distance <= IMAGE_SHIFT_MM:
         return []
-    cause = "boards are out of place by a few millimetres, or all plates lie high; the images were laid on each other"
+    cause = "boards are out of place by a few millimetres, or all plates lie high; the images were aligned"
     do = "measure where the antennas are (`polysight calibrate direct-path`) and correct the rig file"
     if has_drift:
-        cause = "the drift of a phase moves an image, and some of it is left; the images were laid on each other"
-        do = "see the drift of the phase; if it is gone and this stays, measure where the antennas are"
+        cause = "the drift of a phase moves an image, and some of it is left; the images were aligned"
+        do = "remove the cause of the drift of the phase first; if this remains, measure where the antennas are"
     return [reason(
         "care",
         f"the images of H and V lay {distance:.1f} mm apart (x {apart_mm[0]:+z.1f}, y {apart_mm[1]:+z.1f} mm)",
@@ -481,15 +482,17 @@ def judge_fringes(probability: float, has_gaps: bool = False, behind: float = 0.
     """
     if not is_known(probability) or probability <= FRINGES_CARE:
         return []
-    what = "V / H changes over the scan in fringes, more than the plates can tell"
+    what = "V / H changes over the scan in fringes, by more than the plates can explain"
     if has_gaps:
         return [reason(
-            "care", what, "positions without data do that to the image", f"record the missing positions; {RECONSTRUCT}",
+            "care", what, "positions without data cause this in the image", "record the missing positions; "
+            f"{RECONSTRUCT}",
             2.8,
         )]  # fmt: skip
     if is_known(behind) and behind > BACKGROUND_CARE:
         return [reason(
-            "care", what, "what lies behind the plates shines through them and does that, as a second path does",
+            "care", what, "what lies behind the plates shines through them and causes this; a second path causes "
+            "it, too",
             "cover what lies behind the plates with absorber, or move it 300 mm away", 2.8,
         )]  # fmt: skip
     return [reason(
@@ -577,17 +580,18 @@ def judge_flatness(
     if is_known(relief_rad) and relief_rad > RELIEF_CARE_RAD:
         return [reason(
             "care", f"plates are rough, wavy or bent: the phase of H scatters by {np.degrees(relief_rad):.0f} degrees",
-            "an uneven surface is seen from other places by H and V; errors are larger, counted by the scatter",
+            "H and V see an uneven surface from different places; the errors are larger, and include this scatter",
             "lay flat plates, or press them onto a plane", 2.1,
         )]  # fmt: skip
     if not all(map(is_known, ripple)) or max(ripple) <= RIPPLE_CARE:
         return []
     cause = (
-        "uneven plates or bright edges, a second path beside the direct path, interference, or a small aperture do that"
+        "uneven plates or bright edges, a second path beside the direct path, interference, or a small aperture "
+        "cause this"
     )
     action = "use even plates; take reflectors away from the line between transmitter and receivers; scan a larger area"
     if has_gaps:
-        cause = "positions without data do that to the image"
+        cause = "positions without data cause this in the image"
         action = f"record the missing positions; {RECONSTRUCT}"
     if is_boxed:
         cause = f"boxes that reach the plates' edges, {cause}"
@@ -611,7 +615,7 @@ def judge_tilts(across_deg: Mapping[int, float]) -> list[Finding]:
     return [reason(
         "care", f"patch {steepest} rises by {tilted[steepest]:+z.1f} degrees across the plane of incidence{remark}",
         "the polarisation turns with it: 5 to 13 % of a permittivity per degree, corrected to about a quarter",
-        "lay plates and metal flat; shim the tilted one", 1.3,
+        "lay plates and metal flat; put spacers under the tilted one", 1.3,
     )]  # fmt: skip
 
 
@@ -635,9 +639,9 @@ def judge_smears(smears: Mapping[int, Finding]) -> list[Finding]:
     if not smears:
         return []
     fault = next(iter(smears.values()))
-    subject = f"patch {next(iter(smears))} is no object, but"
+    subject = f"patch {next(iter(smears))} is not an object, but"
     if len(smears) > 1:
-        subject = f"patches {', '.join(map(str, smears))} are no objects, but each is"
+        subject = f"patches {', '.join(map(str, smears))} are not objects, but each is"
     return [reason("care", f"{subject} {fault.what}", fault.why, fault.do, 1.9)]
 
 

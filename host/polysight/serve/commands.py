@@ -492,7 +492,7 @@ def _export(site: Site, scan: RequestedScan, body: ExportRequest) -> None:
     out = folder / "export"
     if not out.resolve().is_relative_to(folder.resolve()):
         raise DataError(
-            f"{out}: leads out of the scan", "it is a link", "remove the link, or use `polysight export --out`",
+            f"{out}: is outside the scan", "it is a link", "remove the link, or use `polysight export --out`",
             code=ErrorCode.PATH_OUTSIDE,
         )  # fmt: skip
     options = [f"--{name}" for name in body.formats]

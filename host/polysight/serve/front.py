@@ -334,7 +334,8 @@ class Reader:
             if not is_answered:
                 problem = "The reading part of the server does not answer"
                 do = "load the page again; pause, stop and abort still work"
-                await refuse(503, ErrorCode.NO_ANSWER, problem, "it starts, or was ended", do)(scope, receive, send)
+                answer = refuse(503, ErrorCode.NO_ANSWER, problem, "it is starting, or was ended", do)
+                await answer(scope, receive, send)
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         """Connect to the reading process, which may be starting. Raises OSError after `READER_PATIENCE_S`."""

@@ -84,7 +84,7 @@ class Programs:
             raise DeviceError(
                 # The error of a full disk has no file name.
                 f"{folder}: {kind} cannot be started: {e.filename or program_folder}: {e.strerror or e}",
-                "no room, no permission, or no memory",
+                "no disk space, no permission, or no memory",
                 "remove the cause; or give the same command in a terminal",
             ) from None
 
@@ -179,7 +179,7 @@ class Queue:
             names = [waiting for waiting, _ in self._list_requests()]
             if name in names or len(names) >= MAX_WAITING:
                 raise ConfigError(
-                    f"{name} cannot be queued", f"it is queued already, or {MAX_WAITING} scans are",
+                    f"{name} cannot be queued", f"it is already in the queue, or the queue has {MAX_WAITING} scans",
                     "wait, or give another name", code=ErrorCode.NAME_TAKEN,
                 )  # fmt: skip
             if not names:

@@ -196,7 +196,7 @@ async def _send_live_picture(site: Site, request: Request) -> Response:
     """Answer with a picture of the live view; 404 until the first row is processed."""
     picture = (await _open_watch(site, request)).shown.pictures.get(request.path_params["name"])
     if picture is None:
-        problem = "This picture is not there yet"
+        problem = "This picture does not exist yet"
         return refuse(404, ErrorCode.FILE_MISSING, problem, "no row is processed", "it comes with the first row")
     return Response(picture.png, media_type="image/png")
 

@@ -155,7 +155,7 @@ def _make_folder(root: Path, control: bool) -> None:
     if not control or root.absolute().parent != Path.cwd():
         raise ConfigError(
             f"{root}: no such folder",
-            "scans are listed under it; one elsewhere may lie on a drive that is not mounted, so it is not made",
+            "scans are listed under it; a folder elsewhere may be on a drive that is not mounted, so it is not created",
             f"mkdir -p {quote(root)}, or give another",
             code=ErrorCode.FILE_MISSING,
         )
@@ -187,7 +187,7 @@ def _check_scan_folder(folder: Path) -> None:
         return
     other_files = [path.name for path in folder.iterdir() if path.name != NOTES_FILE and not path.name.startswith(".")]
     if not other_files:
-        sys.stderr.write(f"note: no scan is in {folder} yet; the page waits for it to begin\n")
+        sys.stderr.write(f"note: {folder} contains no scan yet; the page waits until a scan begins\n")
         return
     remedy = "give the folder of one scan"
     scans_below = Scans(folder).list()
@@ -195,7 +195,7 @@ def _check_scan_folder(folder: Path) -> None:
         newest = folder / scans_below[0].name
         remedy += f": polysight preview {quote(newest)}; polysight serve {quote(folder)} shows them all"
     raise DataError(
-        f"{folder}: no scan is in it, but {other_files[0]}", "a scan has a folder of its own", remedy,
+        f"{folder}: contains no scan, but {other_files[0]}", "a scan has a folder of its own", remedy,
         code=ErrorCode.FILE_FOREIGN,
     )  # fmt: skip
 
@@ -488,7 +488,7 @@ def describe_server(access: Access, what: str, bound: tuple[str, int]) -> str:
         lines.append(f"anyone who reaches this machine and has the token can read all scans{warning}")
         if sys.stderr.isatty():
             lines.append(draw_code(addresses[0]))
-    lines.append("Ctrl-C ends the page; started programs go on\n")
+    lines.append("Ctrl-C ends the page; programs that it started continue\n")
     return "\n".join(line for line in lines if line)
 
 

@@ -104,7 +104,9 @@ class Site:
     def config(self) -> Path:
         """The rig file of new scans. Raises ConfigError without one."""
         if self._config is None:
-            raise ConfigError("this server has no rig file", "it was started without", "polysight serve --config FILE")
+            raise ConfigError(
+                "this server has no rig file", "it was started without one", "polysight serve --config FILE"
+            )
         return self._config
 
     @property
@@ -273,7 +275,8 @@ class Readers:
 def _no_answer_error(folder: str) -> DeviceError:
     """Return the error of a folder that does not answer."""
     return DeviceError(
-        f"{folder or 'the folder of scans'} did not answer within {READ_S:g} s", "its drive is gone, or very busy",
+        f"{folder or 'the folder of scans'} did not answer within {READ_S:g} s", "its drive is disconnected, or "
+        "very busy",
         "check the network drive, then load the page again", code=ErrorCode.NO_ANSWER,
     )  # fmt: skip
 

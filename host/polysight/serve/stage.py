@@ -69,7 +69,10 @@ class StageControl:
         """Move, and wait for the end. Refused while another jog of this server moves."""
         if not self._jogging.acquire(blocking=False):
             raise ScanError(
-                "the stage moves already", "another jog has not ended", "wait for it, or stop it", code=ErrorCode.BUSY
+                "the stage is already moving",
+                "another jog has not ended",
+                "wait for it, or stop it",
+                code=ErrorCode.BUSY,
             )
         try:
             return self._ask(lambda pi, rig: pi.jog(request.axis, request.distance_mm, rig.stage.speed_mm_s))

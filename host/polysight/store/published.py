@@ -155,7 +155,7 @@ def read_stream(file: Path, log: PacketLog | None, shape: RowShape, zero_filled:
     if not zero_filled and raw.size != log.size.sum():
         raise DataError(
             f"{file}: {raw.size} bytes, its packet log says {log.size.sum()}",
-            "file and log are not of one recording, or one of them was cut",
+            "file and log do not belong to one recording, or one of them is incomplete",
             "fetch both again",
             code=ErrorCode.MISMATCH,
         )

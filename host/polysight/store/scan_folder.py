@@ -372,7 +372,7 @@ class ScanFolder:
             raise DataError(
                 f"{self.path}: row {row} of {board_name} is not committed",
                 "the scan was interrupted before it, or the board was not recorded",
-                f"`polysight resume {quote(self.path)}` takes the rows that are missing",
+                f"`polysight resume {quote(self.path)}` records the missing rows",
                 code=ErrorCode.NO_DATA,
             )
         path = self.path / board.file
@@ -426,7 +426,7 @@ class ScanFolder:
     def _suggest_remedy(self) -> str:
         """Return the remedy for a file of a row that is not as committed."""
         return (
-            f"restore it from a copy, or `polysight resume {quote(self.path)}` takes its row again;"
+            f"restore it from a copy, or `polysight resume {quote(self.path)}` retakes its row;"
             f" `polysight validate {quote(self.path)}` names every damaged file"
         )
 

@@ -19,7 +19,7 @@ from polysight_shared.raster import plan_raster
 # Bytes of a file that are in memory at a time (chosen).
 _CHUNK = 1 << 22
 # Remedies of a damaged file of a row and of a damaged event log.
-_COPY_REMEDY = "restore it from a copy, or resume takes its row again"
+_COPY_REMEDY = "restore it from a copy, or `polysight resume` retakes its row"
 _FETCH_REMEDY = "resume fetches the rest from the Pi's journal"
 # What is said instead of a remedy if the damaged lines of the manifest cost no row.
 _NO_ROW_LOST = "every row is committed"
@@ -64,7 +64,7 @@ def validate(path: Path) -> list[Finding]:
     being_written = manifest.is_being_written(path / MANIFEST)
     findings = []
     if content.torn:
-        findings.append(_note(MANIFEST, "the last line is torn by a kill or power cut", "resume cuts it off"))
+        findings.append(_note(MANIFEST, "the last line is incomplete after a kill or power cut", "resume cuts it off"))
     try:
         scan = scan_folder.ScanFolder(path, content)
         rows = scan.committed_rows()
@@ -90,7 +90,7 @@ def validate(path: Path) -> list[Finding]:
     missing = len([row for row in planned_rows if row not in rows])
     ended = scan.facts(ScanEnded)
     if missing:
-        remedy = f"`polysight resume {quote(path)}` takes them"
+        remedy = f"`polysight resume {quote(path)}` records them"
         findings.append(_note(MANIFEST, f"{missing} of {scan.plan.rows} rows are not committed", remedy))
     elif not ended:
         findings.append(_note(MANIFEST, "no scan_ended: the program ended before it was written"))
@@ -107,7 +107,7 @@ def find_damaged_rows(scan: scan_folder.ScanFolder) -> dict[int, list[str]]:
     if unreadable:
         raise DeviceError(
             f"{scan.path / unreadable[0].where}: {unreadable[0].what}",
-            f"the disk fails, or its server is away ({len(unreadable)} files); nothing was changed",
+            f"the disk fails, or its server does not respond ({len(unreadable)} files); nothing was changed",
             f"check the disk, then `polysight resume {quote(scan.path)}`",
             code=ErrorCode.FILE_UNREADABLE,
         )
@@ -144,7 +144,7 @@ def _describe_loss(scan: scan_folder.ScanFolder) -> str:
         rows = f"row {absent[0]} is"
     else:
         rows = f"rows {', '.join(map(str, absent))} are"
-    return f"facts are lost: {rows} not committed; `polysight resume {quote(scan.path)}` takes them again"
+    return f"facts are lost: {rows} not committed; `polysight resume {quote(scan.path)}` records them again"
 
 
 def _check_row(scan: scan_folder.ScanFolder, row: RowCommitted) -> list[Finding]:
@@ -301,7 +301,9 @@ def _check_events(scan: scan_folder.ScanFolder) -> list[Finding]:
         return [_make_error(scan_folder.EVENTS, e.what, e.remedy)]
     findings = []
     if log.torn:
-        findings.append(_note(scan_folder.EVENTS, "the last event is torn by a kill or power cut", _FETCH_REMEDY))
+        findings.append(
+            _note(scan_folder.EVENTS, "the last event is incomplete after a kill or power cut", _FETCH_REMEDY)
+        )
     commits = [(fact.row, fact.events) for fact in scan.facts(RowCommitted) if fact.events is not None]
     if commits:
         row, committed = commits[-1]

@@ -68,12 +68,14 @@ MOST_REAL = 39.0
 # is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_rejected_surfaces.py).
 MAX_LEVEL_MISS = 0.05
 MAX_BAND_RISE = 0.01
-NO_SINGLE_MEDIUM = "no single medium reflects so: a thin wall, a coating, an edge, or a second echo at the same place"
+NO_SINGLE_MEDIUM = (
+    "no single medium reflects in this way: a thin wall, a coating, an edge, or a second echo at the same place"
+)
 # A segment may be an echo from inside a body if this share of its points lies at least this far behind another surface.
 # At a smaller distance a window does not resolve both.
 MIN_SHARE_BEHIND = 0.8
 MIN_DEPTH_M = 0.03
-BEHIND_ANOTHER_REASON = "it lies behind another surface: an echo from inside a body, whose place and form are not these"
+BEHIND_ANOTHER_REASON = "it lies behind another surface: an echo from inside a body, whose place and form are different"
 # Diffraction at an edge changes the slopes of windows near the border of the zone that its surface reflects to: by up
 # to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065

@@ -48,7 +48,7 @@ STAGES = {
     "received": "one chirp as received",
     "aligned": "one chirp after burst alignment",
     "averaged": "the direct path in a position's average",
-    "referenced": "the object beside the direct path in a position's average",
+    "referenced": "the object relative to the direct path in a position's average",
 }
 
 PUBLISHED_STD = {"frequency_hz": 138.0, "phase_rad": 0.022}

@@ -124,7 +124,7 @@ class EmulatedUno:
                 self._pulse_cycles = (pulse, setup, hold)
             else:
                 self.troubles.append(" ".join(values[1:]))
-        raise DeviceError("the UNO emulator ended", "it crashed; its last words are on standard error", "report it")
+        raise DeviceError("the UNO emulator ended", "it crashed; its last output is on standard error", "report it")
 
     def _apply_action(self, line: str) -> None:
         """Send a command to the emulator, and read its answer. Raises DeviceError."""

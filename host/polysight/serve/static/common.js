@@ -68,7 +68,7 @@ export async function reach(path, given, options, limit = ANSWER_MS) {
     if (error === INTERRUPTED) throw new Refused({ what: "A command went first", code: INTERRUPTED }, 0);
     throw new Refused({
       what: late ? `No answer within ${limit / 1000} s` : "The server is not responding",
-      why: late ? "the server or its machine is very busy, or it hangs" : "`polysight serve` was ended, or the network is gone",
+      why: late ? "the server or its machine is very busy, or it hangs" : "`polysight serve` was ended, or the network is interrupted",
       do: shell,
     }, 0);
   } finally { reads.delete(cut); }

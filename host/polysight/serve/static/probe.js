@@ -24,7 +24,7 @@ export async function showProbe(scan, x, y, library, isCurrent) {
     if (!isCurrent()) return null;
     complain("probe-hint");
   } catch (error) { complain("probe-hint", error); return null; }
-  by("probe-hint").textContent = told.lit ? "" : "The scan does not illuminate this place.";
+  by("probe-hint").textContent = told.lit ? "" : "The scan does not illuminate this position.";
   const facts = [["place", `x ${signed(told.place_mm[0], 1)}, y ${signed(told.place_mm[1], 1)} mm`],
     ["|H|, |V|", `${db(told.h_db)}, ${db(told.v_db)}${told.referenced ? " relative to metal" : ""}`],
     ["P", told.p.real === null ? "nothing" : `${complex(told.p)}${told.p_sigma === null ? "" : ` ± ${number(told.p_sigma, 2)}`}`]];

@@ -89,7 +89,7 @@ function overlay(pen, at) {
 function setMetal(box) {
   metal = box;
   drawsMetal = false;
-  by("draw-metal").textContent = box ? `Metal reference: ${box.map((v) => signed(v)).join(", ")} mm` : "Metal reference: found by itself";
+  by("draw-metal").textContent = box ? `Metal reference: ${box.map((v) => signed(v)).join(", ")} mm` : "Metal reference: found automatically";
   drawing(labels?.open);
 }
 

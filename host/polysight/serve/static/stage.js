@@ -6,7 +6,7 @@ const JOG_MS = 70000; // a jog ends within 60 s
 const STEPS_MM = [-100, -10, -1, 1, 10, 100];
 // What each state of the Pi is called here.
 const WORDS = {
-  idle: "Not homed: home it first.", homing: "Homing.", jogging: "Moving.", homed: "At rest.", ready: "A scan that stands still has it.",
+  idle: "Not homed: home it first.", homing: "Homing.", jogging: "Moving.", homed: "At rest.", ready: "A scan controls it, and it does not move.",
   fault: "Fault: home it.",
 };
 let looking = false, jogs = false;
@@ -24,7 +24,7 @@ function show(place) {
     }))));
   }));
   by("stage-home").disabled = moves;
-  if (!by("stage-told").classList.contains("wrong")) by("stage-told").textContent = WORDS[place.state] ?? "A scan has it.";
+  if (!by("stage-told").classList.contains("wrong")) by("stage-told").textContent = WORDS[place.state] ?? "A scan controls it.";
   return moves;
 }
 

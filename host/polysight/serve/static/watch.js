@@ -49,7 +49,7 @@ function showStatus() {
     const open = scan.committed < scan.rows;
     if (open && Number.isFinite(motion.left_s)) {
       left = motion.left_s ? `${span(motion.left_s)} left` : "nearly done";
-      ends = state.paused ? "once it goes on" : `ends about ${clock(motion.now_s + motion.left_s)}`;
+      ends = state.paused ? "once it continues" : `ends about ${clock(motion.now_s + motion.left_s)}`;
       if (motion.left_from !== "measured") ends += motion.left_from === "plan" ? ", by the plan" : ", a first guess";
     } else if (open && state.running) {
       ends = "time left: known after the first row";

@@ -16,6 +16,9 @@ from polysight_simulators.loopback import move_to_subnet
 from polysight_simulators.stage import __main__ as stage
 from polysight_simulators.uno import __main__ as uno
 
+# Exit status of a command with wrong arguments
+WRONG_ARGUMENTS = 2
+
 
 @pytest.mark.parametrize(
     ("main", "arguments"),
@@ -29,7 +32,7 @@ from polysight_simulators.uno import __main__ as uno
 def test_a_seed_is_a_whole_number_from_zero(main, arguments, seed, capsys):
     with pytest.raises(SystemExit) as caught:
         main([*arguments, "--seed", seed])
-    assert caught.value.code == 2
+    assert caught.value.code == WRONG_ARGUMENTS
     assert f"--seed: {seed} is not a whole number" in capsys.readouterr().err
 
 
@@ -37,16 +40,17 @@ def test_the_link_to_a_port_replaces_no_file(tmp_path):
     file = tmp_path / "notes.txt"
     file.write_text("mine")
     arguments = stage.parser().parse_args(["--config", str(RIG_FILE), "--link", str(file)])
-    for run in (lambda: stage._run(arguments, threading.Event()), lambda: uno._run(arguments)):
-        with expect_refusal(ErrorCode.FILE_EXISTS, file):
-            run()
+    with expect_refusal(ErrorCode.FILE_EXISTS, file):
+        stage._run(arguments, threading.Event())
+    with expect_refusal(ErrorCode.FILE_EXISTS, file):
+        uno._run(arguments)
     assert file.read_text() == "mine"
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf"])
 def test_a_time_scale_that_is_not_a_positive_number_is_refused_before_a_process_starts(tmp_path, capsys, speed):
     arguments = ["--config", str(RIG_FILE), "--pattern", "--dir", str(tmp_path / "rig"), f"--time-scale={speed}"]
-    assert simulated_rig.main(arguments) == 2
+    assert simulated_rig.main(arguments) == WRONG_ARGUMENTS
     assert f"--time-scale {speed}" in capsys.readouterr().err
 
 
@@ -58,7 +62,7 @@ def move_native(boards):
     return move_to_subnet(msgspec.structs.replace(rig, radar=radar), "127.3.4")
 
 
-def test_simulated_boards_replace_those_identified_by_plug_and_die():
+def test_simulated_boards_replace_boards_identified_by_usb_plug_and_die():
     die = "00000001-00000002-00000003-00000004"
     moved = move_native([NativeRadar(usb_path=f"1-4.{n}", die_id=die, ldo_bypass=True) for n in range(3)])
     for board in moved.boards:
@@ -67,7 +71,8 @@ def test_simulated_boards_replace_those_identified_by_plug_and_die():
         assert moved.radar.native[board.name] == NativeRadar(usb_serial=place, ldo_bypass=True)
 
 
-def test_simulated_boards_have_the_acknowledgement_of_those_that_they_replace():
+def test_a_simulated_board_is_acknowledged_if_the_board_that_it_replaces_is():
+    """`ldo_bypass_acknowledged` names the board for which a person has acknowledged the bypass: here the second one."""
     serials = ["FT0", "FT1", "FT2"]
     moved = move_native([NativeRadar(s, ldo_bypass=True, ldo_bypass_acknowledged="FT1") for s in serials])
     acknowledged = [n.ldo_bypass_acknowledged == n.usb_serial for n in moved.radar.native.values()]

@@ -48,13 +48,17 @@ def test_a_packet_that_is_not_a_request_gets_no_answer(junk: bytes) -> None:
 def test_a_card_survives_any_bytes(junk: bytes) -> None:
     card = Card(HOME)
     for datagram in (junk, b"\x5a\xa5" + junk):
+        # A reply, and a status if the command ended a record
         assert len(card.command(datagram, 0.0)) <= 2
 
 
-def test_the_eeprom_is_taken_at_the_next_power_cycle() -> None:
+def test_settings_in_the_eeprom_are_used_from_the_next_power_cycle_on() -> None:
     card = Card(HOME)
+    # Addresses of host and card, MAC address, ports 4200 and 4201
     body = bytes.fromhex("1e21a8c0 b521a8c0 139078563412 6810 6910")
-    assert list_messages(card.command(bytes.fromhex("5aa5 0400 1200") + body + b"\xaa\xee", 0.0))[0][4] == 0
+    request = bytes.fromhex("5aa5 0400 1200") + body + bytes.fromhex("aaee")
+    success = bytes.fromhex("5aa5 0400 0000 aaee")
+    assert list_messages(card.command(request, 0.0)) == [success]
     assert card.network == HOME
     card.power_cycle()
     assert card.network == Network("192.168.33.30", "192.168.33.181", bytes.fromhex("123456789013"), 4200, 4201)

@@ -1,4 +1,4 @@
-"""Any order of commands, LVDS data and waiting: the card sends the stream that it got.
+"""The simulated card sends the LVDS data that it receives, for any order of commands, data and pauses.
 
 Codes of commands: 0x01 reset, 0x03 configure, 0x05 start, 0x06 stop, 0x0A status, 0x0B packets.
 """
@@ -12,6 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from polysight_simulators.cards.dca1000 import TAIL_S, Card, Message, Network, Output, Packets, Status, make_message
 
 HOME = Network("192.168.33.30", "192.168.33.180", bytes.fromhex("123456789012"), 4096, 4098)
+# The card ends a record without data after this time.
+NO_DATA_TIMEOUT_S = 30.0
 # Statuses with which a record ends.
 ENDS = {Status.RECORD_COMPLETED, Status.NO_LVDS_DATA}
 
@@ -21,9 +23,9 @@ def request(code: int, body: bytes = b"") -> bytes:
 
 
 class AnyUse(RuleBasedStateMachine):
-    """The card compared with a model: bytes that it got, bytes that it sent, and if it records.
+    """The card compared with a model: the bytes that it received and sent, and whether it records.
 
-    `suits` is False while the card is configured for another number of lanes than the LVDS data has.
+    `lanes_match` is False while the card is configured for another number of lanes than the LVDS data has.
     """
 
     @initialize(
@@ -36,9 +38,9 @@ class AnyUse(RuleBasedStateMachine):
         self.count = count
         self.now = 0.0
         self.recording = False
-        self.suits = True
+        self.lanes_match = True
         self.payload = 1456
-        # Bytes of the record that the card got, and that it has sent.
+        # Bytes of the record that the card received, and that the host received from it.
         self.given = b""
         self.received = b""
         self.last_data: float | None = None
@@ -46,7 +48,7 @@ class AnyUse(RuleBasedStateMachine):
         self.sizes: list[int] = []
 
     def compare(self, outputs: list[Output], ends: bool) -> None:
-        """Compare what the card sent with the model; `ends`: True if the record ends with it."""
+        """Compare the card's packets and messages with the model; `ends`: True if the record ends with them."""
         packets = [row.tobytes() for o in outputs if isinstance(o, Packets) for row in o.rows]
         assert self.recording or not packets, "data outside a record"
         for packet in packets:
@@ -82,33 +84,33 @@ class AnyUse(RuleBasedStateMachine):
         outputs = self.card.command(request(0x05), self.now)
         if not self.recording:
             self.begin()
-        self.compare(outputs, False)
+        self.compare(outputs, ends=False)
 
     @rule()
     def stop(self) -> None:
         outputs = self.card.command(request(0x06), self.now)
         assert outputs[0] == make_message(0x06, 0)
-        self.compare(outputs[1:], self.recording)
+        self.compare(outputs[1:], ends=self.recording)
 
     @rule(n=st.integers(0, 9000))
     def data(self, n: int) -> None:
         fresh = ((np.arange(n) + self.next_byte) % 251).astype(np.uint8)
         self.next_byte += n
         outputs = self.card.process_lvds(fresh, self.now)
-        if self.recording and self.suits:
+        if self.recording and self.lanes_match:
             self.given += fresh.tobytes()
             self.last_data = self.now
-        self.compare(outputs, False)
+        self.compare(outputs, ends=False)
 
     @rule(seconds=st.sampled_from([0.001, 0.5, TAIL_S, 31.0]))
     def wait(self, seconds: float) -> None:
         self.now += seconds
-        # A record ends 30 s after its start if no data came, else some time after the last data.
+        # A record ends 30 s after its start if no data came, otherwise `TAIL_S` after the last data.
         if self.last_data is None:
-            end_s = self.started + 30.0
+            end_s = self.started + NO_DATA_TIMEOUT_S
         else:
             end_s = self.last_data + TAIL_S
-        self.compare(self.card.tick(self.now), self.recording and self.now >= end_s)
+        self.compare(self.card.tick(self.now), ends=self.recording and self.now >= end_s)
 
     @rule(code=st.sampled_from([0x02, 0x09, 0x0A, 0x0E, 0x07, 0x77]), body=st.binary(max_size=8))
     def ask(self, code: int, body: bytes) -> None:
@@ -121,9 +123,9 @@ class AnyUse(RuleBasedStateMachine):
     def configure(self, body: str) -> None:
         assert self.card.command(request(0x03, bytes.fromhex(body)), self.now) == [make_message(0x03, 0)]
         if body == "01010102031e":
-            self.suits = True
+            self.lanes_match = True
         elif body == "01020102031e":
-            self.suits = False
+            self.lanes_match = False
 
     @rule(size=st.sampled_from([48, 1000, 1470, 1472]), ticks=st.integers(0, 5000))
     @precondition(lambda self: not self.recording)
@@ -135,13 +137,13 @@ class AnyUse(RuleBasedStateMachine):
         assert self.card.packet_delay_s == ticks * 8e-9
 
     @rule(power=st.booleans())
-    def start_afresh(self, power: bool) -> None:
+    def power_cycle_or_reset(self, power: bool) -> None:
         if power:
             self.card.power_cycle()
         else:
             assert self.card.command(request(0x01), self.now) == [make_message(0x01, 0)]
         self.recording = False
-        self.suits = True
+        self.lanes_match = True
         self.payload = 1456
         self.sequence = 1
         self.count = 0
@@ -149,7 +151,7 @@ class AnyUse(RuleBasedStateMachine):
     @property
     def started(self) -> float:
         deadline = self.card.deadline_s
-        return 0.0 if deadline is None else deadline - 30.0
+        return 0.0 if deadline is None else deadline - NO_DATA_TIMEOUT_S
 
     @invariant()
     def the_card_knows_whether_it_records(self) -> None:

@@ -40,12 +40,13 @@ def test_interpolation_between_frequencies_is_exact() -> None:
     samples = sample_frequencies_hz(rig)
     field = build_field(rig, scene, board, samples)
     offset = np.array([[0.021, -0.033]])
+    # The field is computed at a few of the 256 frequencies and interpolated between them.
     assert len(field.nodes_hz) < 16
     everywhere = read(field, offset, samples, 0, samples)
     exact = optics.field_exact(rig, scene, board, offset, samples)
     # The difference beyond a common factor is the error of the interpolation over frequency.
     common = np.vdot(everywhere, exact) / np.vdot(everywhere, everywhere)
-    # 1e-4 is chosen, far below the noise of a scan.
+    # 1e-4 is far below the noise of a scan; 4e-6 is measured.
     assert np.abs(everywhere * common - exact).max() < 1e-4 * np.abs(exact).max()
 
 
@@ -68,7 +69,7 @@ def test_a_large_mirror_shows_the_image_of_the_transmitter(role: str) -> None:
     image = antennas.rx_m[0] * [1, 1, -1] + [0, 0, 2 * antennas.plane_z_m]
     path = float(np.linalg.norm(image - antennas.tx_m))
     expected = -antennas.direct_m[0] / path * np.exp(2j * np.pi * f[0] * path / SPEED_OF_LIGHT_M_S)
-    # The plate's edges still ring by some percent at each offset; their mean does not.
+    # The echoes of the plate's edges change the field by up to 11 % at single offsets, by 0.2 % in the mean (measured).
     assert abs(np.mean(field_values) / expected - 1) < 0.03
     assert np.abs(np.abs(field_values) / abs(expected) - 1).max() < 0.25
 
@@ -80,7 +81,8 @@ def test_echoes_add_up() -> None:
     f = np.array([77e9, 80e9])
     for board in rig.receivers:
         total = optics.field_exact(rig, both_plates, board, offsets, f)
-        assert np.allclose(total, sum(optics.field_exact(rig, s, board, offsets, f) for s in parts), atol=1e-12)
+        sum_of_parts = sum(optics.field_exact(rig, scene, board, offsets, f) for scene in parts)
+        assert np.allclose(total, sum_of_parts, atol=1e-12)
 
 
 def test_leakage_mixes_the_two_polarisations() -> None:
@@ -89,17 +91,20 @@ def test_leakage_mixes_the_two_polarisations() -> None:
     f = np.array([78e9])
     h, v = rig.receivers
 
-    def interpolate_field(board: Any, **d: Any) -> complex:
-        return complex(optics.field_exact(rig, scene.with_disturbances(ideal=True, **d), board, offsets, f)[0, 0])
+    def compute_field(board: Any, **leakage: Any) -> complex:
+        leaky_scene = scene.with_disturbances(ideal=True, **leakage)
+        return complex(optics.field_exact(rig, leaky_scene, board, offsets, f)[0, 0])
 
-    # From no leakage to full leakage H gains all of p: linear in between.
-    s_only = interpolate_field(h)
-    s_and_p = interpolate_field(h, leakage_h=[1.0, 0.0])
-    assert np.isclose(interpolate_field(h, leakage_h=[0.05, 0.02]), s_only + np.conj(0.05 + 0.02j) * (s_and_p - s_only))
-    assert np.isclose(interpolate_field(h, leakage_v=[0.1, 0.0]), s_only)
-    assert not np.isclose(interpolate_field(v, leakage_v=[0.1, 0.0]), interpolate_field(v))
+    # H receives s. Leakage of 1 adds all of p, less leakage that fraction of p. Samples are conjugates of fields.
+    s_only = compute_field(h)
+    s_and_p = compute_field(h, leakage_h=[1.0, 0.0])
+    expected = s_only + np.conj(0.05 + 0.02j) * (s_and_p - s_only)
+    assert np.isclose(compute_field(h, leakage_h=[0.05, 0.02]), expected)
+    # The leakage of V changes V and not H.
+    assert np.isclose(compute_field(h, leakage_v=[0.1, 0.0]), s_only)
+    assert not np.isclose(compute_field(v, leakage_v=[0.1, 0.0]), compute_field(v))
     leaky = scene.with_disturbances(leakage_v=[0.0, 0.1])
-    # The conjugate, as samples have it.
+    # The direct path, too, has the conjugate.
     assert optics.direct_factor(v, leaky) == 1 - 0.1j
 
 
@@ -124,10 +129,12 @@ F = 78.5e9
 
 
 @given(st.floats(0.01, 1.5))
-def test_a_good_conductor_tends_to_metal_with_p_of_plus_one(theta: float) -> None:
+def test_a_good_conductor_reflects_as_metal_in_both_polarisations(theta: float) -> None:
     s, p = optics.half_space(1e12 - 1e12j, theta)
     m_s, m_p = optics.plate_reflection(Plate("m", (0, 0), (1, 1), metal=True), F, np.array(theta))
     assert m_s == m_p == -1
+    # A permittivity of 1.4e12 differs from a perfect conductor by the inverse of its root, about 1e-6, and in p by this
+    # over the cosine of the incidence angle.
     assert abs(s - m_s) < 1e-4
     assert abs(p - m_p) < 1e-4 / np.cos(theta)
 
@@ -151,10 +158,14 @@ def test_the_echo_of_the_back_of_a_sheet_comes_after_that_of_its_front() -> None
     path_m = np.linspace(-1.0, 1.0, 2001)
     # Echo against path: the spectrum over the band, with a window against side lobes.
     advance = np.exp(-2j * np.pi / SPEED_OF_LIGHT_M_S * np.outer(path_m, f)) * np.hanning(f.size)
-    # To the back and again to the front, at the angle inside by Snell's law; relative to the front's echo.
+    # Path to the back and again to the front, at the angle inside by Snell's law, relative to the echo of the front.
     inside_m = 2 * thick_m * np.sqrt(eps - np.sin(theta) ** 2)
     for board in rig.receivers:
         reflect = optics.board_reflectivity(board, Scene("one sheet", plates=(sheet,)).with_disturbances(ideal=True))
         amplitudes = np.abs(advance @ np.array([complex(reflect(sheet, hz, theta)) for hz in f]))
+        # Without the echo of the front, which is at 0
         echo_of_back = np.where(np.abs(path_m) > 0.15, amplitudes, 0)
-        assert abs(path_m[np.argmax(echo_of_back)] - inside_m) < 0.01
+        peak_m = path_m[np.argmax(echo_of_back)]
+        # The path is 0.36 m; with a wrong sign of the phase it would be -0.36 m. Resolution (c over the band) is 9 cm;
+        # the peak is 4 mm off (measured).
+        assert abs(peak_m - inside_m) < 0.01

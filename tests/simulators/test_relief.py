@@ -1,4 +1,4 @@
-"""Tilted, raised and rough plates: the fast field equals the exact sum, and both agree with optics."""
+"""The fast field of tilted, raised and rough plates equals the exact sum, and both agree with optics."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ RIG = load_published_rig()
 GRID = {"columns": 21, "rows": 15, "step_x_mm": 10.0, "step_y_mm": 10.0}
 PLATE = {"name": "a", "centre_mm": [0.0, 0.0], "size_mm": [60.0, 60.0], "permittivity": [4.0, 0.4]}
 # Six plates at different heights, and flat ones of several materials.
-SIX = [
+SIX_HEIGHTS = [
     {**PLATE, "centre_mm": [60.0 * a, 60.0 * b], "size_mm": [45.0, 45.0], "height_mm": 2.5 * a + b}
     for a in (-1, 0, 1)
     for b in (-1, 1)
@@ -47,7 +47,9 @@ def compute_fields(n: int = 12, role: str = "receive_h", rx: int = 1, **tables: 
     offsets = np.random.default_rng(0).uniform(-1, 1, (n, 2)) * [0.1, 0.07]
     nodes = [0, 128, 255]
     carrier = np.exp(2j * np.pi * samples[nodes] * field.centre_path_m / SPEED_OF_LIGHT_M_S)
-    fast = field.interpolate(offsets[:, 0], offsets[:, 1])[:, rx] @ node_matrix(field, samples)[0][:, nodes] * carrier
+    to_samples, _ = node_matrix(field, samples)
+    at_offsets = field.interpolate(offsets[:, 0], offsets[:, 1])[:, rx]
+    fast = at_offsets @ to_samples[:, nodes] * carrier
     return fast, field_exact(rig, scene, board, offsets, samples[nodes], rx)
 
 
@@ -58,25 +60,28 @@ def compute_rms_error(fast: np.ndarray, exact: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("tables", "bound"),
     [
-        # Relative RMS errors; the bounds are chosen, below the noise of a scan.
+        # Relative RMS errors, below the noise of a scan. The largest one that is measured is 0.004, at two degrees.
         ({"plates": FLAT, "points": [{"position_mm": [55.0, -60.0], "amplitude": [0.3, 0.2]}]}, 5e-4),
         ({"plates": [{**PLATE, "tilt_deg": [1.0, 0.0]}]}, 0.002),
         ({"plates": [{**PLATE, "tilt_deg": [0.0, 1.0]}]}, 0.002),
         ({"plates": [{**PLATE, "tilt_deg": [2.0, -2.0]}]}, 0.005),
         ({"plates": [{**PLATE, "height_mm": -7.0}]}, 2e-4),
-        ({"plates": SIX, "points": [{"position_mm": [0.0, 0.0], "height_mm": 3.0}]}, 0.002),
-        ({"plates": SIX, "plane_tilt_deg": [0.7, -0.5], "plane_shift_mm": -2.0}, 0.003),
+        ({"plates": SIX_HEIGHTS, "points": [{"position_mm": [0.0, 0.0], "height_mm": 3.0}]}, 0.002),
+        ({"plates": SIX_HEIGHTS, "plane_tilt_deg": [0.7, -0.5], "plane_shift_mm": -2.0}, 0.003),
     ],
     ids=["flat plates and a point", "tilt x", "tilt y", "two degrees", "height", "many heights", "tilted plane"],
 )
 @pytest.mark.parametrize("role", ["receive_h", "receive_v"])
 def test_the_fast_field_equals_the_exact_sum(tables: dict[str, Any], bound: float, role: str) -> None:
-    assert compute_rms_error(*compute_fields(role=role, **tables)) < bound
+    fast, exact = compute_fields(role=role, **tables)
+    assert compute_rms_error(fast, exact) < bound
 
 
 def test_the_fast_field_of_a_rough_plate_equals_the_exact_sum() -> None:
     rough = {**PLATE, "size_mm": [45.0, 36.0], "rough_mm": 0.3, "tilt_deg": [0.5, 0.2]}
-    assert compute_rms_error(*compute_fields(n=6, plates=[rough])) < 0.002
+    fast, exact = compute_fields(n=6, plates=[rough])
+    # As for smooth plates that are tilted by one degree; 5e-4 is measured.
+    assert compute_rms_error(fast, exact) < 0.002
 
 
 def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
@@ -84,31 +89,32 @@ def test_height_turns_the_phase_by_2_k_cos_theta() -> None:
     board = rig.receivers[0]
     frequency_hz = np.array([78.5e9])
     cos_theta = np.cos(np.radians(incidence_deg(rig, board)))
-    field_at_plane = field_exact(
-        rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.0}])[1], board, np.zeros((1, 2)), frequency_hz
-    )[0, 0]
-    field_raised = field_exact(
-        rig, make_scene_and_rig(plates=[{**PLATE, "height_mm": 0.2}])[1], board, np.zeros((1, 2)), frequency_hz
-    )[0, 0]
-    # A positive height is farther away: the echo comes later.
-    assert np.angle(field_raised / field_at_plane) == pytest.approx(2 * WAVE * cos_theta * 0.2e-3, abs=0.01)
+    height_m = 0.2e-3
+
+    def compute_field(height_m: float) -> complex:
+        _, scene = make_scene_and_rig(plates=[{**PLATE, "height_mm": 1e3 * height_m}])
+        return field_exact(rig, scene, board, np.zeros((1, 2)), frequency_hz)[0, 0]
+
+    # A positive height is farther away: the echo comes later. Of the 0.38 rad 7e-5 are missing (measured).
+    turn_rad = np.angle(compute_field(height_m) / compute_field(0.0))
+    assert turn_rad == pytest.approx(2 * WAVE * cos_theta * height_m, abs=0.01)
 
 
 def test_a_shifted_plane_equals_another_object_distance_but_does_not_change_the_rig() -> None:
     rig, shifted = make_scene_and_rig(plates=[PLATE], plane_shift_mm=1.5)
     assert rig.geometry.object_distance_mm == 499.0
-    nearer, distant = make_scene_and_rig(plates=[PLATE], object_distance_mm=500.5)
+    distant_rig, distant_scene = make_scene_and_rig(plates=[PLATE], object_distance_mm=499.0 + 1.5)
     board = rig.receivers[0]
     offsets = np.array([[0.01, -0.02], [0.04, 0.03]])
     frequencies_hz = np.array([77e9, 80e9])
     field = field_exact(rig, shifted, board, offsets, frequencies_hz)
     # The image centre does not depend on the distance: both boards' antennas lie at z = 0.
-    assert (
-        np.abs(field - field_exact(nearer, distant, board, offsets, frequencies_hz)).max() < 1e-3 * np.abs(field).max()
-    )
+    expected = field_exact(distant_rig, distant_scene, board, offsets, frequencies_hz)
+    assert np.abs(field - expected).max() < 1e-3 * np.abs(field).max()
 
 
-def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitude() -> None:
+def test_roughness_reduces_the_mean_amplitude_as_theory_says() -> None:
+    """The factor is exp(-2 (k sigma cos(theta))^2), with the wave number k; sigma is the rms height."""
     rig, _ = make_scene_and_rig()
     board = rig.receivers[0]
     samples = np.array([78.5e9])
@@ -123,7 +129,8 @@ def test_roughness_takes_exp_of_minus_2_k_sigma_cos_theta_squared_of_the_amplitu
 
     smooth = compute_amplitude(0.0, 1)
     for rough_mm in (0.15, 0.3):
-        coherent = np.mean([compute_amplitude(rough_mm, seed) for seed in range(24)]) / smooth
+        mean_factor = np.mean([compute_amplitude(rough_mm, seed) for seed in range(24)]) / smooth
         expected = np.exp(-2 * (WAVE * rough_mm / 1e3 * cos) ** 2)
-        assert coherent.real == pytest.approx(expected, abs=0.04)
-        assert abs(coherent.imag) < 0.04
+        # The factors are 0.96 and 0.85. The mean of 24 rough plates deviates by up to 0.006 (measured).
+        assert mean_factor.real == pytest.approx(expected, abs=0.04)
+        assert abs(mean_factor.imag) < 0.04

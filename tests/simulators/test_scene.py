@@ -71,9 +71,9 @@ def test_a_wrong_key_or_value_is_refused_by_name(raw: dict[str, Any], named: str
 
 
 def test_every_disturbance_has_an_off_value_and_ideal_uses_them_all() -> None:
-    # These say where another disturbance acts, and have no value without effect.
-    shaping = {"bend_us", "ripple_us"}
-    assert set(SWITCHED_OFF) | shaping == set(Disturbances.__struct_fields__)
+    # These two are times of other disturbances: no value switches anything off.
+    times_of_others = {"bend_us", "ripple_us"}
+    assert set(SWITCHED_OFF) | times_of_others == set(Disturbances.__struct_fields__)
     ideal = msgspec.to_builtins(make_scene(disturbances={"ideal": True}).disturbances)
     expected = msgspec.to_builtins(msgspec.convert(SWITCHED_OFF, Disturbances))
     assert ideal == expected
@@ -123,6 +123,7 @@ def test_every_example_fits_the_published_rig(rig: Instrument, path: Path) -> No
 def test_the_library_does_not_contain_the_demo_scan() -> None:
     demo = load_scene(REPO / "examples" / "nine-materials.toml")
     library = [load_scene(p) for p in sorted((REPO / "examples" / "library").glob("*.toml"))]
+    # The files were found.
     assert len(library) >= 4
     assert len({s.seed for s in [demo, *library]}) == len(library) + 1
     materials = {p.name: (p.permittivity, p.metal) for p in demo.plates}

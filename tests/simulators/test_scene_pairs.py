@@ -27,9 +27,10 @@ WRONG_NUMBERS = (float("nan"), float("inf"), -float("inf"), 1e308, -1e308, 5e-32
 WRONG_TYPES = ("many", [], [[]], {}, True)
 # Texts: none, a long one, a mark that reverses the direction, a line break, a path, format codes, and a usual one.
 WORDS = ("", "x" * 300, "e\u202exe", "a\nb", "../x", "%s{}", "metal")
-# Larger scenes are not simulated, since they take long; and pairs that are drawn without --long. Chosen.
+# Scenes with more positions, or with lengths beyond this, are not simulated: they take long.
 MOST_POSITIONS = 64
 LARGEST_MM = 300.0
+# Number of pairs that are drawn without --long
 PAIRS = 16
 
 KINDS_OF_PLATES: list[dict[str, Any]] = [
@@ -159,7 +160,7 @@ def check_scene(scene: dict[str, Any], folder: Path, capsys: pytest.CaptureFixtu
 def test_each_pair_of_keys_makes_a_whole_scan_or_is_refused(tmp_path, capsys, request):
     draw = random.Random(1)
     pairs = list(itertools.combinations(list_keys(), 2))
-    # The keys were found.
+    # The keys were found: there are 160, which make 12,720 pairs.
     assert len(pairs) > 5000
     if not request.config.getoption("--long"):
         pairs = draw.sample(pairs, PAIRS)

@@ -1,4 +1,4 @@
-"""A simulated scan on disk: both layouts have the radars' bytes, and truth.json the truth of the scene."""
+"""The files of a simulated scan: rows have the radars' bytes, events agree with the rows, truth.json has the scene."""
 
 import json
 from pathlib import Path
@@ -42,11 +42,14 @@ def test_rows_contain_the_radars_bytes_at_true_positions(folder: Path) -> None:
     # Odd rows start at the largest x, and move on until the first pulse and during each burst: 20 mm/s are 0.03 mm
     # between two pulses.
     assert np.isclose(x[0], 20.0 - RIG.stage.speed_mm_s * FIRST_PULSE_DELAY_S)
-    assert np.allclose(np.diff(x.reshape(5, 16), axis=1), -0.03)
-    assert np.allclose(np.diff(x.reshape(5, 16)[:, 0]), -10.0)
+    # [position, pulse]
+    x_of_pulses = x.reshape(5, 16)
+    assert np.allclose(np.diff(x_of_pulses, axis=1), -0.03)
+    assert np.allclose(np.diff(x_of_pulses[:, 0]), -10.0)
     expected = radar.chirps("RV", x, y, first_chirp=len(x))
     raw = (folder / "raw" / "RV" / "0001.bin").read_bytes()
-    assert len(raw) == 5 * 16 * 4096
+    # 256 samples of 4 RX, each a complex pair of int16
+    assert len(raw) == 5 * 16 * (256 * 4 * 2 * 2)
     assert np.array_equal(np.frombuffer(raw, "<i2").reshape(expected.shape), expected)
 
 

@@ -21,15 +21,17 @@ def make_plate(rise_deg, **material):
 @pytest.mark.parametrize("rise_deg", [-2.0, -0.5, 0.0, 1.0])
 def test_metal_receives_what_the_image_of_the_transmitter_sends(rise_deg):
     """The image of a dipole e in a mirror of normal n is 2 (n e) n - e; H and V are its parts along s and p."""
-    w = np.radians(rise_deg)
-    normal = np.array([0.0, np.sin(w), -np.cos(w)])
+    rise_rad = np.radians(rise_deg)
+    normal = np.array([0.0, np.sin(rise_rad), -np.cos(rise_rad)])
     s_axis = np.array([0.0, 1.0, 0.0])
     p_of_transmitter = np.array([np.cos(THETA), 0.0, -np.sin(THETA)])
     p_of_receiver = np.array([np.cos(THETA), 0.0, np.sin(THETA)])
     sent = s_axis + p_of_transmitter
     image = 2 * normal * (normal @ sent) - sent
     h, v = turn_reflection(make_plate(rise_deg, metal=True), 78e9, np.array(THETA))
-    assert [complex(h).real, complex(v).real] == pytest.approx([image @ s_axis, image @ p_of_receiver], abs=4e-3)
+    # The formula is of first order in the rise: its square at 2 degrees is 1.2e-3, and the error 2.5e-3 (measured).
+    assert complex(h).real == pytest.approx(image @ s_axis, abs=4e-3)
+    assert complex(v).real == pytest.approx(image @ p_of_receiver, abs=4e-3)
 
 
 @pytest.mark.parametrize("permittivity", [None, 4.0 - 0.4j, 2.6 - 0.01j])
@@ -53,5 +55,6 @@ def test_a_tilted_dielectric_changes_as_in_vector_physical_optics(permittivity):
         expected.append(complex(v) / complex(h))
     change = np.array(generated[1:]) / generated[0] - 1
     predicted = np.array(expected[1:]) / expected[0] - 1
-    # The formula is of first order in the rise, and the boards see a plate from 53 to 58 degrees, not from 55 alone.
+    # The formula is of first order in the rise, and the boards see a plate from 53 to 58 degrees, not from 55 alone:
+    # differences of 8 % are measured.
     assert change == pytest.approx(predicted, rel=0.12, abs=2e-3)

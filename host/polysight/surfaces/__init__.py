@@ -1,10 +1,13 @@
 """Surfaces: shape and permittivity of curved and tilted objects, from the samples of one scan (docs/surfaces.md).
 
 `Samples` are what the pipeline holds of a board after synchronisation. `see_points` finds the specular points in H and
-measures the same points in V; `analyse_surface` gives points, normals, curvature and permittivity with covariance, with
-the gains that `learn_gains` takes from points of a metal sphere or plate. `write_surface` and `read_surface` are the
-files. In order: `window` (fit of one echo), `joint` (of several), `paths` (search), `points` (geometry), `measure`
-(both receivers, segments), `optics` (polarisation, curved reflection), `voltages`, `gains`, `permittivity`, `result`.
+measures the same points in V. `learn_gains` learns the receivers' gains from points of a metal sphere or plate. With
+these, `analyse_surface` gives points, normals, curvature, and permittivity with its covariance. `write_surface` and
+`read_surface` write and read the files.
+
+Modules, from the samples to the result: `window` (fit of one echo), `joint` (of several), `points` (geometry), `paths`
+(search), `measure` (both receivers, segments), `optics` (polarisation, curved reflection), `gains`, `permittivity`,
+`result`.
 """
 
 from polysight.surfaces.gains import Gains, find_voltages, learn_gains

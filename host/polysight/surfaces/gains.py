@@ -1,12 +1,15 @@
-"""Gains of both receivers over direction, learnt from metal of known shape: the reference of a permittivity.
+"""Gains of both receivers over direction, learnt from metal of known shape, and the voltages of points.
 
-A metal sphere covers directions; a flat plate gives one. What TX sends depends on the direction of departure, and what
-a receiver takes on that of arrival. At the distance of the reference, one of these directions gives the other. At other
-distances it does not; the error of the level is then half the difference of both estimates. H over V needs only the
-direction of arrival, because TX cancels.
+The measured voltages of H and V are products of the surface's reflection, the path, the spreading and the antennas'
+gains. `find_voltages` removes path and spreading, and computes the rows by which a surface's reflection coefficients
+become voltages for gains of 1 (`optics`). V sees a point from another stage position than H, some 15 mm away, under
+another angle.
 
-`find_voltages` gives the voltages of H and V without path and spreading, and the rows that turn a surface's reflection
-coefficients into such voltages. V sees a point from another stage position (some 15 mm from H's), under another angle.
+`learn_gains` compares such voltages of metal, whose coefficients are known, with those for gains of 1. A metal sphere
+covers many directions; a flat plate gives one. The ratio of the gains of H and V depends on the direction of arrival
+only, because TX cancels. The level of H depends on two directions: that of departure at TX and that of arrival. At the
+distance of the reference one of these gives the other. At other distances it does not: the level is then the mean of
+two estimates, by either direction, and its error is half their difference.
 """
 
 from __future__ import annotations
@@ -36,28 +39,29 @@ from polysight.surfaces.window import WINDOW_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# Blocks of stage positions whose errors count as independent: windows overlap, and ripples of edges and of other echoes
-# are as long as a Fresnel zone (40 to 70 mm).
+# Errors of points in different square blocks of stage offsets, with this side, count as independent: windows overlap,
+# and ripples of edges and of other echoes are as long as a Fresnel zone (40 to 70 mm).
 BLOCK_M = 2 * WINDOW_M
 
 
 @dataclass(frozen=True)
 class Voltages:
-    """Voltages of points [n], with the directions, angles and curvatures that they depend on.
+    """Voltages of n points, with the directions, angles and curvatures that they depend on.
 
     Attributes
     ----------
     voltage, std
-        Voltages of H and V without path and spreading, complex [n, 2], and the standard deviations of either part.
+        Voltages of H and V without path and spreading, complex [n, 2]; standard deviations of their real parts, and of
+        their imaginary parts, [n, 2].
     response
-        Rows of the coefficients of r_s, r_p, s to p and p to s, complex [n, 2 receivers, 4 coefficients].
+        Factors of r_s, r_p, r_sp (s to p) and r_ps in the voltages, complex [n, 2 receivers, 4].
     theta
-        Incidence at H and V, [n, 2], radians: V sees a point from elsewhere, some 0.1 degrees steeper. Near Brewster's
-        angle that changes r_p by some per cent.
+        Angles of incidence for H and V, [n, 2], radians. V's is some 0.1 degrees steeper, which changes r_p by some per
+        cent near Brewster's angle.
     path_m
-        Path from TX to H and V, [n, 2].
+        Path from TX over the point to H and V, [n, 2].
     bend_inside, bend_across, twist
-        Curvatures in and across the plane of incidence, and twist between both, [n].
+        The surface's curvatures in the plane of incidence and across it, and the twist between both, [n], 1 / m.
     arrival, departure
         Directions in which V sees the point, and in which TX sees it for H: x and y of unit vectors, [n, 2].
     band_rise
@@ -93,7 +97,8 @@ def find_voltages(seen: SeenEchoes, optics: Optics, shape: Shape | None = None) 
     tx_m = optics.tx.at_m
     k = optics.wave_number
     surface = (shape.points, shape.normals, shape.curvature)
-    # Stage offsets: those of H's echoes, and those from which V sees the same points, to which its echoes are moved.
+    # H's stage offsets are those of its echoes. V's are those from which it sees the same points; its echoes, measured
+    # close by, are moved there.
     seen_from = {"h": seen.h.at_m, "v": find_offset_that_sees(*surface[:2], seen.v.at_m, tx_m, optics.v.at_m)}
     voltages = []
     std = []
@@ -131,47 +136,51 @@ def find_voltages(seen: SeenEchoes, optics: Optics, shape: Shape | None = None) 
 
 
 def reflect_points(eps: NDArray | complex, points: Voltages, wave_number: float) -> Complex:
-    """Return coefficients (r_s, r_p, s to p, p to s) of the curved surface at each point for H and V, [n, 2, 4]."""
+    """Return the coefficients r_s, r_p, r_sp and r_ps of the curved surface at each point for H and V, [n, 2, 4]."""
     eps_of_receivers = np.asarray(eps)[..., None]
     r_s, r_p = reflect_curved(
         eps_of_receivers, points.theta, points.bend_inside[:, None], points.bend_across[:, None], wave_number
     )
     mixed = mix_twisted(eps_of_receivers, points.theta, points.twist[:, None], wave_number)
-    # The antennas are near: a spherical wave is reflected a little differently than a plane one.
+    # The antennas are near: a spherical wave is not reflected quite like a plane one.
     more_s, more_p = reflect_spherical(eps_of_receivers, points.theta, points.path_m, wave_number)
     return np.stack([r_s + more_s, r_p + more_p, mixed, mixed], axis=2)
 
 
 def predict_voltages(points: Voltages, coefficients: Complex) -> Complex:
-    """Return voltages of H and V [n, 2] that coefficients [n, 2, 4] give with gains of 1."""
+    """Return the voltages of H and V, [n, 2], for coefficients [n, 2, 4] and gains of 1."""
     return np.sum(points.response * coefficients, axis=2)
 
 
 def compute_expansion_parameter(points: Voltages, wave_number: float) -> Array:
-    """Return K / (k cos^3 theta) of each point [n]: ratio of successive orders of reflection at a curved surface.
+    """Return K / (k cos^3(theta)) of each point, [n]: the parameter of the expansion of reflection at a curved surface.
 
-    K is the mean of both curvatures' sizes, k the wave number.
+    Each order of the expansion is about this times the one before. K is the mean of both curvatures' magnitudes, k the
+    wave number.
     """
     bend = (np.abs(points.bend_inside) + np.abs(points.bend_across)) / 2
     return bend / (wave_number * np.cos(points.theta[:, 0]) ** 3)
 
 
 def number_blocks(at_m: Array, shift: tuple[float, float], block_m: float = BLOCK_M) -> NDArray[np.int_]:
-    """Return the number of the block of each stage offset [n, 2]; `shift` moves the borders by a share of a block."""
+    """Return the number of the block of each stage offset, [n]; `at_m` is [n, 2].
+
+    `shift` moves the borders of the blocks in x and y, as a fraction of a block.
+    """
     cell = np.floor(at_m / block_m + np.array(shift)).astype(int)
     _, number = np.unique(cell, axis=0, return_inverse=True)
     return number.reshape(-1)
 
 
-# Degree of the gains' polynomials in the direction of arrival or departure, if the reference covers directions; chosen.
+# Degree of the gains' polynomials in the direction of arrival or departure, if the reference is a sphere; chosen.
 DEGREE = 2
 # A reference whose directions span no more than this, in radians, counts as a plate, which has one direction; chosen.
 LEAST_SPAN_RAD = 0.1
-# Change of ln(H / V) per radian of direction that a flat plate cannot exclude: two boards 20 degrees apart with the
-# pattern cos^2 differ by 0.7.
+# Standard deviation of the unknown change of ln(H / V) per radian from the one direction of a plate: two boards 20
+# degrees apart with the pattern cos^2 differ by 0.7.
 UNKNOWN_SLOPE = 0.7
-# Share of `UNKNOWN_SLOPE` beyond the directions that a sphere covers. It is less than 1, because the polynomial that is
-# fitted to a sphere continues the pattern. Chosen.
+# Factor of `UNKNOWN_SLOPE` outside the directions that a sphere covers. It is less than 1, because the polynomial that
+# is fitted to a sphere continues the pattern. Chosen.
 SHARE_BEYOND_SPHERE = 0.25
 
 
@@ -186,19 +195,22 @@ class Gains:
     ratio_terms
         Coefficients of ln(gain of H / gain of V), complex.
     level_terms
-        Coefficients of ln|gain of H| in the direction of arrival, and in that of departure, [2, terms].
+        Coefficients of ln|gain of H| as a polynomial of the direction of arrival, and as one of that of departure, [2,
+        terms].
     band_rise
         ln of the level in the upper half of the band over that in the lower half, of H and V.
     middle, departure_middle, degree
-        Middles of the directions of arrival and of departure, and the degree of the polynomials.
+        Mean directions of arrival and of departure, from which the polynomials start, [2]; their degree.
     std
-        Standard deviation of each part of ln(H / V) within the directions covered: the misfit of the polynomial without
-        the noise of the reference's points, and the next order of the reference's own curvature.
+        Standard deviation of the real part, and of the imaginary part, of ln(H / V) within the directions covered. It
+        holds the misfit of the polynomial without the noise of the reference's points, and the next order of the
+        expansion in the reference's curvature.
     covered
-        Smallest and largest direction, [2] each.
-    terms_root, cell
-        Square root of the covariance of each part of `ratio_terms`, [terms, blocks]; size of a cell of directions [2]
-        within which the misfit is the same.
+        Smallest and largest direction of arrival of the reference, [2] each.
+    terms_root
+        R [terms, blocks]: the real part of `ratio_terms`, and the imaginary part, has the covariance R R'.
+    cell
+        Size [2] of a cell of directions within which the misfit of the polynomial is the same.
     """
 
     ratio_terms: Complex
@@ -226,7 +238,7 @@ class Gains:
         return np.mean(self._find_levels(points), axis=0)
 
     def estimate_level_std(self, points: Voltages) -> Array:
-        """Return the standard deviation of the level, [n], also where arrival and departure disagree."""
+        """Return the standard deviation of the level, [n]; it includes half the difference of both estimates."""
         level_by_arrival, level_by_departure = self._find_levels(points)
         return np.hypot(np.abs(level_by_arrival - level_by_departure) / 2, self.estimate_unknown_std(points.arrival))
 
@@ -237,11 +249,11 @@ class Gains:
         return self._make_basis(points.arrival) @ arrival_terms, departure @ departure_terms
 
     def estimate_unknown_std(self, arrival: Array) -> Array:
-        """Return the standard deviation of ln(H / V), [n], also of directions that the reference does not cover."""
+        """Return the standard deviation of ln(H / V), [n]; it grows outside the directions that are covered."""
         return np.hypot(self.std, self._extrapolate_std(arrival))
 
     def _extrapolate_std(self, arrival: Array) -> Array:
-        """Return the standard deviation of ln(H / V) by the distance from the directions covered, [n]; 0 within."""
+        """Return the part of the standard deviation that grows outside the directions covered, [n]; 0 within them."""
         low, high = self.covered
         distance_beyond = np.linalg.norm(np.maximum(0, np.maximum(low - arrival, arrival - high)), axis=1)
         if self.degree == 0:
@@ -249,11 +261,11 @@ class Gains:
         return SHARE_BEYOND_SPHERE * UNKNOWN_SLOPE * distance_beyond
 
     def list_errors(self, arrival: Array) -> Array:
-        """Return independent errors of each part of ln(H / V), one standard deviation each, [errors, n].
+        """Return independent errors of the real part of ln(H / V), one standard deviation each, [errors, n].
 
-        The misfit of the polynomials differs from cell to cell of the directions; a wide object averages over it.
-        Errors of the polynomials' terms are common to all directions, and so are those of directions that are not
-        covered.
+        Those of the imaginary part are the same. The misfit of the polynomial is one error per cell of directions: a
+        wide object averages over it. Errors of the polynomial's terms are common to all directions, and so is the one
+        outside the directions covered.
         """
         term_errors = self._make_basis(arrival) @ self.terms_root
         cells = np.floor((arrival - self.middle) / self.cell)
@@ -267,13 +279,16 @@ class Gains:
 
 
 def _evaluate_polynomials(directions: Array, degree: int) -> Array:
-    """Return the products of powers of both columns of `directions` [n, 2] up to a total degree, [n, terms]."""
+    """Return x^i y^j for all i + j <= degree, [n, terms], with x and y the columns of `directions` [n, 2]."""
     terms = [directions[:, 0] ** i * directions[:, 1] ** j for i in range(degree + 1) for j in range(degree + 1 - i)]
     return np.stack(terms, axis=1)
 
 
 def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray, NDArray]:
-    """Return the coefficients of `values` [n] in `basis` [n, terms], and the residuals; outliers lose their weight."""
+    """Return the coefficients [terms] of `values` [n] in `basis` [n, terms], and the residuals [n].
+
+    Least squares with the weights `weight` [n], which are reduced for outliers.
+    """
     coefficients = np.zeros(basis.shape[1], values.dtype)
     residual = values
     # Five rounds, and weights that halve at two standard deviations: chosen.
@@ -288,9 +303,10 @@ def _fit_robustly(basis: Array, values: NDArray, weight: Array) -> tuple[NDArray
 
 
 def learn_gains(metal: Voltages, wave_number: float) -> Gains:
-    """Fit the gains to points of metal; if their directions span no more than `LEAST_SPAN_RAD`, one value for all.
+    """Fit the gains to points of metal.
 
-    `wave_number` is that at the middle of the band, 1 / m.
+    If their directions span no more than `LEAST_SPAN_RAD`, gains are the same in all directions. `wave_number` is that
+    at the middle of the band, rad / m.
     """
     coefficients = reflect_points(np.inf, metal, wave_number)
     gain = metal.voltage / predict_voltages(metal, coefficients)
@@ -298,22 +314,22 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     metal = metal[is_valid]
     gain = gain[is_valid]
     ratio = gain[:, 0] / gain[:, 1]
-    # No point counts as better than 1 % (chosen).
+    # 1 / relative variance; the error of a point is at least 1 % (chosen).
     weight = 1 / (np.sum((metal.std / np.abs(metal.voltage)) ** 2, axis=1) + 1e-4)
     middle = np.average(metal.arrival, axis=0, weights=weight)
     departure_middle = np.average(metal.departure, axis=0, weights=weight)
-    # Few points of wrong directions do not widen the covered range.
+    # Percentiles, so that a few points with wrong directions do not widen the covered range.
     low, high = np.percentile(metal.arrival, [3, 97], axis=0)
     degree = DEGREE if float(np.min(high - low)) > LEAST_SPAN_RAD else 0
     basis = _evaluate_polynomials(metal.arrival - middle, degree)
-    # Phases are taken about their mean, so that none wraps.
+    # Phases are measured from their mean, so that none wraps.
     centre = np.angle(np.sum(weight * ratio / np.abs(ratio)))
     log_ratio = np.log(np.abs(ratio)) + 1j * (np.angle(ratio * np.exp(-1j * centre)) + centre)
     ratio_terms, residual = _fit_robustly(basis, log_ratio, weight)
     departure_basis = _evaluate_polynomials(metal.departure - departure_middle, degree)
     level = np.log(np.abs(gain[:, 0]))
     level_terms = np.stack([_fit_robustly(terms, level, weight)[0] for terms in (basis, departure_basis)])
-    # The next order of metal's own correction, r_p / r_s = 1 + first order.
+    # The next order of the expansion for the metal's curvature, with r_p / r_s = 1 + first order.
     first_order = np.abs(coefficients[is_valid, 0, 1] / coefficients[is_valid, 0, 0] - 1)
     next_order = float(np.median(first_order * compute_expansion_parameter(metal, wave_number)))
     noise2 = np.sum((metal.std / np.abs(metal.voltage)) ** 2, axis=1)
@@ -323,7 +339,7 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
     rate = np.linalg.lstsq(metal.at_m - metal.at_m.mean(axis=0), metal.arrival - middle, rcond=None)[0]
     cell = BLOCK_M * np.linalg.norm(rate, axis=0) if degree else np.full(2, np.inf)
     block = number_blocks(metal.at_m, (0.0, 0.0))
-    # Errors are independent from block to block: each block's shifts the terms by its column of the inverse.
+    # Errors of blocks are independent: an error of one block changes the terms by its column of the pseudo-inverse.
     block_means = np.stack([np.bincount(block, term) / np.bincount(block) for term in basis.T], axis=1)
     return Gains(
         ratio_terms=ratio_terms,
@@ -340,9 +356,10 @@ def learn_gains(metal: Voltages, wave_number: float) -> Gains:
 
 
 def _compute_misfit_std(residual: Complex, noise2: Array, at_m: Array) -> tuple[float, float]:
-    """Return the standard deviation of each part of a fit's residuals, and its part by noise of variance `noise2` [n].
+    """Return the standard deviation of a fit's residuals averaged over blocks, and that which noise explains.
 
-    It is the root mean square over blocks of the mean `residual` [n] in each block.
+    Both are those of the real part, and of the imaginary part. `residual` [n] are the residuals, `noise2` [n] the
+    variances of the points' noise, `at_m` [n, 2] their stage offsets.
     """
     # Outliers count as five times the median (chosen).
     clipped = residual / np.maximum(1, np.abs(residual) / (5 * np.median(np.abs(residual)) + 1e-12))

@@ -1,12 +1,14 @@
 """From the samples of H and V to specular points with both voltages, and their grouping into segments.
 
-The *path* of an echo is its length from TX over the surface to RX, and `at_m` [n, 3] the stage offset at which it is
-measured, the middle of a window of positions. The *bend* of an echo is the curvature of its path over the stage
-offset; *curvature* alone is that of the surface where a `Shape` holds it.
+A *segment* is a connected surface: a group of points whose neighbours' paths continue each other. The *path* of an echo
+is its length from TX over the surface to RX, and `at_m` [n, 3] the stage offset at which it is measured, the middle of
+a *window* of stage positions. The *slope* and the *bend* of a path are its first and second derivatives by the stage
+offset; *curvature* is that of the surface. The *ripple* of slopes is their error by edges and by other
+echoes.
 
-H gives place, normal and curvature. V sees the same point with the same normal from another stage position, some 15 mm
-away: its path is predicted, and the phase is taken against this prediction, for separate ranges of H and V are useless
-(0.3 mm is half a radian).
+H gives place, normal and curvature of a point. V sees the same point with the same normal from another stage offset,
+some 15 mm away. V's path is predicted from the point, and its phase is measured against this prediction. Separate
+ranges of H and V would not do: an error of 0.3 mm is half a radian of phase.
 """
 
 from __future__ import annotations
@@ -31,36 +33,37 @@ from polysight.surfaces.points import (
 from polysight.surfaces.window import WINDOW_M, Echoes, Samples
 
 Array = NDArray[np.float64]
-# Points, paths and normals of neighbouring windows that belong to one surface differ by no more than these, beyond the
-# distance of the windows and the noise of the paths. Chosen; 2 mm are half a wavelength.
+# Points, paths and normals of neighbouring windows that belong to one surface differ by no more than these, in addition
+# to what the distance of the windows and the noise of the paths explain. Chosen; 2 mm are half a wavelength.
 MAX_GAP_M = 0.02
 MAX_PATH_MISS_M = 0.002
 MAX_TURN_RAD = 0.35
-# Windows of one surface whose path curvature is averaged; chosen.
+# Bends are fitted to the windows of a surface within this distance; chosen.
 NEIGHBOURHOOD_M = 0.024
-# Points so close on a surface have the same curvature; they are counted in cells; chosen.
+# Points within SAME_CURVATURE_M on a surface are taken to have the same curvature. They are summed in cells of CELL_M.
+# Both are chosen.
 SAME_CURVATURE_M = 0.012
 CELL_M = 0.004
-# A group of fewer points is not a surface: a chance of noise and edges.
+# A group of fewer points does not count as a surface: noise and edges can make it.
 MIN_POINTS = 8
-# Least number of windows to fit a curvature to: each gives two slopes and three curvatures for the five unknowns.
+# Least number of windows to which a bend is fitted: each gives two slopes and three bends for the five unknowns.
 MIN_NEIGHBOURS = 6
-# Windows of one surface from which the ripple of slopes is estimated. Near the border of a zone that reflects, its edge
-# ripples by waves of about 100 mm, which a fit within 24 mm takes for curvature.
+# The ripple of slopes is estimated from the windows of a surface within this distance. The edge of the zone that a
+# surface reflects to makes ripples about 100 mm long, which a fit within 24 mm takes for bends.
 RIPPLE_REACH_M = 0.054
 # Least number of these windows: nine unknowns are fitted.
 MIN_AROUND = 16
-# Distance at which a window's own curvature counts as a slope (see SlopeFit): a third of a window, about the rms
+# The bends of a window count as slopes at this distance (see SlopeFit): a third of a window, about the root mean square
 # distance of its positions from its middle.
 LEVER_OF_WINDOW_M = 0.011
-# A smaller radius (chosen, three wavelengths) is an edge or a wire: what it diffracts is not a reflection.
+# A smaller radius (chosen, three wavelengths) is that of an edge or a wire, which diffracts and does not reflect.
 MIN_RADIUS_M = 0.012
-# Range of z in which objects are searched, and the largest slope of an echo's path over the stage offset; chosen. Fits
-# that start within the search's 0.47 may end somewhat beyond it.
+# Range of z in which objects are searched, and the largest slope of an echo's path; chosen. Fits start from slopes of
+# up to 0.47 (`paths.MAX_SLOPE`), and may end somewhat above it.
 NEAREST_M = 0.2
 FARTHEST_M = 1.4
 MAX_SLOPE = 0.6
-# Offsets of the stage closer than this are of one window.
+# Stage offsets closer than this are those of one window.
 SAME_WINDOW_M = 1e-4
 # Least amplitude of an echo with a usable slope, in standard deviations of its noise.
 MIN_AMPLITUDE_STDS = 5
@@ -85,7 +88,7 @@ class SeenEchoes:
 class Shape:
     """Points [n, 3] (metres, rig frame), normals [n, 3] towards the antennas, cosines of incidence [n], curvature.
 
-    The curvature [n, 2, 2], 1 / m, is in the basis of `points.tangents`, positive for convex bodies.
+    The curvature [n, 2, 2], 1 / m, is in the basis of `points.compute_tangents`, positive for convex bodies.
     """
 
     points: Array
@@ -111,7 +114,7 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     """Find the specular points of a scan in H, and measure the same points in V.
 
     `h` and `v` are the boards' samples, `gate_m` the smallest and the largest path that is searched, metres. The points
-    returned are those of echoes in a group, wider than edges and wires, which V's scan covers too.
+    returned belong to a segment, are not on edges or wires, and lie inside V's scan, too.
     """
     echoes = find_echoes(h, gate_m)
     echoes = echoes[_is_sound(echoes, find_shape(echoes, optics))]
@@ -124,15 +127,14 @@ def see_points(h: Samples, v: Samples, optics: Optics, gate_m: tuple[float, floa
     rx_m = optics.v.at_m
     at_m = find_offset_that_sees(shape.points, shape.normals, echoes.at_m, tx_m, rx_m)
     path, slope, bend = predict_echo(shape.points, shape.normals, shape.curvature, at_m, tx_m, rx_m)
-    # V distinguishes the echoes of one window of H by their paths: number the windows.
+    # The echoes of one window of H are measured together in V: number the windows.
     window = np.unique(np.round(echoes.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
-    # V's echoes are those of the points `is_inside` V's scan only.
-    seen_by_v, is_inside = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
-    return SeenEchoes(echoes[is_inside], seen_by_v, segment[is_inside])
+    seen_by_v, is_measured = measure_echoes(v, at_m, path, slope, bend, window=window, is_measured=keep)
+    return SeenEchoes(echoes[is_measured], seen_by_v, segment[is_measured])
 
 
 def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
-    """True for echoes that a surface can give: within range, not too steep, well above the noise."""
+    """Return True for echoes that a surface can give: within range, not too steep, well above the noise."""
     z_m = shape.points[:, 2]
     is_in_range = np.isfinite(shape.points).all(axis=1) & (z_m > NEAREST_M) & (z_m < FARTHEST_M)
     is_in_view = np.abs(echoes.slope).max(axis=1) < MAX_SLOPE
@@ -141,51 +143,54 @@ def _is_sound(echoes: Echoes, shape: Shape) -> NDArray[np.bool_]:
 
 
 def _is_wide(shape: Shape) -> NDArray[np.bool_]:
-    """True for points whose radii of curvature are larger than those of edges and wires."""
+    """Return True for points whose radii of curvature are larger than those of edges and wires."""
     curvatures = np.linalg.eigvalsh((shape.curvature + np.swapaxes(shape.curvature, 1, 2)) / 2)
     return np.isfinite(curvatures).all(axis=1) & (np.abs(curvatures).max(axis=1) < 1 / MIN_RADIUS_M)
 
 
 def group_echoes(echoes: Echoes, optics: Optics) -> NDArray[np.int_]:
-    """Return the number of the connected surface of each echo [n], largest surface first; -1 for small groups.
+    """Return the number of each echo's segment [n], 0 for the largest one; -1 for groups of few echoes.
 
-    Neighbouring windows belong together if the path of one follows from that of the other by its slope.
+    Echoes of neighbouring windows belong to one segment if the path of one follows from that of the other by its slope,
+    and their points and normals are close.
     """
     count = len(echoes)
     if not count:
         return np.zeros(0, int)
     shape = find_shape(echoes, optics)
-    # Up to 2.3 strides: windows two apart along one axis and one along the other, so that one gap does not part them.
+    # Neighbours are up to 2.3 strides apart: two along one axis and one along the other. So a single missing window
+    # does not split a surface.
     pairs = scipy.spatial.KDTree(echoes.at_m[:, :2]).query_pairs(2.3 * STRIDE_M, output_type="ndarray")
     first, second = pairs.T
+    # The path rises by the mean slope times the distance d of the windows.
     d = (echoes.at_m[second] - echoes.at_m[first])[:, :2]
     rise = np.einsum("np,np->n", echoes.slope[first] + echoes.slope[second], d) / 2
     miss = np.abs(echoes.path_m[second] - echoes.path_m[first] - rise)
     gap = np.linalg.norm(shape.points[second] - shape.points[first], axis=1)
     turn = np.linalg.norm(shape.normals[second] - shape.normals[first], axis=1)
-    # Beyond the limits, paths may differ by four standard deviations, and points by twice the distance of the windows.
+    # To the limits are added: four standard deviations for paths, and twice the distance of the windows for points.
     tolerance = MAX_PATH_MISS_M + 4 * np.hypot(echoes.path_std_m[first], echoes.path_std_m[second])
     joined = (miss < tolerance) & (gap < MAX_GAP_M + 2 * np.linalg.norm(d, axis=1)) & (turn < MAX_TURN_RAD)
     ones = np.ones(int(joined.sum()))
     graph = scipy.sparse.coo_matrix((ones, (first[joined], second[joined])), shape=(count, count))
     _, labels = scipy.sparse.csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(labels)
-    order = np.argsort(-sizes, kind="stable")
-    number = np.empty_like(order)
-    number[order] = np.arange(order.size)
-    number[sizes < MIN_POINTS] = -1
-    return number[labels]
+    labels_by_size = np.argsort(-sizes, kind="stable")
+    number_of_label = np.empty_like(labels_by_size)
+    number_of_label[labels_by_size] = np.arange(labels_by_size.size)
+    number_of_label[sizes < MIN_POINTS] = -1
+    return number_of_label[labels]
 
 
 def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
-    """Replace the curvature of each echo's path by a fit to its neighbours in the same surface; enlarge `slope_std`.
+    """Replace each echo's bend by a fit to its neighbours in the same segment; add the ripple to `slope_std`.
 
     Echoes with too few neighbours are not changed.
-    What a fit leaves of the slopes is an error of each that its own window does not show: ripple of edges and of other
-    echoes, whose variance is added to that of the slope. Ripple is as long as the neighbourhood to which the curvature
-    is fitted, and a fit follows it there. So where there are enough windows it is judged over a larger one, by a fit in
-    which the curvature may change. The variance is averaged over the neighbours, for one fit leaves few independent
-    residuals.
+    Edges and other echoes change slopes in a way that the noise of a single window does not show. This ripple is
+    estimated from the residuals of the fit, and its variance is added to that of the slope. Ripple is about as long as
+    the neighbourhood of the fit, so that the fit follows it and leaves too little. Where there are enough windows, it
+    is therefore estimated over a larger neighbourhood, by a fit in which the bend may change from place to place. A
+    single fit leaves few independent residuals, so that the variance is averaged over the neighbours.
     """
     bend = echoes.bend.copy()
     slope_std = echoes.slope_std.copy()
@@ -215,20 +220,22 @@ def smooth_bends(echoes: Echoes, segment: NDArray[np.int_]) -> Echoes:
 
 
 class SlopeFit:
-    """Least squares of slope g and curvature Q of a path from those of windows at the offsets `d` [n, 2], metres.
+    """Least squares fit of slope g and bend Q at one place, to the slopes and bends of n windows around it.
 
-    Slopes are g + Q d at the distance d. If curvature `may_change`, its four derivatives are fitted too. The windows'
-    own curvatures count as slopes at the distance LEVER_OF_WINDOW_M.
+    The windows are at the offsets `d` [n, 2] from the place, metres. Their slopes are g + Q d, and their bends are Q.
+    If the bend `may_change`, its four derivatives by d are fitted, too. So that bends can be compared with slopes, they
+    are multiplied by LEVER_OF_WINDOW_M.
 
-    `answer` [unknown, equation, n] turns slopes and curvatures of the windows into the unknown; `noise_left` and
-    `ripple_left` [2] are the shares of either error's variance that residuals of both slopes show.
+    `answer` [unknown, equation, n]: the unknowns are the sum of `answer` times the five values (two slopes, three
+    bends) of each window. `noise_left` and `ripple_left` [2]: the residuals of both slopes hold these shares of the
+    variance of noise, and of that of ripple.
     """
 
     def __init__(self, d: Array, *, may_change: bool) -> None:
         x, y = d.T
         zero = np.zeros(len(d))
         one = np.ones(len(d))
-        # Unknown: g_x, g_y, Q_xx, Q_xy, Q_yy; dQ_xx/dx, dQ_xx/dy = dQ_xy/dx, dQ_xy/dy = dQ_yy/dx, dQ_yy/dy.
+        # Unknowns: g_x, g_y, Q_xx, Q_xy, Q_yy; dQ_xx/dx, dQ_xx/dy = dQ_xy/dx, dQ_xy/dy = dQ_yy/dx, dQ_yy/dy.
         slope_x = [one, zero, x, y, zero, x * x / 2, x * y, y * y / 2, zero]
         slope_y = [zero, one, zero, x, y, zero, x * x / 2, x * y, y * y / 2]
         bend_xx = [zero, zero, one, zero, zero, x, y, zero, zero]
@@ -240,7 +247,7 @@ class SlopeFit:
             rows = rows[..., :5]
         rows[2:] *= LEVER_OF_WINDOW_M
         self.matrix = rows[:2]
-        # The windows of a single line do not determine all derivatives.
+        # The pseudo-inverse, because windows on a single line do not determine all derivatives.
         inverse = np.linalg.pinv(np.einsum("rnp,rnq->pq", rows, rows), hermitian=True)
         self.answer = np.einsum("pq,rnq->prn", inverse, rows)
         noise, ripple = correlate_windows(d)
@@ -248,11 +255,10 @@ class SlopeFit:
         self.ripple_left = find_share_left(ripple, self.matrix, inverse)
 
     def apply(self, echoes: Echoes, others: NDArray[np.int_]) -> tuple[Array, Array]:
-        """Return the symmetric curvature [2, 2], and the variance [2] of the slopes' ripple.
+        """Return the symmetric bend [2, 2], and the variance [2] of the slopes' ripple.
 
-        `others` [n] are the indices of the windows in `echoes`.
-        Ripple is what is neither a smooth change nor noise of the windows. Where there is none, its variance scatters
-        about zero.
+        `others` [n] are the indices of the windows in `echoes`. The variance is that of the residuals, without the part
+        of the windows' noise, over `ripple_left`. It may be negative: where there is no ripple it scatters about zero.
         """
         slopes = echoes.slope[others].T
         bends = echoes.bend[others]
@@ -265,7 +271,10 @@ class SlopeFit:
 
 
 def _find_fit(fits: dict[bytes, SlopeFit], d: Array, *, may_change: bool) -> SlopeFit:
-    """Return the fit of a pattern of windows; most windows of a scan have the same neighbours."""
+    """Return the fit for windows at the offsets `d`, from `fits` if it is there.
+
+    Most windows of a scan have neighbours at the same offsets.
+    """
     pattern = np.round(d / SAME_WINDOW_M).astype(np.int16).tobytes() + bytes([may_change])
     if pattern not in fits:
         fits[pattern] = SlopeFit(d, may_change=may_change)
@@ -273,27 +282,33 @@ def _find_fit(fits: dict[bytes, SlopeFit], d: Array, *, may_change: bool) -> Slo
 
 
 def correlate_windows(d: Array) -> tuple[Array, Array]:
-    """Correlations [2, n, n] of the errors of both slopes of windows at the offsets `d` [n, 2], by noise and by ripple.
+    """Return the correlations of the errors of slopes, by noise [2, n, n] and by ripple [2, n, n].
 
-    Windows share data as far as they overlap; s is their distance over the width of a window. A sample's noise acts on
-    the slope in proportion to its distance from the window's middle along the slope's axis, for any place across:
-    hence the correlation is 1 - 3 s + 2 s^3 along that axis and 1 - s across it. Ripple is as long as a window or
-    longer: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8, 16 and 24 mm, about 1 - s.
+    The windows are at the offsets `d` [n, 2]; axis 0 of the results is that of the slope, x or y. Overlapping windows
+    share samples. With s the distance of two windows along an axis over the width of a window, up to 1:
+
+        noise:   1 - 3 s + 2 s^3 along the slope's axis, times 1 - s along the other axis
+        ripple:  1 - s along either axis, multiplied
+
+    Noise: the noise of a sample counts by its distance from the window's middle along the slope's axis, and equally at
+    all places along the other axis. Ripple: normals of simulated plates had correlations of 0.77, 0.49 and 0.13 at 8,
+    16 and 24 mm, about 1 - s.
     """
     distance = np.minimum(1, np.abs(d[:, None] - d[None]) / WINDOW_M)
     across = np.moveaxis(1 - distance, -1, 0)
     along = np.moveaxis(1 - 3 * distance + 2 * distance**3, -1, 0)
     ripple = across[0] * across[1]
-    # The slope in x has x along and y across, that in y the reverse.
+    # Axis 0 is x, y. The slope in x takes `along` of x and `across` of y; that in y the reverse.
     return along * across[::-1], np.stack([ripple, ripple])
 
 
 def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Array:
-    """Return the share [2] of the variance of errors of both slopes that a fit leaves as residuals.
+    """Return the share of the variance of errors of both slopes that a fit leaves as residuals, [2].
 
-    trace((1 - S) C (1 - S)') / n, with S = `matrix` `inverse` `matrix`' the smoother and C the correlation [2, n, n].
-    `matrix` [2, n, p]: both slopes in terms of the unknown; `inverse` [p, p]: of the normal matrix.
-    Errors of the windows' own curvatures are left out.
+        share = trace((1 - S) C (1 - S)') / n,   S = A N A'
+
+    C [2, n, n] is the correlation of the errors. A = `matrix` [2, n, unknown] gives both slopes by the unknowns, and N
+    = `inverse` [unknown, unknown] is the inverse of the normal matrix. Errors of the windows' bends are left out.
     """
     transposed = np.swapaxes(matrix, 1, 2)
     common = transposed @ correlation @ matrix
@@ -303,12 +318,12 @@ def find_share_left(correlation: Array, matrix: Array, inverse: NDArray) -> Arra
 
 
 def share_curvatures(echoes: Echoes, segment: NDArray[np.int_], optics: Optics) -> Echoes:
-    """Replace the curvature of each echo's path by that of the mean motion of the points close by on the surface.
+    """Replace each echo's bend by that of the mean motion of the points near its own on the surface.
 
-    The motion is how far the point moves on the surface while the stage moves (`find_motion`); the path's curvature is
-    linear in it. A small body shows nearly the same place to all windows, which moves by millimetres: each window alone
-    says little about its curvature, all together much. On a plane only the next windows see the same place. Echoes
-    count by power.
+    The motion is how far the specular point moves over the surface with the stage (`find_motion`); the bend is linear
+    in it. The specular point of a small body moves by millimetres only: each window alone determines its curvature
+    badly, all windows together determine it well. On a plane only the next windows have points near by. In the mean,
+    echoes are weighted by power.
     """
     shape = find_shape(echoes, optics)
     geometry = (shape.points, shape.normals, echoes.at_m, optics.tx.at_m, optics.h.at_m)

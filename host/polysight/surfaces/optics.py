@@ -1,22 +1,28 @@
-"""Antennas as vectors, and what one specular point gives: the voltages of H and V as combinations of r_s and r_p.
+"""Polarisation of the antennas, and reflection at a curved surface: the voltages of H and V by r_s and r_p.
 
-At a tilted surface the plane of incidence is turned: H receives p too, and V s. With the fields of the antennas as unit
-vectors across the direction (Ludwig's third definition, carried along the arc from the boresight), a receiver's voltage
-is g spreading exp(-j k L) (r_s (e_T.s)(e_R.s) + r_p (e_T.p_i)(e_R.p_r)): g is the gain of the antennas, k the wave
-number, L the path, e the fields of TX and RX, s the axis across the plane of incidence, and p_i, p_r the axes in it,
-across the incident and the reflected ray. Both coefficients are those of tangential fields, r_s = r_p = -1 for metal.
+H and V are the receivers. At a tilted surface the plane of incidence is turned against their polarisations: H receives
+some p, too, and V some s. A receiver's voltage of an echo is
 
-At a surface of curvature K they differ from Fresnel's to first order in K / k (`reflect_curved`):
-* the wave at the surface is that of a cylinder: the logarithmic derivatives of Hankel functions (by WKB -j cos(theta)
-  - K / (2 k cos^2(theta))) replace the plane wave's, inside and outside;
-* the saddle point sums over directions: <d theta^2> = j K / (2 k cos(theta)) in the plane of incidence, where r''
-  enters, and the same across it, where the angle grows by its square and the plane of incidence turns: s and p mix.
-* curvature may be twisted between both directions: then a cylinder's wave and the sum over directions couple s and p
-  (`mix_twisted`).
-* a spherical wave of a finite path holds directions, too (`reflect_spherical`), at a plane as well.
-The first is Snyder and Love (IEEE Trans. MTT 23, 134, 1975) and, for metal, the second term of Luneberg and Kline; the
-second is the next order of the stationary phase (Felsen and Marcuvitz, section 4.2). The first three are linear in K,
-the last one in 1 / path.
+    g A exp(-j k L) (r_s (e_T.s) (e_R.s) + r_p (e_T.p_i) (e_R.p_r))
+
+* g: gain of the antennas; A: spreading (`points.compute_spreading`); k: wave number, rad / m; L: path, m.
+* r_s, r_p: reflection coefficients of the tangential fields, both -1 for metal.
+* e_T, e_R: fields of TX and RX, unit vectors across the ray by Ludwig's third definition: those in boresight, carried
+  along the arc to the ray's direction.
+* s: unit vector across the plane of incidence; p_i, p_r: those in it, across the incident and the reflected ray.
+
+At a surface of curvature K, r_s and r_p differ from Fresnel's coefficients r. All terms are of first order, the first
+three in K / k, the last one in 1 / (k L):
+* The wave at the surface is that of a cylinder (`_reflect_local`): the logarithmic derivatives of Hankel functions (by
+  WKB -j cos(theta) - K / (2 k cos^2(theta))) replace those of a plane wave, inside and outside. Source: Snyder and Love
+  (IEEE Trans. MTT 23, 134, 1975); for metal, the second term of Luneberg and Kline.
+* An echo is a sum over directions about the specular one (`reflect_curved`). Their variance is <d theta^2> = j K / (2 k
+  cos(theta)) in the plane of incidence, where r'' enters, and the same across it. There the angle of incidence grows by
+  the square of the deviation, and the plane of incidence turns, which mixes s and p. Source: next order of the
+  stationary phase (Felsen and Marcuvitz, section 4.2).
+* Curvature may be twisted between both directions. Then both effects couple s and p (`mix_twisted`).
+* The wave of an antenna at a finite distance is spherical and so a sum over directions, too (`reflect_spherical`). This
+  holds for a plane as well.
 """
 
 from __future__ import annotations
@@ -40,8 +46,9 @@ ANGLE_STEP = 1e-3
 
 @dataclass(frozen=True)
 class Antenna:
-    """Place (metres), boresight, and field vectors at boresight of the wanted polarisation and of the other one, [3].
+    """An antenna: its place, boresight, and field vectors at boresight of both polarisations, [3].
 
+    `at_m` is in metres, rig frame. `wanted` is the polarisation that the antenna is meant to have, `other` the other.
     `leakage` is the amplitude of the other polarisation relative to the wanted one.
     """
 
@@ -65,17 +72,20 @@ class Antenna:
 
 
 def _carry_along_arc(start: Array, ends: Array, vector: NDArray) -> NDArray:
-    """Turn `vector`, across the unit vector `start`, as `start` is turned to `ends` [n, 3] on the shortest arc."""
+    """Return `vector` turned by the rotations that turn the unit vector `start` to `ends` on the shortest arc, [n, 3].
+
+    `vector` [3] is perpendicular to `start`.
+    """
     along_ends = ends @ vector
-    # Rodrigues' rotation for start . vector = 0; the limit is for an end opposite to the start (no arc is shortest).
+    # Rodrigues' rotation for start . vector = 0. The limit avoids a division by 0 if an end is opposite to the start.
     return vector - (start + ends) * (along_ends / np.maximum(1 + ends @ start, 1e-6))[:, None]
 
 
 @dataclass(frozen=True)
 class Optics:
-    """The antennas of a rig as H and V use them: `tx`, and the middle of the RX of both receivers, `h` and `v`.
+    """The antennas of a rig: `tx`, and one for each receiver, `h` and `v`, in the middle of its RX.
 
-    `wave_number`: at the middle of the band, where echoes have their phases; 1 / m.
+    `wave_number`: at the middle of the band, rad / m; the phases of echoes are given there.
     """
 
     tx: Antenna
@@ -91,8 +101,9 @@ class Optics:
 def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) -> Optics:
     """Return the antennas of a rig; the mounts give places and boresights.
 
-    Towards their mirror points on the object plane TX has equal parts of s and p, H has s and V p, as the published
-    images show. `leakage`: of p into H and of s into V. TX has none: its `other` equals its `wanted`.
+    A receiver and TX see each other in a mirror on the object plane at one point of it. Towards this point TX has equal
+    parts of s and p, H has s alone, and V p alone, as the published images show. `leakage`: of p into H and of s into
+    V. TX has none: its `other` equals its `wanted`.
     """
     plane_m = rig.geometry.object_distance_mm / 1e3
     receivers = [np.array(rx_positions_m(rig, board)).mean(axis=0) for board in rig.receivers]
@@ -101,8 +112,8 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
     tx = aim_antenna(tx_m, _compute_boresight(rig.transmitter), receivers[0], plane_m, (half, half))
     h = aim_antenna(receivers[0], _compute_boresight(rig.receivers[0]), tx_m, plane_m, (1.0, 0.0))
     v = aim_antenna(receivers[1], _compute_boresight(rig.receivers[1]), tx_m, plane_m, (0.0, 1.0))
-    # Echoes have the phase at the middle of the linear samples. At another wave number H / V would turn by the
-    # difference of their paths, 0.7 mm at the sphere of the calibration.
+    # The phases of echoes are those at the middle of the linear samples. With another wave number k the phase of H / V
+    # would be wrong by the error of k times the difference of both paths, 0.7 mm at the sphere of the calibration.
     chirp = rig.chirp
     first, end = chirp.linear_samples
     middle_hz = chirp.first_sample_hz + chirp.hz_per_sample * (first + end - 1) / 2
@@ -112,19 +123,20 @@ def make_optics(rig: Instrument, leakage: tuple[complex, complex] = (0j, 0j)) ->
 
 def _compute_boresight(board: Board) -> Array:
     """Return the unit vector in which a board looks, rig frame, [3]."""
-    forward_m = np.array(transform_to_rig((0.0, 0.0, 1000.0), board.mount)) - np.array(
-        transform_to_rig((0.0, 0.0, 0.0), board.mount)
-    )
-    return forward_m / np.linalg.norm(forward_m)
+    origin = np.array(transform_to_rig((0.0, 0.0, 0.0), board.mount))
+    point_ahead = np.array(transform_to_rig((0.0, 0.0, 1000.0), board.mount))
+    forward = point_ahead - origin
+    return forward / np.linalg.norm(forward)
 
 
 def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float, parts: tuple[float, float]) -> Antenna:
-    """Return an antenna with given parts (s, p) towards the point of the object plane that mirrors its partner.
+    """Return an antenna with given parts (s, p) of its field towards the mirror point of its partner.
 
-    Places `at_m` and `partner_m` [3] and the plane in metres, rig frame; `boresight` [3] is a unit vector. Its other
-    polarisation has the parts exchanged. The s axis points along +y.
+    The mirror point is where the antenna sees its partner in a mirror in the plane z = `plane_m`. Places `at_m` and
+    `partner_m` [3] are in metres, rig frame; `boresight` [3] is a unit vector. The other polarisation has the parts
+    exchanged. The s axis points along +y.
     """
-    # The mirror point divides the way to the partner like the distances of both from the plane.
+    # The mirror point divides the line to the partner in the ratio of the distances of both from the plane.
     share = (plane_m - at_m[2]) / (2 * plane_m - at_m[2] - partner_m[2])
     target = np.array([*(at_m + share * (partner_m - at_m))[:2], plane_m])
     direction = (target - at_m) / np.linalg.norm(target - at_m)
@@ -141,9 +153,10 @@ def aim_antenna(at_m: Array, boresight: Array, partner_m: Array, plane_m: float,
 
 @dataclass(frozen=True)
 class VisibleNormals:
-    """Normals that a grid shows at the middle of the image.
+    """Normals of surfaces at the middle of the image that a rig sees within its grid of stage positions.
 
-    `x_deg`, `y_deg`: largest tilts in x and in y. `alias_deg`: those at which phases alias, infinite where none does.
+    `x_deg`, `y_deg`: largest tilts in x and in y. `alias_deg`: tilts in x and in y from which phases alias from one
+    stage position to the next; infinite if none does.
     """
 
     x_deg: float
@@ -152,7 +165,7 @@ class VisibleNormals:
 
 
 def mirror_point(optics: Optics, plane_m: float) -> Array:
-    """Return the point of the plane at z = `plane_m` that mirrors TX into H, with the stage at zero: [3]."""
+    """Return the point [3] of a mirror in the plane z = `plane_m` at which H sees TX; the stage is at zero. Metres."""
     tx_m = optics.tx.at_m
     rx_m = optics.h.at_m
     share = (plane_m - tx_m[2]) / (2 * plane_m - tx_m[2] - rx_m[2])
@@ -161,9 +174,10 @@ def mirror_point(optics: Optics, plane_m: float) -> Array:
 
 
 def visible_normals(rig: Instrument) -> VisibleNormals:
-    """Return the normals that a rig's grid shows: those that mirror TX into H from its ends.
+    """Return the normals that a rig sees within its grid: those at which H sees TX mirrored from the grid's ends.
 
-    The slope of a tilted plane's path is 2 cos(theta) sin(tilt); phases alias where it exceeds lambda / (2 step).
+    The path over a plane with a tilt changes by 2 cos(theta) sin(tilt) per metre of the stage. Phases alias where this
+    exceeds lambda / (2 step).
     """
     optics = make_optics(rig)
     middle = mirror_point(optics, rig.geometry.object_distance_mm / 1e3)
@@ -185,9 +199,11 @@ def visible_normals(rig: Instrument) -> VisibleNormals:
 
 
 def compute_polarisation_row(points: Array, normals: Array, at_m: Array, tx: Antenna, rx: Antenna) -> Complex:
-    """Return coefficients [n, 4] of r_s and r_p in a voltage, and of the reflections from s to p and from p to s.
+    """Return the factors [n, 4] of r_s, r_p, r_sp (s to p) and r_ps (p to s) in a voltage without gain and path.
 
-    `points` and `normals` [n, 3] are seen from stage offsets `at_m` [n, 3].
+        (e_T.s) (e_R.s), (e_T.p_i) (e_R.p_r), (e_T.s) (e_R.p_r), (e_T.p_i) (e_R.s)
+
+    `points` and `normals` are [n, 3], and `at_m` [n, 3] the stage offsets from which the points are seen.
     """
     # Unit vectors from TX and from RX to the points.
     t, r, *_ = compute_unit_legs(points, at_m, tx.at_m, rx.at_m)
@@ -210,10 +226,11 @@ def compute_polarisation_row(points: Array, normals: Array, at_m: Array, tx: Ant
 
 
 def resolve_curvature(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array) -> Array:
-    """Return the curvature in the plane of incidence, across it, and twist between both, [3, n], 1 / m.
+    """Return the curvature in the plane of incidence, that across it, and the twist between both, [3, n], 1 / m.
 
-    `curvature` [n, 2, 2] is that along the `compute_tangents` of the `normals`; `points`, `normals` and the stage
-    offsets `at_m` are [n, 3].
+    With a and b unit vectors along the surface, in the plane of incidence and across it, these are a'K a, b'K b and
+    a'K b. K = `curvature` [n, 2, 2] is given along the `compute_tangents` of the `normals`; `points`, `normals` and the
+    stage offsets `at_m` are [n, 3].
     """
     ray = points - at_m - tx_m
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
@@ -225,7 +242,7 @@ def resolve_curvature(points: Array, normals: Array, curvature: Array, at_m: Arr
 
 
 def reflect_flat(eps: NDArray | complex, theta: Array) -> tuple[Complex, Complex]:
-    """Return Fresnel's r_s and r_p of tangential fields, broadcast; -1 and -1 for an infinite `eps`."""
+    """Return Fresnel's r_s and r_p of tangential fields, -1 for an infinite `eps`; `eps` and `theta` are broadcast."""
     r_s, r_p = fresnel(eps, theta)
     return np.asarray(r_s), np.asarray(r_p)
 
@@ -240,21 +257,22 @@ def reflect_curved(
     """
     bends = (bend_inside, bend_across)
     single_wave = _reflect_local(eps, theta, bends, wave_number)
-    # Derivatives by the angle are those of the flat coefficients. Metal's are -1 at every angle: there those with the
-    # bends count (2 % of V of a sphere of 50 mm). For dielectrics the next order of all other terms is missing anyway,
-    # and derivatives without bends are closer to the series.
+    # The derivatives r' and r'' by the angle are those of flat surfaces for dielectrics: the next order of all other
+    # terms is missing, too, and so the result is closer to the exact series. Flat metal has -1 at every angle, without
+    # derivatives; there those of the curved surface are taken (2 % of V of a sphere of 50 mm).
     is_metal = bool(np.any(np.isinf(eps)))
-    bends_of_slopes = bends
+    bends_of_derivatives = bends
     if not is_metal:
-        bends_of_slopes = (0 * bend_inside, 0 * bend_across)
-    middle = _reflect_local(eps, theta, bends_of_slopes, wave_number)
-    above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_slopes, wave_number)
-    below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_slopes, wave_number)
+        bends_of_derivatives = (0 * bend_inside, 0 * bend_across)
+    middle = _reflect_local(eps, theta, bends_of_derivatives, wave_number)
+    above = _reflect_local(eps, theta + ANGLE_STEP, bends_of_derivatives, wave_number)
+    below = _reflect_local(eps, theta - ANGLE_STEP, bends_of_derivatives, wave_number)
     cos = np.cos(theta)
     sin = np.sin(theta)
     coefficients = []
-    # s, then p. `change_inside` is half the variance of the angle times r''. For `change_across`, the angle grows by
-    # half the squared deviation over tan(theta), and the plane turns by the deviation over sin(theta).
+    # s, then p; `other` is the respective other coefficient. `change_inside` is half the variance of the angle times
+    # r''. `change_across`: a deviation d across increases the angle by d^2 / (2 tan(theta)), and turns the plane of
+    # incidence by d / sin(theta).
     for local, r, other, up, down in zip(single_wave, middle, middle[::-1], above, below, strict=True):
         first = (up - down) / (2 * ANGLE_STEP)
         second = (up - 2 * r + down) / ANGLE_STEP**2
@@ -267,9 +285,10 @@ def reflect_curved(
 def reflect_spherical(
     eps: NDArray | complex, theta: Array, path_m: Array, wave_number: float
 ) -> tuple[Complex, Complex]:
-    """Return additions to (r_s, r_p) [n] for a spherical wave of a finite path, to first order in 1 / (k path).
+    """Return the changes of (r_s, r_p) [n] for a spherical wave with a finite path, to first order in 1 / (k path).
 
-    The sum over directions of a plane: <d theta^2> = j / (k path), in the plane of incidence and across it.
+    The change is j / (2 k path) (r'' + r' / tan(theta)): the variance of the directions is <d theta^2> = j / (k path),
+    in the plane of incidence and across it.
     """
     flat_coefficients = reflect_flat(eps, theta)
     above = reflect_flat(eps, theta + ANGLE_STEP)
@@ -284,10 +303,9 @@ def reflect_spherical(
 
 
 def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number: float) -> Complex:
-    """Coefficient [n] of p from s, and of s from p, at a twisted surface, to first order in curvature / wave number.
+    """Return the coefficient [n] of p from s at a twisted surface, to first order in curvature / wave number.
 
-    `twist`: curvature (1 / m) between the direction of incidence along the surface and normal x that direction. Both
-    coefficients are the same, by reciprocity.
+    That of s from p is the same, by reciprocity. `twist` is a'K b (`resolve_curvature`), 1 / m.
     """
     cos = np.cos(theta)
     sin = np.sin(theta)
@@ -295,10 +313,10 @@ def mix_twisted(eps: NDArray | complex, theta: Array, twist: Array, wave_number:
     next_s, next_p = reflect_flat(eps, theta + ANGLE_STEP)
     previous_s, previous_p = reflect_flat(eps, theta - ANGLE_STEP)
     first = ((next_s - next_p) - (previous_s - previous_p)) / (2 * ANGLE_STEP)
-    # The sum over directions: with the angle of incidence its plane turns.
+    # The sum over directions: the plane of incidence turns while the angle of incidence changes.
     directions = first / (2 * sin * cos) - (r_s - r_p) / (2 * sin**2)
     # The wave of a cylinder: its logarithmic derivative differs from a plane wave's, in air and in the medium. The
-    # tangential electric fields at the surface are 1 + r of the incident ones, the magnetic ones 1 - r.
+    # tangential fields at the surface over the incident ones are 1 + r (electric) and 1 - r (magnetic).
     if np.any(np.isinf(eps)):
         electric = 0.0
         magnetic = 1 / cos**2
@@ -316,14 +334,15 @@ def _reflect_local(
 ) -> tuple[Complex, Complex]:
     """Return coefficients (r_s, r_p) [n] of a single cylindrical wave, without the sum over directions.
 
-    `bends` are the curvatures in the plane of incidence and across it. Both cylinders change the flat coefficients
-    independently, to first order.
+    `bends` are the curvatures in the plane of incidence and across it, 1 / m. To first order each changes the flat
+    coefficients as if it were alone, so that the result is r(inside) + r(across) - r(flat).
     """
     bend_inside, bend_across = bends
     cos = np.cos(theta)
     sin = np.sin(theta)
     if np.any(np.isinf(eps)):
-        # The axial field or its derivative vanishes: s in the plane of incidence and p across it stay -1.
+        # On metal the field along a cylinder's axis vanishes, or its derivative: curvature in the plane of incidence
+        # does not change r_s, and curvature across it does not change r_p.
         turn_p = bend_inside / (wave_number * cos**3)
         turn_s = bend_across / (wave_number * cos)
         return -np.exp(1j * turn_s), -np.exp(1j * turn_p)
@@ -332,9 +351,9 @@ def _reflect_local(
     cos_medium = np.sqrt(1 - sin**2 / eps)
     r_s, r_p = reflect_flat(eps, theta)
 
-    # Cylinder across the plane of incidence. Logarithmic derivatives along the normal, over k: of the waves towards the
-    # surface and away from it in air (`into`, `out`), and of the wave in the medium (`inside_term`). `outer` and
-    # `inner` are the changes by curvature outside and inside.
+    # Curvature in the plane of incidence: a cylinder whose axis is across that plane. `into`, `out` and `inside_term`
+    # are logarithmic derivatives along the normal, over k, of the waves in air towards the surface and away from it,
+    # and of the wave in the medium. `outer` and `inner` are their changes by the curvature, in air and in the medium.
     outer = bend_inside / (2 * wave_number * cos**2)
     inner = bend_inside / (2 * wave_number * cos_medium**2)
     into = 1j * cos - outer
@@ -342,8 +361,9 @@ def _reflect_local(
     inside_term = 1j * root * cos_medium - inner
     local_s = -(into - inside_term) / (out - inside_term)
     local_p = (into - inside_term / eps) / (out - inside_term / eps)
-    # Cylinder along the plane of incidence: the same of the fields along its axis, over the square of the normal wave
-    # numbers (`k_out`, `k_in`, over k), since so the fields around it follow from these.
+    # Curvature across the plane of incidence: a cylinder whose axis lies in that plane. The same for the fields along
+    # its axis, divided by the squares of the normal wave numbers (over k: `k_out`, `k_in`): this turns fields along the
+    # axis into those around it.
     k_out = cos
     k_in = root * cos_medium
     outer = bend_across / (2 * wave_number * k_out)

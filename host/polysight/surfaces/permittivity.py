@@ -9,13 +9,13 @@ squares over its points (`fit_permittivity`) of the equation
 * r: reflection coefficients of the curved surface at the point, which depend on eps; [n, 2 receivers, 4].
 * M: effect of the antennas' polarisations on r (`Voltages.response`); (M r)_H and (M r)_V are the voltages for gains of
   1.
-* b_H, b_V: measured voltages of H and V (`Voltages.voltage`), divided by the receivers' gains (`Gains`). These depend
-  on the
-  direction in which V sees the point (`Voltages.arrival`).
+* b_H, b_V: measured voltages of H and V (`Voltages.voltage`), divided by the receivers' gains (`Gains`). The gains
+  depend on the direction in which V sees the point (`Voltages.arrival`).
 
-Receivers are in the order H, V. The four coefficients are r_s, r_p, s to p, p to s. The last two are 0 without a
-*twist*, a curvature whose axes lie askew to the plane of incidence. The difference of both sides of the equation is the
-*miss* of the point. `wave_number` is that at the middle of the band, rad / m. Permittivities are eps' - j eps''.
+Receivers are in the order H, V. The four coefficients are r_s, r_p, r_sp (s to p) and r_ps. The last two are 0 without
+a *twist*, a curvature whose axes lie askew to the plane of incidence. The difference of both sides of the equation is
+the *miss* of the point. *Ripple* is the error of points by edges and by other echoes; it is similar for neighbouring
+points. `wave_number` is that at the middle of the band, rad / m. Permittivities are eps' - j eps''.
 
 The covariance of (real, imaginary) of eps is the sum over these sources (`add_common_errors`):
 * the scatter of the misses, summed over blocks of stage positions;
@@ -57,61 +57,60 @@ from polysight.surfaces.paths import STRIDE_M
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-# A point is left out of the fit if its misfit, over its own standard deviation, exceeds the median of the segment by
-# more than this factor; chosen.
+# A point is left out of the fit if its |miss| over its standard deviation is more than this times the median of the
+# segment; chosen.
 OUTLIER_RATIO = 4.0
-# Radius in metres of the neighbourhood whose scatter a point is given; chosen: ripples by edges and by other echoes
-# change over such a distance.
+# The covariance of a single point is that of the scatter of the points within this radius; chosen: ripples change over
+# such a distance.
 RIPPLE_M = 0.04
 # Side of the square with the area of a Fresnel zone (40 x 70 mm): ripples that edges make are as long.
 FRESNEL_ZONE_M = 0.053
 # Length of the ripple of flat surfaces: their misses at points 8 mm apart have a correlation of 0.6, at 16 mm 0.3
 # (plates of random scenes, simulated).
 RIPPLE_OF_PLATES_M = 0.024
-# Relative standard deviation of V / H of a point by ripple. It is added to the noise where the points are weighted;
-# chosen.
+# Relative standard deviation of V / H of a point by ripple. It is added to the noise in the weights of points; chosen.
 USUAL_RIPPLE = 0.02
-# A small segment has few blocks, whose scatter is uncertain. So it is averaged with a second estimate: the ripple of
-# the single points, taken as common to a square of `ripple_m`. The second estimate has the weight of this number
-# of blocks; chosen.
+# A small segment has few blocks, so that their scatter alone is an uncertain estimate. It is averaged with a second
+# one: the ripple of the single points, taken as equal within squares of `ripple_m`. The second estimate has the weight
+# of this number of blocks; chosen.
 EXPECTED_BLOCKS = 2.0
 # Relative error of the curvature; chosen: the curvatures of 14 spheres and cylinders (50 to 190 mm, simulated) were
 # measured 0.4 to 3 % too large, 1.6 % in the root mean square, because a window is not small compared with such bodies.
 CURVATURE_ERROR = 0.02
-# The reflection at a curved surface is a series in K / (k cos^3 theta), with K the curvature, k the wave number, theta
-# the angle of incidence. This is its second term over the first, in that unit: 1.9 by the exact series of spheres (100
-# and 200 mm, permittivity 2.8 to 8). Each term is turned by 90 degrees against the one before.
+# The reflection at a curved surface is a series in x = K / (k cos^3(theta)), with K the curvature, k the wave number,
+# theta the angle of incidence. The second-order term is taken as j SECOND_ORDER x times the first-order one. The exact
+# series of spheres (100 and 200 mm, permittivity 2.8 to 8) gives 1.9.
 SECOND_ORDER = 2.0
 # Largest difference of ln |H| of a point from its segment's usual value. At the border of the zone that a surface
-# reflects to the amplitude is half of that inside, 0.69 less in ln: about half of that is allowed.
-# Without a metal reference the antennas' patterns stay in the levels, too, and change them by about as much over the
-# directions: then 0.9 is allowed. Both are chosen.
+# reflects to, the amplitude is half of that inside, 0.69 less in ln: about half of that is allowed. Without a metal
+# reference, the levels also change with the antennas' patterns over the directions, by about as much: then 0.9 is
+# allowed. Both are chosen.
 LEVEL_TOLERANCE = 0.35
 LEVEL_TOLERANCE_WITHOUT_GAINS = 0.9
-# Smallest share of a segment's power in points at its usual level, if it is a surface. The echo that an edge diffracts
-# falls off with the angle, so it has no usual level: three segments of edges alone had 0.36 to 0.56, surfaces 0.91 and
-# more (simulated).
+# A segment is not a surface if a smaller share of its power is in points at its usual level. The echo that an edge
+# diffracts falls off with the angle, so it has no usual level: three segments of edges alone had 0.36 to 0.56, surfaces
+# 0.91 and more (simulated).
 MIN_SHARE_AT_LEVEL = 0.75
-# Smallest amplitude of H relative to metal, if a segment is a surface: that of a half space of permittivity 1.04 at 55
-# degrees. The echo that the end of a cylinder diffracts had 0.02 (simulated).
+# A segment is not a surface if its amplitude of H relative to metal is smaller. A half space of permittivity 1.04 has
+# this value at 55 degrees. The echo that the end of a cylinder diffracts had 0.02 (simulated).
 MIN_REFLECTION = 0.03
 # A point is near the border of its segment if its segment fills less than three quarters of a disc of 50 mm radius
-# about it: at a straight border, nearer than 20 mm. There edges bend normals by degrees, and H / V of a plate with
-# sharp edges is 10 % too large.
+# about it. At a straight border that is nearer than 20 mm. There edges turn normals by degrees, and H / V of a plate
+# with sharp edges is 10 % too large.
 BORDER_DISC_M = 0.05
 MIN_FILLING = 0.75
 # Weight of a point next to the border in the fit of its segment. The weight rises to 1 as interior points fill the disc
-# of `BORDER_DISC_M` about the point. Ripples of edges swing about zero, and a sum whose weights begin and end slowly
-# averages them. The permittivities of the plates of 11 random scenes (simulated) had errors of 2.2 % in the root mean
-# square where all points counted alike, and have 1.2 % so.
+# of `BORDER_DISC_M` about the point. Ripples of edges oscillate about zero, and a sum averages them if its weights rise
+# and fall slowly. The permittivities of the plates of 11 random scenes (simulated) had errors of 2.2 % in the root mean
+# square with equal weights, and have 1.2 % with these.
 LEAST_SHARE = 0.01
 # Stage offsets closer than this belong to one column of windows: rows start a little apart, as the stage moves within a
 # burst.
 SAME_COLUMN_M = 1.5e-3
 # Step of numerical derivatives with respect to the permittivity; chosen.
 EPS_STEP = 1e-4
-# Limits of the permittivity during iterations, of eps' and of the imaginary part -eps''. They hold solids and water,
-# and a little gain (a positive imaginary part), which noise may give.
+# Limits of the permittivity during iterations, of eps' and of the imaginary part -eps''. Solids and water are within
+# them, and a little gain (a positive imaginary part), which noise may give.
 REAL_LIMITS = (1.2, 40)
 IMAGINARY_LIMITS = (-20, 0.5)
 
@@ -129,7 +128,7 @@ class PermittivityFit:
     share
         Factor of each point's weight in addition to its noise and ripple, [n]; 0 for outliers.
     excess2
-        |miss|^2 of each point over its expectation from noise alone, [n]; 1 on average if there is nothing but noise.
+        |miss|^2 of each point over its expectation from noise alone, [n]; 1 on average if there is only noise.
     answer
         Complex [2, n]: if the misses change by d [n], (real, imaginary) of `eps` change by the real part of
         `answer @ d`.
@@ -156,7 +155,7 @@ def _unmix(points: Voltages, voltage: Complex) -> Complex:
 
 
 def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex:
-    """Return the permittivity of each point by itself, complex [n].
+    """Return the permittivity of each point alone, complex [n].
 
     It starts from that of a flat half space with the point's r_s / r_p. Each iteration divides the ratio by the effect
     of the curvature (`curved` over flat) at the last permittivity.
@@ -174,9 +173,9 @@ def point_permittivity(v: Voltages, gains: Gains, wave_number: float) -> Complex
 
 
 def clip_permittivity(eps: NDArray) -> Complex:
-    """Return permittivities, of any shape, limited to `REAL_LIMITS` and `IMAGINARY_LIMITS`; 4 where not finite.
+    """Return permittivities limited to `REAL_LIMITS` and `IMAGINARY_LIMITS`, and 4 where they are not finite.
 
-    So an iteration that leaves the range can continue.
+    An iteration that left the range can then continue.
     """
     finite = np.where(np.isfinite(eps), eps, 4.0)
     return np.clip(np.real(finite), *REAL_LIMITS) + 1j * np.clip(np.imag(finite), *IMAGINARY_LIMITS)
@@ -193,7 +192,7 @@ def find_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Complex:
 
 
 def _compute_noise_of_misses(v: Voltages, gains: Gains, coefficients: Complex) -> Array:
-    """Return the standard deviation of the real part, and of the imaginary part, of each miss by noise alone, [n]."""
+    """Return the standard deviation by noise alone of each miss's real part, and of its imaginary part, [n]."""
     expected = np.abs(predict_voltages(v, coefficients))
     std_h = v.std[:, 0] / np.abs(gains.ratio(v.arrival))
     return np.hypot(std_h * expected[:, 1], v.std[:, 1] * expected[:, 0])
@@ -205,8 +204,8 @@ class _Step:
 
     `miss` [n], `noise` [n] (standard deviation of either part) and `weights` [n] are those at this permittivity; `used`
     [n] is False for outliers. The step of (real, imaginary) is the real part of `influence @ miss`, `influence` complex
-    [2, n]. `answer` is that of `PermittivityFit`: unlike `influence`, it accounts for a changed miss changing its own
-    weight.
+    [2, n]. `answer` is that of `PermittivityFit`. It differs from `influence` because a change of a miss also changes
+    its weight.
     """
 
     miss: Complex
@@ -236,13 +235,14 @@ def _linearise(
     scale = np.hypot(noise, ripple)
     size = np.abs(miss) / scale
     median_size = float(np.median(size)) + 1e-12
-    # If all points fit far better than their errors, good ones must not become outliers (0.3 is chosen).
+    # If all points fit far better than their errors, points with a usual miss must not become outliers (0.3 is chosen).
     is_used = size < OUTLIER_RATIO * max(median_size, 0.3)
-    # Misses of more than twice the usual size lose most of their weight (chosen).
+    # Misses of twice the median size lose half of their weight, larger ones more (chosen).
     falloff = 1 / (1 + (size / (2 * median_size)) ** 2)
     weights = share * is_used / scale**2 * falloff
     # A miss that grows loses weight. On average over the phases of its change, it counts by the square of the falloff.
     rate_weights = weights * falloff
+    # J' W J, [2, 2], with the real and the imaginary part of eps as unknowns.
     information = np.einsum("np,nq,n->pq", jacobian.conj(), jacobian, rate_weights).real
     inverse = np.linalg.inv(information + 1e-15 * np.eye(2))
     influence = -np.einsum("pq,nq,n->pn", inverse, jacobian.conj(), weights)
@@ -256,12 +256,12 @@ def fit_permittivity(
     """Fit one permittivity to points: weighted least squares by Gauss-Newton, with weights that fall for large misses.
 
     `share` [n] is a factor of each point's weight, in addition to noise and ripple; see `find_shares`. `ripple_m` is
-    the length over which the ripple of the misses is alike, metres; it widens the covariance.
+    the length over which the ripple of the misses is similar, metres; a longer one gives a larger covariance.
     """
     point_values = point_permittivity(v, gains, wave_number)
-    # The iteration starts at a small loss at least: an imaginary part of -0.01 or below (chosen).
+    # The iteration starts with at least a small loss: an imaginary part of -0.01 or below (chosen).
     eps = complex(np.median(point_values.real), min(np.median(point_values.imag), -0.01))
-    # Level of H in the unit of a miss: b_H times what V receives of r_p = 1.
+    # Level of H in the unit of a miss: |b_H M_V|, with M_V the factor of r_p in V.
     level = np.abs(v.voltage[:, 0] / gains.ratio(v.arrival) * v.response[:, 1, 1])
     # Without ripple, points of little noise would outweigh all others.
     ripple = USUAL_RIPPLE * level
@@ -287,10 +287,11 @@ def fit_permittivity(
 
 
 def measure_ripple(step: _Step, level: Array) -> Array:
-    """Return the root mean square of the misses beyond noise, `ripple` [n], taken as proportional to `level` [n].
+    """Return the root mean square of the misses without noise, `ripple` [n], taken as proportional to `level` [n].
 
-    Points count by the weights of the fit. Unlike the scatter of blocks, this also sees a ripple that is as long as the
-    segment, which shifts all of its few blocks together.
+    Points have the weights w of the fit: ripple^2 = level^2 sum(w (|miss|^2 - 2 noise^2)) / sum(w level^2). Unlike the
+    scatter of blocks, this also includes a ripple that is as long as the segment, which changes all of its blocks
+    together.
     """
     excess = step.weights @ (np.abs(step.miss) ** 2 - 2 * step.noise**2) / (step.weights @ level**2)
     return level * np.sqrt(max(0.0, float(excess)))
@@ -305,8 +306,8 @@ def _compute_covariance_of_scatter(
     `BLOCK_M`; and the expected one, from `ripple` [n] that is common to squares of `ripple_m`. `at_m` [n, 2] are the
     stage offsets. (Misses of bent surfaces have correlations of 0.7, 0.45, 0.2 and 0 at 8, 16, 24 and 32 mm, as windows
     overlap; simulated.)
-    The covariance is scaled up, because the 95 % region by few blocks is wider than that of a known covariance
-    (Fisher's F instead of chi-square).
+    The covariance is scaled up, because its estimate from few blocks is uncertain: the 95 % region then follows
+    Fisher's F distribution, which is wider than chi-square.
     """
     measured_terms = (influence * miss).real.T
     # Ripple may have any phase: its real part and its imaginary part are independent errors of half the variance each.
@@ -328,8 +329,9 @@ def _sum_over_blocks(terms: Array, influence: Complex, at_m: Array, block_m: flo
 
     Terms of one block are taken as fully correlated, those of different blocks as independent. The effective number of
     blocks is (sum w)^2 / sum w^2, with w the sum of |`influence`|^2 in a block.
-    Both results are means over four grids of blocks, shifted by half a block. So a pair of points counts, on average,
-    by 1 - s along either axis, with s its distance along the axis over `block_m` (0 for s above 1).
+    Both results are means over four grids of blocks, shifted by half a block. On average, the errors of two points then
+    have a correlation of about 1 - s along either axis, with s their distance along the axis over `block_m` (0 for s
+    above 1).
     """
     covariance = np.zeros((2, 2))
     blocks = 0.0
@@ -430,9 +432,9 @@ def add_common_errors(
         add(scan.source, find_common_error(fit, miss, scan, wave_number))
 
     # An error of ln(H / V) of the reference changes b_H in proportion, and with it the first term of the miss,
-    # `h_misfit`. `list_errors` are real, [errors, n]: one standard deviation of either part of ln(H / V).
-    h_misfit = miss + v.voltage[:, 1] * predict_voltages(v, coefficients)[:, 0]
-    reference_changes = (fit.answer * h_misfit) @ gains.list_errors(v.arrival).T
+    # b_H (M r)_V. `list_errors` are real, [errors, n]: one standard deviation of either part of ln(H / V).
+    first_term = miss + v.voltage[:, 1] * predict_voltages(v, coefficients)[:, 0]
+    reference_changes = (fit.answer * first_term) @ gains.list_errors(v.arrival).T
     flat_s, flat_p = reflect_flat(fit.eps, v.theta)
     flat = np.stack([flat_s, flat_p, 0 * flat_s, 0 * flat_s], axis=2)
     first_order = find_misses(v, gains, flat) - miss
@@ -449,10 +451,10 @@ def add_common_errors(
 def find_pattern_changes(eps: complex, v: Voltages, wave_number: float) -> Complex:
     """Return the changes of the coefficients by the slope of H's pattern, and by that of V's, complex [2, n, 2, 4].
 
-    An echo over a finite path L (metres) is a sum over directions, which the pattern weights. To first order that adds
-    j / (k L) r' g to a coefficient r: k is the wave number, r' the derivative of r with respect to the angle, g the
-    slope of ln of the pattern (`UNKNOWN_SLOPE`, per radian). The metal reference does not show it, for r of metal is
-    the same at all angles.
+    An echo over a finite path L (metres) is a sum over directions, weighted by the antenna's pattern. To first order
+    that adds j / (k L) r' g to a coefficient r: k is the wave number, r' the derivative of r by the angle, g the slope
+    of ln of the pattern (`UNKNOWN_SLOPE`, per radian). The metal reference does not include this effect, because r of
+    metal is the same at all angles.
     """
     above = reflect_flat(eps, v.theta + ANGLE_STEP)
     below = reflect_flat(eps, v.theta - ANGLE_STEP)
@@ -483,11 +485,11 @@ def find_reflection(v: Voltages, gains: Gains) -> Array:
 def find_reflecting(voltages: Voltages, amplitude: Array, segment: NDArray[np.int_], gains: Gains | None) -> NDArray:
     """Return True for points [n] where a surface reflects, False for those where only an edge diffracts.
 
-    `segment` [n] is the number of each point's segment. A surface of one medium has the same level everywhere once path
-    and spreading are taken out. At the border of the zone that it reflects to half of the amplitude is left; beyond,
-    the echo that the edge diffracts falls further. So a point reflects if its level is near its segment's usual one:
-    the median, weighted by power (`amplitude` [n] of H, squared), as edges are seen from many more stage positions than
-    a small plate.
+    `segment` [n] is the number of each point's segment. A surface of one medium has the same level of H everywhere,
+    without path and spreading. At the border of the zone that it reflects to, half of the amplitude is left; outside,
+    there is only the echo that the edge diffracts, which is lower still. So a point reflects if its level is near its
+    segment's usual one. This is the median, weighted by power (`amplitude` [n] of H, squared), because edges are seen
+    from many more stage positions than a small plate.
     All points of a segment are False if too little of its power is at the usual level (`MIN_SHARE_AT_LEVEL`), or if
     that level is too low for any medium (`MIN_REFLECTION`). If `gains` is None, levels are not relative to metal: the
     second test is left out, and the tolerance of the first is larger.
@@ -516,8 +518,8 @@ def find_filling(at_m: Array, segment: NDArray[np.int_], extent_m: tuple[Array, 
     """Return the share [n] of a disc about each point that points of its segment fill.
 
     The disc has the radius `BORDER_DISC_M` in the plane of the stage offsets `at_m` [n, 2], metres. `extent_m` is the
-    smallest and the largest offset of the scan, [2] each. Only the part of the disc inside this extent counts, for the
-    end of the scan is not a border of a surface.
+    smallest and the largest offset of the scan, [2] each. Only the part of the disc inside this extent counts, because
+    the end of the scan is not a border of a surface.
     """
     filling = np.zeros(len(at_m))
     stride_m = np.array([_find_stride(column) for column in at_m.T])
@@ -566,11 +568,11 @@ def judge_medium(
 
     A wall or a coating reflects twice. So its level differs from that of a half space of its permittivity, or its
     levels change over the band.
-    The level is |ln(H measured / H expected from `fit.eps`)|, averaged over the points. Twice its standard deviation is
-    subtracted as squares, sqrt(level^2 - (2 std)^2), and 0 is returned if that is negative: errors of the rig do not
-    count, and hide nothing that is larger.
-    The rise is the magnitude of ln(amplitude in the upper half of the band / lower half) relative to metal, minus twice
-    its standard deviation, of H or of V, whichever is larger. It is negative where there is nothing but errors.
+    The level l is ln(H measured / H expected from `fit.eps`), averaged over the points. Returned is sqrt(l^2 - (2
+    std)^2), with std its standard deviation, or 0 if the square is negative: so errors of the rig do not count, and a
+    larger deviation is hardly reduced.
+    The rise is |ln(amplitude in the upper half of the band / lower half)| relative to metal, minus twice its standard
+    deviation, of H or of V, whichever is larger. It is negative where there are only errors.
     `fit`, `v` and `disturbed` hold the same points.
     """
     is_used = fit.share > 0
@@ -582,7 +584,7 @@ def judge_medium(
         return levels[is_used]
 
     levels = find_levels(fit.eps, v, gains)
-    # Ripples by a plate's edges change levels by 10 %. They cancel in the mean weighted by `share`, not in the median.
+    # Ripples of a plate's edges change levels by 10 %. They cancel in the mean weighted by `share`, not in the median.
     level = float(np.average(levels, weights=fit.share[is_used]))
     # Includes the error in directions that the reference does not cover.
     unknown_std = float(np.median(gains.estimate_level_std(v)))
@@ -600,15 +602,15 @@ def judge_medium(
 
 
 def _spread(values: Array) -> float:
-    """Return the standard deviation of values [n] by their median absolute deviation, times 1.48 (normal values)."""
+    """Return the standard deviation of normal values [n]: 1.48 times their median absolute deviation."""
     return 1.48 * float(np.median(np.abs(values - np.median(values))))
 
 
 def point_covariance(v: Voltages, gains: Gains, fit: PermittivityFit, wave_number: float) -> Array:
     """Return the covariance of (real, imaginary) of each point's own permittivity by the scatter around it, [n, 2, 2].
 
-    Ripple by edges and other echoes is not part of a point's noise, and differs over a segment. So the noise's variance
-    is multiplied by the mean of `fit.excess2` over the points within `RIPPLE_M`, outliers included.
+    Ripple is not part of a point's noise, and differs from place to place. So the variance of the noise is multiplied
+    by the mean of `fit.excess2` over the points within `RIPPLE_M`, outliers included.
     """
     neighbours = scipy.spatial.KDTree(v.at_m).query_ball_point(v.at_m, RIPPLE_M)
     excess2 = np.array([fit.excess2[near_points].mean() for near_points in neighbours])

@@ -1,15 +1,28 @@
 """Points, normals and curvatures of a surface from the paths of its echoes, and the paths from these.
 
-With u the stage offset, T and R the antennas, p the specular point, t and r the unit vectors from the antennas to p:
-|p - T - u| + |p - R - u| = L and (t + r)_xy = -g, with g the gradient of the path L by u (the path is stationary in p,
-so its gradient is that of fixed p). The normal is n = -(t + r) / |t + r| and cos(theta) = |t + r| / 2: the angle of
-incidence depends on the place alone.
+Symbols:
 
-With K the surface's curvature, E the tangents [3, 2], H = sum (I - k k') / distance over both legs (k = t or r) and
-X = -E' H_xy (columns x and y), the second derivative of the path by the place on the surface is P = E' H E +
-2 cos(theta) K. Eliminating the place gives that by u, the curvature of the path, Q = H_xy - X' P^-1 X (rows and
-columns x and y), hence K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta)). Curvature is positive for convex bodies.
-P^-1 is how far the point moves with the stage: nothing on an edge, and Q is linear in it. All arrays are [n, ...].
+* u: stage offset. T and R: the antennas at u = 0. p: specular point. t and r: unit vectors from the antennas to p.
+* L: path over p; g and Q: its first and second derivatives by u, the *slope* and the *bend*, along x and y.
+* n: normal; theta: angle of incidence; E [3, 2]: tangents; K [2, 2]: curvature of the surface along the tangents,
+  positive for convex bodies.
+* H [3, 3]: second derivative of the path by p. xy marks the rows or columns x and y, ' a transpose.
+
+The place and the normal follow from the path and its slope. A specular point's path is stationary over the surface, so
+that its slope is that of a fixed p:
+
+    |p - T - u| + |p - R - u| = L,   (t + r)_xy = -g
+    n = -(t + r) / |t + r|,   cos(theta) = |t + r| / 2
+
+The curvature follows from the bend:
+
+    H = sum over k = t and k = r of  (I - k k') / distance,   X = -E' H_xy   (columns x and y)
+    P = E' H E + 2 cos(theta) K     (second derivative of the path by the place on the surface)
+    Q = H_xy - X' P^-1 X            (rows and columns x and y of H)
+    K = (X (H_xy - Q)^-1 X' - E' H E) / (2 cos(theta))
+
+P^-1 is the *motion*: how far p moves over the surface with the stage. It is 0 on an edge, and Q is linear in it. All
+arrays are [n, ...], for n points.
 """
 
 from __future__ import annotations
@@ -18,17 +31,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-# Newton's method doubles the correct digits at each step: from half a metre away a few steps reach full precision; the
-# rest are for starts from which the first steps are cut to LONGEST_STEP_M.
+# Newton's method doubles the number of correct digits at each step: a few steps reach full precision from half a metre
+# away. The further ones are for starts from which the first steps are cut to LONGEST_STEP_M.
 NEWTON_STEPS = 12
 LONGEST_STEP_M = 0.15
-# A step below this was the last that changed anything: the next would be its square.
+# The iteration ends after a step below this: the next one would be about its square.
 SHORTEST_STEP_M = 1e-9
-# Newton's method starts this far in front of the antennas, and never comes closer than NEAREST_M (both chosen): behind
-# them a mirror image of each point has nearly the same path and slope.
+# Newton's method starts this far in front of the antennas, and never comes closer than NEAREST_M (both chosen). Each
+# point has a mirror image behind the antennas, with nearly the same path and slope.
 START_RANGE_M = 0.5
 NEAREST_M = 0.05
-# Keeps a singular matrix solvable. Entries are about 1, so that the added share lies far below the steps' precision.
+# Added to the diagonal of a matrix to keep it invertible. Its entries are about 1, so that this is far below the
+# precision of a step.
 REGULARISATION = 1e-12
 
 
@@ -42,7 +56,7 @@ def compute_unit_legs(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) ->
 
 
 def compute_leg_bend(t: Array, r: Array, out_m: Array, back_m: Array) -> Array:
-    """H: second derivative of the path by the point, [n, 3, 3]."""
+    """Return H [n, 3, 3], the second derivative of the path by the point, 1 / m."""
     eye = np.eye(3)
     out = (eye - t[:, :, None] * t[:, None, :]) / out_m[:, None, None]
     back = (eye - r[:, :, None] * r[:, None, :]) / back_m[:, None, None]
@@ -58,6 +72,7 @@ def locate(path_m: Array, slope: Array, at_m: Array, tx_m: Array, rx_m: Array) -
     for _ in range(NEWTON_STEPS):
         t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
         bisector = t + r
+        # Both equations of the point: L, then g_x and g_y. [n, 3], and their derivatives by the point, [n, 3, 3].
         miss = np.concatenate([(out_m + back_m - path_m)[:, None], bisector[:, :2] + slope], axis=1)
         bend = compute_leg_bend(t, r, out_m, back_m)
         matrix = np.concatenate([bisector[:, None], bend[:, :2]], axis=1)
@@ -80,7 +95,10 @@ def find_normals(points_m: Array, at_m: Array, tx_m: Array, rx_m: Array) -> tupl
 
 
 def compute_tangents(normals: Array) -> Array:
-    """Orthonormal tangents, columns of [n, 3, 2]: the first across y, near x where a surface faces the antennas."""
+    """Return E: two orthonormal tangents, the columns of [n, 3, 2].
+
+    The first is perpendicular to y, and close to x on a surface that faces the antennas.
+    """
     first = np.cross(normals, np.array([0.0, 1.0, 0.0]))
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first)], axis=-1).astype(np.float64)
@@ -89,7 +107,7 @@ def compute_tangents(normals: Array) -> Array:
 def _compute_second_derivatives(
     points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return H in the stage's plane, X, E' H E and 2 cos(theta) of the module's formulas."""
+    """Return H_xy (rows and columns x and y), X, E' H E and 2 cos(theta) of the module's formulas."""
     t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
     bend = compute_leg_bend(t, r, out_m, back_m)
     basis = compute_tangents(normals)
@@ -99,23 +117,23 @@ def _compute_second_derivatives(
 
 
 def find_curvature(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
-    """Curvature K [n, 2, 2] in the basis of `compute_tangents`, 1 / m, of echoes with the path's curvature `bend`."""
+    """Return the curvature K [n, 2, 2] in the basis of `compute_tangents`, 1 / m, of echoes with the bend Q."""
     plane, cross, along_surface, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     difference = plane - bend
-    # The small part keeps the matrix solvable where the path bends as that of a point.
+    # The small part keeps the matrix invertible where the path bends as that of a point (Q = H_xy).
     surface_part = cross @ np.linalg.solve(difference + 1e-9 * np.eye(2), np.swapaxes(cross, 1, 2))
     return (surface_part - along_surface) / twice_cosine[:, None, None]
 
 
 def find_motion(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, bend: Array) -> Array:
-    """Return P^-1 [n, 2, 2], metres, of echoes whose path has the curvature `bend`."""
+    """Return the motion P^-1 [n, 2, 2], metres, of echoes with the bend Q."""
     plane, cross, _, _ = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     inverse = np.linalg.inv(cross)
     return np.swapaxes(inverse, 1, 2) @ (plane - bend) @ inverse
 
 
 def find_bend(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array, motion: Array) -> Array:
-    """Return the curvature [n, 2, 2] of the paths of echoes with a P^-1 of `motion`."""
+    """Return the bend Q [n, 2, 2], 1 / m, of echoes with the motion P^-1."""
     plane, cross, _, _ = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     return plane - np.swapaxes(cross, 1, 2) @ motion @ cross
 
@@ -123,7 +141,7 @@ def find_bend(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Arr
 def predict_echo(
     points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array
 ) -> tuple[Array, Array, Array]:
-    """Return path [n], slope [n, 2] and curvature [n, 2, 2] of the echo of a surface seen from stage offsets [n, 3]."""
+    """Return path L [n], slope g [n, 2] and bend Q [n, 2, 2] of the echo of a surface at stage offsets [n, 3]."""
     t, r, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
     plane, cross, along_surface, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
     second = along_surface + twice_cosine[:, None, None] * curvature
@@ -132,9 +150,9 @@ def predict_echo(
 
 
 def compute_spreading(points: Array, normals: Array, curvature: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
-    """Return cos(theta) / (r1 r2 sqrt |det P|): echo amplitude of a surface that reflects everything, [n]; 1 / m.
+    """Return cos(theta) / (r1 r2 sqrt |det P|), [n], 1 / m: the echo amplitude of a surface that reflects everything.
 
-    A mirror gives 1 / path.
+    r1 and r2 are the distances of the point from TX and RX. For a plane the result is 1 / path.
     """
     _, _, out_m, back_m = compute_unit_legs(points, at_m, tx_m, rx_m)
     _, _, along_surface, twice_cosine = _compute_second_derivatives(points, normals, at_m, tx_m, rx_m)
@@ -145,7 +163,10 @@ def compute_spreading(points: Array, normals: Array, curvature: Array, at_m: Arr
 
 
 def find_offset_that_sees(points: Array, normals: Array, at_m: Array, tx_m: Array, rx_m: Array) -> Array:
-    """Stage offsets [n, 3] from which TX and RX see a point as a mirror with the given normal; starts at `at_m`."""
+    """Return the stage offsets [n, 3] at which TX and RX see a point as a mirror with the given normal.
+
+    The search starts at `at_m` [n, 3].
+    """
     basis = np.swapaxes(compute_tangents(normals), 1, 2)
     at_m = at_m.copy()
     for _ in range(NEWTON_STEPS):

@@ -1,4 +1,8 @@
-"""Result of `polysight surface`: points with normals, curvature and permittivity, and what is known of each segment.
+"""Result of `polysight surface`: points with normals, curvature and permittivity, and a description of each segment.
+
+A *segment* is a connected surface; `analyse_surface` describes the segments of a scan. Segments that are no surface of
+a single medium get no permittivity but a `reason`: metal, edges, walls, coatings, echoes from inside a body. The points
+of walls and of such echoes get larger standard errors (`doubt_places`).
 
 Files: `surface.npz` (docs/spec/products.md) and `surface.ply`, which MeshLab, CloudCompare and Open3D read.
 """
@@ -49,51 +53,53 @@ from polysight_shared.files import write_atomically
 NOT_POINTS = ("scan_id", "simulated", "segments")
 SURFACE = "surface.npz"
 POINTS = "surface.ply"
-# Below this radius the first-order correction of curved surfaces is not enough (tests/surfaces, 8..12 % at 30 mm).
+# Below this radius the first-order correction of curved surfaces is not enough: errors of 8 to 12 % at 30 mm
+# (tests/surfaces).
 MIN_RADIUS_M = 0.040
-# A surface that bends less than this, 1 / m, is flat: a radius of 2 m.
+# A surface with a smaller curvature, 1 / m, counts as flat: a radius of 2 m.
 FLAT_BEND = 0.5
-# Least number of points away from the edges that a permittivity is fitted to; chosen. (`LEAST_POINTS`: of a surface.)
+# Least number of points away from the edges to which a permittivity is fitted; chosen. (`LEAST_POINTS` is the least
+# number of points of a segment.)
 MIN_POINTS = 20
 # A segment whose ratio r_s / r_p is nearer to 1 is metal. Metal has 1; a permittivity of 40 without loss has 1.5 at 55
 # degrees.
 METAL_RATIO = 0.15
-# A loss that is below zero by more than `MAX_GAIN_SIGMA` standard deviations is not a property of one medium, nor is a
-# real part beyond `LEAST_REAL` and `MOST_REAL`: the fit ends at 1.2 and at 40.
+# No single medium has a loss below zero by more than `MAX_GAIN_SIGMA` standard deviations, or a real part outside
+# `LEAST_REAL` and `MOST_REAL`. The fit is limited to 1.2 and 40: a result near these is a fit that left the range.
 MAX_GAIN_SIGMA = 3.0
 LEAST_REAL = 1.25
 MOST_REAL = 39.0
-# Level of H over that of the medium fitted, and its rise over the band, logarithms: beyond, no single surface reflects.
-# Beyond what the rig's errors explain 46 drawn solids have at most 0.020 and 0.0034; walls that pass as a medium which
-# is not theirs have more than 0.05, or 0.01 (tests/surfaces/test_rejected_surfaces.py).
+# Largest deviations from a single medium, both logarithms: of the level of H from that of the fitted medium, and of the
+# levels over the band (`judge_medium`). 46 drawn solids have at most 0.020 and 0.0034. Walls for which a medium that is
+# not theirs was fitted have more than 0.05, or more than 0.01 (tests/surfaces/test_rejected_surfaces.py).
 MAX_LEVEL_MISS = 0.05
 MAX_BAND_RISE = 0.01
 NO_SINGLE_MEDIUM = (
     "no single medium reflects in this way: a thin wall, a coating, an edge, or a second echo at the same place"
 )
-# A segment may be an echo from inside a body if this share of its points lies at least this far behind another surface.
-# At a smaller distance a window does not resolve both.
+# A segment counts as an echo from inside a body if at least this share of its points lies more than MIN_DEPTH_M behind
+# another surface. At a smaller distance a window does not resolve both.
 MIN_SHARE_BEHIND = 0.8
 MIN_DEPTH_M = 0.03
 BEHIND_ANOTHER_REASON = "it lies behind another surface: an echo from inside a body, whose place and form are different"
-# Diffraction at an edge changes the slopes of windows near the border of the zone that its surface reflects to: by up
-# to 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
+# Standard error of slopes near the border of the zone that a surface reflects to, by diffraction at its edge: up to
+# 0.01, in the root mean square 0.0065 (half a plane, tests/surfaces/test_slope_errors.py).
 EDGE_SLOPE_STD = 0.0065
-# Both faces of a wall make one echo, whose path is that of neither: it is the farther off the more its level changes
-# over the band, and the more the faces cancel. `estimate_wall_std`: 2.5 mm for a level that does not change, and 35 mm
-# per unit of its logarithm, at most 11 mm (two faces that one window just resolves); times the third power of 0.45 over
-# the reflection if that is below 0.45 (1: metal), at most 20 mm. With these 95 % of 4000 drawn walls (0.5 to 25 mm,
-# evenly on a logarithmic scale, permittivity 2 to 9, loss 0.001 to 1, 53 degrees) appear within 1.96 standard
-# deviations.
+# Both faces of a wall make one echo, whose path is that of neither. Its error grows with the rise of its level over the
+# band, and where the faces cancel, so that the reflection R (1: metal) is small. `estimate_wall_std`, in mm:
+#     std = min(20, min(11, 2.5 + 35 |rise|) max(1, 0.45 / R)^3)
+# A window just resolves two faces with the error 11 mm. With these numbers 95 % of 4000 drawn walls are measured within
+# 1.96 standard deviations (0.5 to 25 mm, evenly on a logarithmic scale, permittivity 2 to 9, loss 0.001 to 1, 53
+# degrees).
 WALL_STD_M = 0.0025
 WALL_STD_OF_RISE_M = 0.035
 MOST_WALL_STD_M = 0.011
 WALL_REFLECTION = 0.45
 WALL_EXPONENT = 3.0
 MOST_CANCELLED_STD_M = 0.02
-# Relative error of the curvature of what no single medium explains: both faces' echo wanders from window to window.
-# Chosen: of twelve surfaces of walls (1 to 20 mm, another author's exact series) nine had at most 0.21, one 0.44; two
-# were off by a factor of three, and their normals disagreed as far.
+# Relative error of the curvature of a segment that no single medium explains: the error of the path of both faces' echo
+# differs from window to window. Chosen: of twelve surfaces of walls (1 to 20 mm, another author's exact series) nine
+# had at most 0.21, one 0.44; two were wrong by a factor of three, and their normals disagreed as far.
 WALL_BEND_ERROR = 0.25
 
 Array = NDArray[np.float64]
@@ -114,13 +120,15 @@ class Segment:
     incidence_deg
         Mean incidence angle.
     permittivity, covariance
-        eps' - j eps'', and [2][2] of (real, imaginary); None where they are not given, and `reason` says why.
+        eps' - j eps'', and the covariance [2][2] of (real, imaginary); both None if the segment has no permittivity.
+    reason
+        Why the segment has no permittivity; "" if it has one.
     dominated_by
         Source of the largest part of the covariance; "" without one.
     name, confidence
         Material, "" without one, and its probability.
     turned_deg
-        How far a turntable had turned the object.
+        Angle of the turntable during the scan.
     """
 
     number: int
@@ -158,7 +166,7 @@ class Surface:
     position_std_m, normal_std_deg
         float64 [n]: standard deviations along the normal, and of the normal.
     segment, segments
-        Number of each point's segment, [n], and what is known of each.
+        Number of each point's segment, [n], and the segments.
     """
 
     scan_id: str
@@ -186,8 +194,8 @@ def analyse_surface(
 ) -> Surface:
     """Return shape and permittivity of the points seen; without a reference, the shape alone.
 
-    `echoes` are those of H and V; `reference` gives the gains for a rig, also for one that differs by the errors that
-    `uncertainty` states.
+    `echoes` are those of H and V. `reference` returns the gains for a rig; it is also called for rigs that differ from
+    `optics` by the errors in `uncertainty`.
     """
     gains = None if reference is None else reference(optics)
     echoes, share = drop_edges(echoes, optics, gains)
@@ -205,21 +213,21 @@ def analyse_surface(
         disturbed = disturb_scan(echoes, optics, reference, uncertainty)
         for index, segment in enumerate(segments):
             members = (echoes.segment == segment.number) & interior
-            own_voltages = voltages[members]
-            disturbed_members = [replace(d, voltages=d.voltages[members]) for d in disturbed]
+            segment_voltages = voltages[members]
+            disturbed_segment = [replace(scan, voltages=scan.voltages[members]) for scan in disturbed]
             segments[index], fit = judge_segment(
-                segment, own_voltages, gains, disturbed_members, optics.wave_number, share=share[members]
+                segment, segment_voltages, gains, disturbed_segment, optics.wave_number, share=share[members]
             )
             if fit is None:
                 continue
-            sources = add_common_errors(fit, own_voltages, gains, disturbed_members, optics.wave_number)
+            sources = add_common_errors(fit, segment_voltages, gains, disturbed_segment, optics.wave_number)
             segments[index] = add_permittivity(segments[index], fit.eps, sources)
             if segments[index].permittivity is None:
                 continue
-            # The errors that all points share; instead of the segment's scatter each point has its own.
+            # A point has the errors that all points share, and its own scatter instead of the segment's.
             common = sum((c for name, c in sources.items() if name != "scatter"), np.zeros((2, 2)))
-            permittivity[members] = point_permittivity(own_voltages, gains, optics.wave_number)
-            covariance[members] = point_covariance(own_voltages, gains, fit, optics.wave_number) + common
+            permittivity[members] = point_permittivity(segment_voltages, gains, optics.wave_number)
+            covariance[members] = point_covariance(segment_voltages, gains, fit, optics.wave_number) + common
     edge_std = np.where(interior, 0.0, EDGE_SLOPE_STD)[:, None]
     h_echoes = replace(echoes.h, slope_std=np.hypot(echoes.h.slope_std, edge_std))
     position_std_m, normal_std_rad = find_shape_errors(h_echoes, shape, optics, uncertainty)
@@ -243,10 +251,11 @@ def analyse_surface(
 
 
 def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m: tuple[float, float]) -> Surface:
-    """Join scans of an object on a turntable into one surface, as the object stood at the angle zero.
+    """Join scans of an object on a turntable into one surface, turned to where the object was at the angle zero.
 
     The table turns about a vertical axis through `axis_m`, its x and z in the rig frame; a positive angle turns +z
-    towards +x. Segments stay apart: the numbers of each scan follow those of the one before.
+    towards +x. Segments of different scans are not joined: those of each scan get numbers after those of the scan
+    before.
     """
     x, z = axis_m
     axis = np.array([x, 0.0, z])
@@ -255,19 +264,19 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
     for surface, angle_deg in zip(surfaces, angles_deg, strict=True):
         cos = np.cos(np.radians(angle_deg))
         sin = np.sin(np.radians(angle_deg))
-        # Takes the object back to where it stood at the angle zero.
+        # Rotation that turns the object back to the angle zero.
         back = np.array([[cos, 0.0, -sin], [0.0, 1.0, 0.0], [sin, 0.0, cos]])
         normals = surface.normals @ back.T
-        # Curvatures are given in tangents that follow from the normal: they turn with these.
+        # Curvatures are given along tangents, which follow from the normal. [n, 2 new tangents, 2 turned tangents].
         change = np.swapaxes(compute_tangents(normals), 1, 2) @ (back @ compute_tangents(surface.normals))
-        # Behind the highest number, which may exceed the count of segments: edges that were dropped leave gaps.
+        # After the highest number, which may be above the count of segments: edges that were dropped leave gaps.
         first = max((segment.number for segment in segments), default=-1) + 1
-        shared_fields = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name not in NOT_POINTS}
-        shared_fields["points_m"] = (surface.points_m - axis) @ back.T + axis
-        shared_fields["normals"] = normals
-        shared_fields["curvature"] = change @ surface.curvature @ np.swapaxes(change, 1, 2)
-        shared_fields["segment"] = surface.segment + first
-        parts.append(shared_fields)
+        point_fields = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name not in NOT_POINTS}
+        point_fields["points_m"] = (surface.points_m - axis) @ back.T + axis
+        point_fields["normals"] = normals
+        point_fields["curvature"] = change @ surface.curvature @ np.swapaxes(change, 1, 2)
+        point_fields["segment"] = surface.segment + first
+        parts.append(point_fields)
         for segment in surface.segments:
             moved_segment = replace(
                 segment,
@@ -277,7 +286,7 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
                 turned_deg=float(angle_deg),
             )
             segments.append(moved_segment)
-    joined = {name: np.concatenate([shared_fields[name] for shared_fields in parts]) for name in parts[0]}
+    joined = {name: np.concatenate([point_fields[name] for point_fields in parts]) for name in parts[0]}
     return Surface(
         scan_id="+".join(surface.scan_id for surface in surfaces),
         simulated=any(surface.simulated for surface in surfaces),
@@ -287,10 +296,10 @@ def join_turned(surfaces: Sequence[Surface], angles_deg: Sequence[float], axis_m
 
 
 def drop_edges(seen: SeenEchoes, optics: Optics, gains: Gains | None) -> tuple[SeenEchoes, Array]:
-    """Return the points at which surfaces reflect, and what each counts for a permittivity, [n]: 0 near edges.
+    """Return the points at which surfaces reflect, and factors of their weights in a permittivity, [n]: 0 near edges.
 
-    Flat surfaces end before the zone that their edges disturb. Segments that lie in it altogether are edges, unless
-    all do: then the object is small.
+    Flat surfaces lose their points near edges. Segments with too few other points are dropped as edges, unless all
+    segments have too few: then the object is small.
     """
     if not len(seen):
         return seen, np.zeros(0)
@@ -312,7 +321,7 @@ def drop_edges(seen: SeenEchoes, optics: Optics, gains: Gains | None) -> tuple[S
     for number in np.unique(reflecting.segment[is_surface]):
         members = reflecting.segment == number
         if describe_segment(int(number), shape[members]).radius_mm is None:
-            # Flat: only its interior stays.
+            # A flat surface keeps only its interior.
             is_surface &= interior | ~members
     return reflecting[is_surface], share[is_surface]
 
@@ -320,8 +329,8 @@ def drop_edges(seen: SeenEchoes, optics: Optics, gains: Gains | None) -> tuple[S
 def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty: Uncertainty) -> tuple[Array, Array]:
     """Return standard deviations [n] of points along the normal (m) and of normals (rad, both directions together).
 
-    The error of a normal is its turn beyond that of the surface between the two places: a point that only slides along
-    a bent surface has none.
+    An error that moves a point along a curved surface also turns its normal, by the curvature times the distance. The
+    error of a normal is its turn without this part.
     """
     tangent = compute_tangents(shape.normals)
 
@@ -330,15 +339,15 @@ def find_shape_errors(echoes: Echoes, shape: Shape, optics: Optics, uncertainty:
         shift_m = moved.points - shape.points
         turn = np.einsum("nij,ni->nj", tangent, moved.normals - shape.normals)
         slide = np.einsum("nij,ni->nj", tangent, shift_m)
-        bent = np.einsum("njk,nk->nj", shape.curvature, slide)
-        return np.einsum("ni,ni->n", shift_m, shape.normals), turn - bent
+        turn_of_surface = np.einsum("njk,nk->nj", shape.curvature, slide)
+        return np.einsum("ni,ni->n", shift_m, shape.normals), turn - turn_of_surface
 
-    # Each with one coordinate of one antenna off by its standard error.
+    # In each of these rigs one coordinate of one antenna is wrong by its standard error.
     rigs = [rig for source, rig in disturb_optics(optics, uncertainty) if source == "places"]
     changes = [find_changes(find_shape(echoes, rig)) for rig in rigs]
-    # Errors of path and slope by noise, one after the other.
+    # Error of the path by noise.
     changes.append(find_changes(find_shape(replace(echoes, path_m=echoes.path_m + echoes.path_std_m), optics)))
-    # Along x and y of the stage.
+    # Errors of the slopes along x and y.
     for axis in np.eye(2):
         slope = echoes.slope + echoes.slope_std * axis
         changes.append(find_changes(find_shape(replace(echoes, slope=slope), optics)))
@@ -354,25 +363,26 @@ def estimate_wall_std(reflection: float, rise: float) -> float:
     that in the lower.
     """
     steady = min(MOST_WALL_STD_M, WALL_STD_M + WALL_STD_OF_RISE_M * abs(rise))
-    # 0.05 keeps it finite: there the result has long been at its limit.
-    cancelled = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
-    return min(MOST_CANCELLED_STD_M, steady * cancelled**WALL_EXPONENT)
+    # 0.05 avoids a division by zero. With it the result is at its limit.
+    cancellation = max(1.0, WALL_REFLECTION / max(reflection, 0.05))
+    return min(MOST_CANCELLED_STD_M, steady * cancellation**WALL_EXPONENT)
 
 
 def doubt_places(
     segments: Sequence[Segment], echoes: SeenEchoes, shape: Shape, voltages: Voltages, gains: Gains
 ) -> tuple[list[Segment], Array]:
-    """Return the segments with their reasons, and the standard errors of points by what no single medium explains, [n].
+    """Return the segments, and further standard errors of the points of those that no single medium explains, [n].
 
-    They are in metres, 0 for segments of one medium. A wall is not distinguished from other things that no single
-    medium explains, so that the radius gets a wall's error, too.
+    The errors are in metres, 0 for segments of one medium. A segment behind another surface gets this as its reason,
+    and the error of its depth. Any other one is taken as a wall, as it is not distinguished from other causes, and gets
+    the error of a wall's points. The radius gets an error, too.
     """
     reflection = find_reflection(voltages, gains)
     rise = voltages.band_rise[:, 0] - gains.band_rise[0]
     judged = list(segments)
     unknown_m = np.zeros(len(echoes))
     for index, segment in enumerate(segments):
-        # A small radius is judged, too: an echo from inside a body seems to be of a small ball.
+        # Segments with a small radius are tested, too: an echo from inside a body looks like that of a small ball.
         is_small = segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M
         if segment.name or not (segment.reason == NO_SINGLE_MEDIUM or is_small):
             continue
@@ -395,12 +405,12 @@ def doubt_places(
 def find_depth_behind(echoes: SeenEchoes, shape: Shape, number: int) -> float | None:
     """Return how far a segment's points lie behind another surface that the same windows see, metres, or None.
 
-    What comes back from inside a body has no place of its own: rays bend where they enter, and are slow inside. It is
-    seen by the windows that see the body's front, beneath it.
+    An echo from inside a body is seen by the windows that see the body's front. Its point lies behind that front, but
+    not at its true place: rays are refracted where they enter, and are slower inside.
     """
     window = np.unique(np.round(echoes.h.at_m / SAME_WINDOW_M), axis=0, return_inverse=True)[1].reshape(-1)
     members = np.flatnonzero(echoes.segment == number)
-    # The nearest point of another segment in each window, and for each member that of its window.
+    # The nearest point of another segment in each window; `front` is that of the window of each member.
     other_points = np.flatnonzero(echoes.segment != number)
     other_points = other_points[np.argsort(echoes.h.path_m[other_points], kind="stable")]
     windows, first = np.unique(window[other_points], return_index=True)
@@ -411,8 +421,8 @@ def find_depth_behind(echoes: SeenEchoes, shape: Shape, number: int) -> float | 
     is_shared = windows[window_index] == window[members]
     distance_from_front = shape.points[members] - shape.points[front]
     depth_m = -np.einsum("ni,ni->n", distance_from_front, shape.normals[front])
-    beside_m = np.sqrt(np.maximum(0, np.sum(distance_from_front**2, axis=1) - depth_m**2))
-    is_behind = is_shared & (depth_m > MIN_DEPTH_M) & (beside_m < depth_m)
+    lateral_m = np.sqrt(np.maximum(0, np.sum(distance_from_front**2, axis=1) - depth_m**2))
+    is_behind = is_shared & (depth_m > MIN_DEPTH_M) & (lateral_m < depth_m)
     if is_behind.mean() < MIN_SHARE_BEHIND:
         return None
     return float(np.median(depth_m[is_behind]))
@@ -420,7 +430,7 @@ def find_depth_behind(echoes: SeenEchoes, shape: Shape, number: int) -> float | 
 
 def describe_segment(number: int, shape: Shape) -> Segment:
     """Return a segment with its place, normal, radius and incidence angle by the shape of its points."""
-    # The median of the matrices, for noise spreads the two curvatures of each point.
+    # The median over the points of each matrix element: noise drives the two principal curvatures of a point apart.
     usual_curvature = np.median(shape.curvature, axis=0)
     bends, axes = np.linalg.eigh((usual_curvature + usual_curvature.T) / 2)
     largest = int(np.abs(bends).argmax())
@@ -446,9 +456,10 @@ def describe_segment(number: int, shape: Shape) -> Segment:
 def estimate_bend_std(shape: Shape, axis: Array, bend: float) -> float:
     """Return the standard error of a segment's curvature `bend`, 1 / m, along an `axis` [2] of its tangents.
 
-    Curvatures follow from how the paths bend over the stage, and once more from how normals turn over the points. Both
-    agree for a sound surface; a wall or a second echo disturbs them differently. The scatter of the points' curvatures
-    is added whole, for its errors extend over many points.
+    `bend` follows from the second derivatives of the paths. The turn of the normals from point to point gives a second
+    value. Both agree for a surface of one medium; a wall or a second echo disturbs them differently. Their difference
+    and the scatter of the points' curvatures are added as squares. The scatter is not divided by the number of points,
+    because errors extend over many points.
     """
     bends = np.einsum("i,nij,j->n", axis, shape.curvature, axis)
     low, high = np.percentile(bends, [16, 84])
@@ -483,9 +494,9 @@ def judge_segment(
     *,
     share: Array | float = 1.0,
 ) -> tuple[Segment, PermittivityFit | None]:
-    """Fit a segment's permittivity; return the segment and the fit, or the reason in the segment and None.
+    """Fit a segment's permittivity; return the segment and the fit, or the segment with a reason, and None.
 
-    `disturbed` holds the same points as `voltages`; `share` [n] is what each counts.
+    `disturbed` holds the same points as `voltages`; `share` [n] is a factor of their weights.
     """
     if len(voltages) < MIN_POINTS:
         cause = f"{len(voltages)} points away from its edges: too few to average over"
@@ -494,13 +505,13 @@ def judge_segment(
     ratio = complex(np.median(ratios.real), np.median(ratios.imag))
     if abs(ratio - 1) < METAL_RATIO:
         return replace(segment, reason="its ratio is that of metal", name="metal"), None
-    # Length over which edges and other echoes cause similar errors in neighbours.
+    # Length over which the errors by edges and by other echoes are similar.
     ripple_m = RIPPLE_OF_PLATES_M if segment.radius_mm is None else FRESNEL_ZONE_M
     fit = fit_permittivity(voltages, gains, wave_number, share, ripple_m)
     level, rise = judge_medium(fit, voltages, gains, disturbed, wave_number)
     if level > MAX_LEVEL_MISS or rise > MAX_BAND_RISE:
         return replace(segment, reason=NO_SINGLE_MEDIUM), None
-    # A small body may be a thin wall, too, whose points lie off: that is judged before the radius.
+    # The radius is tested last: a small body may be a thin wall, too, whose points have larger errors.
     if segment.radius_mm is not None and segment.radius_mm < 1e3 * MIN_RADIUS_M:
         cause = f"radius {segment.radius_mm:.0f} mm: below {1e3 * MIN_RADIUS_M:.0f} mm only the shape is reliable"
         return replace(segment, reason=cause), None
@@ -552,7 +563,7 @@ def read_surface(path: Path) -> Surface:
 
 
 def _read_segment(row: dict[str, Any]) -> Segment:
-    """Return the segment that :func:`plain_segment` gave. Raises KeyError or TypeError for another row."""
+    """Return the segment of a row that :func:`plain_segment` made. Raises KeyError or TypeError for another row."""
     eps = row["permittivity"]
     covariance = row["covariance"]
     row["permittivity"] = None if eps is None else complex(*eps)
@@ -579,7 +590,7 @@ def point_cloud(surface: Surface) -> bytes:
 
 
 def summary_lines(surface: Surface) -> list[str]:
-    """Describe the surface for people: a line for each segment."""
+    """Return lines that describe the surface in a terminal: a headline, and one for each segment."""
     kind = "simulated " if surface.simulated else ""
     count = len(surface.segments)
     counts = f"{len(surface.segment)} points on {count} surface{'s' * (count != 1)}"

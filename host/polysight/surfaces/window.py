@@ -1,9 +1,17 @@
 """Samples of a board, and the fit of one echo's path in windows of stage positions.
 
-In a window of some 34 mm the path of an echo is L + g.d + d'Q d / 2, with d the offset from the window's centre: the
-six values (L, g_x, g_y, Q_xx, Q_xy, Q_yy). A path runs from TX over the object to RX. A window's RX are added up in
-phase for the direction from which the echo comes, and `maximise` fits values and complex amplitude by the matched
-filter over positions and frequencies.
+A *window* is a square patch of stage positions, 34 mm wide. In it the path of an echo, from TX over the object to the
+middle of the board's RX, is
+
+    L(d) = L + g.d + d'Q d / 2 = sum over p of  B_p(d) v_p
+
+* d: stage offset from the window's centre, m.
+* v = (L, g_x, g_y, Q_xx, Q_xy, Q_yy): the path's length, its slopes and its *bends* (1 / m). Bends are the second
+  derivatives of the path; *curvature* is that of the object's surface.
+
+`add_up` adds up the samples of a window's RX in phase for the direction from which the echo comes (*steering*). Then
+`maximise` fits v and the complex amplitude by the matched filter: v maximises the magnitude of the sum of
+conj(exp(j omega L(d))) times the added samples, over positions and frequencies, with omega = 2 pi f / c.
 """
 
 from __future__ import annotations
@@ -16,13 +24,15 @@ from numpy.typing import NDArray
 from polysight.surfaces.points import compute_unit_legs, locate
 from polysight_shared.units import SPEED_OF_LIGHT_M_S
 
-# Side of a window. Chosen: a larger one resolves echoes better and averages more, but bent surfaces leave the parabola.
+# Side of a window. Chosen: a larger one resolves echoes better and averages more, but in it the path over a curved
+# surface is no longer a parabola.
 WINDOW_M = 0.034
-# Steps of Newton's method: from a start of the coarse search they reach the maximum.
+# Steps of Newton's method that reach the maximum from a start of the coarse search.
 ITERATIONS = 7
-# Positions of a window that are enough to see whether its echoes lie apart; a window of steps of 2 mm has 289.
+# Number of positions that is enough to find out whether a window's echoes are separate. All positions of a window are
+# 289 if the stage's steps are 2 mm.
 THINNED_POSITIONS = 48
-# Largest step of path (m), slopes, and curvatures (1 / m); chosen.
+# Largest change of the six values in one step of a fit: length (m), slopes, bends (1 / m); chosen.
 STEP_LIMITS = np.array([0.02, 0.05, 0.05, 1.5, 1.5, 1.5])
 
 Array = NDArray[np.float64]
@@ -35,10 +45,10 @@ class Samples:
     Attributes
     ----------
     cube
-        complex [rx, frequency, row, column]: an echo of path L is a exp(+2 pi j f (L - direct) / c), seen through
-        `model`.
+        complex [rx, frequency, row, column]: an echo of path L and amplitude a is a exp(+2 pi j f (L - direct) / c),
+        changed by the range gate (`model`).
     valid
-        bool [row, column].
+        bool [row, column]: False where a position has no data.
     offsets_m
         float64 [row, column, 3]: stage offsets.
     frequencies_hz
@@ -46,9 +56,10 @@ class Samples:
     tx_m, rx_m
         Antennas at stage offset zero, [3] and [rx, 3].
     model
-        complex [frequency, frequency]: effect of the range gate on an echo; None: none.
+        complex [frequency, frequency]: the range gate multiplies the frequencies of an echo by this matrix; None
+        without a gate.
     board_middle_m
-        Mean place of all RX of the board, if `rx_m` are only some of them; None: they are all.
+        Mean place of all RX of the board, [3]; None if `rx_m` holds all of them.
     """
 
     cube: NDArray[np.complexfloating]
@@ -67,7 +78,7 @@ class Samples:
 
     @property
     def direct_m(self) -> Array:
-        """Direct path to each RX, [rx]."""
+        """Direct path from TX to each RX, [rx], metres."""
         return np.linalg.norm(self.rx_m - self.tx_m, axis=1)
 
     def window_shape(self) -> tuple[int, int]:
@@ -87,18 +98,18 @@ class Echoes:
     Attributes
     ----------
     at_m
-        Stage offset for which the next four are given, [n, 3], metres.
+        Stage offset at which path, slope, bend and amplitude are given, [n, 3], metres.
     path_m, slope, bend
         Path from TX over the point to the middle of the RX, [n], metres; its first derivatives with respect to the
-        stage offset, [n, 2]; its second derivatives, [n, 2, 2], 1 / m (not the curvature of the surface).
+        stage offset, [n, 2]; its second derivatives, [n, 2, 2], 1 / m.
     amplitude
-        complex [n], with the phase of the path, exp(-j k path), k the wave number at the middle of the band.
+        complex [n]. It includes the phase factor exp(-j k path), k the wave number at the middle of the band.
     amplitude_std
         Standard deviation of the real part, and of the imaginary part, of `amplitude`, [n].
     path_std_m, slope_std
         Standard deviations of `path_m` [n] and `slope` [n, 2] by the residual of the fit.
     share
-        Share of a window's power, without that of its other echoes, that the echo explains, [n].
+        Power of the echo as a share of the window's power without its other echoes, [n].
     band_rise
         ln of the amplitude in the upper half of the band over that in the lower half, [n].
     """
@@ -143,50 +154,54 @@ class Echoes:
 
 @dataclass
 class Windows:
-    """Samples of some windows: [window, rx, frequency, position], offsets from `at_m` [window, position, 2]."""
+    """Samples of some windows."""
 
+    # [window, rx, frequency, position].
     samples: NDArray[np.complex64]
     # 1 where a position has data, else 0: [window, position].
     valid: Array
+    # d: stage offsets from `at_m`, metres, [window, position, 2].
     offsets: Array
-    # Stage offsets for which echoes are given, [window, 3]: the windows' centres, or places near by.
+    # Stage offsets for which echoes are given, metres, [window, 3]: the windows' centres, or places near by.
     at_m: Array
 
 
 class BoardFit:
-    """The matched filter of one board: frequencies, weights and directions.
+    """The matched filter of one board.
 
     Attributes
     ----------
     board
         Its samples.
     omega
-        float64 [frequency]: rates of phase over path, 2 pi f / c, radians per metre.
-    lever
+        float64 [frequency]: 2 pi f / c, the phase per metre of path, radians per metre.
+    rx_places_m
         float64 [rx, 3]: places of the RX relative to the mean of the board's, metres.
-    model, gain, weights
-        Effect of the range gate on an echo, [frequency, frequency] (identity without a gate); the sum over the
-        frequencies of the factors that it leaves of an echo; the share of each frequency in this sum, [frequency].
+    model
+        [frequency, frequency]: effect of the range gate on an echo; the identity without a gate.
+    gain, weights
+        The range gate multiplies an echo at each frequency by a factor, on average over paths. `gain` is the sum of
+        these factors, and `weights` [frequency] are the factors over `gain`.
     middle, mean_square
         Means of `omega` and of its square, weighted by `weights`.
     upper_half, band_rise
-        bool [frequency]: the upper half of the band; ln of the gain there over that of the lower half.
+        bool [frequency], True in the upper half of the band; ln of the factors' sum there over that in the lower half.
     """
 
     def __init__(self, board: Samples) -> None:
         self.board = board
         self.omega = 2 * np.pi * board.frequencies_hz / SPEED_OF_LIGHT_M_S
-        self.lever = board.rx_m - board.middle_m
-        # The effect on echoes in the middle of the range gate, averaged over paths.
+        self.rx_places_m = board.rx_m - board.middle_m
+        # Paths over which the effect of the range gate is averaged; 24 of them are enough (chosen).
         if board.model is None:
             model = np.eye(self.omega.size)
-            # Any paths: without a model the effect is 1 at all. 24 of them are enough for a mean (chosen).
+            # Any paths will do: without a gate all factors are 1.
             excess_m = np.linspace(0.05, 0.6, 24)
         else:
             model = board.model
             excess_m = np.linspace(*_find_gate(board), 24)
+        # [frequency, path]
         unit_echoes = np.exp(1j * np.outer(self.omega, excess_m))
-        # The factor that the gate leaves of an echo at each frequency.
         weights = np.mean((model @ unit_echoes) * unit_echoes.conj(), axis=1).real
         self.gain = float(weights.sum())
         self.upper_half = np.arange(weights.size) >= weights.size // 2
@@ -197,22 +212,26 @@ class BoardFit:
         self.model = model
 
     def compute_steering(self, offsets: Array, path_m: Array, slope: Array) -> NDArray[np.complex128]:
-        """Return the phase factors [window, rx, frequency] with which the RX add in phase for given echoes.
+        """Return the phase factors [window, rx, frequency] with which the RX add up in phase for given echoes.
 
-        One echo per window: its stage offset, `offsets` [window, 3], path [window], both in metres; slope [window, 2].
+        There is one echo per window: `offsets` [window, 3] are the stage offsets and `path_m` [window] the paths there,
+        metres; `slope` is [window, 2].
         """
         board = self.board
         points = locate(path_m, slope, offsets, board.tx_m, board.middle_m)
         _, back, *_ = compute_unit_legs(points, offsets, board.tx_m, board.middle_m)
-        # `back` points from the RX to the echo's point: an RX displaced that way has a shorter path.
-        excess = -back @ self.lever.T - board.direct_m
+        # `back` points from the RX to the echo's point: an RX displaced that way has a shorter path. [window, rx].
+        excess = -back @ self.rx_places_m.T - board.direct_m
         return np.exp(-1j * excess[:, :, None] * self.omega)
 
 
 def _find_gate(board: Samples) -> tuple[float, float]:
-    """Return the excess paths between which the model's gain is judged: a fifth of its unambiguous range."""
+    """Return the smallest and largest excess path over which the gate's effect is averaged, metres.
+
+    They are a fifth of the unambiguous range apart. An excess path is a path less the direct one.
+    """
     reach = SPEED_OF_LIGHT_M_S / (board.frequencies_hz[1] - board.frequencies_hz[0])
-    # A mirror at 0.5 m, about the published rig's object plane, is used for the objects' paths (chosen).
+    # Objects are taken to have the path of a mirror at 0.5 m, about the published rig's object plane (chosen).
     centre = find_mirror_path(board, 0.5) - board.direct_m.mean()
     return centre - reach / 10, centre + reach / 10
 
@@ -224,9 +243,9 @@ def find_mirror_path(board: Samples, z_m: float) -> float:
 
 
 def find_basis(offsets: Array) -> Array:
-    """Return the path's derivatives by its six values, [window, position, 6], at `offsets` [window, position, 2].
+    """Return B = (1, x, y, x^2 / 2, x y, y^2 / 2), [window, position, 6], at d = `offsets` [window, position, 2].
 
-    The values are the path L (metres), its slopes g_x, g_y and curvatures Q_xx, Q_xy, Q_yy (1 / m) at the offset zero.
+    B_p is the derivative of the path by its value v_p.
     """
     x = offsets[..., 0]
     y = offsets[..., 1]
@@ -234,12 +253,12 @@ def find_basis(offsets: Array) -> Array:
 
 
 def pack_values(path_m: Array, slope: Array, bend: Array) -> Array:
-    """Stack paths [n], slopes [n, 2] and curvatures [n, 2, 2] as values [n, 6]."""
+    """Stack paths [n], slopes [n, 2] and bends [n, 2, 2] as values [n, 6]."""
     return np.stack([path_m, *slope.T, bend[:, 0, 0], bend[:, 0, 1], bend[:, 1, 1]], axis=1)
 
 
 def unpack_values(values: Array) -> tuple[Array, Array, Array]:
-    """Return paths [n], slopes [n, 2] and curvatures [n, 2, 2] of values [n, 6]."""
+    """Return paths [n], slopes [n, 2] and bends [n, 2, 2] of values [n, 6]."""
     bend = np.stack([values[:, [3, 4]], values[:, [4, 5]]], axis=1)
     return values[:, 0], values[:, 1:3], bend
 
@@ -248,9 +267,9 @@ def unpack_values(values: Array) -> tuple[Array, Array, Array]:
 class Maximum:
     """Result of :func:`maximise`, one echo per window.
 
-    `values` [window, 6]: the path (`find_basis`); `std` [window, 6]: their standard deviations. `amplitude` [window]:
-    in the phase of the matched filter, without that of the path; `amplitude_std` [window]: standard deviation of either
-    part of it. `share` and `band_rise` [window] are as of :class:`Echoes`.
+    `values` [window, 6] are v, `std` [window, 6] their standard deviations. `amplitude` [window] is without the phase
+    of the path, which the matched filter removes; `amplitude_std` [window] is the standard deviation of its real part,
+    and of its imaginary part. `share` and `band_rise` [window] are those of :class:`Echoes`.
     """
 
     values: Array
@@ -264,15 +283,17 @@ class Maximum:
 def maximise(
     fit: BoardFit, added: NDArray, valid: Array, offsets: Array, values: Array, *, iterations: int = ITERATIONS
 ) -> Maximum:
-    """Maximise |sum of derotated samples| by Newton's method with the expected curvature.
+    """Fit one echo per window by the matched filter, with Newton's method from the start `values` [window, 6].
 
-    `added`: [window, frequency, position], of `add_up`; `valid` [window, position] and `offsets` [window, position, 2]
-    as of :class:`Windows`; `values` [window, 6] to start from. Without iterations these values stay, and only the
+    `added` [window, frequency, position] are the samples of `add_up`; `valid` [window, position] and `offsets`
+    [window, position, 2] are those of :class:`Windows`. With `iterations` = 0 the values are not changed, and only the
     amplitude is measured.
     """
-    # Expected curvature of the maximum: the covariance, over positions and frequencies, of the phase's rates by the six
-    # values. It is scaled to a diagonal of ones, for the values differ by orders of magnitude; the small terms here
-    # and below only keep matrices invertible and divisors from zero.
+    # ln |total| is maximised, total = sum of conj(wave) added over frequencies and positions. Its expected second
+    # derivative by v is -C, with C the covariance of omega B_p over frequencies and positions:
+    #     C_pq = mean(omega^2) mean(B_p B_q) - mean(omega)^2 mean(B_p) mean(B_q)
+    # It is scaled to a diagonal of ones, for the values differ by orders of magnitude; the small terms here and below
+    # only keep matrices invertible and divisors from zero.
     basis = find_basis(offsets)
     count = np.maximum(valid.sum(axis=1), 1)
     weighted = valid[:, :, None] * basis
@@ -283,34 +304,37 @@ def maximise(
     scaled = curvature / scale[:, :, None] / scale[:, None, :] + 1e-9 * np.eye(6)
     values = values.copy()
     # Three sums over the frequencies: of all, weighted by the distance from the middle, and of the band's upper half.
-    rows = np.stack([np.ones_like(fit.omega), fit.omega - fit.middle, fit.upper_half]).astype(np.complex64)
+    # [3, frequency] @ [window, frequency, position].
+    frequency_weights = np.stack([np.ones_like(fit.omega), fit.omega - fit.middle, fit.upper_half]).astype(np.complex64)
     sums = np.zeros(basis.shape[:2], complex)
     upper = np.zeros(basis.shape[:2], complex)
     total = np.zeros(len(values), complex)
     for step in range(iterations + 1):
         paths = (basis @ values[..., None])[..., 0]
-        sums, changing, upper = np.moveaxis(rows @ (make_waves(fit, paths).conj() * added), 1, 0)
-        # Derivative of each position's sum by its path; the gradient is that of ln |total| by the six values.
+        sums, changing, upper = np.moveaxis(frequency_weights @ (make_waves(fit, paths).conj() * added), 1, 0)
+        # Derivative of each position's sum by its path; the gradient is that of ln |total| by v.
         rates = -1j * (fit.middle * sums + changing)
         total = (sums * valid).sum(axis=1)
         if step == iterations:
             break
         gradient = np.einsum("wnp,wn->wp", weighted, rates) / np.where(total == 0, 1, total)[:, None]
-        move = np.linalg.solve(scaled, (gradient.real / scale)[..., None])[..., 0] / scale
-        values += np.clip(move, -STEP_LIMITS, STEP_LIMITS)
-    # The amplitude may change linearly over the window: a plane is taken out before the rest counts as noise. Its value
-    # at the offset zero is the amplitude at `at_m`; the mean is not, where `at_m` is not the window's centre.
+        # C^-1 gradient.
+        values_step = np.linalg.solve(scaled, (gradient.real / scale)[..., None])[..., 0] / scale
+        values += np.clip(values_step, -STEP_LIMITS, STEP_LIMITS)
+    # The amplitude may change linearly over the window: a plane c_0 + c_1 x + c_2 y is fitted to the positions' sums,
+    # and what it leaves counts as noise. c_0 is the amplitude at `at_m`. The mean over the positions would be that at
+    # the window's centre, which may lie elsewhere.
     plane = weighted[:, :, :3]
     matrix = np.einsum("wnp,wnq->wpq", plane, basis[:, :, :3]) + 1e-12 * np.eye(3)
     plane_inverse = np.linalg.inv(matrix)
     plane_terms = np.einsum("wpq,wnq,wn->wp", plane_inverse, plane, sums, optimize=True)
     residual = (sums - np.einsum("wnp,wp->wn", basis[:, :, :3], plane_terms)) * valid
-    # Residual power of a position; the fit has used up nine of them: for six values and the plane's three.
+    # Residual power of a position. Nine unknowns were fitted: six values and the plane's three coefficients.
     power = (np.abs(residual) ** 2).sum(axis=1) / np.maximum(count - 9, 1) / fit.gain**2
-    # Variance of the mean's real part, and of its imaginary part.
+    # Variance of the real part, and of the imaginary part, of the mean over the positions.
     noise = power / count / 2
     amplitude = plane_terms[:, 0] / fit.gain
-    # The mean's phase has the variance noise / |amplitude|^2; the inverse of the curvature carries it to the values.
+    # The mean's phase has the variance noise / |amplitude|^2, and v has the covariance C^-1 noise / |amplitude|^2.
     inverse = np.linalg.inv(scaled)
     spread = np.einsum("wpp->wp", inverse) / scale**2
     std = np.sqrt(spread * (noise / np.maximum(np.abs(amplitude) ** 2, 1e-30))[:, None])
@@ -323,7 +347,7 @@ def maximise(
     return Maximum(
         values=values,
         amplitude=amplitude,
-        # At an offset zero that is not the window's centre, the plane's value is less certain than the mean.
+        # c_0 is less certain than the mean where `at_m` is not the window's centre.
         amplitude_std=np.sqrt(noise * np.maximum(1, count * plane_inverse[:, 0, 0])),
         std=std,
         share=share,
@@ -335,7 +359,7 @@ def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
     """Return the echoes of the maxima in windows."""
     path, slope, bend = unpack_values(maximum.values)
     # The matched filter has taken exp(+j k path) out of the samples. It is put back at the weighted middle of the band,
-    # where an error of the path does not matter; echoes have the other sign.
+    # where an error of the path does not matter. `Echoes` has the conjugate phase.
     turned_amplitude = maximum.amplitude * np.exp(1j * fit.middle * path)
     return Echoes(
         at_m=windows.at_m,
@@ -354,6 +378,7 @@ def make_echoes(fit: BoardFit, windows: Windows, maximum: Maximum) -> Echoes:
 def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array) -> Windows:
     """Return windows whose first positions are at (rows, columns), each [window]; `at_m` as of `Windows`."""
     height, width = board.window_shape()
+    # Rows [window, height, 1] and columns [window, 1, width] of all positions.
     r = rows[:, None, None] + np.arange(height)[:, None]
     c = columns[:, None, None] + np.arange(width)
     count = len(rows)
@@ -366,7 +391,7 @@ def gather_windows(board: Samples, rows: NDArray, columns: NDArray, at_m: Array)
 def add_up(fit: BoardFit, windows: Windows, values: Array) -> NDArray:
     """Return the mean of all RX's samples, in phase for echoes of the given values: [window, frequency, position]."""
     path, slope, _ = unpack_values(values)
-    return add_rx(fit.compute_steering(windows.at_m, path, slope) / len(fit.lever), windows.samples)
+    return add_rx(fit.compute_steering(windows.at_m, path, slope) / len(fit.rx_places_m), windows.samples)
 
 
 def add_rx(factors: NDArray, samples: NDArray[np.complex64]) -> NDArray[np.complex64]:
@@ -434,9 +459,10 @@ def choose_thinned(shape: tuple[int, int]) -> NDArray[np.int_]:
 
     They are indices into the flattened window, row by row.
     """
+    # Each row keeps one of `step` positions, shifted by `turn` from those of the row before.
     step = max(1, round(shape[0] * shape[1] / THINNED_POSITIONS))
     rows, columns = np.indices(shape)
-    # With the golden ratio (1 - 0.618) the lattice is about as wide in all directions.
+    # With 1 less the golden ratio 0.618 the distances to the nearest positions are similar in all directions.
     turn = max(1, round(0.382 * step))
     return np.flatnonzero((turn * rows + columns) % step == 0)
 

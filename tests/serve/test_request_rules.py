@@ -13,7 +13,7 @@ from tests.support.processes import wait_for
 from tests.support.refusals import expect_refusal
 
 from polysight.serve import site as site_module
-from polysight.serve.guard import Access, Guard, cookie_name, read_host_name, tell_error
+from polysight.serve.guard import Access, Guard, answer_error, cookie_name, read_host_name
 from polysight.serve.server import ServerAddress, _check_scan_folder, draw_code, load_token, serve
 from polysight.serve.site import ChangingList, ListedScan, Sizes
 from polysight_shared.errors import ConfigError, DataError, DeviceError, ErrorCode
@@ -186,7 +186,7 @@ def test_the_name_of_the_session_cookie_has_the_port():
 )
 def test_an_error_has_a_status_and_its_three_parts(method, error, status):
     request = Request({"type": "http", "method": method, "headers": [], "path": "/"})
-    answer = asyncio.run(tell_error(request, error))
+    answer = asyncio.run(answer_error(request, error))
     content = json.loads(bytes(answer.body))
     assert answer.status_code == status
     assert {"code", "what", "why", "do"} == set(content)

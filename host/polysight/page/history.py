@@ -237,9 +237,11 @@ class ScanHistory:
         self.last_row_utc = ""
         self.rows_since_trouble = 0
         self.trigger: TriggerHealth | None = None
-        # Durations of rows, the time of the last pause, and the numbers of the fault events that have a notice.
+        # Durations of the rows.
         self._row_seconds: list[float] = []
+        # Beginning of the last pause, seconds since 1970.
         self._paused_at = 0.0
+        # Sequence numbers of the fault events that have a notice already.
         self._fault_seqs: set[int] = set()
 
     # --- the manifest ---

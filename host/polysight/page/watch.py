@@ -444,10 +444,11 @@ class Watch:
         self._viewer: RowViewer | None = None
         self._listener: PiListener | None = None
         self._problem = ""
-        # The time that the last sign of life names, when it was seen, and when the manifest last grew: the first since
-        # 1970, the others on the monotonic clock.
+        # Time of the last sign of life by its file, seconds since 1970.
         self._life_s: float | None = None
+        # Time at which it was first seen here, on the monotonic clock.
         self._life_at = float("-inf")
+        # Time at which the manifest last grew, on the monotonic clock.
         self._grown_at = float("-inf")
 
     def _run(self) -> None:
@@ -538,7 +539,8 @@ class Watch:
         life = read_life(self.folder)
         life_s = None if life is None else life.written_s
         if life_s is not None and life_s != self._life_s:
-            # The first sign may be old; from then on changes count, not clocks.
+            # The first sign may be old: its age is the difference of two clocks. A later one is new when it changes,
+            # whatever the file system's clock says.
             age_s = 0.0
             if self._life_s is None:
                 age_s = max(0.0, wall_s - life_s)

@@ -1,9 +1,9 @@
 """POST requests of the reading process: plan, doctor, scans, labels, notes, processing.
 
-Browsers reach the process of the pages (`front`), which forwards to the reading process all requests but those for
-static pages and running scans; it has checked the token of each.
-Each is a command of `polysight` as well; what takes long runs as that command, in a process of its own. `Site.rig` is a
-lock: it is held from the check that the rig is free until a program uses it.
+Browsers reach the process of the pages (`front`), which checks the token of each request and forwards it to the reading
+process, except for requests for static pages and running scans. Each action of this file is a command of `polysight` as
+well; one that takes long runs as that command, in a process of its own. `Site.rig` is a lock: it is held from the check
+that the rig is free until a program uses it.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ class Door:
             self._handle_silent(next(iter(self._silent)))
 
     def _look(self, client: socket.socket) -> bool:
-        """Give a connection to who answers it; False if nothing can be read from it yet."""
+        """Give a connection to the process that answers it; False if nothing can be read from it yet."""
         try:
             head = client.recv(HEAD_BYTES, socket.MSG_PEEK)
         except BlockingIOError:

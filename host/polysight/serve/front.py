@@ -35,7 +35,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from polysight.acquisition import BADGES, LAPSE_S, STATES, ScanCommand, SignOfLife, send_command
 from polysight.catalogue import Scans
 from polysight.serve.commands import decode_body
-from polysight.serve.guard import HANDLERS, Access, Guard, cookie_name, refuse, tell_no_page
+from polysight.serve.guard import HANDLERS, Access, Guard, answer_no_page, cookie_name, refuse
 from polysight.serve.stage import JogRequest, StageControl, StagePlace
 from polysight_shared.errors import DataError, ErrorCode
 
@@ -53,10 +53,11 @@ PAGES = {
     "/check": ("check", "Check plate · polysight", "scan"),
 }
 MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-# How long a request waits for the reading process to start (or start again), and the time between two tries; chosen, as
-# the bytes that are passed on at a time.
+# Longest time that a request waits for the reading process to start, or to start again; chosen.
 READER_PATIENCE_S = 20.0
+# Time between two attempts to connect to it; chosen.
 CONNECT_INTERVAL_S = 0.1
+# Bytes of an answer that are passed on at a time; chosen.
 CHUNK_BYTES = 1 << 16
 # Running scans are looked for at most this often, for any number of pages; chosen.
 RUNNING_AGE_S = 0.5
@@ -155,7 +156,7 @@ def page_routes(front: Front) -> list[Route]:
         answer = files.get(request.path_params["name"])
         if answer is not None:
             return answer
-        return await tell_no_page(request, DataError("no such file", "the address is wrong", "go to the first page"))
+        return await answer_no_page(request, DataError("no such file", "the address is wrong", "go to the first page"))
 
     async def describe_page(request: Request) -> Response:
         access = front.access

@@ -263,7 +263,7 @@ def refuse(status: int, code: ErrorCode, problem: str, why: str, do: str) -> Res
     return JSONResponse({"code": code, "what": problem, "why": why, "do": do}, status)
 
 
-async def tell_error(request: Request, e: Exception) -> Response:
+async def answer_error(request: Request, e: Exception) -> Response:
     """Answer with an error that was raised. A file that cannot be written or read is not a defect of this program."""
     if isinstance(e, OSError):
         error = convert_os_error(e)
@@ -304,7 +304,7 @@ NO_PAGE = """<!doctype html>
 """
 
 
-async def tell_no_page(request: Request, e: Exception) -> Response:
+async def answer_no_page(request: Request, e: Exception) -> Response:
     """Answer for an address that does not exist: with a page to a browser, as JSON to a program."""
     del e
     if not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", ""):
@@ -312,13 +312,13 @@ async def tell_no_page(request: Request, e: Exception) -> Response:
     return refuse(404, ErrorCode.OTHER, "There is no such page", "the address is wrong", "begin at the list of scans")
 
 
-async def _tell_nobody(request: Request, e: Exception) -> Response:
+async def _answer_disconnected(request: Request, e: Exception) -> Response:
     """Answer a client that disconnected in the middle of its request."""
     del request, e
     return Response(status_code=400)
 
 
-async def _tell_defect(request: Request, e: Exception) -> Response:
+async def _answer_defect(request: Request, e: Exception) -> Response:
     """Answer for an exception that nothing has foreseen; its traceback goes to stderr."""
     sys.stderr.write(f"{request.method} {request.url.path}\n{''.join(traceback.format_exception(e))}")
     sys.stderr.flush()
@@ -328,9 +328,9 @@ async def _tell_defect(request: Request, e: Exception) -> Response:
 
 
 HANDLERS: dict[Any, Any] = {
-    PolysightError: tell_error,
-    OSError: tell_error,
-    ClientDisconnect: _tell_nobody,
-    404: tell_no_page,
-    Exception: _tell_defect,
+    PolysightError: answer_error,
+    OSError: answer_error,
+    ClientDisconnect: _answer_disconnected,
+    404: answer_no_page,
+    Exception: _answer_defect,
 }

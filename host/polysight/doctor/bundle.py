@@ -41,13 +41,15 @@ Not included: raw data, images, labels, keys. Words from files in pi.key_dir, an
 this computer.
 """
 REDACTION = "[removed]"
-# Limits of the archive: lines of a manifest, numbers of scans, logs and traces, and bytes of a file; chosen.
+# Limits of the archive, all chosen: lines of a manifest, and numbers of scans, logs and traces.
 _MAX_LINES = 60
 _MAX_SCANS = 3
 _MAX_LOGS = 20
 _MAX_TRACES = 6
+# Bytes that are put into the archive from the end of a log, and from the end of a trace; chosen.
 _TAIL_BYTES = 64 << 10
 _TRACE_BYTES = 4 << 20
+# Bytes that are read of a key file, and of a manifest; chosen.
 _KEY_BYTES = 64 << 10
 _MANIFEST_BYTES = 64 << 20
 _KERNEL = ("proc/version", "proc/sys/net/core/rmem_max", "proc/sys/net/core/rmem_default", "proc/loadavg",

@@ -60,7 +60,7 @@ _RX_MAX_WORD = 1
 _RX_WORD = 5
 # Files of sysfs that count packets which an interface dropped.
 _DROP_COUNTERS = ("rx_missed_errors", "rx_fifo_errors", "rx_dropped")
-# Bytes after which the probe of a disk ends, and seconds after which it ends on a slow disk; chosen.
+# The probe of a disk ends after this many bytes, or on a slow disk after this time; both are chosen.
 _PROBE_BYTES = 64 << 20
 _PROBE_S = 2.0
 
@@ -394,7 +394,7 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
             (Path(folder) / "raw" / board.name).mkdir(parents=True)
         cards.configure()
         radars.arm(frames)
-        cards.begin_row(0, 1, bursts, Path(folder))
+        cards.begin_row(row=0, take=1, points=bursts, folder=Path(folder))
         radars.note_row_start()
         pulses_sent = pi.pulse(frames, rig.burst.period_us, rig.burst.width_us)
         deadline = time.monotonic() + _LAST_PACKET_S + rig.limits.end_of_record_s
@@ -405,7 +405,7 @@ def capture_frames(rig: Instrument, pi: PiClient, bursts: int) -> tuple[dict[str
         states = radars.states()
         captured = {}
         for name, row in rows.items():
-            # The recording of row 0 keeps the name of an unfinished one: nothing commits it.
+            # Nothing commits this row 0: its file keeps the name of an unfinished one.
             payload = np.fromfile(Path(folder) / "raw" / name / f"0000{PART_SUFFIX}", np.uint8)
             chirps = frames * rig.burst.chirps
             words, valid = view_row_words(payload, row.missing, chirps, rig.chirp.samples, len(rig.antennas.rx_mm))

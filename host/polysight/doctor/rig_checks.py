@@ -50,15 +50,19 @@ from polysight_shared.sockets import HOST_KEYS, is_loopback
 
 # Least speed of the disk relative to the data rate of a scan; chosen.
 _SPEED_MARGIN = 2.0
-# Differences of the clocks of host and Pi that are a warning and an error (this, too, against our files' time); chosen.
+# Difference of the clocks of host and Pi from which on there is a warning; chosen.
 _MAX_CLOCK_OFFSET_S = 1.0
+# Difference that is an error: one of the clocks is not set. The host's clock is an error, too, if it is earlier than
+# this program's files by more. Chosen.
 _CLOCK_LOST_S = 60.0
 _CLOCK_REMEDY = "`timedatectl set-ntp true`, or set it by hand; a Pi has no battery for its clock"
 # Hops of the network survey that concern a card.
 _CARD_HOPS = ("host", "route", "link", "card")
-# Least values of the interface to a card: MTU for a card's frames, its speed, and its receive descriptors (chosen).
+# Least MTU of the interface to a card, which holds a card's packets.
 _MIN_MTU = 1500
+# Least speed of the interface.
 _MIN_SPEED_MBIT = 1000
+# Least number of its receive descriptors; chosen.
 _MIN_RING = 512
 
 

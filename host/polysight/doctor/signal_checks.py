@@ -145,8 +145,10 @@ def judge_skew(rig: Instrument, signals: dict[str, DirectSignal]) -> Finding:
     h, v = rig.receivers
     # Mean and standard error of the delay of each board, s.
     delay = {b.name: signals[b.name].start_delay_s(rig) for b in (h, v)}
-    skew = delay[v.name][0] - delay[h.name][0]
-    uncertainty = float(np.hypot(delay[h.name][1], delay[v.name][1]))
+    h_delay, h_error = delay[h.name]
+    v_delay, v_error = delay[v.name]
+    skew = v_delay - h_delay
+    uncertainty = float(np.hypot(h_error, v_error))
     jitter = max(float(unwrap_if(signals[b.name].if_hz, rig).std()) for b in (h, v)) / rig.chirp.slope_hz_per_s
     ppm = {b.name: signals[b.name].crystal_ppm(rig) for b in (h, v)}
     observed = f"{v.name} starts {skew * 1e9:+z.2f} +- {uncertainty * 1e9:.2f} ns after {h.name}; " + ", ".join(

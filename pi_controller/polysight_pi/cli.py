@@ -30,11 +30,12 @@ if TYPE_CHECKING:
 
 # Pause between two bursts of `pulse` (chosen).
 PAUSE_NS = 10_000_000
-# Largest number of bursts or events, and of an event: what a message to the service can carry.
+# Largest count of bursts or events, and largest number of an event: the largest that a message to the service can hold.
 MAX_COUNT = 2**31 - 1
-# Largest distance and speed of `jog` (chosen: further than any stage goes), and longest timeout.
+# Largest distance and speed of `jog`; chosen: further and faster than any stage goes.
 MAX_DISTANCE_MM = 10_000.0
 MAX_SPEED_MM_S = 10_000.0
+# Longest timeout; chosen.
 MAX_TIMEOUT_S = 1e6
 
 
@@ -249,7 +250,7 @@ def _load_rig(args: argparse.Namespace) -> Instrument:
     try:
         rig = load_instrument(args.config)
     except ConfigError as e:
-        # What a person types first on the Pi, in another folder than the rig file's.
+        # On the Pi, a person may run the first command in another folder than that of the rig file.
         if e.code == ErrorCode.FILE_MISSING and Path(RIG_FILE).exists():
             e.remedy = f"give the rig file of this Pi: `--config {RIG_FILE}`"
         raise

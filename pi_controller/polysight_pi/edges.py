@@ -101,14 +101,15 @@ class RowMotion(NamedTuple):
         `stops` are steps from the beginning of the row, ascending. The time at rest is not included, because no one
         knows it: an interval in which a stop lies is a lower limit.
         """
+        # Steps from the beginning of the row to each point.
+        distances = [self.run_up + point * abs(self.step) for point in range(self.points)]
         times: list[float] = []
         begin_s = 0.0
-        point = 0
         for begin, end in pairwise([0, *stops, self.length]):
             leg = _Leg.plan(end - begin, self)
-            while point < self.points and (steps_from_start := self.run_up + point * abs(self.step)) <= end:
-                times.append(begin_s + leg.time_s(steps_from_start - begin))
-                point += 1
+            # The points of this leg are the first ones that have no time yet.
+            while len(times) < self.points and distances[len(times)] <= end:
+                times.append(begin_s + leg.time_s(distances[len(times)] - begin))
             begin_s += leg.time_s(end - begin)
         return times, begin_s
 
@@ -129,7 +130,8 @@ class _Leg(NamedTuple):
     def plan(distance: int, motion: RowMotion) -> _Leg:
         """Return the leg over `distance` steps with speed and acceleration of `motion`.
 
-        One that is too short for full speed speeds up over half of its distance, and slows down over the other.
+        On a leg that is too short for full speed, the stage speeds up over half of the distance and slows down over the
+        other half.
         """
         ramp = min(motion.ramp, distance // 2)
         slowest = slowest_feed(motion.accel)
@@ -157,8 +159,10 @@ class _Leg(NamedTuple):
         ramp = len(self.up_s) - 1
         if steps <= ramp:
             return self.up_s[steps]
+        # The steps after the ramp are made at constant speed, and the last ones while the stage slows down.
         cruised = min(steps, self.distance - ramp) - ramp
-        return self.up_s[ramp] + cruised * self.cruise_s + self.down_s[steps - ramp - cruised]
+        slowed = steps - ramp - cruised
+        return self.up_s[ramp] + cruised * self.cruise_s + self.down_s[slowed]
 
 
 def _step_s(speed: float) -> float:
@@ -247,7 +251,9 @@ class EdgeTimes:
         for point in range(1, self._motion.points):
             interval_s = (self._edges_ns[point] - self._edges_ns[point - 1]) * 1e-9
             steps_from_start = self._motion.run_up + point * abs(self._motion.step)
-            waited = any(steps_from_start - abs(self._motion.step) <= stop < steps_from_start for stop in stops)
+            steps_before = steps_from_start - abs(self._motion.step)
+            # The stage rested in this interval, for an unknown time: its duration is a lower limit.
+            waited = any(steps_before <= stop < steps_from_start for stop in stops)
             expected_s = points_s[point] - points_s[point - 1]
             if waited and interval_s > expected_s:
                 continue
@@ -272,7 +278,7 @@ class EdgeTimes:
             return ""
         if late_s < 0:
             kind = "a spurious or early edge"
-        # Several intervals in one, each with its tolerance.
+        # Edges are lost if the interval is as long as several together, each with its tolerance.
         elif lost_edges and abs(late_s - lost_edges * self._interval_s) <= (lost_edges + 1) * tolerance_s:
             kind = f"{lost_edges} edges lost"
         else:

@@ -44,9 +44,11 @@ SET_VALUES = 0xC010B40F
 _VALUES = struct.Struct("=QQ")
 # The module parameter of spidev: longest transfer, bytes.
 BUFSIZ_FILE = Path("/sys/module/spidev/parameters/bufsiz")
-# _IOW('k', 0, struct spi_ioc_transfer[1]), _IOW('k', 1, __u8); mode 0, without chip select where the driver has that.
+# Request of a transfer: _IOW('k', 0, struct spi_ioc_transfer[1]).
 MESSAGE = 0x40206B00
+# Request to set the SPI mode: _IOW('k', 1, __u8).
 WRITE_MODE = 0x40016B01
+# SPI mode 0, and the bit for a transfer without chip select, which not every driver has.
 MODE_NO_CS = 0x40
 MODE_0 = 0x00
 # struct spi_ioc_transfer: tx, rx, len, speed_hz, delay_us, bits, cs_change, tx_nbits, rx_nbits, ...
@@ -374,6 +376,7 @@ class SpiDevice:
         buffer = array.array("B", data)
         self.received = array.array("B", bytes(len(data)))
         addresses = buffer.buffer_info()[0], self.received.buffer_info()[0]
+        # No delay, words of 8 bits, and the default of every other field.
         message = _TRANSFER.pack(*addresses, len(data), clock_hz, 0, 8, 0, 0, 0, 0, 0)
         try:
             begin_ns = time.monotonic_ns()
@@ -411,17 +414,20 @@ class SpiLines(TriggerInput):
     def transfer(self, burst: SpiBurst) -> tuple[int, int]:
         """Send a burst and count the pulses that MISO receives; return the times before and after. Raises DeviceError.
 
-        The first bit on the wire is the most significant one of `high`. So a pulse begins at a set bit whose left
-        neighbour is clear, and the longest pulse has as many bits as `high & high >> 1` can be repeated until it is 0.
+        The first bit on the wire is the most significant one of `high`, so that `high >> 1` has at each bit the one
+        before it in time.
         """
         times = self._device.transfer(burst.data, burst.clock_hz)
         high = int.from_bytes(self._device.received.tobytes(), "big")
-        pulses = self._seen.pulses + (high & ~(high >> 1)).bit_count()
+        # A pulse begins at a set bit after a clear one.
+        starts = high & ~(high >> 1)
+        # Each round takes the first bit from every pulse: the longest pulse has as many bits as there are rounds.
         longest = 0
         while high:
             high &= high >> 1
             longest += 1
-        self._seen = ReturnedPulses(pulses, max(self._seen.width_max_ns, round(longest * burst.bit_ns)))
+        width_max_ns = max(self._seen.width_max_ns, round(longest * burst.bit_ns))
+        self._seen = ReturnedPulses(self._seen.pulses + starts.bit_count(), width_max_ns)
         return times
 
     def count_returned(self, sent: int) -> ReturnedPulses | None:  # noqa: ARG002 - MISO was read with the transfers

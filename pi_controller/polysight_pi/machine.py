@@ -28,9 +28,9 @@ from polysight_shared.faults import PiFault, StageError, explain
 from polysight_shared.raster import Row
 from polysight_shared.stage_line import HOMING_TIMEOUT_S, Immediate, Reply
 
-# Time between two published statuses of a moving stage, of which about four a second are enough to draw it, and of one
-# at rest; chosen.
+# Least time between two published statuses of a moving stage: about four a second are enough to draw it. Chosen.
 STATUS_EVENT_S = 0.24
+# The same for a stage at rest; chosen.
 REST_STATUS_EVENT_S = 1.0
 # Consecutive statuses at rest after which the stage's report of a motion's end counts as lost; chosen.
 RESTING_STATUSES = 3

@@ -134,7 +134,8 @@ class Server:
         """
         next_beat = time.monotonic()
         while True:
-            # No longer than the other socket's thread: an idle one would count as late between rare heartbeats.
+            # Like the other socket's thread, this one waits no longer than POLL_MS: with rare heartbeats it would count
+            # as late otherwise.
             wait_s = min(POLL_MS / 1e3, max(0.0, next_beat - time.monotonic()))
             try:
                 raw = self._unsent.get(timeout=wait_s)

@@ -46,8 +46,8 @@ BANNER_TIMEOUT_S = 3.0
 ANSWER_TIMEOUT_S = 0.1
 # How often a line is sent before the stage counts as lost: for 2.1 s, because a busy machine may read late (chosen).
 TRIES = 21
-# How often a line is sent that arrives damaged: those answers come at once, and a stage that chatters sends any number
-# of them (chosen).
+# How often a line is sent that arrives damaged (chosen): that answer comes immediately, and a stage that chatters may
+# send any number of such answers.
 DAMAGED_TRIES = 4
 # Error numbers of answers that report a damaged line: it is sent again.
 RETRIED_ERRORS = (StageError.BAD_CRC, StageError.LINE_TOO_LONG)

@@ -17,7 +17,7 @@ from polysight_shared.messages import MAX_COMMAND_BYTES
 Socket = zmq.Socket[bytes]
 HOST_KEYS = ("pi.key", "host.key_secret")
 """Key files that the host needs, made on the Pi. `pi.key_secret` never leaves the Pi."""
-# Key files that the Pi needs.
+# The Pi's key with its secret part: the only key file that the Pi needs.
 PI_SECRET_KEY = "pi.key_secret"
 PI_KEYS = (PI_SECRET_KEY,)
 # First frame of every event; the second is the packed event.

@@ -13,8 +13,9 @@ import msgspec
 
 from polysight_shared.errors import ProtocolError
 
-# docs/spec/stage-line.md: the version that the banner names, and the longest line including its line end, bytes.
+# Version of the protocol that the banner names (docs/spec/stage-line.md).
 PROTOCOL_VERSION = 2
+# Longest line, with its line end (docs/spec/stage-line.md).
 MAX_LINE_BYTES = 96
 # Largest sequence number of a line; 0 follows.
 MAX_SEQUENCE = 65535
@@ -100,13 +101,15 @@ def unseal(line: bytes) -> str:
     """
     if len(line) > MAX_LINE_BYTES:
         raise ProtocolError(f"stage line of {len(line)} bytes is longer than {MAX_LINE_BYTES}")
+    # A line ends with "*", four digits of the CRC and the line end: six characters.
     if len(line) < 6 or line[-1:] != b"\n" or line[-6:-5] != b"*":
         raise ProtocolError(f"not a stage line: {line!r}")
     body = line[:-6]
     tail = line[-5:-1]
     if tail != b"%04X" % crc16(body):
         raise ProtocolError(f"checksum {tail!r} of stage line {body!r} is wrong, expected {crc16(body):04X}")
-    if any(not 0x20 <= c < 0x7F or c == 0x2A for c in body):
+    # Printable ASCII reaches from the space, 0x20, to "~", 0x7E.
+    if any(not 0x20 <= c < 0x7F or c == ord("*") for c in body):
         raise ProtocolError(f"stage line {body!r} contains a reserved character")
     return body.decode("ascii")
 

@@ -139,7 +139,9 @@ class WireClient:
         """Return the next line, or None after `timeout_s` (None: wait for ever). Raises DeviceError without a hub."""
         while not self._pending:
             # A timeout of 0 would make the socket non-blocking.
-            self._socket.settimeout(timeout_s if timeout_s is None else max(timeout_s, 1e-6))
+            if timeout_s is not None:
+                timeout_s = max(timeout_s, 1e-6)
+            self._socket.settimeout(timeout_s)
             try:
                 data = self._socket.recv(1 << 16)
             except (TimeoutError, BlockingIOError):
